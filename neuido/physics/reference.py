@@ -1,0 +1,116 @@
+"""The slow twin of `mpm.py`: the same substep in plain torch, differentiable by autograd. An oracle for tests and benchmarks.
+
+Written from the equations, not from the kernels: nothing is shared with them but the tables of colliders and clamps.
+"""
+
+import torch
+from torch import Tensor
+
+from neuido.physics.effects import Effects
+from neuido.physics.kernels import SEPARATE, SLIP, STICKY
+from neuido.physics.laws import Law
+from neuido.physics.mpm import Simulator
+from neuido.types import ParticleState
+
+
+def _splines(cells: Tensor) -> tuple[Tensor, Tensor]:
+    """First node (P, 3) and weights (P, 3 nodes, 3 axes) of the quadratic B-spline."""
+    base = torch.floor(cells.detach() - 0.5)
+    f = cells - base
+    weights = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2], dim=1)
+    return base.long(), weights
+
+
+def _contact(v: Tensor, normal: Tensor, kind: int, friction: Tensor) -> Tensor:
+    vn = (v * normal).sum(-1, keepdim=True)
+    tangent = v - vn * normal
+    if kind == STICKY:
+        return torch.zeros_like(v)
+    if kind == SLIP:
+        return tangent
+    assert kind == SEPARATE
+    speed = tangent.norm(dim=-1, keepdim=True)
+    stuck = (speed <= -friction * vn) | (vn >= 0.0)
+    safe = torch.where(stuck, torch.ones_like(speed), speed)
+    slid = torch.where(stuck, torch.zeros_like(v), tangent * (1.0 + torch.where(stuck, 0.0, friction * vn) / safe))
+    return torch.where(vn < 0.0, slid, v)
+
+
+def substep(
+    sim: Simulator,
+    state: ParticleState,
+    elasticity: Law,
+    plasticity: Law | None = None,
+    *,
+    effects: Effects | None = None,
+    gravity: Tensor | None = None,
+    friction: Tensor | None = None,
+    mass: Tensor | None = None,
+) -> ParticleState:
+    """One substep of all scenes; arguments as in `Simulator.rollout`."""
+    effects = Effects() if effects is None else effects
+    gravity = (sim.gravity if gravity is None else gravity) + effects.acceleration(sim.scene_count, sim.mass)
+    friction = sim.colliders.friction if friction is None else friction
+    mass = sim.mass if mass is None else mass
+    force = effects.force_table(sim.scene_count, sim.mass)
+    viscosity = effects.viscosity(sim.scene_count, sim.mass)
+    eye = torch.eye(3, dtype=sim.dtype, device=sim.device)
+    parts = []
+    tau_all = elasticity(state.F, sim.particles)
+    for s in range(sim.scene_count):
+        own = slice(sim.particles.offsets[s], sim.particles.offsets[s + 1])
+        x, v, C, F = (t[own] for t in state)
+        tau, m, volume = tau_all[own], mass[own], sim.volume[own]
+        dx, dt = sim.dx[s], sim.dt[s]
+        if viscosity is not None:
+            D = 0.5 * (C + C.transpose(1, 2))
+            t = D.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
+            tau = tau + torch.linalg.det(F)[:, None, None] * (2.0 * viscosity[s, 0] * (D - t / 3.0 * eye) + viscosity[s, 1] * t * eye)
+        base, w = _splines((x - sim.origin[s]) / dx)
+        offsets = torch.cartesian_prod(*[torch.arange(3, device=sim.device)] * 3)
+        nodes = base[:, None, :] + offsets
+        weight = w[:, offsets[:, 0], 0] * w[:, offsets[:, 1], 1] * w[:, offsets[:, 2], 2]
+        arm = sim.origin[s] + nodes * dx - x[:, None, :]
+        shape = sim.grid_shape[1:]
+        flat = ((nodes[..., 0] * shape[1] + nodes[..., 1]) * shape[2] + nodes[..., 2]).reshape(-1)
+        affine = m[:, None, None] * C - dt * volume[:, None, None] * 4.0 / dx**2 * tau
+        momentum = weight[..., None] * (m[:, None, None] * v[:, None, :] + torch.einsum("pab,pnb->pna", affine, arm))
+        grid_p = x.new_zeros(shape[0] * shape[1] * shape[2], 3)
+        grid_m = x.new_zeros(grid_p.shape[0])
+        grid_p = grid_p.index_add(0, flat, momentum.reshape(-1, 3))
+        grid_m = grid_m.index_add(0, flat, (weight * m[:, None]).reshape(-1))
+        full = grid_m > 0
+        u = grid_p / torch.where(full, grid_m, 1.0)[:, None]
+        index = torch.cartesian_prod(*[torch.arange(n, device=sim.device) for n in shape])
+        place = sim.origin[s] + index * dx
+        u = u + dt * (gravity[s] - force[s, 2] * (place - force[s, 3:]))
+        speed = torch.where(full[:, None], u, 1.0).norm(dim=1, keepdim=True)
+        u = u / (1.0 + dt * (force[s, 0] + force[s, 1] * speed))
+        for c in range(sim.colliders.kind.shape[1]):
+            kind = int(sim.colliders.kind[s, c])
+            if kind:
+                normal = sim.colliders.normal[s, c]
+                inside = (place - sim.colliders.point[s, c]) @ normal <= 1e-4 * dx
+                u = torch.where((inside & full)[:, None], _contact(torch.where(full[:, None], u, 1.0), normal, kind, friction[s, c]), u)
+        for lower, upper in zip(sim.clamp_lower[s], sim.clamp_upper[s]):
+            u = torch.where(((place >= lower) & (place <= upper)).all(1, keepdim=True), 0.0, u)
+        u = torch.where(full[:, None], u, 0.0)[flat].reshape(len(x), 27, 3)
+        held = sim.held[own].bool()
+        v_next = torch.where(held[:, None], 0.0, (weight[..., None] * u).sum(1))
+        C_next = 4.0 / dx**2 * torch.einsum("pn,pna,pnb->pab", weight, u, arm)
+        C_next = torch.where(held[:, None, None], 0.0, C_next)
+        parts.append((x + dt * v_next, v_next, C_next, (eye + dt * C_next) @ F))
+    x, v, C, trial = (torch.cat(t) for t in zip(*parts))
+    return ParticleState(x, v, C, trial if plasticity is None else plasticity(trial, sim.particles))
+
+
+def rollout(sim: Simulator, steps: int, elasticity: Law, plasticity: Law | None = None, *, state: ParticleState | None = None,
+            every: int = 1, **options) -> ParticleState:  # fmt: skip
+    """Frames of `steps` substeps, shaped as `Simulator.rollout` shapes them."""
+    state = sim.state if state is None else state
+    frames = [state]
+    for n in range(steps):
+        state = substep(sim, state, elasticity, plasticity, **options)
+        if (n + 1) % every == 0:
+            frames.append(state)
+    return ParticleState(*(torch.stack(parts) for parts in zip(*frames)))

@@ -1,0 +1,125 @@
+"""The tuples that cross rooms. SI units; shapes with P particles, S scenes, B samples, K frames."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from torch import Tensor
+
+Vector = tuple[float, float, float]
+
+
+class ParticleState(NamedTuple):
+    """The state of P particles, or of K frames of them with a leading K."""
+
+    x: Tensor
+    """Position [m], (P, 3)."""
+    v: Tensor
+    """Velocity [m/s], (P, 3)."""
+    C: Tensor
+    """Affine velocity, about the velocity gradient [1/s], (P, 3, 3)."""
+    F: Tensor
+    """Elastic deformation gradient [-], (P, 3, 3)."""
+
+
+class Particles(NamedTuple):
+    """Which scene each of the concatenated particles belongs to; scene s owns offsets[s]:offsets[s+1]."""
+
+    scene: Tensor
+    """Scene index, (P,) int32."""
+    offsets: tuple[int, ...]
+    """First particle of each scene, and P at the end: S + 1 numbers."""
+
+
+class Body(NamedTuple):
+    """One body at t = 0."""
+
+    x: Tensor
+    """Position [m], (P, 3)."""
+    v: Tensor
+    """Velocity [m/s], (P, 3)."""
+    volume: Tensor
+    """Volume [m^3], (P,)."""
+    F: Tensor | None = None
+    """Deformation gradient [-], (P, 3, 3); the identity where absent."""
+
+
+class TrajectoryBatch(NamedTuple):
+    """Samples of constitutive behaviour (paper, Stage I), in the order of a substep: trial, corrected, stress."""
+
+    trial: Tensor
+    """Trial deformation gradient F_tr before the plastic correction [-], (B, 3, 3)."""
+    corrected: Tensor
+    """Corrected deformation gradient, the plastic law of the trial [-], (B, 3, 3)."""
+    stress: Tensor
+    """Kirchhoff stress, the elastic law of the corrected gradient [Pa], (B, 3, 3)."""
+    trajectory: Tensor
+    """Index of the trajectory that a sample comes from, (B,) int64."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A half-space collider: material is kept on the side that the normal points to.
+
+    `contact` is `sticky` (velocity zero in the collider), `slip` (no normal velocity) or `separate` (no inward normal
+    velocity; `friction` is Coulomb's coefficient, and `inf` stops all sliding for as long as the material presses).
+    """
+
+    point: Vector
+    normal: Vector
+    contact: str = "separate"
+    friction: float = 0.0
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box [m]."""
+
+    lower: Vector
+    upper: Vector
+
+
+@dataclass(frozen=True)
+class AttachedMass:
+    """A mass [kg] spread over the particles that lie in the box at t = 0, in proportion to their volume."""
+
+    box: Box
+    mass: float
+
+
+@dataclass(frozen=True)
+class Walls:
+    """The six walls of the domain, `inset` cells inside it."""
+
+    contact: str = "separate"
+    friction: float = 0.0
+    inset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The set-up of one simulation: domain, grid, step, gravity and what the body meets.
+
+    `cells` counts the grid cells along the domain's longest side; `dt` is the substep [s]; `walls = None` leaves the domain
+    open (a particle that leaves it is then an error).
+    """
+
+    lower: Vector = (0.0, 0.0, 0.0)
+    upper: Vector = (1.0, 1.0, 1.0)
+    cells: int = 32
+    dt: float = 1e-3
+    gravity: Vector = (0.0, -9.8, 0.0)
+    colliders: tuple[Plane, ...] = ()
+    walls: Walls | None = Walls()
+    clamps: tuple[Box, ...] = ()
+    attached_masses: tuple[AttachedMass, ...] = ()
+
+    @property
+    def dx(self) -> float:
+        """Cell size [m]."""
+        return max(u - l for l, u in zip(self.lower, self.upper)) / self.cells
+
+    @property
+    def nodes(self) -> tuple[int, int, int]:
+        """Grid nodes along each axis, without padding."""
+        return tuple(math.ceil((u - l) / self.dx - 1e-9) + 1 for l, u in zip(self.lower, self.upper))  # type: ignore[return-value]

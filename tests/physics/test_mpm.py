@@ -1,0 +1,282 @@
+"""The rollout against its slow twin, finite differences and Warp's own autodiff."""
+
+import pytest
+import torch
+import warp as wp
+
+from neuido.errors import UserError
+from neuido.physics import kernels, reference
+from neuido.physics.effects import Effects
+from neuido.physics.laws import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
+from neuido.physics.mpm import Simulator, _Plan
+from neuido.types import Body, Box, ParticleState, Plane, Scene, Walls
+from tests.physics.bodies import DEVICES, block, busy_scenes
+
+NAMES = "x v C F mass gravity friction acceleration linear quadratic pull centre shear bulk young poisson yield".split()
+
+
+def leaf(value, device="cpu"):
+    return torch.as_tensor(value, dtype=torch.float64).clone().to(device).requires_grad_()
+
+
+class Problem:
+    """Two busy scenes with every differentiable input as a leaf."""
+
+    def __init__(self, device="cpu"):
+        scenes, bodies = busy_scenes()
+        self.sim = Simulator(scenes, bodies, dtype=torch.float64, device=device)
+        g = torch.Generator().manual_seed(3)
+        F = self.sim.state.F + 0.05 * torch.randn(self.sim.state.F.shape, generator=g, dtype=torch.float64).to(device)
+        self.state = ParticleState(*(leaf(t, device) for t in (*self.sim.state[:3], F)))
+        self.mass, self.gravity = leaf(self.sim.mass, device), leaf(self.sim.gravity, device)
+        self.friction = leaf(self.sim.colliders.friction, device)
+        values = ([0.3, 0.2, 0.1], [0.5, 0.7], [0.2, 0.3], [2.0, 3.0], [[0.5, 0.5, 0.5], [0.2, 0.3, 0.4]], [3.0, 5.0], [2.0, 4.0])
+        self.effects = [leaf(v, device) for v in values]
+        self.young, self.poisson, self.yield_stress = leaf(5e4, device), leaf(0.3, device), leaf(2e3, device)
+
+    def leaves(self):
+        return [*self.state, self.mass, self.gravity, self.friction, *self.effects, self.young, self.poisson, self.yield_stress]
+
+    def laws(self):
+        return (
+            stack([FixedCorotated(self.young, self.poisson), Sigma(2 * self.young, self.poisson)]),
+            stack([VonMises(self.yield_stress, self.young, self.poisson), DruckerPrager(25.0, 2 * self.young, self.poisson)]),
+        )
+
+    def loss(self, run, steps, every):
+        frames = run(
+            steps,
+            *self.laws(),
+            state=self.state,
+            mass=self.mass,
+            gravity=self.gravity,
+            friction=self.friction,
+            effects=Effects(*self.effects),
+            every=every,
+        )
+        total = 0.0
+        for i, t in enumerate(frames):
+            weights = torch.randn(t.shape, generator=torch.Generator().manual_seed(i), dtype=t.dtype)
+            total = total + (t * weights.to(t.device)).sum()
+        return total, frames
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_rollout_equals_its_slow_twin(device):
+    p = Problem(device)
+    fast, frames = p.loss(p.sim.rollout, 12, 3)
+    slow, expected = p.loss(lambda *a, **k: reference.rollout(p.sim, *a, **k), 12, 3)
+    for name, a, b in zip("xvCF", frames, expected):
+        assert torch.allclose(a, b, rtol=0, atol=1e-11 * float(b.detach().abs().max())), name
+    for name, a, b in zip(NAMES, torch.autograd.grad(fast, p.leaves()), torch.autograd.grad(slow, p.leaves()), strict=True):
+        assert float((a - b).norm()) <= 1e-9 * float(b.norm()), f"{name}: {float((a - b).norm() / b.norm()):.2e}"
+        assert float(b.norm()) > 0, name
+
+
+def test_rollout_gradient_equals_finite_differences():
+    p = Problem()
+    gradients = torch.autograd.grad(p.loss(p.sim.rollout, 6, 2)[0], p.leaves())
+    for name, t, gradient in zip(NAMES, p.leaves(), gradients, strict=True):
+        direction = torch.randn(t.shape, generator=torch.Generator().manual_seed(9), dtype=t.dtype)
+        # relative steps; the loss is piecewise smooth and this one stays on its piece
+        h = 2e-5 * float(t.detach().norm() / direction.norm())
+        with torch.no_grad():
+            values = []
+            for shift in (-2, -1, 1, 2):
+                t.add_(shift * h * direction)
+                values.append(float(p.loss(p.sim.rollout, 6, 2)[0]))
+                t.sub_(shift * h * direction)
+        numeric = (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * h)
+        analytic = float((gradient * direction).sum())
+        assert abs(numeric - analytic) <= 1e-6 * max(abs(analytic), 1e-3 * abs(float(gradient.norm() * direction.norm()))), name
+
+
+class Stage:
+    """The arrays of one substep of the busy scenes, for one kernel at a time."""
+
+    def __init__(self):
+        p = Problem()
+        self.sim, self.p = p.sim, p
+        self.plan = _Plan(p.sim, *p.laws(), 1, 1)
+        g = torch.Generator().manual_seed(1)
+        count = len(p.sim.mass)
+        self.state = [t.detach().clone() for t in p.state]
+        self.state[2] = self.state[2] + 3.0 * torch.randn(count, 3, 3, generator=g, dtype=torch.float64)
+        self.tau = 1e3 * torch.randn(count, 3, 3, generator=g, dtype=torch.float64)
+        self.force = Effects(*(t.detach() for t in p.effects)).force_table(2, p.sim.mass).contiguous()
+        self.viscosity = torch.tensor([[3.0, 2.0], [5.0, 4.0]], dtype=torch.float64)
+        self.g = g
+
+    def random(self, t):
+        return torch.randn(t.shape, generator=self.g, dtype=torch.float64)
+
+    def grid(self):
+        x, v, C, _ = self.state
+        return self.plan.to_grid(x, v, C, self.tau, self.sim.mass).clone()
+
+
+def kernel_cases(stage: Stage):
+    """Per kernel: inputs by argument name, the differentiable ones, and what it writes."""
+    sim = stage.sim
+    x, v, C, F = stage.state
+    place = {"scene": sim.particles.scene, "origin": sim.origin, "dx": sim.dx, "dt": sim.dt}
+    table = sim.colliders
+    walls = {"point": table.point, "normal": table.normal, "kind": table.kind, "lower": sim.clamp_lower, "upper": sim.clamp_upper}
+    grid = stage.grid()
+    velocity = torch.zeros(*sim.grid_shape, 3, dtype=torch.float64)
+    moving = {"held": sim.held, "step": 0, "status": torch.zeros(3, dtype=torch.int32)}
+    next_C = torch.zeros_like(C)
+    field = 0.5 * stage.random(velocity)
+    return {
+        "add_viscous_stress": (
+            {"scene": sim.particles.scene, "viscosity": stage.viscosity, "C": C, "F": F},
+            ["viscosity", "C", "F"],
+            {"tau": stage.tau.clone()},
+        ),
+        "particles_to_grid": (
+            {**place, "mass": sim.mass, "volume": sim.volume, "x": x, "v": v, "C": C, "tau": stage.tau},
+            ["mass", "x", "v", "C", "tau"],
+            {"grid": torch.zeros_like(grid)},
+        ),
+        "update_grid": (
+            {**{k: place[k] for k in ("origin", "dx", "dt")}, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
+             "friction": table.friction.clone(), "grid": grid},
+            ["gravity", "force", "friction", "grid"],
+            {"velocity": velocity},
+        ),
+        "grid_to_particles": (
+            {**place, **moving, "velocity": field, "x": x, "F": F},
+            ["velocity", "x", "F"],
+            {"x_next": torch.zeros_like(x), "v_next": torch.zeros_like(v), "C_next": next_C, "F_trial": torch.zeros_like(F)},
+        ),
+    }  # fmt: skip
+
+
+def launch(stage, kernel, values):
+    dim = stage.sim.grid_shape if "update_grid" in kernel.key else len(stage.sim.mass)
+    stage.plan.launch(kernel, dim, [values[arg.label] for arg in kernel.adj.args])
+
+
+KERNELS = ["add_viscous_stress", "particles_to_grid", "update_grid", "grid_to_particles"]
+
+
+def hand_adjoint(stage, name, inputs, wanted, outputs, weights):
+    """The production adjoint kernel, fed with the gradients `weights` of the outputs."""
+    adjoint = getattr(stage.sim.kernels, f"{name}_adjoint")
+    values = dict(inputs) | {"parameters": True}
+    values |= {f"a_{key}": weights[key].clone() for key in outputs}
+    values |= {f"a_{key}": torch.zeros_like(inputs[key]) for key in wanted}
+    values |= {key: outputs[key] for key in outputs if key == "C_next"}
+    launch(stage, adjoint, values)
+    return {key: values[f"a_{key}"] for key in wanted}
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernel_adjoint_equals_finite_differences(name):
+    stage = Stage()
+    inputs, wanted, outputs = kernel_cases(stage)[name]
+    forward = getattr(stage.sim.kernels, name)
+
+    def run(changes):
+        out = {key: t.clone() for key, t in outputs.items()}
+        launch(stage, forward, dict(inputs) | changes | out)
+        return out
+
+    base = run({})
+    weights = {key: stage.random(t) for key, t in outputs.items()}
+    analytic = hand_adjoint(stage, name, inputs, wanted, base, weights)
+    for key in wanted:
+        t = inputs[key]
+        direction = stage.random(t)
+        if key == "grid":  # only nodes that carry mass, in proportion to what they carry
+            direction = direction * t.abs()
+        h = 1e-5 * float(t.norm() / direction.norm())
+        values = [
+            sum(float((out * weights[k]).sum()) for k, out in run({key: t + shift * h * direction}).items()) for shift in (-2, -1, 1, 2)
+        ]
+        numeric = (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * h)
+        expected = float((analytic[key] * direction).sum())
+        assert abs(numeric - expected) <= 1e-6 * abs(expected) + 1e-9 * float(analytic[key].norm() * direction.norm()), key
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernel_adjoint_equals_warp_autodiff(name):
+    """Warp's own adjoint is right here but for the colliders' loop, which carries a value: `update_grid` runs it without planes."""
+    stage = Stage()
+    inputs, wanted, outputs = kernel_cases(stage)[name]
+    if name == "update_grid":
+        inputs |= {"kind": torch.zeros_like(inputs["kind"])}
+    oracle = getattr(kernels.build(wp.float64, enable_backward=True), name)
+    weights = {key: stage.random(t) for key, t in outputs.items()}
+    forward = {key: t.clone() for key, t in outputs.items()}
+    launch(stage, getattr(stage.sim.kernels, name), dict(inputs) | forward)
+    analytic = hand_adjoint(stage, name, inputs, wanted, forward, weights)
+    arrays = {}
+    for arg in oracle.adj.args:
+        value = (dict(inputs) | outputs)[arg.label]
+        if isinstance(value, torch.Tensor):
+            value = wp.from_torch(value.clone(), dtype=arg.type.dtype, requires_grad=arg.label in (*wanted, *outputs))
+        arrays[arg.label] = value
+    with wp.Tape() as tape:
+        dim = stage.sim.grid_shape if name == "update_grid" else len(stage.sim.mass)
+        wp.launch(oracle, dim=dim, inputs=[arrays[arg.label] for arg in oracle.adj.args], device="cpu")
+    tape.backward(grads={arrays[key]: wp.from_torch(weights[key].clone(), dtype=arrays[key].dtype) for key in outputs})
+    for key in set(wanted) - ({"friction"} if name == "update_grid" else set()):
+        expected = wp.to_torch(arrays[key].grad).reshape(analytic[key].shape)
+        full = torch.ones_like(expected)
+        if key == "grid":
+            full = (inputs["grid"][..., 3:] > 0).double().expand_as(expected)
+        error = float(((analytic[key] - expected) * full).norm() / expected.norm())
+        assert error <= 1e-10, f"{key}: {error:.2e}"
+
+
+def test_frames_do_not_depend_on_how_they_are_kept():
+    p = Problem()
+    with torch.no_grad():
+        every = p.loss(p.sim.rollout, 12, 1)[1]
+        third = p.loss(p.sim.rollout, 12, 3)[1]
+    with_gradient = p.loss(p.sim.rollout, 12, 3)[1]
+    for a, b, c in zip(every, third, with_gradient):
+        assert torch.equal(a[::3], b)
+        assert torch.equal(b, c)
+
+
+def test_float32_follows_float64():
+    scenes, bodies = busy_scenes()
+    law = NeoHookean(5e4, 0.3)
+    runs = [Simulator(scenes, bodies, dtype=dtype).rollout(20, law, every=20) for dtype in (torch.float32, torch.float64)]
+    for name, a, b in zip("xvCF", *runs):
+        assert float((a.double() - b).abs().max() / b.abs().max()) < 2e-4, name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(body=block((0.4, 0.9, 0.4), (0.6, 1.1, 0.6), (2, 2, 2))), "outside the domain"),
+        (dict(scene=Scene(cells=32, dt=5e-3)), "lower `dt`"),
+        (dict(body=block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (2, 2, 2), velocity=(0.0, -70.0, 0.0))), "crosses a cell"),
+        (dict(scene=Scene(clamps=(Box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),))), "clamp"),
+        (dict(scene=Scene(colliders=(Plane((0, 0, 0), (0, 1, 0), "glue"),))), "glue"),
+        (dict(scene=Scene(colliders=(Plane((0, 0, 0), (0, 0, 0)),))), "normal"),
+        (dict(scene=Scene(walls=Walls("separate", -1.0))), "friction is -1"),
+        (dict(density=-3.0), "density is -3"),
+        (dict(steps=10, every=3), "multiple of every"),
+        (dict(effects=Effects(drag_linear=-1.0)), "drag_linear is -1"),
+        (dict(effects=Effects(viscosity_shear=1e5)), "viscosity"),
+        (dict(scene=Scene(walls=None), body=block((0.4, 0.0, 0.4), (0.6, 0.2, 0.6), (4, 4, 4), velocity=(0.0, -9.0, 0.0)), steps=100),
+         "left the domain"),
+        (dict(body=Body(torch.tensor([[0.5, float("nan"), 0.5]]), torch.zeros(1, 3), torch.ones(1))), "NaN"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_clear_line(change, message):
+    body = change.get("body", block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (4, 4, 4)))
+    with pytest.raises(UserError, match=message) as error:
+        sim = Simulator(change.get("scene", Scene()), body, density=change.get("density", 1000.0))
+        sim.rollout(change.get("steps", 10), FixedCorotated(1e5, 0.3), effects=change.get("effects"), every=change.get("every", 1))
+    assert "\n" not in str(error.value)
+
+
+def test_a_step_that_blows_up_is_an_error_not_a_nan():
+    sim = Simulator(Scene(cells=16, dt=5e-3), block((0.3, 0.3, 0.3), (0.7, 0.7, 0.7), (6, 6, 6), velocity=(1.0, -3.0, 0.0)))
+    with pytest.raises(UserError, match="lower `dt`"):
+        sim.rollout(400, FixedCorotated(5e6, 0.3), check=False, every=400)
