@@ -13,17 +13,18 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics.kernels import CONTACTS
+from neuido.physics.grid_kernels import CONTACTS
 from neuido.types import Box, Plane, Scene
 
 
 class ColliderTable(NamedTuple):
     """K planes for each of S scenes; rows that a scene does not use have kind 0."""
 
-    point: Tensor
-    """A point on the plane [m], (S, K, 3)."""
-    normal: Tensor
-    """Unit normal that points to the material [-], (S, K, 3)."""
+    plane: Tensor
+    """Unit normal n that points to the material, and the offset w: a node at x is inside where n x <= w, (S, K, 4).
+
+    A node that lies on the plane to 1e-4 of a cell counts as inside; the offset of an unused row is -inf.
+    """
     kind: Tensor
     """1 sticky, 2 slip, 3 separate, 0 none, (S, K) int32."""
     friction: Tensor
@@ -59,23 +60,24 @@ def collider_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.de
     """The planes of all scenes, padded to the largest number of them."""
     rows = [planes_of(scene) for scene in scenes]
     count = max(1, *(len(row) for row in rows))
-    point = torch.zeros(len(scenes), count, 3, dtype=torch.float64)
-    normal = torch.zeros(len(scenes), count, 3, dtype=torch.float64)
+    plane = torch.zeros(len(scenes), count, 4, dtype=torch.float64)
+    plane[..., 3] = -torch.inf
     kind = torch.zeros(len(scenes), count, dtype=torch.int32)
     friction = torch.zeros(len(scenes), count, dtype=torch.float64)
-    for s, row in enumerate(rows):
-        for c, plane in enumerate(row):
-            point[s, c] = torch.tensor(plane.point, dtype=torch.float64)
-            n = torch.tensor(plane.normal, dtype=torch.float64)
-            normal[s, c] = n / n.norm()
-            kind[s, c] = CONTACTS[plane.contact]
-            friction[s, c] = plane.friction
-    return ColliderTable(point.to(device, dtype), normal.to(device, dtype), kind.to(device), friction.to(device, dtype))
+    for s, (scene, row) in enumerate(zip(scenes, rows)):
+        for c, given in enumerate(row):
+            normal = torch.tensor(given.normal, dtype=torch.float64)
+            normal = normal / normal.norm()
+            plane[s, c, :3] = normal
+            plane[s, c, 3] = normal @ torch.tensor(given.point, dtype=torch.float64) + 1e-4 * scene.dx
+            kind[s, c] = CONTACTS[given.contact]
+            friction[s, c] = given.friction
+    return ColliderTable(plane.to(device, dtype), kind.to(device), friction.to(device, dtype))
 
 
 def clamp_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Lower and upper corners of the clamps, (S, B, 3) each [m]; unused rows hold an empty box."""
-    count = max(1, *(len(scene.clamps) for scene in scenes))
+    count = max(len(scene.clamps) for scene in scenes)
     lower = torch.full((len(scenes), count, 3), torch.inf, dtype=torch.float64)
     upper = torch.full((len(scenes), count, 3), -torch.inf, dtype=torch.float64)
     for s, scene in enumerate(scenes):

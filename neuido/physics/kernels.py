@@ -1,15 +1,17 @@
-"""Warp kernels of one MLS-MPM substep and their hand-written adjoints, for float32 and float64, CPU and CUDA.
+"""Warp kernels of the transfers between particles and grid, and their hand-written adjoints, for float32 and float64.
 
 A substep (paper, appendix "Material Point Method"; the MLS form of Hu et al. 2018) moves P particles of S scenes at once.
-Scene s has its own slab `grid[s]` of the four-dimensional grid, padded by PAD nodes on each side so that the quadratic
-stencil of a particle in the domain never leaves it.
+The grid is one array over all nodes of all scenes, [scene, x, y, z] with z fastest, and each scene's part is padded by PAD
+nodes on each side so that the quadratic stencil of a particle in the domain never leaves it. Nodes hold four numbers:
+(momentum, mass) or (velocity, 0).
 
-    particles_to_grid   tau, C, v -> momentum and mass of the nodes          k = 4/dx^2, A = m C - dt V0 k tau
-    update_grid         nodal velocity: gravity, body forces, colliders, clamps
+    particles_to_grid   tau, C, v -> momentum and mass of the nodes          A = m C - dt V0 (4/dx^2) tau
+    (grid_kernels)      nodal velocity: gravity, body forces, colliders, clamps
     grid_to_particles   v, C, x, and the trial F_tr = (I + dt C) F
 
 `*_adjoint` kernels take the adjoint of what the forward kernel wrote and add to the adjoint of what it read. The adjoint of
-the scatter is a gather and has no atomics; only the adjoint of the gather scatters.
+the scatter is a gather and has no atomics; only the adjoint of the gather scatters. The 27 nodes are summed axis by axis,
+since weights, arms and slopes are products over the axes: about a third of the operations of the plain sum.
 """
 
 import functools
@@ -18,17 +20,24 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from neuido.physics import grid_kernels
+
 PAD = 2
 """Nodes added on each side of the domain."""
-
-STICKY, SLIP, SEPARATE = 1, 2, 3
-CONTACTS = {"sticky": STICKY, "slip": SLIP, "separate": SEPARATE}
 
 LOST, FAST = 1, 2
 """Codes in status[0]: a particle outside the padded grid; one that moves by more than a cell a substep, or is not finite."""
 
-BODY_FORCE_SIZE = 6
-"""Columns of the body-force table: linear drag [1/s], quadratic drag [1/m], pull [1/s^2], its centre x, y, z [m]."""
+ADD4 = """
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    atomicAdd(reinterpret_cast<float4*>(&grid.data[node]), make_float4(value[0], value[1], value[2], value[3]));
+#elif defined(__CUDA_ARCH__)
+    for (int c = 0; c < 4; ++c) atomicAdd(&grid.data[node].c[c], value[c]);
+#else
+    for (int c = 0; c < 4; ++c) grid.data[node].c[c] += value[c];
+#endif
+"""
+"""One vector reduction instead of four scalar ones: four times faster on a Hopper GPU."""
 
 
 def start_warp() -> None:
@@ -44,14 +53,14 @@ def real_of(dtype: torch.dtype) -> type:
 
 @functools.cache
 def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
-    """The kernels for one scalar type, compiled on first launch.
+    """All kernels of a substep for one scalar type, compiled on first launch.
 
     Args:
         real: `wp.float32` or `wp.float64`.
-        enable_backward: Also generate Warp's own adjoints (the oracle of the tests).
+        enable_backward: Also generate Warp's own adjoints of the forward kernels (the oracle of the tests).
 
     Returns:
-        A namespace of kernels and of the vector types `vec3`, `vec4`, `mat33`.
+        A namespace of kernels, those of `grid_kernels` included.
     """
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
@@ -61,6 +70,17 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
     adjoint_kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+
+    if real is wp.float32 and not enable_backward:
+
+        @wp.func_native(ADD4)
+        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4): ...
+
+    else:
+
+        @func
+        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4):
+            wp.atomic_add(grid, node, value)
 
     @func
     def spline(f: real):
@@ -76,116 +96,48 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         return vec3(f - real(1.5), real(-2.0) * (f - real(1.0)), f - real(0.5))
 
     @func
-    def first_node(x: vec3, origin: vec3, inv_dx: real, nx: int, ny: int, nz: int):
+    def first_moment(w: vec3):
+        """Weights times the node's number in the stencil, 0, 1 or 2."""
+        return vec3(real(0.0), w[1], real(2.0) * w[2])
+
+    @func
+    def first_node(cells: vec3, nodes: wp.vec3i):
         """The lowest node of a particle's stencil, clamped into the grid (a lost particle is flagged elsewhere)."""
-        i = int(wp.floor((x[0] - origin[0]) * inv_dx - real(0.5)))
-        j = int(wp.floor((x[1] - origin[1]) * inv_dx - real(0.5)))
-        k = int(wp.floor((x[2] - origin[2]) * inv_dx - real(0.5)))
-        return wp.vec3i(wp.clamp(i, 0, nx - 3), wp.clamp(j, 0, ny - 3), wp.clamp(k, 0, nz - 3))
+        return wp.vec3i(
+            wp.clamp(int(wp.floor(cells[0] - real(0.5))), 0, nodes[0] - 3),
+            wp.clamp(int(wp.floor(cells[1] - real(0.5))), 0, nodes[1] - 3),
+            wp.clamp(int(wp.floor(cells[2] - real(0.5))), 0, nodes[2] - 3),
+        )
 
     @func
-    def offset_in_cells(x: vec3, origin: vec3, inv_dx: real, base: wp.vec3i):
-        f = (x - origin) * inv_dx
-        return vec3(f[0] - real(base[0]), f[1] - real(base[1]), f[2] - real(base[2]))
+    def flat(s: int, node: wp.vec3i, nodes: wp.vec3i):
+        return ((s * nodes[0] + node[0]) * nodes[1] + node[1]) * nodes[2] + node[2]
 
     @func
-    def arm(i: int, j: int, k: int, f: vec3, h: real):
-        """From the particle to node (i, j, k) of its stencil [m]."""
-        return vec3(real(i) - f[0], real(j) - f[1], real(k) - f[2]) * h
+    def within(cells: vec3, base: wp.vec3i):
+        """Distance to the first node of the stencil, in cells."""
+        return vec3(cells[0] - real(base[0]), cells[1] - real(base[1]), cells[2] - real(base[2]))
 
     @func
-    def contact(v: vec3, n: vec3, kind: int, friction: real):
-        """Velocity of a node inside a collider, from its velocity before."""
-        vn = wp.dot(v, n)
-        out = v
-        if kind == wp.static(STICKY):
-            out = vec3(real(0.0), real(0.0), real(0.0))
-        elif kind == wp.static(SLIP):
-            out = v - vn * n
-        elif kind == wp.static(SEPARATE):
-            if vn < real(0.0):
-                t = v - vn * n
-                speed = wp.length(t)
-                if speed <= -friction * vn:
-                    out = vec3(real(0.0), real(0.0), real(0.0))
-                else:
-                    out = t * (real(1.0) + friction * vn / wp.max(speed, real(1.0e-30)))
-        return out
+    def velocity_of(q: vec4):
+        return vec3(q[0], q[1], q[2])
 
     @func
-    def contact_adjoint(v: vec3, n: vec3, kind: int, friction: real, a: vec3):
-        """Adjoint of `contact`: that of v (first three) and of the friction (last)."""
-        vn = wp.dot(v, n)
-        out = vec4(a[0], a[1], a[2], real(0.0))
-        if kind == wp.static(STICKY):
-            out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
-        elif kind == wp.static(SLIP):
-            b = a - wp.dot(a, n) * n
-            out = vec4(b[0], b[1], b[2], real(0.0))
-        elif kind == wp.static(SEPARATE):
-            if vn < real(0.0):
-                t = v - vn * n
-                speed = wp.length(t)
-                if speed <= -friction * vn:
-                    out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
-                else:
-                    s = wp.max(speed, real(1.0e-30))
-                    e = t / s
-                    ea = wp.dot(e, a)
-                    at = a + (friction * vn / s) * (a - ea * e)
-                    at = at - wp.dot(at, n) * n
-                    b = at + (friction * ea) * n
-                    out = vec4(b[0], b[1], b[2], vn * ea)
-        return out
+    def column(A: mat33, c: int):
+        return vec3(A[0, c], A[1, c], A[2, c])
 
-    @kernel
-    def add_viscous_stress(
-        scene: wp.array(dtype=wp.int32),
-        viscosity: wp.array2d(dtype=real),
-        C: wp.array(dtype=mat33),
-        F: wp.array(dtype=mat33),
-        tau: wp.array(dtype=mat33),
-    ):
-        """tau += J (2 eta dev D + zeta tr(D) I), D = sym C: Kelvin-Voigt, columns eta (shear) and zeta (bulk) in Pa s."""
-        p = wp.tid()
-        s = wp.min(scene[p], viscosity.shape[0] - 1)
-        D = real(0.5) * (C[p] + wp.transpose(C[p]))
-        t = wp.trace(D)
-        eta = viscosity[s, 0]
-        i3 = wp.identity(n=3, dtype=real)
-        tau[p] = tau[p] + wp.determinant(F[p]) * (real(2.0) * eta * D + (viscosity[s, 1] - real(2.0) / real(3.0) * eta) * t * i3)
-
-    @adjoint_kernel
-    def add_viscous_stress_adjoint(
-        scene: wp.array(dtype=wp.int32),
-        viscosity: wp.array2d(dtype=real),
-        C: wp.array(dtype=mat33),
-        F: wp.array(dtype=mat33),
-        a_tau: wp.array(dtype=mat33),
-        a_C: wp.array(dtype=mat33),
-        a_F: wp.array(dtype=mat33),
-        a_viscosity: wp.array2d(dtype=real),
-    ):
-        p = wp.tid()
-        s = wp.min(scene[p], viscosity.shape[0] - 1)
-        D = real(0.5) * (C[p] + wp.transpose(C[p]))
-        t = wp.trace(D)
-        J = wp.determinant(F[p])
-        eta = viscosity[s, 0]
-        zeta = viscosity[s, 1]
-        A = real(0.5) * (a_tau[p] + wp.transpose(a_tau[p]))
-        tA = wp.trace(A)
-        AD = wp.ddot(A, D)
-        shear = real(2.0) * (AD - t * tA / real(3.0))
-        i3 = wp.identity(n=3, dtype=real)
-        a_C[p] = a_C[p] + J * (real(2.0) * eta * (A - (tA / real(3.0)) * i3) + zeta * tA * i3)
-        c0 = vec3(F[p][0, 0], F[p][1, 0], F[p][2, 0])
-        c1 = vec3(F[p][0, 1], F[p][1, 1], F[p][2, 1])
-        c2 = vec3(F[p][0, 2], F[p][1, 2], F[p][2, 2])
-        cofactor = wp.matrix_from_cols(wp.cross(c1, c2), wp.cross(c2, c0), wp.cross(c0, c1))
-        a_F[p] = a_F[p] + (eta * shear + zeta * t * tA) * cofactor
-        wp.atomic_add(a_viscosity, s, 0, J * shear)
-        wp.atomic_add(a_viscosity, s, 1, J * t * tA)
+    @func
+    def cell_of(y: vec3, origin: vec3, h: real, nodes: wp.vec3i):
+        """Whether the stencil of a particle at y lies in the padded grid."""
+        c = (y - origin) / h
+        return (
+            c[0] >= real(0.5)
+            and c[1] >= real(0.5)
+            and c[2] >= real(0.5)
+            and c[0] <= real(nodes[0]) - real(1.5)
+            and c[1] <= real(nodes[1]) - real(1.5)
+            and c[2] <= real(nodes[2]) - real(1.5)
+        )
 
     @kernel
     def particles_to_grid(
@@ -193,32 +145,44 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         origin: wp.array(dtype=vec3),
         dx: wp.array(dtype=real),
         dt: wp.array(dtype=real),
+        nodes: wp.vec3i,
         mass: wp.array(dtype=real),
         volume: wp.array(dtype=real),
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         C: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33),
-        grid: wp.array4d(dtype=vec4),
+        grid: wp.array(dtype=vec4),
     ):
         """Nodes get (momentum [kg m/s], mass [kg]); `grid` must be zero before."""
         p = wp.tid()
         s = scene[p]
         h = dx[s]
         m = mass[p]
-        base = first_node(x[p], origin[s], real(1.0) / h, grid.shape[1], grid.shape[2], grid.shape[3])
-        f = offset_in_cells(x[p], origin[s], real(1.0) / h, base)
+        cells = (x[p] - origin[s]) / h
+        base = first_node(cells, nodes)
+        f = within(cells, base)
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
-        A = m * C[p] - (dt[s] * volume[p] * real(4.0) / (h * h)) * tau[p]
+        hA = h * m * C[p] - (dt[s] * volume[p] * real(4.0) / h) * tau[p]
+        ax = column(hA, 0)
+        ay = column(hA, 1)
+        az = column(hA, 2)
+        bi = m * v[p] - hA * f
+        node = flat(s, base, nodes)
         for i in range(3):
+            bj = bi
             for j in range(3):
+                bk = bj
+                wij = wx[i] * wy[j]
+                row = node + (i * nodes[1] + j) * nodes[2]
                 for k in range(3):
-                    w = wx[i] * wy[j] * wz[k]
-                    d = arm(i, j, k, f, h)
-                    q = w * (m * v[p] + A * d)
-                    wp.atomic_add(grid, s, base[0] + i, base[1] + j, base[2] + k, vec4(q[0], q[1], q[2], w * m))
+                    w = wij * wz[k]
+                    add4(grid, row + k, vec4(w * bk[0], w * bk[1], w * bk[2], w * m))
+                    bk = bk + az
+                bj = bj + ay
+            bi = bi + ax
 
     @adjoint_kernel
     def particles_to_grid_adjoint(
@@ -226,13 +190,14 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         origin: wp.array(dtype=vec3),
         dx: wp.array(dtype=real),
         dt: wp.array(dtype=real),
+        nodes: wp.vec3i,
         mass: wp.array(dtype=real),
         volume: wp.array(dtype=real),
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         C: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33),
-        a_grid: wp.array4d(dtype=vec4),
+        a_grid: wp.array(dtype=vec4),
         a_mass: wp.array(dtype=real),
         a_x: wp.array(dtype=vec3),
         a_v: wp.array(dtype=vec3),
@@ -244,169 +209,80 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         s = scene[p]
         h = dx[s]
         m = mass[p]
-        ratio = dt[s] * real(4.0) / (h * h)
-        base = first_node(x[p], origin[s], real(1.0) / h, a_grid.shape[1], a_grid.shape[2], a_grid.shape[3])
-        f = offset_in_cells(x[p], origin[s], real(1.0) / h, base)
+        cells = (x[p] - origin[s]) / h
+        base = first_node(cells, nodes)
+        f = within(cells, base)
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
+        ix = first_moment(wx)
+        iy = first_moment(wy)
+        iz = first_moment(wz)
         gx = spline_slope(f[0])
         gy = spline_slope(f[1])
         gz = spline_slope(f[2])
-        A = m * C[p] - (ratio * volume[p]) * tau[p]
-        At = wp.transpose(A)
-        s0 = vec3(real(0.0), real(0.0), real(0.0))
-        sx = vec3(real(0.0), real(0.0), real(0.0))
-        s1 = wp.outer(s0, s0)
+        ratio = dt[s] * volume[p] * real(4.0) / (h * h)
+        hA = h * (m * C[p] - ratio * tau[p])
+        ax = column(hA, 0)
+        ay = column(hA, 1)
+        az = column(hA, 2)
+        bi = m * v[p] - hA * f
+        node = flat(s, base, nodes)
+        zero = vec3(real(0.0), real(0.0), real(0.0))
+        s0 = zero
+        sx = zero
+        sy = zero
+        sz = zero
+        slope = zero
         sm = real(0.0)
         for i in range(3):
+            bj = bi
+            ti = zero
+            tiy = zero
+            tiz = zero
+            pi = real(0.0)
+            piy = real(0.0)
+            piz = real(0.0)
+            mi = real(0.0)
             for j in range(3):
+                bk = bj
+                tj = zero
+                tjz = zero
+                pj = real(0.0)
+                pjz = real(0.0)
+                mj = real(0.0)
+                row = node + (i * nodes[1] + j) * nodes[2]
                 for k in range(3):
-                    w = wx[i] * wy[j] * wz[k]
-                    slope = vec3(gx[i] * wy[j] * wz[k], wx[i] * gy[j] * wz[k], wx[i] * wy[j] * gz[k]) / h
-                    d = arm(i, j, k, f, h)
-                    g = a_grid[s, base[0] + i, base[1] + j, base[2] + k]
-                    a = vec3(g[0], g[1], g[2])
-                    s0 += w * a
-                    s1 += wp.outer(w * a, d)
-                    sm += w * g[3]
-                    sx += (wp.dot(a, m * v[p] + A * d) + m * g[3]) * slope - w * (At * a)
+                    g = a_grid[row + k]
+                    a = velocity_of(g)
+                    phi = wp.dot(a, bk) + m * g[3]
+                    tj += wz[k] * a
+                    tjz += iz[k] * a
+                    pj += wz[k] * phi
+                    pjz += gz[k] * phi
+                    mj += wz[k] * g[3]
+                    bk = bk + az
+                ti += wy[j] * tj
+                tiy += iy[j] * tj
+                tiz += wy[j] * tjz
+                pi += wy[j] * pj
+                piy += gy[j] * pj
+                piz += wy[j] * pjz
+                mi += wy[j] * mj
+                bj = bj + ay
+            s0 += wx[i] * ti
+            sx += ix[i] * ti
+            sy += wx[i] * tiy
+            sz += wx[i] * tiz
+            slope += vec3(gx[i] * pi, wx[i] * piy, wx[i] * piz)
+            sm += wx[i] * mi
+            bi = bi + ax
+        s1 = h * wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
         a_v[p] = m * s0
         a_C[p] = m * s1
-        a_tau[p] = -(ratio * volume[p]) * s1
-        a_x[p] = a_x[p] + sx
+        a_tau[p] = -ratio * s1
+        a_x[p] = a_x[p] + (slope - wp.transpose(hA) * s0) / h
         a_mass[p] = a_mass[p] + wp.dot(s0, v[p]) + wp.ddot(s1, C[p]) + sm
-
-    @func
-    def push(v0: vec3, x: vec3, dt: real, g: vec3, force: wp.array2d(dtype=real), row: int):
-        """Nodal velocity after gravity and the body forces; drag is implicit in its size, so any coefficient is stable."""
-        centre = vec3(force[row, 3], force[row, 4], force[row, 5])
-        u = v0 + dt * (g - force[row, 2] * (x - centre))
-        return u / (real(1.0) + dt * (force[row, 0] + force[row, 1] * wp.length(u)))
-
-    @func
-    def clamped(x: vec3, s: int, lower: wp.array2d(dtype=vec3), upper: wp.array2d(dtype=vec3)):
-        inside = bool(False)
-        for b in range(lower.shape[1]):
-            l = lower[s, b]
-            u = upper[s, b]
-            if x[0] >= l[0] and x[1] >= l[1] and x[2] >= l[2] and x[0] <= u[0] and x[1] <= u[1] and x[2] <= u[2]:
-                inside = True
-        return inside
-
-    @func
-    def inside_plane(x: vec3, point: vec3, normal: vec3, h: real):
-        # a node that lies on the plane to rounding counts as inside
-        return wp.dot(x - point, normal) <= real(1.0e-4) * h
-
-    @func
-    def collide(
-        v: vec3,
-        x: vec3,
-        h: real,
-        s: int,
-        count: int,
-        point: wp.array2d(dtype=vec3),
-        normal: wp.array2d(dtype=vec3),
-        kind: wp.array2d(dtype=wp.int32),
-        friction: wp.array2d(dtype=real),
-    ):
-        """The velocity after the first `count` colliders, in their order."""
-        out = v
-        for c in range(count):
-            if kind[s, c] > 0:
-                if inside_plane(x, point[s, c], normal[s, c], h):
-                    out = contact(out, normal[s, c], kind[s, c], friction[s, c])
-        return out
-
-    @kernel
-    def update_grid(
-        origin: wp.array(dtype=vec3),
-        dx: wp.array(dtype=real),
-        dt: wp.array(dtype=real),
-        gravity: wp.array(dtype=vec3),
-        force: wp.array2d(dtype=real),
-        point: wp.array2d(dtype=vec3),
-        normal: wp.array2d(dtype=vec3),
-        kind: wp.array2d(dtype=wp.int32),
-        friction: wp.array2d(dtype=real),
-        lower: wp.array2d(dtype=vec3),
-        upper: wp.array2d(dtype=vec3),
-        grid: wp.array4d(dtype=vec4),
-        velocity: wp.array4d(dtype=vec3),
-    ):
-        s, i, j, k = wp.tid()
-        g = grid[s, i, j, k]
-        out = vec3(real(0.0), real(0.0), real(0.0))
-        if g[3] > real(0.0):
-            x = origin[s] + vec3(real(i), real(j), real(k)) * dx[s]
-            if not clamped(x, s, lower, upper):
-                v0 = vec3(g[0], g[1], g[2]) / g[3]
-                u = push(v0, x, dt[s], gravity[s], force, s)
-                out = collide(u, x, dx[s], s, kind.shape[1], point, normal, kind, friction)
-        velocity[s, i, j, k] = out
-
-    @adjoint_kernel
-    def update_grid_adjoint(
-        origin: wp.array(dtype=vec3),
-        dx: wp.array(dtype=real),
-        dt: wp.array(dtype=real),
-        gravity: wp.array(dtype=vec3),
-        force: wp.array2d(dtype=real),
-        point: wp.array2d(dtype=vec3),
-        normal: wp.array2d(dtype=vec3),
-        kind: wp.array2d(dtype=wp.int32),
-        friction: wp.array2d(dtype=real),
-        lower: wp.array2d(dtype=vec3),
-        upper: wp.array2d(dtype=vec3),
-        grid: wp.array4d(dtype=vec4),
-        a_velocity: wp.array4d(dtype=vec3),
-        a_grid: wp.array4d(dtype=vec4),
-        a_gravity: wp.array(dtype=vec3),
-        a_force: wp.array2d(dtype=real),
-        a_friction: wp.array2d(dtype=real),
-        parameters: bool,
-    ):
-        """Writes a_grid; adds to the adjoints of gravity, body forces and friction where `parameters` is set."""
-        s, i, j, k = wp.tid()
-        g = grid[s, i, j, k]
-        out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
-        if g[3] > real(0.0):
-            h = dx[s]
-            x = origin[s] + vec3(real(i), real(j), real(k)) * h
-            if not clamped(x, s, lower, upper):
-                v0 = vec3(g[0], g[1], g[2]) / g[3]
-                u = push(v0, x, dt[s], gravity[s], force, s)
-                a = a_velocity[s, i, j, k]
-                planes = kind.shape[1]
-                for r in range(planes):
-                    c = planes - 1 - r
-                    if kind[s, c] > 0:
-                        if inside_plane(x, point[s, c], normal[s, c], h):
-                            before = collide(u, x, h, s, c, point, normal, kind, friction)
-                            b = contact_adjoint(before, normal[s, c], kind[s, c], friction[s, c], a)
-                            a = vec3(b[0], b[1], b[2])
-                            if parameters:
-                                wp.atomic_add(a_friction, s, c, b[3])
-                # the implicit drag: v = u / D, D = 1 + dt (c1 + c2 |u|)
-                centre = vec3(force[s, 3], force[s, 4], force[s, 5])
-                u = v0 + dt[s] * (gravity[s] - force[s, 2] * (x - centre))
-                speed = wp.length(u)
-                D = real(1.0) + dt[s] * (force[s, 0] + force[s, 1] * speed)
-                aD = -wp.dot(a, u) / (D * D)
-                au = a / D
-                if speed > real(0.0):
-                    au = au + (aD * dt[s] * force[s, 1] / speed) * u
-                if parameters:
-                    wp.atomic_add(a_gravity, s, dt[s] * au)
-                    wp.atomic_add(a_force, s, 0, dt[s] * aD)
-                    wp.atomic_add(a_force, s, 1, dt[s] * speed * aD)
-                    wp.atomic_add(a_force, s, 2, -dt[s] * wp.dot(au, x - centre))
-                    wp.atomic_add(a_force, s, 3, dt[s] * force[s, 2] * au[0])
-                    wp.atomic_add(a_force, s, 4, dt[s] * force[s, 2] * au[1])
-                    wp.atomic_add(a_force, s, 5, dt[s] * force[s, 2] * au[2])
-                out = vec4(au[0], au[1], au[2], -wp.dot(au, v0)) / g[3]
-        a_grid[s, i, j, k] = out
 
     @kernel
     def grid_to_particles(
@@ -415,7 +291,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         origin: wp.array(dtype=vec3),
         dx: wp.array(dtype=real),
         dt: wp.array(dtype=real),
-        velocity: wp.array4d(dtype=vec3),
+        nodes: wp.vec3i,
+        velocity: wp.array(dtype=vec4),
         x: wp.array(dtype=vec3),
         F: wp.array(dtype=mat33),
         x_next: wp.array(dtype=vec3),
@@ -436,22 +313,38 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
             C_next[p] = wp.outer(zero, zero)
             F_trial[p] = F[p]
             return
-        base = first_node(x[p], origin[s], real(1.0) / h, velocity.shape[1], velocity.shape[2], velocity.shape[3])
-        f = offset_in_cells(x[p], origin[s], real(1.0) / h, base)
+        cells = (x[p] - origin[s]) / h
+        base = first_node(cells, nodes)
+        f = within(cells, base)
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
+        ix = first_moment(wx)
+        iy = first_moment(wy)
+        iz = first_moment(wz)
+        node = flat(s, base, nodes)
         v = zero
-        B = wp.outer(zero, zero)
+        vx = zero
+        vy = zero
+        vz = zero
         for i in range(3):
+            ui = zero
+            uiy = zero
+            uiz = zero
             for j in range(3):
-                for k in range(3):
-                    w = wx[i] * wy[j] * wz[k]
-                    d = arm(i, j, k, f, h)
-                    g = velocity[s, base[0] + i, base[1] + j, base[2] + k]
-                    v += w * g
-                    B += wp.outer(w * g, d)
-        C = (real(4.0) / (h * h)) * B
+                row = node + (i * nodes[1] + j) * nodes[2]
+                u0 = velocity_of(velocity[row])
+                u1 = velocity_of(velocity[row + 1])
+                u2 = velocity_of(velocity[row + 2])
+                uj = wz[0] * u0 + wz[1] * u1 + wz[2] * u2
+                ui += wy[j] * uj
+                uiy += iy[j] * uj
+                uiz += wy[j] * (iz[1] * u1 + iz[2] * u2)
+            v += wx[i] * ui
+            vx += ix[i] * ui
+            vy += wx[i] * uiy
+            vz += wx[i] * uiz
+        C = (real(4.0) / h) * wp.matrix_from_cols(vx - f[0] * v, vy - f[1] * v, vz - f[2] * v)
         y = x[p] + dt[s] * v
         x_next[p] = y
         v_next[p] = v
@@ -460,10 +353,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         code = int(0)
         if not (wp.length(v) * dt[s] < h):
             code = wp.static(FAST)
-        for axis in range(3):
-            cell = (y[axis] - origin[s][axis]) / h
-            if not (cell >= real(0.5) and cell <= real(velocity.shape[axis + 1]) - real(1.5)):
-                code = wp.max(code, wp.static(LOST))
+        if not cell_of(y, origin[s], h, nodes):
+            code = wp.max(code, wp.static(LOST))
         if code > 0:
             if wp.atomic_cas(status, 0, 0, code) == 0:
                 status[1] = p
@@ -476,15 +367,17 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         origin: wp.array(dtype=vec3),
         dx: wp.array(dtype=real),
         dt: wp.array(dtype=real),
-        velocity: wp.array4d(dtype=vec3),
+        nodes: wp.vec3i,
+        velocity: wp.array(dtype=vec4),
         x: wp.array(dtype=vec3),
         F: wp.array(dtype=mat33),
+        v_next: wp.array(dtype=vec3),
         C_next: wp.array(dtype=mat33),
         a_x_next: wp.array(dtype=vec3),
         a_v_next: wp.array(dtype=vec3),
         a_C_next: wp.array(dtype=mat33),
         a_F_trial: wp.array(dtype=mat33),
-        a_velocity: wp.array4d(dtype=vec3),
+        a_velocity: wp.array(dtype=vec4),
         a_x: wp.array(dtype=vec3),
         a_F: wp.array(dtype=mat33),
     ):
@@ -496,8 +389,9 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
             a_x[p] = a_x_next[p]
             a_F[p] = a_F_trial[p]
             return
-        base = first_node(x[p], origin[s], real(1.0) / h, velocity.shape[1], velocity.shape[2], velocity.shape[3])
-        f = offset_in_cells(x[p], origin[s], real(1.0) / h, base)
+        cells = (x[p] - origin[s]) / h
+        base = first_node(cells, nodes)
+        f = within(cells, base)
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
@@ -506,33 +400,44 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         gz = spline_slope(f[2])
         aF = a_F_trial[p]
         a_F[p] = aF + dt[s] * (wp.transpose(C_next[p]) * aF)
-        aB = (real(4.0) / (h * h)) * (a_C_next[p] + dt[s] * (aF * wp.transpose(F[p])))
-        aBt = wp.transpose(aB)
-        av = a_v_next[p] + dt[s] * a_x_next[p]
-        ax = a_x_next[p]
+        hB = (real(4.0) / h) * (a_C_next[p] + dt[s] * (aF * wp.transpose(F[p])))
+        bx = column(hB, 0)
+        by = column(hB, 1)
+        bz = column(hB, 2)
+        qi = a_v_next[p] + dt[s] * a_x_next[p] - hB * f
+        node = flat(s, base, nodes)
+        slope = vec3(real(0.0), real(0.0), real(0.0))
         for i in range(3):
+            qj = qi
+            pi = real(0.0)
+            piy = real(0.0)
+            piz = real(0.0)
             for j in range(3):
+                qk = qj
+                pj = real(0.0)
+                pjz = real(0.0)
+                wij = wx[i] * wy[j]
+                row = node + (i * nodes[1] + j) * nodes[2]
                 for k in range(3):
-                    w = wx[i] * wy[j] * wz[k]
-                    slope = vec3(gx[i] * wy[j] * wz[k], wx[i] * gy[j] * wz[k], wx[i] * wy[j] * gz[k]) / h
-                    d = arm(i, j, k, f, h)
-                    u = velocity[s, base[0] + i, base[1] + j, base[2] + k]
-                    q = av + aB * d
-                    ax += wp.dot(q, u) * slope - w * (aBt * u)
-                    wp.atomic_add(a_velocity, s, base[0] + i, base[1] + j, base[2] + k, w * q)
-        a_x[p] = ax
+                    w = wij * wz[k]
+                    phi = wp.dot(qk, velocity_of(velocity[row + k]))
+                    pj += wz[k] * phi
+                    pjz += gz[k] * phi
+                    add4(a_velocity, row + k, vec4(w * qk[0], w * qk[1], w * qk[2], real(0.0)))
+                    qk = qk + bz
+                pi += wy[j] * pj
+                piy += gy[j] * pj
+                piz += wy[j] * pjz
+                qj = qj + by
+            slope += vec3(gx[i] * pi, wx[i] * piy, wx[i] * piz)
+            qi = qi + bx
+        a_x[p] = a_x_next[p] + (slope - wp.transpose(hB) * v_next[p]) / h
 
     return SimpleNamespace(
-        vec3=vec3,
-        vec4=vec4,
-        mat33=mat33,
         module=name,
-        add_viscous_stress=add_viscous_stress,
-        add_viscous_stress_adjoint=add_viscous_stress_adjoint,
         particles_to_grid=particles_to_grid,
         particles_to_grid_adjoint=particles_to_grid_adjoint,
-        update_grid=update_grid,
-        update_grid_adjoint=update_grid_adjoint,
         grid_to_particles=grid_to_particles,
         grid_to_particles_adjoint=grid_to_particles_adjoint,
+        **vars(grid_kernels.build(real, enable_backward)),
     )

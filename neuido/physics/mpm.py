@@ -7,6 +7,7 @@ F = F_hat(F_tr). The slow twin is `reference.py`.
 """
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -106,7 +107,9 @@ class Simulator:
         self._load_scenes()
         self._load_bodies(bodies, densities)
         nodes = [max(scene.nodes[a] for scene in self.scenes) + 2 * kernels.PAD for a in range(3)]
+        self.nodes = wp.vec3i(*nodes)
         self.grid_shape = (len(self.scenes), *nodes)
+        self.node_count = math.prod(self.grid_shape)
         self._grid: dict[str, Tensor] = {}
 
     def _load_scenes(self) -> None:
@@ -169,10 +172,10 @@ class Simulator:
     def scene_count(self) -> int:
         return len(self.scenes)
 
-    def scratch(self, name: str, *inner: int) -> Tensor:
-        """A grid-sized buffer (S, nx, ny, nz, *inner) that is kept between rollouts."""
+    def scratch(self, name: str) -> Tensor:
+        """A buffer of four numbers a node, (S nx ny nz, 4), that is kept between rollouts."""
         if name not in self._grid:
-            self._grid[name] = torch.empty(*self.grid_shape, *inner, dtype=self.dtype, device=self.device)
+            self._grid[name] = torch.empty(self.node_count, 4, dtype=self.dtype, device=self.device)
         return self._grid[name]
 
     def check_step(self, elasticity: ElasticLaw, viscosity: Tensor | None = None, mass: Tensor | None = None) -> None:
@@ -255,7 +258,7 @@ class Simulator:
         if check:
             self.check_step(elasticity, viscosity, mass)
         plan = _Plan(self, elasticity, plasticity, steps, every)
-        law_tensors = [t.contiguous() for t in plan.law_tensors()]
+        law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
         if viscosity is None:
             viscosity = mass.new_empty(0)
         inputs = (*state, mass, pull, force, friction, viscosity.contiguous(), *law_tensors)
@@ -302,22 +305,22 @@ class _Plan:
 
     def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor) -> Tensor:
         sim = self.simulator
-        grid = sim.scratch("grid", 4).zero_()
+        grid = sim.scratch("grid").zero_()
         self.launch(sim.kernels.particles_to_grid, len(x),
-                    [sim.particles.scene, sim.origin, sim.dx, sim.dt, mass, sim.volume, x, v, C, tau, grid])  # fmt: skip
+                    [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.volume, x, v, C, tau, grid])  # fmt: skip
         return grid
 
     def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor) -> Tensor:
         sim = self.simulator
-        velocity = sim.scratch("velocity", 3)
-        self.launch(sim.kernels.update_grid, sim.grid_shape, [*self._grid_inputs(pull, force, friction), grid, velocity])
+        velocity = sim.scratch("velocity")
+        self.launch(sim.kernels.update_grid, sim.node_count, [*self._grid_inputs(pull, force, friction), grid, velocity])
         return velocity
 
-    def _grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor) -> list[Tensor]:
+    def _grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor) -> list:
         sim = self.simulator
         table = sim.colliders
-        return [sim.origin, sim.dx, sim.dt, pull, force, table.point, table.normal, table.kind, friction,
-                sim.clamp_lower, sim.clamp_upper]  # fmt: skip
+        return [sim.origin, sim.dx, sim.dt, pull, force, table.plane, table.kind, friction,
+                sim.clamp_lower, sim.clamp_upper, sim.nodes]  # fmt: skip
 
     def forward(self, inputs: Sequence[Tensor], keep_all: bool) -> tuple[Tensor, ...]:
         """Frames of x, v, C, F; of every substep if `keep_all`, else every `every`-th."""
@@ -342,7 +345,7 @@ class _Plan:
                 grid = self.to_grid(x, v, C, tau, mass)
                 velocity = self.on_grid(grid, pull, force, friction)
                 self.launch(sim.kernels.grid_to_particles, len(x),
-                            [sim.particles.scene, sim.held, sim.origin, sim.dx, sim.dt, velocity, x, F, then[0], then[1], then[2],
+                            [sim.particles.scene, sim.held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, then[0], then[1], then[2],
                              then[3] if plastic is None else trial, n, status])  # fmt: skip
                 if plastic is not None:
                     plastic.forward(law[self.split :], trial, then[3], sim.particles)
@@ -380,7 +383,7 @@ class _Plan:
         now = [t.new_zeros(t.shape[1:]) for t in saved]
         then = [torch.empty_like(t) for t in now]
         tau, a_tau, trial, a_trial = (torch.empty_like(now[3]) for _ in range(4))
-        a_velocity, a_grid = sim.scratch("a_velocity", 3), sim.scratch("a_grid", 4)
+        a_velocity, a_grid = sim.scratch("a_velocity"), sim.scratch("a_grid")
         with torch_stream(sim.device):
             for n in reversed(range(self.steps)):
                 if (n + 1) % self.every == 0:
@@ -397,12 +400,12 @@ class _Plan:
                     self.plasticity.adjoint(law[self.split :], trial, now[3], a_trial.zero_(), a_law[self.split :], sim.particles)
                     a_out = a_trial
                 self.launch(k.grid_to_particles_adjoint, len(x),
-                            [sim.particles.scene, sim.held, sim.origin, sim.dx, sim.dt, velocity, x, F, C_next, now[0], now[1], now[2],
+                            [sim.particles.scene, sim.held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, saved[1][n + 1], C_next, now[0], now[1], now[2],
                              a_out, a_velocity.zero_(), a_x, a_F])  # fmt: skip
-                self.launch(k.update_grid_adjoint, sim.grid_shape,
+                self.launch(k.update_grid_adjoint, sim.node_count,
                             [*self._grid_inputs(pull, force, friction), grid, a_velocity, a_grid, a_pull, a_force, a_friction, parameters])  # fmt: skip
                 self.launch(k.particles_to_grid_adjoint, len(x),
-                            [sim.particles.scene, sim.origin, sim.dx, sim.dt, mass, sim.volume, x, v, C, tau, a_grid, a_mass,
+                            [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.volume, x, v, C, tau, a_grid, a_mass,
                              a_x, a_v, a_C, a_tau])  # fmt: skip
                 if viscosity.numel():
                     self.launch(k.add_viscous_stress_adjoint, len(x),

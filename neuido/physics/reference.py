@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuido.physics.effects import Effects
-from neuido.physics.kernels import SEPARATE, SLIP, STICKY
+from neuido.physics.grid_kernels import SEPARATE, SLIP, STICKY
 from neuido.physics.laws import Law
 from neuido.physics.mpm import Simulator
 from neuido.types import ParticleState
@@ -89,8 +89,8 @@ def substep(
         for c in range(sim.colliders.kind.shape[1]):
             kind = int(sim.colliders.kind[s, c])
             if kind:
-                normal = sim.colliders.normal[s, c]
-                inside = (place - sim.colliders.point[s, c]) @ normal <= 1e-4 * dx
+                normal, offset = sim.colliders.plane[s, c, :3], sim.colliders.plane[s, c, 3]
+                inside = place @ normal <= offset
                 u = torch.where((inside & full)[:, None], _contact(torch.where(full[:, None], u, 1.0), normal, kind, friction[s, c]), u)
         for lower, upper in zip(sim.clamp_lower[s], sim.clamp_upper[s]):
             u = torch.where(((place >= lower) & (place <= upper)).all(1, keepdim=True), 0.0, u)

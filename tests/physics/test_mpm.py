@@ -119,11 +119,11 @@ def kernel_cases(stage: Stage):
     """Per kernel: inputs by argument name, the differentiable ones, and what it writes."""
     sim = stage.sim
     x, v, C, F = stage.state
-    place = {"scene": sim.particles.scene, "origin": sim.origin, "dx": sim.dx, "dt": sim.dt}
+    place = {"scene": sim.particles.scene, "origin": sim.origin, "dx": sim.dx, "dt": sim.dt, "nodes": sim.nodes}
     table = sim.colliders
-    walls = {"point": table.point, "normal": table.normal, "kind": table.kind, "lower": sim.clamp_lower, "upper": sim.clamp_upper}
+    walls = {"plane": table.plane, "kind": table.kind, "lower": sim.clamp_lower, "upper": sim.clamp_upper}
     grid = stage.grid()
-    velocity = torch.zeros(*sim.grid_shape, 3, dtype=torch.float64)
+    velocity = torch.zeros_like(grid)
     moving = {"held": sim.held, "step": 0, "status": torch.zeros(3, dtype=torch.int32)}
     next_C = torch.zeros_like(C)
     field = 0.5 * stage.random(velocity)
@@ -139,7 +139,7 @@ def kernel_cases(stage: Stage):
             {"grid": torch.zeros_like(grid)},
         ),
         "update_grid": (
-            {**{k: place[k] for k in ("origin", "dx", "dt")}, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
+            {**{k: place[k] for k in ("origin", "dx", "dt", "nodes")}, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
              "friction": table.friction.clone(), "grid": grid},
             ["gravity", "force", "friction", "grid"],
             {"velocity": velocity},
@@ -153,7 +153,7 @@ def kernel_cases(stage: Stage):
 
 
 def launch(stage, kernel, values):
-    dim = stage.sim.grid_shape if "update_grid" in kernel.key else len(stage.sim.mass)
+    dim = stage.sim.node_count if "update_grid" in kernel.key else len(stage.sim.mass)
     stage.plan.launch(kernel, dim, [values[arg.label] for arg in kernel.adj.args])
 
 
@@ -166,7 +166,7 @@ def hand_adjoint(stage, name, inputs, wanted, outputs, weights):
     values = dict(inputs) | {"parameters": True}
     values |= {f"a_{key}": weights[key].clone() for key in outputs}
     values |= {f"a_{key}": torch.zeros_like(inputs[key]) for key in wanted}
-    values |= {key: outputs[key] for key in outputs if key == "C_next"}
+    values |= {key: outputs[key] for key in outputs if key in ("C_next", "v_next")}
     launch(stage, adjoint, values)
     return {key: values[f"a_{key}"] for key in wanted}
 
@@ -205,7 +205,7 @@ def test_kernel_adjoint_equals_warp_autodiff(name):
     stage = Stage()
     inputs, wanted, outputs = kernel_cases(stage)[name]
     if name == "update_grid":
-        inputs |= {"kind": torch.zeros_like(inputs["kind"])}
+        inputs |= {"plane": torch.where(torch.arange(4) == 3, -torch.inf, inputs["plane"])}
     oracle = getattr(kernels.build(wp.float64, enable_backward=True), name)
     weights = {key: stage.random(t) for key, t in outputs.items()}
     forward = {key: t.clone() for key, t in outputs.items()}
@@ -218,7 +218,7 @@ def test_kernel_adjoint_equals_warp_autodiff(name):
             value = wp.from_torch(value.clone(), dtype=arg.type.dtype, requires_grad=arg.label in (*wanted, *outputs))
         arrays[arg.label] = value
     with wp.Tape() as tape:
-        dim = stage.sim.grid_shape if name == "update_grid" else len(stage.sim.mass)
+        dim = stage.sim.node_count if name == "update_grid" else len(stage.sim.mass)
         wp.launch(oracle, dim=dim, inputs=[arrays[arg.label] for arg in oracle.adj.args], device="cpu")
     tape.backward(grads={arrays[key]: wp.from_torch(weights[key].clone(), dtype=arrays[key].dtype) for key in outputs})
     for key in set(wanted) - ({"friction"} if name == "update_grid" else set()):
