@@ -1,0 +1,64 @@
+# `make demo` and `make test` create the environment and install first, where that is not done.
+#   PYTHON       the interpreter that creates the environment, 3.11 or later
+#   TORCH        what pip installs first; a build for another device or version, say TORCH='torch==2.12.0' CONSTRAINTS=
+#   CONSTRAINTS  the file of pinned versions; empty: the newest that pyproject.toml admits
+PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
+	$$p -c 'import sys, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+CONSTRAINTS ?= constraints.txt
+TORCH ?= $(shell grep '^torch==' constraints.txt)
+VENV ?= .venv
+
+pin := $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
+bin := $(VENV)/bin
+installed := $(VENV)/.installed
+
+.PHONY: help venv demo test test-slow test-gpu lint format types clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo 'make demo      train on small simulated bodies, CPU, a few minutes'
+	@echo 'make test      run the tests'
+	@echo 'make test-slow, test-gpu, lint, format, types, venv, clean'
+
+venv: $(installed)
+
+# torch comes first: its build decides what the rest may need, and a version that is there is not replaced.
+$(VENV)/.torch:
+	@test -n '$(PYTHON)' || { echo 'make: no Python >= 3.11 with venv found; set PYTHON' >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(bin)/python -m pip install '$(TORCH)'
+	@touch $@
+
+$(installed): $(VENV)/.torch pyproject.toml $(CONSTRAINTS)
+	$(bin)/python -m pip install $(pin) -e '.[dev]'
+	@touch $@
+
+demo: $(installed)
+	$(bin)/neuido demo
+
+test: export OMP_NUM_THREADS = 1
+test: $(installed)
+	$(bin)/python -m pytest -m 'not slow and not gpu'
+
+test-slow: export OMP_NUM_THREADS = 1
+test-slow: $(installed)
+	$(bin)/python -m pytest -m slow
+
+# The same tests of physics and networks with every array on the GPU.
+test-gpu: $(installed)
+	NEUIDO_TEST_DEVICE=cuda $(bin)/python -m pytest tests/physics
+
+lint: $(installed)
+	$(bin)/ruff check .
+	$(bin)/ruff format --check .
+
+format: $(installed)
+	$(bin)/ruff check --fix .
+	$(bin)/ruff format .
+
+types: $(installed)
+	$(bin)/pyright
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +

@@ -1,0 +1,15 @@
+"""neuido: a neural operator that reads a material's law of motion from video.
+
+Importing this package imports neither torch nor lightning; the submodules do.
+"""
+
+from pathlib import Path
+
+__version__ = "0.1.0"
+
+
+def configs_root() -> Path:
+    """The folder of the configurations: beside the package in a checkout, inside it in a wheel."""
+    package = Path(__file__).resolve().parent
+    checkout = package.parent
+    return checkout / "configs" if (checkout / "pyproject.toml").is_file() else package / "configs"

@@ -1,0 +1,195 @@
+"""The `neuido` command, in two tiers.
+
+Light commands are plain functions, imported by name and offered through jsonargparse: their `--help` costs no import of torch. The
+commands of the Lightning trainer (`fit`, `validate`, `test`, `predict`) build a LightningCLI in subclass mode: YAML gives `class_path` and
+`init_args` of the model and the data module.
+
+Whatever the user can mend ends in one line on stderr and exit status 2. `NEUIDO_TRACEBACK=1` shows the traceback instead.
+"""
+
+import argparse
+import importlib
+import logging
+import os
+import pickle
+import re
+import signal
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import neuido
+from neuido.errors import UserError
+
+if TYPE_CHECKING:
+    from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+
+LIGHT = {  # name: (module, function, one line for the list); the module must import torch only inside its functions
+    "simulate": ("neuido.data.simulate", "simulate", "Generate the constitutive trajectories of Stage I."),
+    "demo": ("neuido.demo", "demo", "Train on small simulated bodies and compare the learned laws with the true ones."),
+    "doctor": ("neuido.doctor", "doctor", "Print versions and devices, and run a small rollout on each device."),
+}
+HEAVY = {
+    "fit": "Train a model.",
+    "validate": "Run one validation epoch.",
+    "test": "Run one test epoch.",
+    "predict": "Run inference.",
+}
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the command line; exits with 0 (done), 1 (a check failed), 2 (the user can mend it) or 130 (interrupted).
+
+    Args:
+        args: Arguments without the program's name; those of the process where absent.
+    """
+    try:
+        status = _dispatch(list(sys.argv[1:] if args is None else args))
+    except KeyboardInterrupt:
+        _fail("interrupted", 128 + signal.SIGINT)
+    except Exception as error:
+        line = None if os.environ.get("NEUIDO_TRACEBACK") else _one_line(error)
+        if line is None:
+            raise
+        _fail(line, 2)
+    sys.exit(status)
+
+
+def _dispatch(args: list[str]) -> int:
+    name = args[0] if args else "--help"
+    if name in ("-h", "--help"):
+        print(_help())
+        return 0
+    if name == "--version":
+        print(f"neuido {neuido.__version__}")
+        return 0
+    if name not in LIGHT and name not in HEAVY:
+        raise UserError(f"unknown command '{name}': use one of {', '.join([*HEAVY, *LIGHT])}")
+    args = _find_configs(args)
+    os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # lightning's own calls, lightning issue 21900
+    if name in LIGHT:
+        return _run_light(name, args[1:])
+    run_lightning(args)
+    return 0
+
+
+def _run_light(name: str, args: list[str]) -> int:
+    from jsonargparse import auto_cli
+
+    module, function, _ = LIGHT[name]
+    component = getattr(importlib.import_module(module), function)
+    status = auto_cli(component, args=args, as_positional=False, prog=f"neuido {name}", exit_on_error=False)
+    return status if isinstance(status, int) else 0
+
+
+def run_lightning(args: list[str]) -> "LightningCLI":
+    """Run a command of the trainer; the model, the data module and the trainer are attributes of what it returns."""
+    _quiet_lightning()
+    from lightning.pytorch import LightningDataModule, LightningModule
+    from lightning.pytorch.cli import LightningCLI
+
+    for module in ("neuido.models.pretrain", "neuido.data.trajectories"):  # so that their class names resolve without a path
+        importlib.import_module(module)
+
+    class NeuidoCLI(LightningCLI):
+        def add_arguments_to_parser(self, parser: "LightningArgumentParser") -> None:
+            parser.link_arguments("data.trajectory_count", "model.init_args.trajectory_count", apply_on="instantiate")
+
+        def before_instantiate_classes(self) -> None:
+            # Lightning loads a remote checkpoint with pickle unless told otherwise; here that takes an explicit `--weights_only false`.
+            options = self.config[self.subcommand]
+            if options.get("weights_only") is None:
+                options["weights_only"] = True
+
+    parser = {"exit_on_error": False}  # raise argparse.ArgumentError instead of 100 lines of usage
+    return NeuidoCLI(
+        LightningModule,
+        LightningDataModule,
+        subclass_mode_model=True,
+        subclass_mode_data=True,
+        auto_configure_optimizers=False,
+        seed_everything_default=0,
+        parser_kwargs={"prog": "neuido", "version": neuido.__version__, **parser, **{name: dict(parser) for name in HEAVY}},
+        args=args,
+    )
+
+
+def _find_configs(args: list[str]) -> list[str]:
+    found = list(args)
+    for i, (before, argument) in enumerate(zip(["", *args], args, strict=False)):
+        if before in ("-c", "--config"):
+            found[i] = find_config(argument)
+        elif argument.startswith("--config="):
+            found[i] = "--config=" + find_config(argument.removeprefix("--config="))
+    return found
+
+
+def find_config(name: str) -> str:
+    """The path of a configuration: a file here, or one that comes with neuido by its name."""
+    if name.lstrip().startswith("{") or Path(name).is_file():  # jsonargparse accepts the content itself too
+        return name
+    own = neuido.configs_root() / (name.removeprefix("configs/").removesuffix(".yaml") + ".yaml")
+    if own.is_file():
+        return str(own)
+    raise UserError(f"no configuration file '{name}', neither here nor in {neuido.configs_root()}: change --config")
+
+
+def _help() -> str:
+    table = HEAVY | {name: text for name, (*_, text) in LIGHT.items()}
+    commands = "\n".join(f"  {name:<10}{text}" for name, text in table.items())
+    return (
+        f"usage: neuido [--help] [--version] COMMAND [--config FILE] [OPTIONS]\n\n{neuido.__doc__.splitlines()[0]}\n\n"
+        f"commands:\n{commands}\n\n`neuido COMMAND --help` lists the options of a command; `--print_config` writes them as YAML."
+    )
+
+
+def _one_line(error: BaseException) -> str | None:
+    """The line for the user, or None for an error that only a programmer can mend."""
+    cause: BaseException | None = error
+    while cause is not None:  # jsonargparse wraps what a constructor raises
+        if isinstance(cause, UserError):
+            return " ".join(str(cause).split())
+        cause = cause.__cause__
+    if isinstance(error, argparse.ArgumentError):
+        return _condense(str(error))
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.strerror}: '{error.filename}'"
+    if isinstance(error, pickle.UnpicklingError):
+        return "the checkpoint cannot be read weights-only: it is damaged, or holds objects that reading would execute"
+    if isinstance(error, FileNotFoundError) or type(error).__name__ == "MisconfigurationException":
+        return " ".join(str(error).split())
+    return None
+
+
+NOISE = re.compile(  # the lines of jsonargparse's messages that tell a user nothing
+    r"Does not validate|Subtypes:|Errors:|Given value type:|Given value: (Nest|Name|[{\[])|Expected a (<class 'None|path but)|$"
+)
+
+
+def _condense(message: str) -> str:
+    """Keep of jsonargparse's indented message what names the key, the fault and the value."""
+    lines = [line.strip().removeprefix("- ") for line in message.splitlines()]
+    text = ": ".join(dict.fromkeys(line.rstrip(":") for line in lines if not NOISE.match(line)))
+    text = re.sub(r"Parser key \"([\w.]+)\"", r"--\1", text)
+    text = re.sub(r"Problem with given class_path '(.+?)'", r"\1", text)
+    text = re.sub(r"Expected a dot import path string: (\S+): Given value: .*", r"no class '\1' is known; give its import path", text)
+    text = re.sub(r"Expected a <class '(\w+)'>", r"expected \1", text)
+    return re.sub(r"(: Given|\. Got) value: ", ", got ", text)
+
+
+def _fail(line: str, status: int) -> None:
+    print(f"neuido: {line}", file=sys.stderr)
+    sys.exit(status)
+
+
+def _quiet_lightning() -> None:
+    """Drop lightning's advertisements and the warnings about its own code."""
+    logging.getLogger("lightning.fabric.utilities.seed").setLevel(logging.WARNING)  # config.yaml states the seed
+    chatter = re.compile(r".*Tip: |TPU available")
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda record: not chatter.match(record.getMessage()))
+    warnings.filterwarnings("ignore", message=r".*LightningCLI's args parameter is intended")  # sys.argv is passed on as it is
+    warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).* is deprecated")
+    warnings.filterwarnings("ignore", message=r".*tensorboardX.* has been removed")
+    warnings.filterwarnings("ignore", message=r".*does not have many workers")  # the data sets are memory maps

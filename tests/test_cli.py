@@ -1,0 +1,202 @@
+"""The command line: help without torch, and one line with status 2 for whatever the user can mend."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import neuido
+from neuido import cli
+from neuido.cli import main
+
+ROOT = Path(neuido.__file__).parents[1]
+STAGE1 = str(neuido.configs_root() / "stage1.yaml")
+
+
+def run(capsys, *args: str) -> tuple[int, str, str]:
+    """Run the command in this process: status, stdout, stderr."""
+    with pytest.raises(SystemExit) as stop:
+        main(list(args))
+    out, err = capsys.readouterr()
+    return stop.value.code, out, err
+
+
+def assert_one_line(capsys, args: list[str], *words: str) -> None:
+    status, _, err = run(capsys, *args)
+    lines = [line for line in err.splitlines() if line.strip()]
+    assert status == 2, err
+    assert len(lines) == 1, err
+    assert lines[0].startswith("neuido: ")
+    assert len(lines[0]) < 400
+    for word in words:
+        assert word in lines[0]
+
+
+@pytest.mark.parametrize("name", ["--help", "--version", *[f"{name} --help" for name in cli.LIGHT]])
+def test_help_loads_no_torch(name):
+    code = f"""
+import atexit, sys
+atexit.register(lambda: print("LOADED", sorted({{"torch", "lightning", "warp"}} & set(sys.modules))))
+from neuido.cli import main
+main({name.split()!r})
+"""
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert "LOADED []" in answer.stdout
+    assert "neuido" in answer.stdout
+    assert answer.stderr == ""
+
+
+def test_help_names_every_command(capsys):
+    status, out, _ = run(capsys, "--help")
+    assert status == 0
+    for name in [*cli.LIGHT, *cli.HEAVY]:
+        assert f"\n  {name} " in out
+
+
+def test_light_help_comes_from_the_docstring(capsys):
+    status, out, _ = run(capsys, "simulate", "--help")
+    assert status == 0
+    for word in ("neuido simulate", "--config", "--print_config", "--held_out", "Substep, s."):
+        assert word in out
+
+
+def test_version(capsys):
+    assert run(capsys, "--version") == (0, f"neuido {neuido.__version__}\n", "")
+
+
+def test_module_and_script_are_one_command():
+    answer = subprocess.run([sys.executable, "-m", "neuido", "simlate"], capture_output=True, text=True, cwd=ROOT)
+    assert answer.returncode == 2
+    assert answer.stderr == f"neuido: unknown command 'simlate': use one of {', '.join([*cli.HEAVY, *cli.LIGHT])}\n"
+
+
+def test_light_wrong_key_on_the_command_line(capsys):
+    assert_one_line(capsys, ["simulate", "--out", "x", "--instancez", "3"], "instancez")
+
+
+def test_light_wrong_key_in_yaml(capsys, tmp_path):
+    path = tmp_path / "wrong.yaml"
+    path.write_text("out: x\ninstancez: 3\n")
+    assert_one_line(capsys, ["simulate", "--config", str(path)], "instancez")
+
+
+def test_light_wrong_type(capsys):
+    assert_one_line(capsys, ["simulate", "--out", "x", "--instances", "many"], "instances", "int", "many")
+
+
+def test_broken_yaml(capsys, tmp_path):
+    path = tmp_path / "broken.yaml"
+    path.write_text("out: [\n a: b: c\n")
+    assert_one_line(capsys, ["simulate", "--config", str(path)], "line 2")
+
+
+def test_yaml_is_read_safely(capsys, tmp_path):
+    path, victim = tmp_path / "evil.yaml", tmp_path / "victim"
+    path.write_text(f"out: !!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ['{victim}']]\n")
+    status, _, _ = run(capsys, "simulate", "--config", str(path))
+    assert status == 2
+    assert not victim.exists()
+
+
+@pytest.mark.parametrize("command", ["simulate", "fit"])
+def test_missing_configuration(capsys, command):
+    assert_one_line(capsys, [command, "--config", "nowhere.yaml"], "nowhere.yaml", "--config")
+
+
+def test_configurations_that_come_with_neuido_are_found_from_anywhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("configs/stage1.yaml", "stage1.yaml", "stage1"):
+        assert cli._find_configs(["fit", "--config", name, f"--config={name}"]) == ["fit", "--config", STAGE1, f"--config={STAGE1}"]
+    Path("stage1.yaml").touch()
+    assert cli._find_configs(["-c", "stage1.yaml"]) == ["-c", "stage1.yaml"]
+
+
+@pytest.mark.parametrize(
+    "families",
+    [
+        "{elastic: {young: [-1.0e5, -1.0e5], poisson: [0.2, 0.2]}}",
+        "{elastic: {young: [1.0e5, 1.0e5], poisson: [0.5, 0.5]}}",
+    ],
+)
+def test_impossible_material(capsys, tmp_path, families):
+    args = ["simulate", "--out", str(tmp_path / "out"), "--families", families]
+    assert_one_line(capsys, args, "young" if "-1.0e5" in families else "poisson", "-100000" if "-1.0e5" in families else "0.5")
+
+
+def test_step_above_the_stability_limit(capsys, tmp_path):
+    args = ["simulate", "--out", str(tmp_path / "out"), "--dt", "0.1", "--steps", "2", "--instances", "1", "--held_out", "0"]
+    assert_one_line(capsys, [*args, "--particles_per_side", "3", "--progress", "false", "--device", "cpu"], "dt", "0.1")
+
+
+def test_interrupt(capsys, monkeypatch):
+    def interrupted(args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_dispatch", interrupted)
+    assert run(capsys, "doctor") == (130, "", "neuido: interrupted\n")
+
+
+def test_fault_of_the_program_keeps_its_traceback(monkeypatch):
+    def broken(args):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(cli, "_dispatch", broken)
+    with pytest.raises(ZeroDivisionError):
+        main(["doctor"])
+
+
+def test_traceback_on_demand(monkeypatch):
+    monkeypatch.setenv("NEUIDO_TRACEBACK", "1")
+    with pytest.raises(ValueError, match="unknown command"):
+        main(["doktor"])
+
+
+class TestLightning:
+    """The commands of the trainer; importing Lightning takes some seconds once."""
+
+    def test_wrong_key_in_yaml(self, capsys, tmp_path):
+        path = tmp_path / "wrong.yaml"
+        path.write_text(Path(STAGE1).read_text() + "\nmodell:\n  lr: 1\n")
+        assert_one_line(capsys, ["fit", "--config", str(path)], "modell")
+
+    def test_wrong_model_option(self, capsys):
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--model.latent_dimm", "3"], "latent_dimm")
+
+    def test_wrong_model_type(self, capsys):
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--model.latent_dim", "many"], "latent_dim", "int", "many")
+
+    def test_wrong_trainer_option(self, capsys):
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--trainer.max_epochz", "3"], "--trainer.max_epochz")
+
+    def test_wrong_trainer_type(self, capsys):
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--trainer.max_epochs", "many"], "--trainer.max_epochs", "many")
+
+    @pytest.mark.parametrize("name", ["Nowhere", "neuido.models.pretrain.Nowhere", "nowhere.Model"])
+    def test_unknown_class(self, capsys, name):
+        assert_one_line(capsys, ["fit", "--model", name, "--data", "TrajectoryDataModule"], "owhere")
+
+    def test_nothing_given(self, capsys):
+        assert_one_line(capsys, ["fit"], "model", "data")
+
+    def test_missing_trajectories(self, capsys, tmp_path):
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--data.root", str(tmp_path)], str(tmp_path), "neuido simulate")
+
+    def test_checkpoint_is_read_weights_only(self, capsys, tmp_path):
+        checkpoint, victim = tmp_path / "evil.ckpt", tmp_path / "victim"
+
+        class Evil:
+            def __reduce__(self):
+                return (Path.touch, (victim,))
+
+        torch.save({"state_dict": {}, "hyper_parameters": Evil()}, checkpoint)
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--ckpt_path", str(checkpoint)], "weights-only")
+        assert not victim.exists()
+
+    def test_help(self, capsys):
+        status, out, _ = run(capsys, "fit", "--help")
+        assert status == 0
+        assert "neuido" in out
+        assert "--ckpt_path" in out
+        assert "--optimizer" not in out

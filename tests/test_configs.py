@@ -1,0 +1,46 @@
+"""Every YAML under configs is accepted by the real command line."""
+
+import inspect
+
+import pytest
+import yaml
+
+import neuido
+from neuido import cli
+from neuido.data.simulate import simulate
+
+ROOT = neuido.configs_root()
+CONFIGS = sorted(ROOT.rglob("*.yaml"))
+
+
+def content(path) -> dict:
+    return yaml.safe_load(path.read_text())
+
+
+def command_of(path) -> str | None:
+    """The command that a configuration is for, by its keys."""
+    keys = set(content(path))
+    if "model" in keys:
+        return "fit"
+    if keys <= {*inspect.signature(simulate).parameters}:
+        return "simulate"
+    return None
+
+
+def test_there_are_configurations():
+    assert {"stage1.yaml", "quickstart.yaml"} <= {path.name for path in CONFIGS}
+
+
+@pytest.mark.parametrize("path", [p for p in CONFIGS if "scenes" not in p.parts and "sweeps" not in p.parts], ids=lambda p: p.stem)
+def test_command_line_accepts(path, capsys):
+    command = command_of(path)
+    assert command is not None, f"no command takes {path.name}"
+    required = ["--out", "nowhere"] if command == "simulate" and "out" not in content(path) else []
+    with pytest.raises(SystemExit) as stop:
+        cli.main([command, "--config", str(path), *required, "--print_config"])
+    out, err = capsys.readouterr()
+    assert stop.value.code == 0, err
+    printed = yaml.safe_load(out)
+    for key, value in content(path).items():
+        if not isinstance(value, dict | list):
+            assert printed[key] == value

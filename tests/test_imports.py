@@ -1,0 +1,83 @@
+"""The package imports in one direction, and little at its start."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "neuido"
+MODULES = sorted(path.relative_to(PACKAGE.parent).with_suffix("").as_posix().replace("/", ".") for path in PACKAGE.rglob("*.py"))
+
+ROOT = ("neuido.__version__", "neuido.configs_root")
+GROUND = ("neuido.types", "neuido.errors")
+NETS = ("neuido.models.operator", "neuido.models.encoder", "neuido.models.flow", "neuido.models.splatting", "neuido.models.baselines")
+ROOMS = {  # room: the parts of neuido that it may import, itself included
+    "neuido.types": (),
+    "neuido.errors": (),
+    "neuido.physics": (*GROUND, "neuido.physics"),
+    "neuido.data": (*GROUND, "neuido.physics", "neuido.data"),
+    "neuido.models": (*GROUND, "neuido.physics", "neuido.models", "neuido.metrics", "neuido.losses"),
+    "neuido.losses": GROUND,
+    "neuido.metrics": (*GROUND, "neuido.physics", "neuido.losses"),
+}
+PHYSICS_MAY = {"torch", "numpy", "warp", "neuido"} | set(sys.stdlib_module_names)
+
+
+def within(name: str, parts: tuple[str, ...]) -> bool:
+    return any(name == part or name.startswith(part + ".") for part in parts)
+
+
+def imports(source: str, module: str = "neuido.test") -> set[str]:
+    """Every module that a source imports, at its top or inside a function; `from a import b` counts as a.b."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                base = ".".join([*module.split(".")[: -node.level], *filter(None, [node.module])])
+            found |= {f"{base}.{alias.name}" for alias in node.names}
+    return found
+
+
+def imports_of(module: str) -> set[str]:
+    path = PACKAGE.parent / (module.replace(".", "/") + ".py")
+    return imports(path.read_text(), module)
+
+
+def test_reader_sees_every_form_of_import():
+    source = "import a.b\nfrom c import d\ndef f():\n    from ..e import g\n"
+    assert imports(source, "neuido.x.y") == {"a.b", "c.d", "neuido.e.g"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_direction(module):
+    for room, allowed in ROOMS.items():
+        if within(module, (room,)):
+            own = {name for name in imports_of(module) if within(name, ("neuido",)) and name not in ROOT}
+            wrong = {name for name in own if not within(name, allowed)}
+            assert not wrong, f"{module} imports {sorted(wrong)}; {room} may import {allowed} alone"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_third_parties(module):
+    names = {name.split(".")[0] for name in imports_of(module)}
+    if within(module, ("neuido.physics",)):
+        assert names <= PHYSICS_MAY, f"{module} imports {sorted(names - PHYSICS_MAY)}"
+    if module in NETS:
+        assert not names & {"lightning", "pytorch_lightning"}, f"{module} is a net and imports Lightning"
+    if module != "neuido.models.adapter":
+        assert "peft" not in names, f"{module} imports peft"
+    assert "pytorch_lightning" not in names, f"{module} imports pytorch_lightning; the package is lightning"
+    if module != "neuido.cli":
+        assert "wandb" not in (PACKAGE.parent / (module.replace(".", "/") + ".py")).read_text().lower(), f"{module} names wandb"
+
+
+@pytest.mark.parametrize("module", ["neuido", "neuido.cli", "neuido.__main__", "neuido.errors", "neuido.doctor", "neuido.data.simulate"])
+def test_light_modules_load_neither_torch_nor_lightning(module):
+    code = f"import sys, {module}; print(sorted({{'torch', 'lightning', 'warp', 'jsonargparse'}} & set(sys.modules)))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
+    assert answer.stdout.strip() == "[]"
