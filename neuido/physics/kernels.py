@@ -17,10 +17,10 @@ since weights, arms and slopes are products over the axes: about a third of the 
 import functools
 from types import SimpleNamespace
 
-import torch
 import warp as wp
 
 from neuido.physics import grid_kernels
+from neuido.physics.device import start_warp
 
 PAD = 2
 """Nodes added on each side of the domain."""
@@ -38,17 +38,6 @@ ADD4 = """
 #endif
 """
 """One vector reduction instead of four scalar ones: four times faster on a Hopper GPU."""
-
-
-def start_warp() -> None:
-    """Initialise Warp without its banner; safe to call again."""
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    wp.init()
-
-
-def real_of(dtype: torch.dtype) -> type:
-    """The Warp scalar type of a torch float type."""
-    return {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
 
 
 @functools.cache

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from neuido.physics import warp_linalg
+from neuido.physics.device import start_warp
 
 FIXED_COROTATED, SIGMA, NEO_HOOKEAN = 0, 1, 2
 IDENTITY, VON_MISES, DRUCKER_PRAGER = 0, 1, 2
@@ -42,7 +43,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     The two options exist for the tests: `enable_backward` lets Warp generate adjoints of the forward kernels as well, and `builtin_svd`
     puts Warp's own `svd3` in place of the Jacobi iteration (whose data-dependent loop Warp cannot differentiate).
     """
-    wp.init()
+    start_warp()
     mat = wp.types.matrix((3, 3), real)
     vec = wp.types.vector(3, real)
     floor = wp.constant(real(FLOOR))

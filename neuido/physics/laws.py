@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics import law_kernels, linalg
+from neuido.physics.device import launch, real_of, torch_stream
 from neuido.physics.law import AutogradElastic, AutogradLaw, AutogradPlastic, ElasticLaw, Law, Parameter, PlasticLaw
 from neuido.physics.law_kernels import FLOOR
 from neuido.types import Particles
@@ -106,22 +106,13 @@ class _Classical(Law):
         self, name: str, tensors: Sequence[Tensor], arrays: Sequence[Tensor], parameters: Tensor | None, particles: Particles
     ) -> None:
         F = arrays[0]
-        real, mat = (wp.float32, wp.mat33f) if F.dtype == torch.float32 else (wp.float64, wp.mat33d)
-        kernel = getattr(law_kernels.kernels(real), name)
-        matrices = [wp.from_torch(a.detach(), dtype=mat, requires_grad=False, return_ctype=True) for a in arrays]
-        # Bare descriptors keep no tensor alive, so `row` needs its name until the launch.
+        kernel = getattr(law_kernels.kernels(real_of(F.dtype)), name)
         row = tensors[0].detach().to(F).contiguous()
-        inputs: list[Any] = [
-            matrices[0],
-            wp.from_torch(self._kinds(F.device), dtype=wp.int32, requires_grad=False, return_ctype=True),
-            wp.from_torch(row, dtype=real, requires_grad=False, return_ctype=True),
-            wp.from_torch(particles.scene, dtype=wp.int32, requires_grad=False, return_ctype=True),
-            *matrices[1:],
-        ]
+        inputs: list[Any] = [F, self._kinds(F.device), row, particles.scene, *arrays[1:]]
         if name.endswith("adjoint"):
-            inputs.append(None if parameters is None else wp.from_torch(parameters, dtype=real, requires_grad=False, return_ctype=True))
-        stream = wp.stream_from_torch(torch.cuda.current_stream(F.device)) if F.is_cuda else None
-        wp.launch(kernel, dim=F.shape[0], inputs=inputs, device=wp.device_from_torch(F.device), stream=stream)
+            inputs.append(parameters)
+        with torch_stream(F.device):
+            launch(kernel, len(F), inputs, F.device)
 
     def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
         self._launch("correct" if self._correct else "stress", tensors, [F, out], None, particles)

@@ -6,9 +6,8 @@ The order of a substep is the paper's (appendix, "Material Point Method"): P2G w
 F = F_hat(F_tr). The slow twin is `reference.py`.
 """
 
-import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +18,7 @@ from torch import Tensor
 from neuido.errors import UserError
 from neuido.physics import kernels
 from neuido.physics.colliders import clamp_table, collider_table, inside_box
+from neuido.physics.device import launch, real_of, torch_stream
 from neuido.physics.effects import Effects
 from neuido.physics.laws import ElasticLaw, PlasticLaw
 from neuido.types import Body, Particles, ParticleState, Scene
@@ -54,16 +54,6 @@ def affine_velocity(x: Tensor, v: Tensor, neighbours: int = 32, chunk: int = 204
         ridge = 1e-6 * normal.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] * torch.eye(3, dtype=x.dtype, device=x.device)
         out.append(torch.linalg.solve(normal + ridge, nx.transpose(1, 2) @ nv).transpose(1, 2))
     return torch.cat(out).contiguous()
-
-
-@contextlib.contextmanager
-def torch_stream(device: torch.device) -> Iterator[None]:
-    """Warp launches go to torch's current stream while this is open."""
-    if device.type == "cuda":
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
-            yield
-    else:
-        yield
 
 
 class Simulator:
@@ -102,8 +92,8 @@ class Simulator:
         densities = [float(density)] * len(bodies) if isinstance(density, (int, float)) else [float(d) for d in density]
         if len(densities) != len(bodies) or not all(d > 0 for d in densities):
             raise UserError(f"density is {density}; give one positive number, or one for each of {len(bodies)} scenes")
-        self.device, self.dtype = torch.device(device), dtype
-        self.kernels = kernels.build(kernels.real_of(dtype))
+        self.device, self.dtype = torch.empty(0, device=device).device, dtype  # with its index, which Warp needs
+        self.kernels = kernels.build(real_of(dtype))
         self._load_scenes()
         self._load_bodies(bodies, densities)
         nodes = [max(scene.nodes[a] for scene in self.scenes) + 2 * kernels.PAD for a in range(3)]
@@ -287,13 +277,8 @@ class _Plan:
         self.split = len(elastic)
         return (*elastic, *plastic)
 
-    def launch(self, kernel: wp.Kernel, dim: Any, inputs: list) -> None:
-        """Launch with torch tensors in place of Warp arrays, typed by the kernel's own annotations."""
-        arguments = [
-            wp.from_torch(value, dtype=arg.type.dtype, requires_grad=False) if isinstance(value, Tensor) else value
-            for value, arg in zip(inputs, kernel.adj.args, strict=True)
-        ]
-        wp.launch(kernel, dim=dim, inputs=arguments, device=wp.device_from_torch(self.simulator.device))
+    def launch(self, kernel: wp.Kernel, dim: int, inputs: list) -> None:
+        launch(kernel, dim, inputs, self.simulator.device)
 
     # -- forward -------------------------------------------------------------------------------------------------
 

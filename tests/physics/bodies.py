@@ -1,10 +1,14 @@
 """Small bodies and scenes for the tests of the simulator."""
 
+import os
+
 import torch
 
 from neuido.types import Body, Box, Plane, Scene, Walls
 
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+DEVICE = os.environ.get("NEUIDO_TEST_DEVICE", "cpu")
+"""Where tests run that are not repeated for each device; `make test-gpu` sets it to cuda."""
+DEVICES = [DEVICE] if "NEUIDO_TEST_DEVICE" in os.environ else ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
 def block(lower, upper, counts, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, 0.0)) -> Body:
@@ -17,7 +21,7 @@ def block(lower, upper, counts, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, 0.0)) 
     size = 1.0
     for l, u in zip(lower, upper):
         size *= u - l
-    return Body(x, v, torch.full((len(x),), size / len(x), dtype=torch.float64))
+    return Body(x.to(DEVICE), v.to(DEVICE), torch.full((len(x),), size / len(x), dtype=torch.float64, device=DEVICE))
 
 
 def cloud(count, lower, upper, velocity, seed) -> Body:
@@ -25,7 +29,7 @@ def cloud(count, lower, upper, velocity, seed) -> Body:
     g = torch.Generator().manual_seed(seed)
     x = torch.rand(count, 3, generator=g, dtype=torch.float64) * (upper - lower) + lower
     v = torch.tensor(velocity, dtype=torch.float64) + 0.5 * torch.randn(count, 3, generator=g, dtype=torch.float64)
-    return Body(x, v, torch.full((count,), (upper - lower) ** 3 / count, dtype=torch.float64))
+    return Body(x.to(DEVICE), v.to(DEVICE), torch.full((count,), (upper - lower) ** 3 / count, dtype=torch.float64, device=DEVICE))
 
 
 def busy_scenes() -> tuple[list[Scene], list[Body]]:
@@ -40,3 +44,8 @@ def busy_scenes() -> tuple[list[Scene], list[Body]]:
         Scene(upper=(1.0, 0.9, 0.8), cells=8, dt=1e-3, walls=Walls("sticky"), clamps=(Box((0.1, 0.5, 0.1), (0.5, 0.6, 0.6)),)),
     ]
     return scenes, [cloud(24, 0.1, 0.4, (0.0, -2.0, 1.0), 0), cloud(32, 0.05, 0.6, (0.3, -1.0, 0.0), 1)]
+
+
+def same(a, b) -> bool:
+    """Equal to the bit; on a GPU, where sums of floats come in any order, to rounding."""
+    return torch.equal(a, b) if a.device.type == "cpu" else torch.allclose(a, b, rtol=1e-9, atol=1e-9)

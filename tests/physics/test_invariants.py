@@ -9,13 +9,13 @@ from neuido.physics.effects import Effects
 from neuido.physics.laws import DruckerPrager, FixedCorotated, Identity, NeoHookean, Sigma, VonMises, stack
 from neuido.physics.mpm import Simulator, _Plan, affine_velocity
 from neuido.types import AttachedMass, Body, Box, ParticleState, Plane, Scene, Walls
-from tests.physics.bodies import DEVICES, block
+from tests.physics.bodies import DEVICE, DEVICES, block, same
 
 NO_GRAVITY = (0.0, 0.0, 0.0)
 SOFT = FixedCorotated(1e5, 0.3)
 
 
-def simulator(scene, body, device="cpu", **options):
+def simulator(scene, body, device=DEVICE, **options):
     return Simulator(scene, body, dtype=torch.float64, device=device, **options)
 
 
@@ -63,7 +63,7 @@ def test_a_substep_conserves_mass_momentum_and_spin(device):
 def test_a_rollout_starts_with_the_affine_velocity():
     body = block((0.35, 0.35, 0.35), (0.65, 0.65, 0.65), (8, 8, 8), velocity=(1.0, -2.0, 0.0), spin=(4.0, 4.0, 4.0))
     sim = simulator(Scene(gravity=NO_GRAVITY, cells=32, dt=5e-4), body)
-    omega = torch.tensor([[0.0, -4.0, 4.0], [4.0, 0.0, -4.0], [-4.0, 4.0, 0.0]], dtype=torch.float64)
+    omega = torch.tensor([[0.0, -4.0, 4.0], [4.0, 0.0, -4.0], [-4.0, 4.0, 0.0]], dtype=torch.float64, device=DEVICE)
     assert torch.allclose(sim.state.C, omega.expand_as(sim.state.C), atol=1e-6)
 
     def spin(C):
@@ -127,7 +127,7 @@ def test_drag_and_pull_in_closed_form():
     w = v
     for _ in range(steps):
         w = (w - 9.8e-3) / (1 + 3e-3)
-    assert torch.allclose(frames.v[1][:, 1], torch.tensor(w, dtype=torch.float64), atol=1e-10)
+    assert torch.allclose(frames.v[1][:, 1], torch.tensor(w, dtype=torch.float64, device=DEVICE), atol=1e-10)
     exact = -9.8 / 3 + (v + 9.8 / 3) * math.exp(-3 * 0.06)
     assert abs(w - exact) < 2e-3
     frames = simulator(scene, body).rollout(steps, SOFT, effects=Effects(drag_quadratic=2.0), every=steps)
@@ -157,8 +157,8 @@ def test_energy_never_grows_in_an_elastic_bounce(device):
 
 def test_frame_indifference_of_a_rollout():
     """A scene turned by 90 degrees about y gives the turned motion."""
-    R = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
-    centre = torch.tensor([0.5, 0.0, 0.5], dtype=torch.float64)
+    R = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64, device=DEVICE)
+    centre = torch.tensor([0.5, 0.0, 0.5], dtype=torch.float64, device=DEVICE)
     body = block((0.3, 0.1, 0.4), (0.7, 0.3, 0.55), (6, 4, 4), velocity=(1.0, -2.0, 0.5), spin=(1.0, 2.0, 3.0))
     turned = Body((body.x - centre) @ R.T + centre, body.v @ R.T, body.volume)
     laws = Sigma(3e5, 0.25), VonMises(5e3, 3e5, 0.25)
@@ -204,7 +204,7 @@ def test_one_launch_of_three_scenes_equals_three_launches(device):
 
 def test_a_parameter_batch_of_one_scene_equals_single_runs():
     body = block((0.3, 0.02, 0.3), (0.7, 0.4, 0.7), (5, 5, 5), velocity=(0.0, -2.0, 0.0))
-    young = torch.tensor([5e4, 1e5, 2e5], dtype=torch.float64)
+    young = torch.tensor([5e4, 1e5, 2e5], dtype=torch.float64, device=DEVICE)
     sim = simulator([Scene(cells=16)] * 3, [body] * 3)
     frames = sim.rollout(80, NeoHookean(young, 0.3), effects=Effects(drag_linear=torch.tensor([0.0, 1.0, 2.0])), every=80)
     for s in range(3):
@@ -245,7 +245,7 @@ def test_a_clamped_beam_sags_and_its_clamp_holds():
     mass = AttachedMass(Box((0.64, 0.4, 0.4), (0.7, 0.6, 0.6)), 0.5)
     scene = Scene(cells=32, dt=5e-4, clamps=(clamp,), attached_masses=(mass,))
     sim = simulator(scene, body)
-    assert torch.isclose(sim.mass.sum(), torch.tensor(1000 * 0.5 * 0.1 * 0.1 + 0.5, dtype=torch.float64))
+    assert torch.isclose(sim.mass.sum(), torch.tensor(1000 * 0.5 * 0.1 * 0.1 + 0.5, dtype=torch.float64, device=DEVICE))
     frames = sim.rollout(200, FixedCorotated(3e5, 0.3), every=200)
     held = body.x[:, 0] <= 0.28
     assert torch.equal(frames.x[1][held], body.x[held])
@@ -316,4 +316,4 @@ def test_state_round_trip_continues_a_rollout():
     half = ParticleState(*(t[1] for t in whole))
     rest = sim.rollout(30, Sigma(1e5, 0.3), VonMises(2e3, 1e5, 0.3), state=half, every=30)
     for a, b in zip(whole, rest):
-        assert torch.equal(a[2], b[1])
+        assert same(a[2], b[1])

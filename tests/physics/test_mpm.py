@@ -10,19 +10,19 @@ from neuido.physics.effects import Effects
 from neuido.physics.laws import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
 from neuido.physics.mpm import Simulator, _Plan
 from neuido.types import Body, Box, ParticleState, Plane, Scene, Walls
-from tests.physics.bodies import DEVICES, block, busy_scenes
+from tests.physics.bodies import DEVICE, DEVICES, block, busy_scenes, same
 
 NAMES = "x v C F mass gravity friction acceleration linear quadratic pull centre shear bulk young poisson yield".split()
 
 
-def leaf(value, device="cpu"):
+def leaf(value, device=DEVICE):
     return torch.as_tensor(value, dtype=torch.float64).clone().to(device).requires_grad_()
 
 
 class Problem:
     """Two busy scenes with every differentiable input as a leaf."""
 
-    def __init__(self, device="cpu"):
+    def __init__(self, device=DEVICE):
         scenes, bodies = busy_scenes()
         self.sim = Simulator(scenes, bodies, dtype=torch.float64, device=device)
         g = torch.Generator().manual_seed(3)
@@ -77,7 +77,7 @@ def test_rollout_gradient_equals_finite_differences():
     p = Problem()
     gradients = torch.autograd.grad(p.loss(p.sim.rollout, 6, 2)[0], p.leaves())
     for name, t, gradient in zip(NAMES, p.leaves(), gradients, strict=True):
-        direction = torch.randn(t.shape, generator=torch.Generator().manual_seed(9), dtype=t.dtype)
+        direction = torch.randn(t.shape, generator=torch.Generator().manual_seed(9), dtype=t.dtype).to(t.device)
         # relative steps; the loss is piecewise smooth and this one stays on its piece
         h = 2e-5 * float(t.detach().norm() / direction.norm())
         with torch.no_grad():
@@ -99,16 +99,15 @@ class Stage:
         self.sim, self.p = p.sim, p
         self.plan = _Plan(p.sim, *p.laws(), 1, 1)
         g = torch.Generator().manual_seed(1)
-        count = len(p.sim.mass)
-        self.state = [t.detach().clone() for t in p.state]
-        self.state[2] = self.state[2] + 3.0 * torch.randn(count, 3, 3, generator=g, dtype=torch.float64)
-        self.tau = 1e3 * torch.randn(count, 3, 3, generator=g, dtype=torch.float64)
-        self.force = Effects(*(t.detach() for t in p.effects)).force_table(2, p.sim.mass).contiguous()
-        self.viscosity = torch.tensor([[3.0, 2.0], [5.0, 4.0]], dtype=torch.float64)
         self.g = g
+        self.state = [t.detach().clone() for t in p.state]
+        self.state[2] = self.state[2] + 3.0 * self.random(self.state[2])
+        self.tau = 1e3 * self.random(self.state[3])
+        self.force = Effects(*(t.detach() for t in p.effects)).force_table(2, p.sim.mass).contiguous()
+        self.viscosity = torch.tensor([[3.0, 2.0], [5.0, 4.0]], dtype=torch.float64, device=DEVICE)
 
     def random(self, t):
-        return torch.randn(t.shape, generator=self.g, dtype=torch.float64)
+        return torch.randn(t.shape, generator=self.g, dtype=torch.float64).to(DEVICE)
 
     def grid(self):
         x, v, C, _ = self.state
@@ -124,7 +123,7 @@ def kernel_cases(stage: Stage):
     walls = {"plane": table.plane, "kind": table.kind, "lower": sim.clamp_lower, "upper": sim.clamp_upper}
     grid = stage.grid()
     velocity = torch.zeros_like(grid)
-    moving = {"held": sim.held, "step": 0, "status": torch.zeros(3, dtype=torch.int32)}
+    moving = {"held": sim.held, "step": 0, "status": torch.zeros(3, dtype=torch.int32, device=DEVICE)}
     next_C = torch.zeros_like(C)
     field = 0.5 * stage.random(velocity)
     return {
@@ -205,7 +204,7 @@ def test_kernel_adjoint_equals_warp_autodiff(name):
     stage = Stage()
     inputs, wanted, outputs = kernel_cases(stage)[name]
     if name == "update_grid":
-        inputs |= {"plane": torch.where(torch.arange(4) == 3, -torch.inf, inputs["plane"])}
+        inputs |= {"plane": torch.where(torch.arange(4, device=DEVICE) == 3, -torch.inf, inputs["plane"])}
     oracle = getattr(kernels.build(wp.float64, enable_backward=True), name)
     weights = {key: stage.random(t) for key, t in outputs.items()}
     forward = {key: t.clone() for key, t in outputs.items()}
@@ -219,7 +218,7 @@ def test_kernel_adjoint_equals_warp_autodiff(name):
         arrays[arg.label] = value
     with wp.Tape() as tape:
         dim = stage.sim.node_count if name == "update_grid" else len(stage.sim.mass)
-        wp.launch(oracle, dim=dim, inputs=[arrays[arg.label] for arg in oracle.adj.args], device="cpu")
+        wp.launch(oracle, dim=dim, inputs=[arrays[arg.label] for arg in oracle.adj.args], device=DEVICE)
     tape.backward(grads={arrays[key]: wp.from_torch(weights[key].clone(), dtype=arrays[key].dtype) for key in outputs})
     for key in set(wanted) - ({"friction"} if name == "update_grid" else set()):
         expected = wp.to_torch(arrays[key].grad).reshape(analytic[key].shape)
@@ -237,14 +236,14 @@ def test_frames_do_not_depend_on_how_they_are_kept():
         third = p.loss(p.sim.rollout, 12, 3)[1]
     with_gradient = p.loss(p.sim.rollout, 12, 3)[1]
     for a, b, c in zip(every, third, with_gradient):
-        assert torch.equal(a[::3], b)
-        assert torch.equal(b, c)
+        assert same(a[::3], b)
+        assert same(b, c)
 
 
 def test_float32_follows_float64():
     scenes, bodies = busy_scenes()
     law = NeoHookean(5e4, 0.3)
-    runs = [Simulator(scenes, bodies, dtype=dtype).rollout(20, law, every=20) for dtype in (torch.float32, torch.float64)]
+    runs = [Simulator(scenes, bodies, dtype=dtype, device=DEVICE).rollout(20, law, every=20) for dtype in (torch.float32, torch.float64)]
     for name, a, b in zip("xvCF", *runs):
         assert float((a.double() - b).abs().max() / b.abs().max()) < 2e-4, name
 
@@ -271,12 +270,12 @@ def test_float32_follows_float64():
 def test_bad_input_is_one_clear_line(change, message):
     body = change.get("body", block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (4, 4, 4)))
     with pytest.raises(UserError, match=message) as error:
-        sim = Simulator(change.get("scene", Scene()), body, density=change.get("density", 1000.0))
+        sim = Simulator(change.get("scene", Scene()), body, density=change.get("density", 1000.0), device=DEVICE)
         sim.rollout(change.get("steps", 10), FixedCorotated(1e5, 0.3), effects=change.get("effects"), every=change.get("every", 1))
     assert "\n" not in str(error.value)
 
 
 def test_a_step_that_blows_up_is_an_error_not_a_nan():
-    sim = Simulator(Scene(cells=16, dt=5e-3), block((0.3, 0.3, 0.3), (0.7, 0.7, 0.7), (6, 6, 6), velocity=(1.0, -3.0, 0.0)))
+    sim = Simulator(Scene(cells=16, dt=5e-3), block((0.3, 0.3, 0.3), (0.7, 0.7, 0.7), (6, 6, 6), velocity=(1.0, -3.0, 0.0)), device=DEVICE)
     with pytest.raises(UserError, match="lower `dt`"):
         sim.rollout(400, FixedCorotated(5e6, 0.3), check=False, every=400)

@@ -1,0 +1,90 @@
+"""How far the learned laws drive real bodies from where the classical law drives them, beside NCLaw's own trained networks.
+
+    python benchmarks/laws.py --data FOLDER [--weights pretrained] [--steps 400] [--device cuda] [--out laws.csv]
+
+For each of the ten real bodies and each of NCLaw's three materials: 400 substeps with the classical law, with the operator's
+law of that material (the latent of its training trajectory), and with NCLaw's networks. The figure is the matched-particle
+RMSE to the classical motion, the root of the mean over frames and particles, in 1e-3 of the unit cube. The step is the
+scene's own, halved until the stiffest law is well inside the stability limit; all three laws use the same.
+"""
+
+import argparse
+import csv
+import dataclasses
+import math
+import os
+from pathlib import Path
+
+import torch
+
+from neuido.data.scenes import load_scene, scene_names
+from neuido.errors import UserError
+from neuido.models.baselines import nclaw
+from neuido.models.operator import IntrinsicDynamicsOperator
+from neuido.physics.laws import material
+from neuido.physics.mpm import Simulator
+
+MATERIALS = {
+    "jelly": ({"law": "fixed_corotated", "young": 1e5, "poisson": 0.2}, {"law": "identity"}),
+    "plasticine": ({"law": "sigma", "young": 3e5, "poisson": 0.25}, {"law": "von_mises", "yield_stress": 5e3}),
+    "sand": ({"law": "sigma", "young": 1e6, "poisson": 0.2}, {"law": "drucker_prager", "friction_angle": 25.0}),
+}
+COURANT = 0.6
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=os.environ.get("NEUIDO_DATA"))
+    parser.add_argument("--weights", default="pretrained")
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--bodies", nargs="+", default=[name for name in scene_names() if name != "nclaw-cube"])
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    if options.data is None:
+        parser.error("give --data or set NEUIDO_DATA")
+    operator = IntrinsicDynamicsOperator.load(options.weights).to(options.device)
+    rows = []
+    print("| body | material | dt [s] | ours | NCLaw | ours / NCLaw |\n| --- | --- | --- | --- | --- | --- |")
+    # bodies that share a grid run in one launch
+    setups = [load_scene(name, options.data) for name in options.bodies]
+    for cells in sorted({setup.scene.cells for setup in setups}):
+        group = [(name, setup) for name, setup in zip(options.bodies, setups) if setup.scene.cells == cells]
+        for name, parts in MATERIALS.items():
+            classical = material(*parts)
+            wave = math.sqrt(float(classical[0].modulus()) / 1000.0)
+            scenes = []
+            for _, setup in group:
+                dt = setup.scene.dt
+                while dt * wave / setup.scene.dx > COURANT:
+                    dt /= 2
+                scenes.append(dataclasses.replace(setup.scene, dt=dt))
+            sim = Simulator(scenes, [setup.body for _, setup in group], device=options.device)
+            with torch.no_grad():
+                truth = sim.rollout(options.steps, *classical, every=5).x
+                errors = {}
+                for label, laws in (("ours", operator.laws(operator.latent(name))), ("nclaw", nclaw(Path(options.data) / f"peers/nclaw-{name}.npz"))):
+                    try:
+                        x = sim.rollout(options.steps, *laws, every=5).x
+                        errors[label] = (x - truth).square().sum(-1)
+                    except UserError as error:
+                        print(f"| {label} {name} failed: {error} |")
+                        errors[label] = torch.full(truth.shape[:2], math.nan, device=truth.device)
+            for s, (body, _) in enumerate(group):
+                own = slice(sim.particles.offsets[s], sim.particles.offsets[s + 1])
+                ours, theirs = (1e3 * float(errors[label][:, own].mean().sqrt()) for label in ("ours", "nclaw"))
+                rows.append({"body": body, "material": name, "dt": scenes[s].dt, "ours": ours, "nclaw": theirs, "ratio": ours / theirs})
+                print(f"| {body} | {name} | {scenes[s].dt:g} | {ours:.3f} | {theirs:.3f} | {ours / theirs:.3f} |", flush=True)
+    for name in MATERIALS:
+        own = [row for row in rows if row["material"] == name]
+        ours, theirs = (math.sqrt(sum(row[key] ** 2 for row in own) / len(own)) for key in ("ours", "nclaw"))
+        print(f"| all | {name} | | {ours:.3f} | {theirs:.3f} | {ours / theirs:.3f} |")
+    if options.out:
+        with options.out.open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0])
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Stage I at the paper's scale for several latent dimensions and both trunks: one table, the paper's figures beside.
+
+    python benchmarks/stage1.py --data data/trajectories --out runs/stage1 [--dims 32 64 128 256] [--trunks objective raw]
+
+Makes the trajectories first where they are missing. The fits run side by side, one or more for each GPU (`--per-device`),
+each as a process `neuido fit --config configs/stage1.yaml`; OUT gets their logs, their weights (safetensors) and table.md.
+"""
+
+import argparse
+import csv
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).resolve().parent.parent
+PAPER = {32: (1023.0, 3.598e-8), 64: (839.2, 3.211e-8), 256: (688.5, 3.341e-8)}
+"""Stress MSE and plastic MSE of the paper's Table 3, which leaves out d = 128. The data are not the same: the paper gives no ranges."""
+
+COLUMNS = [
+    ("val/stress_mse", "stress MSE [Pa^2]"),
+    ("val/plastic_mse", "plastic MSE"),
+    ("val/stress_error", "stress error, median"),
+    ("val/plastic_error_yielding", "plastic error where it flows, median"),
+    ("instance/stress_error", "stress error, held-out instances"),
+    ("instance/plastic_error_yielding", "plastic error, held-out instances"),
+    ("instance/plastic_mse", "plastic MSE, held-out instances"),
+]
+
+
+def command(options: argparse.Namespace, trunk: str, dim: int) -> list[str]:
+    name = f"{trunk}-{dim}"
+    arguments = [
+        "fit", "--config", str(ROOT / "configs" / "stage1.yaml"), "--model.trunk", trunk, "--model.latent_dim", str(dim),
+        "--model.save_to", str(options.out / f"{name}.safetensors"), "--data.root", str(options.data),
+        "--trainer.logger.save_dir", str(options.out), "--trainer.logger.name", name,
+        "--trainer.enable_progress_bar", "false", *options.extra,
+    ]  # fmt: skip
+    return [sys.executable, "-m", "neuido", *arguments]
+
+
+def figures(folder: Path) -> dict[str, float]:
+    """The last value of each column of a run's metrics.csv."""
+    found: dict[str, float] = {}
+    for path in sorted(folder.glob("version_*/metrics.csv"), key=lambda p: p.stat().st_mtime):
+        with path.open() as file:
+            for row in csv.DictReader(file):
+                found |= {key: float(value) for key, value in row.items() if value not in ("", None)}
+    return found
+
+
+def table(options: argparse.Namespace, seconds: dict[str, float]) -> str:
+    head = ["trunk", "d", *(title for _, title in COLUMNS), "minutes"]
+    lines = ["| " + " | ".join(head) + " |", "| " + " | ".join("---" for _ in head) + " |"]
+    for trunk in options.trunks:
+        for dim in options.dims:
+            name = f"{trunk}-{dim}"
+            found = figures(options.out / name)
+            cells = [f"{found[key]:.3g}" if key in found else "missing" for key, _ in COLUMNS]
+            lines.append("| " + " | ".join([trunk, str(dim), *cells, f"{seconds.get(name, float('nan')) / 60:.1f}"]) + " |")
+    for dim, (stress, plastic) in PAPER.items():
+        if dim in options.dims:
+            lines.append("| " + " | ".join(["paper, Table 3", str(dim), f"{stress:g}", f"{plastic:g}", *[""] * (len(COLUMNS) - 1)]) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("data/trajectories"))
+    parser.add_argument("--out", type=Path, default=Path("runs/stage1"))
+    parser.add_argument("--dims", type=int, nargs="+", default=[32, 64, 128, 256])
+    parser.add_argument("--trunks", nargs="+", default=["objective", "raw"])
+    parser.add_argument("--per-device", type=int, default=1, help="fits at a time on each GPU")
+    parser.add_argument("extra", nargs="*", help="further arguments of `neuido fit`, after --")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    if not (options.data / "index.json").exists():
+        start = time.time()
+        arguments = ["simulate", "--config", str(ROOT / "configs" / "trajectories.yaml"), "--out", str(options.data)]
+        subprocess.run([sys.executable, "-m", "neuido", *arguments], check=True, env=environment)
+        print(f"trajectories made in {time.time() - start:.0f} s", flush=True)
+    devices = max(1, torch.cuda.device_count())
+    waiting = [(trunk, dim) for dim in sorted(options.dims, reverse=True) for trunk in options.trunks]
+    running: dict[str, tuple[subprocess.Popen, int, float]] = {}
+    seconds: dict[str, float] = {}
+    load = [0] * devices
+    while waiting or running:
+        while waiting and min(load) < options.per_device:
+            trunk, dim = waiting.pop(0)
+            device = load.index(min(load))
+            log = (options.out / f"{trunk}-{dim}.log").open("w")
+            one = {**environment, "CUDA_VISIBLE_DEVICES": str(device)} if torch.cuda.is_available() else environment
+            process = subprocess.Popen(command(options, trunk, dim), stdout=log, stderr=subprocess.STDOUT, env=one)
+            running[f"{trunk}-{dim}"] = (process, device, time.time())
+            load[device] += 1
+        for name, (process, device, start) in list(running.items()):
+            if process.poll() is not None:
+                seconds[name] = time.time() - start
+                load[device] -= 1
+                del running[name]
+                state = "done" if process.returncode == 0 else f"FAILED ({process.returncode}), see {options.out / name}.log"
+                print(f"{name}: {state}, {seconds[name]:.0f} s", flush=True)
+                (options.out / "table.md").write_text(table(options, seconds) + "\n")
+        time.sleep(0.5)
+    print(table(options, seconds))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Where torch and Warp meet: start-up, streams, and launches of Warp kernels on torch tensors."""
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+
+import torch
+import warp as wp
+from torch import Tensor
+
+
+def start_warp() -> None:
+    """Initialise Warp without its banner, and without its remark on a missing driver; safe to call again."""
+    level = max(wp.config.log_level, wp.LOG_WARNING)
+    wp.config.log_level = wp.LOG_ERROR
+    with contextlib.nullcontext() if torch.cuda.is_available() else _silent_stderr():
+        wp.init()
+    wp.config.log_level = level
+
+
+@contextlib.contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """The remark comes from Warp's C library, so the descriptor itself is turned away."""
+    kept, hole = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(hole, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(hole)
+
+
+def real_of(dtype: torch.dtype) -> type:
+    """The Warp scalar type of a torch float type."""
+    return {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
+
+
+@contextlib.contextmanager
+def torch_stream(device: torch.device) -> Iterator[None]:
+    """Warp launches go to torch's current stream while this is open."""
+    if device.type == "cuda":
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
+            yield
+    else:
+        yield
+
+
+def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
+    """Launch a kernel with torch tensors in place of Warp arrays, typed by the kernel's own annotations.
+
+    Inside `torch_stream` it goes to torch's current stream. The tensors keep their memory and must outlive the launch.
+    """
+    inputs = [
+        wp.from_torch(value.detach(), dtype=arg.type.dtype, requires_grad=False, return_ctype=True) if isinstance(value, Tensor) else value
+        for value, arg in zip(arguments, kernel.adj.args, strict=True)
+    ]
+    wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device))
