@@ -21,9 +21,9 @@ import torch
 
 from neuido.data.scenes import load_scene
 from neuido.data.shapes import ball
-from neuido.models.operator import IntrinsicDynamicsOperator
 from neuido.physics.laws import FixedCorotated, NeoHookean
 from neuido.physics.mpm import Simulator
+from neuido.physics.networks import ObjectiveElastic, ObjectivePlastic
 from neuido.types import Body, Scene, Walls
 
 SIX = {"bouncy-ball": 25744, "clay-cat": 23554, "honey-bottle": 20777, "jelly-duck": 23419, "rubber-pawn": 15907, "sand-fish": 24894}
@@ -57,21 +57,31 @@ def bodies(names: list[str], data: Path | None) -> tuple[list[Scene], list[Body]
 
 
 def neural(count: int, device: torch.device) -> tuple:
-    """The laws of `count` latents of an operator with random weights, stiff enough to stand (its elastic output is damped)."""
-    torch.manual_seed(0)
-    operator = IntrinsicDynamicsOperator().to(device)
-    with torch.no_grad():
-        operator.elastic_trunk.out.weight.mul_(1e-2)
-        operator.elastic_trunk.out.bias.zero_()
-    z = torch.randn(count, operator.latent_dim, device=device, requires_grad=True)
-    return (*operator.laws(z), z)
+    """Effective networks of `count` materials with random weights about Hencky elasticity and a yield strain of 5 %.
+
+    The last layers are the leaves: they are what Stage II and a latent z reach (the trunks are frozen there).
+    """
+    g = torch.Generator().manual_seed(0)
+
+    def draw(*shape: int, scale: float) -> torch.Tensor:
+        return (scale * torch.randn(*shape, generator=g)).to(device)
+
+    def network(kind: type, bias: list[float]):
+        hidden = 64
+        shared = [draw(1, hidden, 9, scale=0.5), draw(1, hidden, scale=0.5), draw(1, hidden, hidden, scale=0.1), draw(1, hidden, scale=0.1)]
+        last = draw(count, len(bias), hidden, scale=2e-3).requires_grad_()
+        offset = torch.tensor(bias).expand(count, -1).clone().to(device).requires_grad_()
+        return kind(*shared, last, offset), [last, offset]
+
+    elastic, leaves = network(ObjectiveElastic, [0.5, 1.0, 0.0, 0.0])
+    plastic, more = network(ObjectivePlastic, [5.0, 0.0, 100.0])
+    return elastic, plastic, leaves + more
 
 
 def scene_case(names: list[str], steps: int) -> Callable:
     def make(device: torch.device, data: Path | None):
         sim = Simulator(*bodies(names, data), device=device)
-        elastic, plastic, z = neural(len(names), device)
-        return sim, (elastic, plastic, z), steps
+        return sim, neural(len(names), device), steps
 
     return make
 
@@ -84,7 +94,7 @@ def block_case(per_side: int, cells: int, steps: int, law: Callable) -> Callable
         body = Body(x, v, torch.full((len(x),), 0.6**3 / len(x), dtype=torch.float64))
         stiffness = torch.tensor([1e5], device=device, requires_grad=True)
         sim = Simulator(Scene(cells=cells, dt=2e-4), body, device=device)
-        return sim, (law(stiffness, 0.3), None, stiffness), steps
+        return sim, (law(stiffness, 0.3), None, [stiffness]), steps
 
     return make
 
@@ -106,7 +116,7 @@ CASES = [
 
 def measure(case: Case, device: torch.device, data: Path | None, repeat: int) -> dict:
     """Median seconds, particle-substeps a second and bytes of one case."""
-    sim, (elastic, plastic, leaf), steps = case.make(device, data)
+    sim, (elastic, plastic, leaves), steps = case.make(device, data)
     weight = torch.randn(len(sim.mass), 3, device=device)
     cuda = device.type == "cuda"
 
@@ -114,8 +124,7 @@ def measure(case: Case, device: torch.device, data: Path | None, repeat: int) ->
         with torch.set_grad_enabled(case.gradient):
             frames = sim.rollout(steps, elastic, plastic, every=max(1, steps // 80), check=False)
             if case.gradient:
-                leaf.grad = None
-                (frames.x[-1] * weight).sum().backward(retain_graph=True)
+                torch.autograd.grad((frames.x[-1] * weight).sum(), leaves, retain_graph=True)
 
     run()
     if cuda:

@@ -1,0 +1,118 @@
+"""The operator: contraction is exact, gradients reach z and all weights, files come back as they were."""
+
+import pytest
+import torch
+from torch import nn
+
+from neuido.errors import UserError
+from neuido.models import operator as module
+from neuido.models.operator import IntrinsicDynamicsOperator, affine
+from neuido.physics import networks
+from neuido.types import Particles
+
+SMALL = {"latent_dim": 6, "basis_dim": 5, "hidden_dim": 16, "head_dim": 8}
+
+
+def make(trunk):
+    torch.manual_seed(0)
+    return IntrinsicDynamicsOperator(trunk, **SMALL).double()
+
+
+def deformations(scenes=3, samples=7):
+    generator = torch.Generator().manual_seed(1)
+    return torch.eye(3, dtype=torch.float64) + 0.05 * torch.randn(scenes, samples, 3, 3, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("trunk", ["raw", "objective"])
+def test_contraction_equals_the_sum_over_basis_functions(trunk):
+    operator, F = make(trunk), deformations()
+    z = torch.randn(3, 6, dtype=torch.float64)
+    elastic, plastic = operator.coefficients(z)
+    phi_e, phi_p = operator.basis(F)
+    c_e, c_p = torch.einsum("sk,snko->sno", elastic, phi_e), torch.einsum("sk,snko->sno", plastic, phi_p)
+    if trunk == "raw":
+        tau, corrected = networks.RAW_STRESS_SCALE * c_e.view(F.shape), F + networks.STRAIN_SCALE * c_p.view(F.shape)
+    else:
+        tau, corrected = networks.isotropic_stress(F, c_e), networks.return_map(F, c_p)
+    torch.testing.assert_close(operator.elastic(z, F), tau)
+    torch.testing.assert_close(operator.plastic(z, F), corrected)
+    for law, expected in zip(operator.laws(z), (tau, corrected)):
+        particles = Particles(torch.arange(3, dtype=torch.int32).repeat_interleave(7), (0, 7, 14, 21))
+        torch.testing.assert_close(law(F.view(-1, 3, 3), particles), expected.view(-1, 3, 3))
+
+
+@pytest.mark.parametrize("trunk", ["raw", "objective"])
+def test_gradients_of_kernels_and_twins_agree(trunk):
+    """Stage I (F fixed, kernels) and the twin (F differentiable) give the same gradient of z and of every weight."""
+    operator, F = make(trunk), deformations()
+    z = torch.randn(3, 6, dtype=torch.float64, requires_grad=True)
+    with torch.no_grad():
+        operator.plastic_trunk.out.bias += 0.5  # inside and outside of yield
+    wanted = [z, *operator.parameters()]
+    grads = []
+    for differentiable in (False, True):
+        x = F.clone().requires_grad_(differentiable)
+        loss = (operator.elastic(z, x) / 1e4).square().sum() + 1e3 * (operator.plastic(z, x) - x.detach()).square().sum()
+        grads.append(torch.autograd.grad(loss, wanted))
+    for kernel, twin in zip(*grads):
+        assert twin.abs().max() > 0
+        if trunk == "raw":
+            torch.testing.assert_close(kernel, twin)
+    for i in range(1 + 6 if trunk == "objective" else 0):  # z and the elastic trunk: no clamp, so no straight-through gradient
+        if i > 0:
+            torch.testing.assert_close(grads[0][i], grads[1][i], rtol=1e-7, atol=1e-9)
+
+
+def test_laws_are_graph_nodes_of_latent_and_weights():
+    operator = make("objective")
+    z = torch.randn(6, dtype=torch.float64, requires_grad=True)
+    elastic, plastic = operator.laws(z)
+    total = sum(t.square().sum() for law in (elastic, plastic) for t in law.tensors())
+    grads = torch.autograd.grad(total, [z, *operator.parameters()])
+    assert all(g.abs().max() > 0 for g in grads)
+    assert elastic.modulus().shape == (1,)
+
+
+def test_wrapped_linear_layers_are_merged():
+    class Adapted(nn.Module):
+        def __init__(self, base):
+            super().__init__()
+            self.base, self.a, self.b = base, nn.Linear(4, 2, bias=False), nn.Linear(2, 3, bias=False)
+            self.in_features = base.in_features
+
+        def forward(self, x):
+            return self.base(x) + self.b(self.a(x))
+
+    base = nn.Linear(4, 3)
+    adapted = Adapted(base)
+    weight, bias = affine(adapted)
+    torch.testing.assert_close(weight, base.weight + adapted.b.weight @ adapted.a.weight)
+    torch.testing.assert_close(bias, base.bias)
+
+
+def test_file_round_trip(tmp_path):
+    operator = IntrinsicDynamicsOperator("raw", **SMALL)
+    operator.name_latents(torch.randn(2, 6), ["jelly", "sand"], ["elastic", "sand"])
+    operator.save(tmp_path / "weights.safetensors", {"stress_error": 0.01})
+    loaded = IntrinsicDynamicsOperator.load(tmp_path / "weights.safetensors")
+    assert loaded.config == operator.config
+    assert all(torch.equal(a, b) for a, b in zip(loaded.state_dict().values(), operator.state_dict().values(), strict=True))
+    assert torch.equal(loaded.latent("sand"), operator.latents[1])
+    assert loaded.latent_families == ["elastic", "sand"]
+    assert loaded.card["stress_error"] == 0.01 and "date" in loaded.card
+    assert [p.name for p in tmp_path.iterdir()] == ["weights.safetensors"]
+
+
+def test_errors_name_the_option(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="trunk = 'cooked'"):
+        IntrinsicDynamicsOperator("cooked")
+    with pytest.raises(UserError, match="basis_dim = 0"):
+        IntrinsicDynamicsOperator(basis_dim=0)
+    monkeypatch.setattr(module, "PRETRAINED", tmp_path / "none.safetensors")
+    with pytest.raises(UserError, match=r"missing.*neuido fit"):
+        IntrinsicDynamicsOperator.load("pretrained")
+    (tmp_path / "text").write_text("not safetensors at all")
+    with pytest.raises(UserError, match="not a safetensors file"):
+        IntrinsicDynamicsOperator.load(tmp_path / "text")
+    with pytest.raises(UserError, match="no latent is named 'tofu'"):
+        IntrinsicDynamicsOperator(**SMALL).latent("tofu")

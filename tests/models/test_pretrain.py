@@ -1,0 +1,190 @@
+"""Stage I learns, scores materials that it has not seen, and goes on after SIGKILL as if nothing had happened."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from lightning.pytorch import Trainer, seed_everything
+
+from neuido.data.simulate import simulate
+from neuido.data.trajectories import TrajectoryDataModule
+from neuido.errors import UserError
+from neuido.models.operator import IntrinsicDynamicsOperator
+from neuido.models.pretrain import ConstitutiveMetrics, PretrainModule, answer, fit_latents
+from neuido.physics.laws import FixedCorotated, Sigma, VonMises
+from neuido.types import TrajectoryBatch
+
+SMALL = {"latent_dim": 8, "basis_dim": 8, "hidden_dim": 16, "head_dim": 16}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Six training trajectories and three held-out ones of 40 steps of 64 particles."""
+    path = tmp_path_factory.mktemp("stage1")
+    simulate(str(path), instances=2, held_out=1, particles_per_side=4, steps=40, velocity=(1.0, -30.0, -2.0), device="cpu", progress=False)
+    return path
+
+
+def trainer(tmp_path, **options):
+    options = {"max_epochs": 3, "logger": False, "enable_checkpointing": False, **options}
+    return Trainer(
+        accelerator="cpu", default_root_dir=tmp_path, enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=10, **options
+    )
+
+
+def synthetic(materials=16, samples=32):
+    """Jelly and plasticine of several stiffnesses, from their laws."""
+    generator = torch.Generator().manual_seed(0)
+    young = torch.logspace(4, 6, materials)
+    trial = torch.eye(3) + 0.05 * torch.randn(materials, samples, 3, 3, generator=generator)
+    corrected, stress = torch.empty_like(trial), torch.empty_like(trial)
+    for i, E in enumerate(young.tolist()):
+        plastic = VonMises(0.03 * E, E, 0.3) if i % 2 else (lambda F: F)
+        corrected[i] = plastic(trial[i])
+        stress[i] = (Sigma if i % 2 else FixedCorotated)(E, 0.3)(corrected[i])
+    flat = [t.reshape(-1, 3, 3).contiguous() for t in (trial, corrected, stress)]
+    rms = stress.flatten(2).norm(dim=2).square().mean(1).sqrt(), (corrected - trial).flatten(2).norm(dim=2).square().mean(1).sqrt()
+    return TrajectoryBatch(*flat, torch.arange(materials).repeat_interleave(samples)), 0.01 * rms[0], 0.01 * rms[1] + 1e-5
+
+
+def test_training_learns_and_an_unseen_material_needs_only_its_latent():
+    batch, stress_epsilon, residual_epsilon = synthetic()
+    torch.manual_seed(0)
+    operator = IntrinsicDynamicsOperator("objective", latent_dim=16, basis_dim=16, hidden_dim=32, head_dim=32)
+    z = torch.randn(16, 16, requires_grad=True)
+    optimizer = torch.optim.AdamW([{"params": operator.parameters()}, {"params": [z], "lr": 5e-2}], lr=5e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 600)
+    for _ in range(600):
+        optimizer.zero_grad()
+        answers = answer(operator, z, batch, stress_epsilon, residual_epsilon)
+        (answers.stress_error.mean() + answers.plastic_error.mean()).backward()
+        optimizer.step()
+        schedule.step()
+    assert answers.stress_error.median() < 0.02
+    assert answers.plastic_error[1::2].median() < 0.4  # plasticine
+    assert answers.plastic_error[::2].median() == 0  # jelly
+
+    # A jelly whose stiffness lies between those of training.
+    frozen = [p.clone() for p in operator.parameters()]
+    F = batch.trial[:64]
+    new = TrajectoryBatch(F, F, FixedCorotated(5e4, 0.3)(F), torch.zeros(64, dtype=torch.long))
+    epsilons = 0.01 * new.stress.flatten(1).norm(dim=1).mean()[None], torch.tensor([1e-5])
+    before = min(answer(operator, row[None], new, *epsilons).stress_error.mean() for row in z.detach())
+    fitted = fit_latents(operator, new, z.detach(), *epsilons, steps=150)
+    after = answer(operator, fitted, new, *epsilons)
+    assert before > 0.05 and after.stress_error.mean() < 0.025
+    assert after.plastic_error.max() == 0
+    assert all(torch.equal(p, q) and p.requires_grad for p, q in zip(operator.parameters(), frozen))
+
+
+def test_metrics_by_hand():
+    batch, stress_epsilon, residual_epsilon = synthetic(materials=2, samples=64)
+    operator = IntrinsicDynamicsOperator(**SMALL)
+    answers = answer(operator, torch.randn(2, 8), batch, stress_epsilon, residual_epsilon)
+    answers = answers._replace(stress=1.25 * batch.stress.view_as(answers.stress), corrected=batch.corrected.view_as(answers.corrected))
+    answers = answers._replace(stress_error=torch.full((2, 64), 0.25), plastic_error=torch.arange(128.0).view(2, 64))
+    metrics = ConstitutiveMetrics("val/", ["elastic", "plasticine"])
+    metrics.update(answers, batch)
+    values = metrics.compute()
+    assert values["val/stress_mse"].item() == pytest.approx((0.25 * batch.stress).square().mean().item(), rel=1e-4)
+    assert values["val/plastic_mse"].item() == 0
+    assert values["val/stress_error"].item() == pytest.approx(0.25, rel=0.03)
+    assert values["val/plastic_error/elastic"].item() == pytest.approx(31, rel=0.05)
+    assert values["val/plastic_error/plasticine"].item() == pytest.approx(95, rel=0.05)
+    flows = (batch.corrected - batch.trial).flatten(1).norm(dim=1) > 1e-5
+    assert not flows[:64].any() and flows[64:].any()
+    assert values["val/plastic_error_yielding"].item() == pytest.approx(torch.arange(128.0)[flows].median().item(), rel=0.05)
+
+
+@pytest.mark.parametrize("trunk", ["objective", "raw"])
+def test_fit_writes_the_operator_and_test_scores_it(folder, tmp_path, trunk):
+    seed_everything(0)
+    data = TrajectoryDataModule(str(folder), batch_size=300, validation_samples=50, instance_samples=60)
+    model = PretrainModule(6, trunk, **SMALL, instance_steps=10, save_to=str(tmp_path / "operator.safetensors"))
+    fit = trainer(tmp_path, enable_checkpointing=True)
+    fit.fit(model, data)
+    loaded = IntrinsicDynamicsOperator.load(tmp_path / "operator.safetensors")
+    assert torch.equal(loaded.latents, model.latents.detach())
+    assert {"jelly", "plasticine", "sand"} <= set(loaded.latent_names)
+    assert loaded.card["figures"]["val/stress_error"] > 0 and loaded.card["figures"]["instance/stress_error"] > 0
+
+    again = PretrainModule.load_from_checkpoint(fit.checkpoint_callback.best_model_path, weights_only=True)
+    assert all(torch.equal(a, b) for a, b in zip(again.state_dict().values(), model.state_dict().values(), strict=True))
+    (values,) = trainer(tmp_path).test(model, TrajectoryDataModule(str(folder), batch_size=300), verbose=False)
+    assert {"test/stress_mse", "test/plastic_mse", "instance/stress_error", "instance/plastic_error_yielding"} <= set(values)
+
+    started = PretrainModule(6, trunk, **SMALL, init_from=str(tmp_path / "operator.safetensors"))
+    assert torch.equal(started.latents, model.latents)
+
+
+def test_errors_name_the_option(folder, tmp_path):
+    with pytest.raises(UserError, match=r"model.trajectory_count = 7.*6 trajectories"):
+        trainer(tmp_path).fit(PretrainModule(7, **SMALL), TrajectoryDataModule(str(folder)))
+    with pytest.raises(UserError, match="plastic_target = 'half'"):
+        PretrainModule(6, plastic_target="half")
+    IntrinsicDynamicsOperator(**SMALL).save(tmp_path / "small.safetensors")
+    with pytest.raises(UserError, match="init_from"):
+        PretrainModule(6, init_from=str(tmp_path / "small.safetensors"))
+
+
+RUN = """
+import sys, torch
+from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.callbacks import ModelCheckpoint
+from neuido.data.trajectories import TrajectoryDataModule
+from neuido.models.pretrain import PretrainModule
+
+root, out, resume = sys.argv[1], sys.argv[2], sys.argv[3:] or [None]
+torch.set_num_threads(1)
+seed_everything(0)
+model = PretrainModule(6, latent_dim=8, basis_dim=8, hidden_dim=16, head_dim=16, instance_steps=0, save_to=out + "/operator.safetensors")
+data = TrajectoryDataModule(root, batch_size=120)
+checkpoint = ModelCheckpoint(dirpath=out, every_n_train_steps=30, save_last=True)
+trainer = Trainer(max_epochs=3, accelerator="cpu", logger=False, callbacks=[checkpoint], gradient_clip_val=1.0, num_sanity_val_steps=0,
+                  enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=7)
+trainer.fit(model, data, ckpt_path=resume[0])
+"""
+
+
+def test_killed_and_resumed_ends_with_the_same_weights(folder, tmp_path):
+    def start(out, *resume):
+        (tmp_path / out).mkdir(exist_ok=True)
+        command = [sys.executable, "-c", RUN, str(folder), str(tmp_path / out), *resume]
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2])
+
+    def finish(process):
+        _, errors = process.communicate(timeout=120)
+        assert process.returncode == 0, errors
+
+    last = tmp_path / "killed" / "last.ckpt"
+    killed, whole = start("killed"), start("whole")
+    deadline = time.monotonic() + 90
+    while not last.is_file():
+        assert killed.poll() is None and time.monotonic() < deadline, "the run ended before its first checkpoint"
+        time.sleep(0.005)
+    time.sleep(0.05)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    assert killed.returncode == -signal.SIGKILL
+    state = torch.load(last, weights_only=True)
+    steps = len(order(folder))
+    assert 0 < state["global_step"] < 3 * steps and state["global_step"] % steps != 0  # in the middle of an epoch
+    assert not (tmp_path / "killed" / "operator.safetensors").exists()
+
+    finish(start("killed", str(last)))
+    finish(whole)
+    one, two = (IntrinsicDynamicsOperator.load(tmp_path / out / "operator.safetensors") for out in ("killed", "whole"))
+    assert torch.equal(one.latents, two.latents)
+    for (name, a), b in zip(one.state_dict().items(), two.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    assert one.card["steps"] == two.card["steps"] == 3 * steps
+
+
+def order(folder):
+    data = TrajectoryDataModule(str(folder), batch_size=120)
+    data.setup()
+    return data.order
