@@ -63,7 +63,10 @@ def main() -> None:
             with torch.no_grad():
                 truth = sim.rollout(options.steps, *classical, every=5).x
                 errors = {}
-                for label, laws in (("ours", operator.laws(operator.latent(name))), ("nclaw", nclaw(Path(options.data) / f"peers/nclaw-{name}.npz"))):
+                for label, laws in (
+                    ("ours", operator.laws(operator.latent(name))),
+                    ("nclaw", nclaw(Path(options.data) / f"peers/nclaw-{name}.npz")),
+                ):
                     try:
                         x = sim.rollout(options.steps, *laws, every=5).x
                         errors[label] = (x - truth).square().sum(-1)

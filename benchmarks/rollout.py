@@ -108,7 +108,9 @@ CASES = [
     Case("bouncy-ball, neural law, forward", scene_case(["bouncy-ball"], 10), False, devices=("cpu",)),
     Case("bouncy-ball, neural law, forward + backward", scene_case(["bouncy-ball"], 10), True, devices=("cpu",)),
     Case("10k particles, 32^3, neo-Hookean (no SVD), forward", block_case(22, 32, 50, NeoHookean), False, 6e6, "p-s/s", devices=("cpu",)),
-    Case("10k particles, 32^3, neo-Hookean, forward + backward", block_case(22, 32, 50, NeoHookean), True, 1.8e6, "p-s/s", devices=("cpu",)),
+    Case(
+        "10k particles, 32^3, neo-Hookean, forward + backward", block_case(22, 32, 50, NeoHookean), True, 1.8e6, "p-s/s", devices=("cpu",)
+    ),
     Case("10k particles, 32^3, fixed corotated, forward", block_case(22, 32, 50, FixedCorotated), False, devices=("cpu",)),
     Case("10k particles, 32^3, fixed corotated, forward + backward", block_case(22, 32, 50, FixedCorotated), True, devices=("cpu",)),
 ]

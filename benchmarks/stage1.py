@@ -1,6 +1,8 @@
 """Stage I at the paper's scale for several latent dimensions and both trunks: one table, the paper's figures beside.
 
-    python benchmarks/stage1.py --data data/trajectories --out runs/stage1 [--dims 32 64 128 256] [--trunks objective raw]
+    python benchmarks/stage1.py --data data/trajectories --out runs/stage1 [--runs objective-64-128 raw-128-128 ...]
+
+A run is named TRUNK-WIDTH-DIM: the trunk, its hidden width, and the latent dimension d.
 
 Makes the trajectories first where they are missing. The fits run side by side, one or more for each GPU (`--per-device`),
 each as a process `neuido fit --config configs/stage1.yaml`; OUT gets their logs, their weights (safetensors) and table.md.
@@ -31,10 +33,10 @@ COLUMNS = [
 ]
 
 
-def command(options: argparse.Namespace, trunk: str, dim: int) -> list[str]:
-    name = f"{trunk}-{dim}"
+def command(options: argparse.Namespace, name: str) -> list[str]:
+    trunk, width, dim = name.split("-")
     arguments = [
-        "fit", "--config", str(ROOT / "configs" / "stage1.yaml"), "--model.trunk", trunk, "--model.latent_dim", str(dim),
+        "fit", "--config", str(ROOT / "configs" / "stage1.yaml"), "--model.trunk", trunk, "--model.hidden_dim", width, "--model.latent_dim", dim,
         "--model.save_to", str(options.out / f"{name}.safetensors"), "--data.root", str(options.data),
         "--trainer.logger.save_dir", str(options.out), "--trainer.logger.name", name,
         "--trainer.enable_progress_bar", "false", *options.extra,
@@ -53,17 +55,14 @@ def figures(folder: Path) -> dict[str, float]:
 
 
 def table(options: argparse.Namespace, seconds: dict[str, float]) -> str:
-    head = ["trunk", "d", *(title for _, title in COLUMNS), "minutes"]
+    head = ["trunk", "width", "d", *(title for _, title in COLUMNS), "minutes"]
     lines = ["| " + " | ".join(head) + " |", "| " + " | ".join("---" for _ in head) + " |"]
-    for trunk in options.trunks:
-        for dim in options.dims:
-            name = f"{trunk}-{dim}"
-            found = figures(options.out / name)
-            cells = [f"{found[key]:.3g}" if key in found else "missing" for key, _ in COLUMNS]
-            lines.append("| " + " | ".join([trunk, str(dim), *cells, f"{seconds.get(name, float('nan')) / 60:.1f}"]) + " |")
+    for name in options.runs:
+        found = figures(options.out / name)
+        cells = [f"{found[key]:.3g}" if key in found else "missing" for key, _ in COLUMNS]
+        lines.append("| " + " | ".join([*name.split("-"), *cells, f"{seconds.get(name, float('nan')) / 60:.1f}"]) + " |")
     for dim, (stress, plastic) in PAPER.items():
-        if dim in options.dims:
-            lines.append("| " + " | ".join(["paper, Table 3", str(dim), f"{stress:g}", f"{plastic:g}", *[""] * (len(COLUMNS) - 1)]) + " |")
+        lines.append("| " + " | ".join(["paper, Table 3", "", str(dim), f"{stress:g}", f"{plastic:g}", *[""] * (len(COLUMNS) - 1)]) + " |")
     return "\n".join(lines)
 
 
@@ -71,8 +70,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("data/trajectories"))
     parser.add_argument("--out", type=Path, default=Path("runs/stage1"))
-    parser.add_argument("--dims", type=int, nargs="+", default=[32, 64, 128, 256])
-    parser.add_argument("--trunks", nargs="+", default=["objective", "raw"])
+    parser.add_argument(
+        "--runs", nargs="+", default=[f"{trunk}-{dim}" for trunk in ("objective-64", "raw-128") for dim in (32, 64, 128, 256)]
+    )
     parser.add_argument("--per-device", type=int, default=1, help="fits at a time on each GPU")
     parser.add_argument("extra", nargs="*", help="further arguments of `neuido fit`, after --")
     options = parser.parse_args()
@@ -80,22 +80,22 @@ def main() -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     if not (options.data / "index.json").exists():
         start = time.time()
-        arguments = ["simulate", "--config", str(ROOT / "configs" / "trajectories.yaml"), "--out", str(options.data)]
+        arguments = ["simulate", "--config", str(ROOT / "configs" / "trajectories.yaml"), "--out", str(options.data), "--batch", "40"]
         subprocess.run([sys.executable, "-m", "neuido", *arguments], check=True, env=environment)
         print(f"trajectories made in {time.time() - start:.0f} s", flush=True)
     devices = max(1, torch.cuda.device_count())
-    waiting = [(trunk, dim) for dim in sorted(options.dims, reverse=True) for trunk in options.trunks]
+    waiting = list(options.runs)
     running: dict[str, tuple[subprocess.Popen, int, float]] = {}
     seconds: dict[str, float] = {}
     load = [0] * devices
     while waiting or running:
         while waiting and min(load) < options.per_device:
-            trunk, dim = waiting.pop(0)
+            name = waiting.pop(0)
             device = load.index(min(load))
-            log = (options.out / f"{trunk}-{dim}.log").open("w")
+            log = (options.out / f"{name}.log").open("w")
             one = {**environment, "CUDA_VISIBLE_DEVICES": str(device)} if torch.cuda.is_available() else environment
-            process = subprocess.Popen(command(options, trunk, dim), stdout=log, stderr=subprocess.STDOUT, env=one)
-            running[f"{trunk}-{dim}"] = (process, device, time.time())
+            process = subprocess.Popen(command(options, name), stdout=log, stderr=subprocess.STDOUT, env=one)
+            running[name] = (process, device, time.time())
             load[device] += 1
         for name, (process, device, start) in list(running.items()):
             if process.poll() is not None:

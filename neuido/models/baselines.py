@@ -65,7 +65,8 @@ def _network(weights: dict[str, Tensor], part: str, path: Path) -> Callable[[Ten
             cache[key] = [w.to(F) for w in layers]
         first, second, last = cache[key]
         eye = torch.eye(3, dtype=F.dtype, device=F.device)
-        sigma, R = linalg.frame(F).sigma, linalg.polar(F)[0]
+        U, sigma, V = linalg.svd(F, gap=0.0)
+        R = U @ V.mT if not F.requires_grad else linalg.polar(F)[0]
         x = torch.cat([sigma - 1, (F.mT @ F - eye).flatten(1), torch.linalg.det(F)[:, None] - 1], dim=1)
         x = functional.gelu(functional.linear(functional.gelu(functional.linear(x, first)), second))
         X = functional.linear(x, last).unflatten(1, (3, 3))

@@ -24,7 +24,7 @@ GAP = 1e-6
 
 
 class LawKernels(NamedTuple):
-    """The four kernels for one scalar type. `kinds` (S,) int32, `params` (S, n); a particle of scene s reads row min(s, S - 1)."""
+    """The kernels for one scalar type. `kinds` (S,) int32, `params` (S, n); a particle of scene s reads row min(s, S - 1)."""
 
     stress: Any
     """(F, kinds, params (S, 2) [mu, lambda], scene, tau)"""
@@ -34,6 +34,8 @@ class LawKernels(NamedTuple):
     """(F, kinds, params (S, 1), scene, corrected)"""
     correct_adjoint: Any
     """(F, kinds, params, scene, grad_corrected, grad_F, grad_params or None): both gradients are added to."""
+    decompose: Any
+    """(F, U, sigma, V): the principal frame, sigma with the sign of det F on the last."""
 
 
 @functools.cache
@@ -290,4 +292,12 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
                         wp.atomic_add(grad_params, s, 0, weight * along)
                 grad_F[p] = grad_F[p] + U * B * wp.transpose(V)
 
-    return LawKernels(stress, stress_adjoint, correct, correct_adjoint)
+    @wp.kernel(enable_backward=False, module="unique")
+    def decompose(F: wp.array(dtype=mat), U: wp.array(dtype=mat), sigma: wp.array(dtype=vec), V: wp.array(dtype=mat)):
+        p = wp.tid()
+        u, excess, v = frame(F[p])
+        U[p] = u
+        sigma[p] = vec(one + excess[0], one + excess[1], one + excess[2])
+        V[p] = v
+
+    return LawKernels(stress, stress_adjoint, correct, correct_adjoint, decompose)

@@ -3,7 +3,7 @@
 Convention throughout: F = U diag(sigma) V^T with rotations U and V, sigma_1 >= sigma_2 >= |sigma_3|; sigma_3 carries the sign of det F.
 In the frame P = U^T dF V the derivatives split into a symmetric part, divided by sigma_j - sigma_i, and a skew part, divided by
 sigma_i + sigma_j. Only the first is singular at repeated singular values, and for an isotropic function it is a divided difference.
-Everything here runs in plain torch, float32 or float64; it is the slow twin of `law_kernels`.
+Everything here is plain torch, float32 or float64, the slow twin of `law_kernels`; on CUDA the frame itself comes from there.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from neuido.physics.law_kernels import GAP
+from neuido.physics.device import launch, real_of, torch_stream
+from neuido.physics.law_kernels import GAP, kernels
 
 
 class Frame(NamedTuple):
@@ -27,6 +28,12 @@ class Frame(NamedTuple):
 
 
 def _decompose(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    if F.is_cuda:  # torch decomposes large batches of small matrices slowly there
+        flat = F.detach().reshape(-1, 3, 3).contiguous()
+        U, V, sigma = torch.empty_like(flat), torch.empty_like(flat), flat.new_empty(len(flat), 3)
+        with torch_stream(F.device):
+            launch(kernels(real_of(F.dtype)).decompose, len(flat), [flat, U, sigma, V], F.device)
+        return U.view(F.shape), sigma.view(F.shape[:-1]), V.view(F.shape)
     U, sigma, Vh = torch.linalg.svd(F)
     V = Vh.mT
     flip_u, flip_v = torch.linalg.det(U).sign(), torch.linalg.det(V).sign()

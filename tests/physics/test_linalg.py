@@ -152,3 +152,21 @@ def test_float32_and_leading_axes():
     assert R.dtype == torch.float32
     (R.sum() + S.sum() + (U * sigma.unsqueeze(-2) @ V.mT).sum()).backward()
     assert torch.isfinite(F.grad).all()
+
+
+def test_the_kernel_frame_decomposes_as_torch_does():
+    """What CUDA uses in place of torch's SVD, run here on the CPU: same singular values, rotations, and product."""
+    from neuido.physics.device import launch, real_of
+    from neuido.physics.law_kernels import kernels
+
+    g = torch.Generator().manual_seed(5)
+    F = torch.randn(200, 3, 3, generator=g, dtype=torch.float64)
+    F[:50] = torch.eye(3, dtype=torch.float64) + 1e-3 * F[:50]
+    F[0] = torch.eye(3)
+    U, V, sigma = torch.empty_like(F), torch.empty_like(F), torch.empty(200, 3, dtype=torch.float64)
+    launch(kernels(real_of(F.dtype)).decompose, 200, [F, U, sigma, V], F.device)
+    expected = linalg.svd(F, gap=0.0)[1]
+    assert torch.allclose(sigma, expected, atol=1e-12)
+    assert torch.allclose(U @ torch.diag_embed(sigma) @ V.mT, F, atol=1e-12)
+    for R in (U, V):
+        assert torch.allclose(torch.linalg.det(R), torch.ones(200, dtype=torch.float64), atol=1e-12)
