@@ -36,7 +36,8 @@ COLUMNS = [
 def command(options: argparse.Namespace, name: str) -> list[str]:
     trunk, width, dim = name.split("-")
     arguments = [
-        "fit", "--config", str(ROOT / "configs" / "stage1.yaml"), "--model.trunk", trunk, "--model.hidden_dim", width, "--model.latent_dim", dim,
+        "fit", "--config", str(ROOT / "configs" / "stage1.yaml"),
+        "--model.trunk", trunk, "--model.hidden_dim", width, "--model.latent_dim", dim,
         "--model.save_to", str(options.out / f"{name}.safetensors"), "--data.root", str(options.data),
         "--trainer.logger.save_dir", str(options.out), "--trainer.logger.name", name,
         "--trainer.enable_progress_bar", "false", *options.extra,

@@ -74,9 +74,7 @@ def _print_devices() -> list[str]:
         print(f"  cuda:{i}: {properties.name}, {properties.total_memory / 2**30:.0f} GiB, compute {properties.major}.{properties.minor}")
     release = _driver_release()
     dotted = ["none" if version is None else ".".join(map(str, version)) for version in (toolkit, driver)]
-    print(
-        f"  driver {release or 'none'} (CUDA {dotted[1]}); built for CUDA: torch {torch.version.cuda or 'none'}, warp {dotted[0]}"
-    )
+    print(f"  driver {release or 'none'} (CUDA {dotted[1]}); built for CUDA: torch {torch.version.cuda or 'none'}, warp {dotted[0]}")
     if release and not torch.cuda.is_available():
         print("  torch does not see the GPU: install a CUDA build of torch (README, Install)")
     if toolkit and (driver or release) and (driver or (0,))[0] < toolkit[0]:

@@ -137,7 +137,9 @@ def test_drag_and_pull_in_closed_form():
     # a stiff pull (many times the body's own weight) on a rigid-like body: a harmonic oscillator of its centre
     still = block((0.55, 0.45, 0.45), (0.65, 0.55, 0.55), (3, 3, 3))
     effects = Effects(position_force=400.0, position_centre=(0.5, 0.5, 0.5))
-    frames = simulator(Scene(gravity=NO_GRAVITY, cells=16, dt=2.5e-4), still).rollout(400, FixedCorotated(1e5, 0.3), effects=effects, every=400)
+    frames = simulator(Scene(gravity=NO_GRAVITY, cells=16, dt=2.5e-4), still).rollout(
+        400, FixedCorotated(1e5, 0.3), effects=effects, every=400
+    )
     assert abs(float(frames.x[1][:, 0].mean()) - (0.5 + 0.1 * math.cos(20 * 0.1))) < 2e-3
 
 
@@ -208,7 +210,9 @@ def test_a_parameter_batch_of_one_scene_equals_single_runs():
     sim = simulator([Scene(cells=16)] * 3, [body] * 3)
     frames = sim.rollout(80, NeoHookean(young, 0.3), effects=Effects(drag_linear=torch.tensor([0.0, 1.0, 2.0])), every=80)
     for s in range(3):
-        alone = simulator(Scene(cells=16), body).rollout(80, NeoHookean(float(young[s]), 0.3), effects=Effects(drag_linear=float(s)), every=80)
+        alone = simulator(Scene(cells=16), body).rollout(
+            80, NeoHookean(float(young[s]), 0.3), effects=Effects(drag_linear=float(s)), every=80
+        )
         assert torch.allclose(frames.x[1].view(3, -1, 3)[s], alone.x[1], atol=1e-12)
 
 
