@@ -22,6 +22,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from neuido.physics.device import start_warp
+
 DELTA = 1e-5
 """Floor of the deviatoric strain q [-]: keeps its derivative finite at F = I."""
 
@@ -33,23 +35,13 @@ LODE = 3.0 * math.sqrt(6.0)
 FEATURES, STRESS_COEFFICIENTS, YIELD_COEFFICIENTS = 9, 4, 3
 
 
-@functools.cache
-def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
-    """The kernels for one scalar type, compiled on first launch.
-
-    Args:
-        real: `wp.float32` or `wp.float64`.
-        enable_backward: Also generate Warp's own adjoints (the oracle of the tests).
-
-    Returns:
-        A namespace of kernels and of the matrix type `mat33`.
-    """
-    wp.init()
+def functions(real: type, name: str) -> SimpleNamespace:
+    """Warp functions of one particle, for the kernels of a module `name` (those here, and the fused ones)."""
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
     vec3 = wp.types.vector(length=3, dtype=real)
-    name = f"neuido.networks.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
+    vec4 = wp.types.vector(length=4, dtype=real)
+    vec9 = wp.types.vector(length=9, dtype=real)
     func = functools.partial(wp.func, module=name)
-    kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
 
     @func
     def unit():
@@ -135,47 +127,52 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         gY = g * A + real(0.5) * gA * B + real(wp.static(1.0 / 3.0)) * gB * C + real(0.25) * gC
         return real(0.25) * symmetric(gY)
 
-    @kernel
-    def features(F: wp.array(dtype=mat33), X: wp.array2d(dtype=real)):
-        p = wp.tid()
-        N, h = shrinkage(F[p])
+    @func
+    def measure(F: mat33):
+        """N, h, and the invariants l, A, q of the Hencky strain."""
+        N, h = shrinkage(F)
         H = hencky(h)
         l = wp.trace(H)
         A = H - (l / real(3.0)) * unit()
-        q = norm(A)
-        d = wp.determinant(A)
-        X[p, 0] = real(0.25) * asinh(l * real(wp.static(1.0 / FINE)))
-        X[p, 1] = asinh(l * real(wp.static(1.0 / COARSE)))
-        X[p, 2] = real(0.25) * asinh(q * real(wp.static(1.0 / FINE)))
-        X[p, 3] = asinh(q * real(wp.static(1.0 / COARSE)))
-        X[p, 4] = l / wp.sqrt(l * l + q * q)
-        X[p, 5] = real(LODE) * d / (q * q * q)
-        X[p, 6] = real(LINEAR) * l
-        X[p, 7] = real(LINEAR) * q
-        X[p, 8] = real(LINEAR) * d / (q * q)
+        return N, h, l, A, norm(A)
 
     @func
-    def features_adjoint(l: real, A: mat33, q: real, X: wp.array2d(dtype=real), p: int):
-        """Adjoints of l, q and A (through its determinant) from that of the features, row p of X."""
+    def features_of(l: real, A: mat33, q: real):
+        d = wp.determinant(A)
+        x = vec9()
+        x[0] = real(0.25) * asinh(l * real(wp.static(1.0 / FINE)))
+        x[1] = asinh(l * real(wp.static(1.0 / COARSE)))
+        x[2] = real(0.25) * asinh(q * real(wp.static(1.0 / FINE)))
+        x[3] = asinh(q * real(wp.static(1.0 / COARSE)))
+        x[4] = l / wp.sqrt(l * l + q * q)
+        x[5] = real(LODE) * d / (q * q * q)
+        x[6] = real(LINEAR) * l
+        x[7] = real(LINEAR) * q
+        x[8] = real(LINEAR) * d / (q * q)
+        return x
+
+    @func
+    def features_adjoint(l: real, A: mat33, q: real, X: vec9):
+        """Adjoints of l, q and A (through its determinant) from that of the features."""
         d = wp.determinant(A)
         r2 = l * l + q * q
         r3 = r2 * wp.sqrt(r2)
         q2 = q * q
         gl = (
-            X[p, 0] * real(wp.static(0.25 / FINE)) * asinh_slope(l * real(wp.static(1.0 / FINE)))
-            + X[p, 1] * real(wp.static(1.0 / COARSE)) * asinh_slope(l * real(wp.static(1.0 / COARSE)))
-            + X[p, 4] * q2 / r3
-            + X[p, 6] * real(LINEAR)
+            X[0] * real(wp.static(0.25 / FINE)) * asinh_slope(l * real(wp.static(1.0 / FINE)))
+            + X[1] * real(wp.static(1.0 / COARSE)) * asinh_slope(l * real(wp.static(1.0 / COARSE)))
+            + X[4] * q2 / r3
+            + X[6] * real(LINEAR)
         )
         gq = (
-            X[p, 2] * real(wp.static(0.25 / FINE)) * asinh_slope(q * real(wp.static(1.0 / FINE)))
-            + X[p, 3] * real(wp.static(1.0 / COARSE)) * asinh_slope(q * real(wp.static(1.0 / COARSE)))
-            - X[p, 4] * l * q / r3
-            - X[p, 5] * real(wp.static(3.0 * LODE)) * d / (q2 * q2)
-            + X[p, 7] * real(LINEAR)
-            - X[p, 8] * real(wp.static(2.0 * LINEAR)) * d / (q2 * q)
+            X[2] * real(wp.static(0.25 / FINE)) * asinh_slope(q * real(wp.static(1.0 / FINE)))
+            + X[3] * real(wp.static(1.0 / COARSE)) * asinh_slope(q * real(wp.static(1.0 / COARSE)))
+            - X[4] * l * q / r3
+            - X[5] * real(wp.static(3.0 * LODE)) * d / (q2 * q2)
+            + X[7] * real(LINEAR)
+            - X[8] * real(wp.static(2.0 * LINEAR)) * d / (q2 * q)
         )
-        gd = X[p, 5] * real(LODE) / (q2 * q) + X[p, 8] * real(LINEAR) / q2
+        gd = X[5] * real(LODE) / (q2 * q) + X[8] * real(LINEAR) / q2
         return gl, gq, gd * cofactor(A)
 
     @func
@@ -184,82 +181,48 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         g = gA + (gq / q) * A
         return symmetric(g) + ((gl - wp.trace(g) / real(3.0)) * unit())
 
-    @kernel
-    def stress(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, tau: wp.array(dtype=mat33)):
-        p = wp.tid()
-        N, h = shrinkage(F[p])
-        H = hencky(h)
-        l = wp.trace(H)
-        A = H - (l / real(3.0)) * unit()
-        q = norm(A)
+    @func
+    def stress_of(l: real, A: mat33, q: real, c: vec4, scale: real):
         a = wp.ddot(A, A)
         D = A * A - (a / real(3.0)) * unit()
-        tau[p] = scale * ((c[p, 0] * l + c[p, 3] * a / q) * unit() + c[p, 1] * A + (c[p, 2] / q) * D)
-
-    @kernel
-    def stress_coefficients_adjoint(F: wp.array(dtype=mat33), scale: real, g_tau: wp.array(dtype=mat33), g_c: wp.array2d(dtype=real)):
-        """Writes the adjoint of c."""
-        p = wp.tid()
-        N, h = shrinkage(F[p])
-        H = hencky(h)
-        l = wp.trace(H)
-        A = H - (l / real(3.0)) * unit()
-        q = norm(A)
-        a = wp.ddot(A, A)
-        D = A * A - (a / real(3.0)) * unit()
-        g = scale * g_tau[p]
-        t = wp.trace(g)
-        g_c[p, 0] = l * t
-        g_c[p, 1] = wp.ddot(g, A)
-        g_c[p, 2] = wp.ddot(g, D) / q
-        g_c[p, 3] = a / q * t
-
-    @kernel
-    def stress_adjoint(
-        F: wp.array(dtype=mat33),
-        c: wp.array2d(dtype=real),
-        scale: real,
-        g_tau: wp.array(dtype=mat33),
-        g_X: wp.array2d(dtype=real),
-        g_F: wp.array(dtype=mat33),
-    ):
-        """Adds to the adjoint of F what comes through the generators and through the features."""
-        p = wp.tid()
-        N, h = shrinkage(F[p])
-        H = hencky(h)
-        l = wp.trace(H)
-        A = H - (l / real(3.0)) * unit()
-        q = norm(A)
-        a = wp.ddot(A, A)
-        gl, gq, gA = features_adjoint(l, A, q, g_X, p)
-        g = symmetric(scale * g_tau[p])
-        t = wp.trace(g)
-        gl += c[p, 0] * t
-        gD = (c[p, 2] / q) * (g - (t / real(3.0)) * unit())
-        gA += c[p, 1] * g + real(2.0) * symmetric(gD * A) + (real(2.0) * c[p, 3] * t / q) * A
-        gq -= (c[p, 2] * (wp.ddot(g, A * A) - a * t / real(3.0)) + c[p, 3] * a * t) / (q * q)
-        g_F[p] = g_F[p] + strain_adjoint(F[p], N, h, hencky_adjoint(gl, gq, gA, A, q))
+        return scale * ((c[0] * l + c[3] * a / q) * unit() + c[1] * A + (c[2] / q) * D)
 
     @func
-    def flow(l: real, q: real, c: wp.array2d(dtype=real), scale: real, p: int):
+    def stress_coefficients(l: real, A: mat33, q: real, scale: real, g_tau: mat33):
+        """Adjoint of c."""
+        a = wp.ddot(A, A)
+        D = A * A - (a / real(3.0)) * unit()
+        g = scale * g_tau
+        t = wp.trace(g)
+        return vec4(l * t, wp.ddot(g, A), wp.ddot(g, D) / q, a / q * t)
+
+    @func
+    def stress_gradient(F: mat33, N: mat33, h: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, g_tau: mat33, X: vec9):
+        """Adjoint of F: what comes through the generators, and through the features, whose adjoint is X."""
+        a = wp.ddot(A, A)
+        gl, gq, gA = features_adjoint(l, A, q, X)
+        g = symmetric(scale * g_tau)
+        t = wp.trace(g)
+        gl += c[0] * t
+        gD = (c[2] / q) * (g - (t / real(3.0)) * unit())
+        gA += c[1] * g + real(2.0) * symmetric(gD * A) + (real(2.0) * c[3] * t / q) * A
+        gq -= (c[2] * (wp.ddot(g, A * A) - a * t / real(3.0)) + c[3] * a * t) / (q * q)
+        return strain_adjoint(F, N, h, hencky_adjoint(gl, gq, gA, A, q))
+
+    @func
+    def flow(l: real, q: real, c: vec4, scale: real):
         """Unclamped deviatoric fraction f, clamped f, and volumetric correction u."""
-        x = real(1.0) - (scale * c[p, 0] + c[p, 1] * wp.max(-l, real(0.0))) / q
+        x = real(1.0) - (scale * c[0] + c[1] * wp.max(-l, real(0.0))) / q
         f = wp.clamp(x, real(0.0), real(1.0))
         u = real(0.0)
         if l > real(0.0):
-            u = wp.clamp(l - scale * c[p, 2], real(0.0), l)
+            u = wp.clamp(l - scale * c[2], real(0.0), l)
         return x, f, u
 
-    @kernel
-    def correction(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, out: wp.array(dtype=mat33)):
-        p = wp.tid()
-        N, h = shrinkage(F[p])
-        H = hencky(h)
-        l = wp.trace(H)
-        A = H - (l / real(3.0)) * unit()
-        q = norm(A)
-        x, f, u = flow(l, q, c, scale, p)
-        out[p] = wp.exp(-u / real(3.0)) * (exponential(-f * A) * F[p])
+    @func
+    def correction_of(F: mat33, l: real, A: mat33, q: real, c: vec4, scale: real):
+        x, f, u = flow(l, q, c, scale)
+        return wp.exp(-u / real(3.0)) * (exponential(-f * A) * F)
 
     @func
     def flow_adjoint(F: mat33, A: mat33, f: real, u: real, g: mat33):
@@ -270,6 +233,131 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         gM = exponential_adjoint(M, s * g * wp.transpose(F))
         return -wp.ddot(gM, A), -s * wp.ddot(g, E * F) / real(3.0), gM, s * E * g
 
+    @func
+    def correction_coefficients(
+        F: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, straight_through: int, g_out: mat33
+    ):
+        """Adjoint of c; `straight_through` lets it pass a clamp where descent leads back into the range."""
+        x, f, u = flow(l, q, c, scale)
+        gf, gu, gM, gF = flow_adjoint(F, A, f, u, g_out)
+        if x < real(0.0) and not (straight_through == 1 and gf < real(0.0)):
+            gf = real(0.0)
+        if x > real(1.0) and not (straight_through == 1 and gf > real(0.0)):
+            gf = real(0.0)
+        r = scale * c[2]
+        if l <= real(0.0):
+            gu = real(0.0)
+        elif r > l and not (straight_through == 1 and gu < real(0.0)):
+            gu = real(0.0)
+        elif r < real(0.0) and not (straight_through == 1 and gu > real(0.0)):
+            gu = real(0.0)
+        return vec4(-gf * scale / q, -gf * wp.max(-l, real(0.0)) / q, -gu * scale, real(0.0))
+
+    @func
+    def correction_gradient(F: mat33, N: mat33, h: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, g_out: mat33, X: vec9):
+        """Adjoint of F: what comes through the return map, and through the features, whose adjoint is X."""
+        x, f, u = flow(l, q, c, scale)
+        gf, gu, gM, gF = flow_adjoint(F, A, f, u, g_out)
+        gl, gq, gA = features_adjoint(l, A, q, X)
+        gA -= f * gM
+        if x > real(0.0) and x < real(1.0):
+            gq += gf * (real(1.0) - x) / q
+            if l < real(0.0):
+                gl += gf * c[1] / q
+        if l > real(0.0) and scale * c[2] < l:
+            gl += gu
+        return gF + strain_adjoint(F, N, h, hencky_adjoint(gl, gq, gA, A, q))
+
+    return SimpleNamespace(
+        vec4=vec4,
+        vec9=vec9,
+        mat33=mat33,
+        measure=measure,
+        features_of=features_of,
+        stress_of=stress_of,
+        stress_coefficients=stress_coefficients,
+        stress_gradient=stress_gradient,
+        correction_of=correction_of,
+        correction_coefficients=correction_coefficients,
+        correction_gradient=correction_gradient,
+    )
+
+
+@functools.cache
+def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
+    """The kernels for one scalar type, compiled on first launch; features (P, 9), coefficients (P, 4) or (P, 3).
+
+    Args:
+        real: `wp.float32` or `wp.float64`.
+        enable_backward: Also generate Warp's own adjoints (the oracle of the tests).
+    """
+    start_warp()
+    name = f"neuido.networks.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
+    own = functions(real, name)
+    vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
+    measure, features_of, stress_of, stress_coefficients = own.measure, own.features_of, own.stress_of, own.stress_coefficients
+    stress_gradient, correction_of = own.stress_gradient, own.correction_of
+    correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
+    func = functools.partial(wp.func, module=name)
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
+
+    @func
+    def row4(c: wp.array2d(dtype=real), p: int):
+        last = real(0.0)
+        if c.shape[1] > 3:
+            last = c[p, 3]
+        return vec4(c[p, 0], c[p, 1], c[p, 2], last)
+
+    @func
+    def row9(X: wp.array2d(dtype=real), p: int):
+        x = vec9()
+        for i in range(9):
+            x[i] = X[p, i]
+        return x
+
+    @kernel
+    def features(F: wp.array(dtype=mat33), X: wp.array2d(dtype=real)):
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        x = features_of(l, A, q)
+        for i in range(9):
+            X[p, i] = x[i]
+
+    @kernel
+    def stress(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, tau: wp.array(dtype=mat33)):
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        tau[p] = stress_of(l, A, q, row4(c, p), scale)
+
+    @kernel
+    def stress_coefficients_adjoint(F: wp.array(dtype=mat33), scale: real, g_tau: wp.array(dtype=mat33), g_c: wp.array2d(dtype=real)):
+        """Writes the adjoint of c."""
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        g = stress_coefficients(l, A, q, scale, g_tau[p])
+        for i in range(4):
+            g_c[p, i] = g[i]
+
+    @kernel
+    def stress_adjoint(
+        F: wp.array(dtype=mat33),
+        c: wp.array2d(dtype=real),
+        scale: real,
+        g_tau: wp.array(dtype=mat33),
+        g_X: wp.array2d(dtype=real),
+        g_F: wp.array(dtype=mat33),
+    ):
+        """Adds to the adjoint of F."""
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        g_F[p] = g_F[p] + stress_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_tau[p], row9(g_X, p))
+
+    @kernel
+    def correction(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, out: wp.array(dtype=mat33)):
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        out[p] = correction_of(F[p], l, A, q, row4(c, p), scale)
+
     @kernel
     def correction_coefficients_adjoint(
         F: wp.array(dtype=mat33),
@@ -279,29 +367,12 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         g_out: wp.array(dtype=mat33),
         g_c: wp.array2d(dtype=real),
     ):
-        """Writes the adjoint of c; `straight_through` lets it pass a clamp where descent leads back into the range."""
+        """Writes the adjoint of c."""
         p = wp.tid()
-        N, h = shrinkage(F[p])
-        H = hencky(h)
-        l = wp.trace(H)
-        A = H - (l / real(3.0)) * unit()
-        q = norm(A)
-        x, f, u = flow(l, q, c, scale, p)
-        gf, gu, gM, gF = flow_adjoint(F[p], A, f, u, g_out[p])
-        if x < real(0.0) and not (straight_through == 1 and gf < real(0.0)):
-            gf = real(0.0)
-        if x > real(1.0) and not (straight_through == 1 and gf > real(0.0)):
-            gf = real(0.0)
-        r = scale * c[p, 2]
-        if l <= real(0.0):
-            gu = real(0.0)
-        elif r > l and not (straight_through == 1 and gu < real(0.0)):
-            gu = real(0.0)
-        elif r < real(0.0) and not (straight_through == 1 and gu > real(0.0)):
-            gu = real(0.0)
-        g_c[p, 0] = -gf * scale / q
-        g_c[p, 1] = -gf * wp.max(-l, real(0.0)) / q
-        g_c[p, 2] = -gu * scale
+        N, h, l, A, q = measure(F[p])
+        g = correction_coefficients(F[p], l, A, q, row4(c, p), scale, straight_through, g_out[p])
+        for i in range(3):
+            g_c[p, i] = g[i]
 
     @kernel
     def correction_adjoint(
@@ -312,24 +383,10 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         g_X: wp.array2d(dtype=real),
         g_F: wp.array(dtype=mat33),
     ):
-        """Adds to the adjoint of F what comes through the return map and through the features."""
+        """Adds to the adjoint of F."""
         p = wp.tid()
-        N, h = shrinkage(F[p])
-        H = hencky(h)
-        l = wp.trace(H)
-        A = H - (l / real(3.0)) * unit()
-        q = norm(A)
-        x, f, u = flow(l, q, c, scale, p)
-        gf, gu, gM, gF = flow_adjoint(F[p], A, f, u, g_out[p])
-        gl, gq, gA = features_adjoint(l, A, q, g_X, p)
-        gA -= f * gM
-        if x > real(0.0) and x < real(1.0):
-            gq += gf * (real(1.0) - x) / q
-            if l < real(0.0):
-                gl += gf * c[p, 1] / q
-        if l > real(0.0) and scale * c[p, 2] < l:
-            gl += gu
-        g_F[p] = g_F[p] + gF + strain_adjoint(F[p], N, h, hencky_adjoint(gl, gq, gA, A, q))
+        N, h, l, A, q = measure(F[p])
+        g_F[p] = g_F[p] + correction_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_out[p], row9(g_X, p))
 
     return SimpleNamespace(
         mat33=mat33,
