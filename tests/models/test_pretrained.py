@@ -1,0 +1,94 @@
+"""The weights that come with the package: small, loadable, near the laws they were trained on, and described by their card."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from neuido.models.operator import PRETRAINED, IntrinsicDynamicsOperator
+from neuido.models.pretrain import PretrainModule
+from neuido.physics.laws import material
+
+MATERIALS = {
+    "jelly": ({"law": "fixed_corotated", "young": 1e5, "poisson": 0.2}, {"law": "identity"}),
+    "plasticine": ({"law": "sigma", "young": 3e5, "poisson": 0.25}, {"law": "von_mises", "yield_stress": 5e3}),
+    "sand": ({"law": "sigma", "young": 1e6, "poisson": 0.2}, {"law": "drucker_prager", "friction_angle": 25.0}),
+}
+
+
+@pytest.fixture(scope="module")
+def operator() -> IntrinsicDynamicsOperator:
+    return IntrinsicDynamicsOperator.load()
+
+
+def deformations(strain: float, count: int = 2000) -> torch.Tensor:
+    return torch.eye(3) + strain * torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0))
+
+
+def test_file(operator):
+    assert PRETRAINED.stat().st_size < 4e6
+    assert set(MATERIALS) <= set(operator.latent_names)
+    assert len(operator.latents) == 90
+    assert operator.config["trunk"] == "objective" and operator.config["latent_dim"] == 128
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+@torch.no_grad()
+def test_laws_are_near_the_classical_ones(operator, name):
+    classical, flow = material(*MATERIALS[name])
+    elastic, plastic = operator.laws(operator.latent(name))
+    assert elastic.modulus().item() == pytest.approx(classical.modulus().item(), rel=0.01)
+    assert elastic(torch.eye(3)[None]).abs().max() == 0
+    F = deformations(1e-2)
+    stress = classical(F)
+    error = (elastic(F) - stress).flatten(1).norm(dim=1) / stress.flatten(1).norm(dim=1)
+    assert error.median() <= 0.02
+    corrected = flow(F)
+    residual = (corrected - F).flatten(1).norm(dim=1)
+    wrong = (plastic(F) - corrected).flatten(1).norm(dim=1)
+    flows = residual > 1e-5
+    if name == "jelly":
+        assert not flows.any() and wrong.max() < 1e-6
+    else:
+        assert flows.any() and (wrong / residual)[flows].median() < 0.02
+
+
+@torch.no_grad()
+def test_materials_differ(operator):
+    """The check above would pass for one law under three names if the names were mixed up; they are not."""
+    F = deformations(1e-2)
+    stiffness = {name: operator.laws(operator.latent(name))[0](F).norm().item() for name in MATERIALS}
+    assert stiffness["jelly"] * 2 < stiffness["plasticine"] < stiffness["sand"] / 2
+
+
+def test_a_fit_starts_from_them(operator):
+    module = PretrainModule(90, init_from="pretrained")
+    for (name, mine), theirs in zip(module.operator.state_dict().items(), operator.state_dict().values(), strict=True):
+        assert torch.equal(mine, theirs), name
+    assert torch.equal(module.latents, operator.latents)
+    other = PretrainModule(6, init_from="pretrained")  # other trajectories: the weights without their latents
+    assert torch.equal(other.operator.elastic_trunk.out.weight, operator.elastic_trunk.out.weight)
+    assert other.latents.shape == (6, 128)
+
+
+def test_the_card_quotes_the_file(operator):
+    """Every figure of the card's first table is that of the file, and so are date and number of steps."""
+    card = (Path(PRETRAINED).parent / "README.md").read_text()
+    section = card.split("## Figures")[1].split("Median relative error of the stress, over")[0]
+    rows = dict(re.findall(r"^\| ([^|]+?) \| (.+) \|$", section, flags=re.MULTILINE))
+    figures = operator.card["figures"]
+    keys = {
+        "stress error": ["stress_error"],
+        "stress error, elastic / plasticine / sand": [f"stress_error/{family}" for family in ("elastic", "plasticine", "sand")],
+        "stress MSE [Pa²]": ["stress_mse"],
+        "plastic error where it flows": ["plastic_error_yielding"],
+        "plastic error, elastic / plasticine / sand": [f"plastic_error/{family}" for family in ("elastic", "plasticine", "sand")],
+        "plastic MSE": ["plastic_mse"],
+    }
+    for title, names in keys.items():
+        for stage, cell in zip(("val", "instance"), rows[title].split(" | "), strict=True):
+            quoted = [float(number) for number in cell.split(" / ")]
+            assert quoted == pytest.approx([figures[f"{stage}/{name}"] for name in names], rel=5e-3), (title, stage)
+    assert operator.card["date"] in card
+    assert f"{operator.card['steps']:,} steps" in card
