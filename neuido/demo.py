@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from neuido.models.operator import IntrinsicDynamicsOperator
 
 STEPS, EVERY, DT = 600, 200, 5e-4
+CELLS, INSET = 20, 2.0
 
 
 class Comparison(NamedTuple):
@@ -69,7 +70,7 @@ def _compare(operator: "IntrinsicDynamicsOperator", name: str, family: str, para
     from neuido.types import Scene, Walls
 
     body = ball(centre=(0.5, 0.3, 0.5), radius=0.15, spacing=0.027, velocity=(0.5, -1.0, 0.0))
-    simulator = Simulator(Scene(cells=20, dt=DT, walls=Walls(inset=2.0)), body)
+    simulator = Simulator(Scene(cells=CELLS, dt=DT, walls=Walls(inset=INSET)), body)
     with torch.no_grad():
         true = simulator.rollout(STEPS, *laws(family, [parameters]), every=EVERY).x
         learned = simulator.rollout(STEPS, *operator.cpu().laws(operator.latent(name)), every=EVERY).x
@@ -90,16 +91,20 @@ def _draw(compared: list[Comparison], path: Path) -> None:
 
     times = [DT * EVERY * k for k in range(len(compared[0].true))]
     figure = Figure(figsize=(2.8 * len(times), 1.8 * len(compared)), layout="constrained")
+    figure.suptitle("A falling ball, a shape that training has not seen: all particles, from the front", fontsize=9)
     panels = figure.subplots(len(compared), len(times), squeeze=False, sharex=True, sharey=True)
     for row, each in zip(panels, compared, strict=True):
-        row[0].set_ylabel(each.name)
+        row[0].set_ylabel(f"{each.name}\ny [m]", fontsize=9)
         for panel, true, learned in zip(row, each.true, each.learned, strict=True):
+            panel.axhline(INSET / CELLS, color="0.4", linewidth=0.8)  # the floor
             panel.scatter(true[:, 0], true[:, 1], s=14, facecolors="none", edgecolors="0.6", linewidths=0.5, label="true law")
             panel.scatter(learned[:, 0], learned[:, 1], s=3, color="tab:red", linewidths=0, label="learned law")
             panel.set(xlim=(0.1, 0.9), ylim=(0.05, 0.5), aspect="equal")
             panel.tick_params(labelsize=6)
     for panel, time in zip(panels[0], times, strict=True):
         panel.set_title(f"t = {time:g} s", fontsize=9)
+    for panel in panels[-1]:
+        panel.set_xlabel("x [m]", fontsize=8)
     panels[0][0].legend(fontsize=6, loc="upper right")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
