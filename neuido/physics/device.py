@@ -40,19 +40,21 @@ def real_of(dtype: torch.dtype) -> type:
 def torch_stream(device: torch.device) -> Iterator[None]:
     """Warp launches go to torch's current stream while this is open."""
     if device.type == "cuda":
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
+        # no events between streams: everything is on torch's, and a capture forbids them
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False):
             yield
     else:
         yield
 
 
-def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
+def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, *, block: int = 256) -> None:
     """Launch a kernel with torch tensors in place of Warp arrays, typed by the kernel's own annotations.
 
-    Inside `torch_stream` it goes to torch's current stream. The tensors keep their memory and must outlive the launch.
+    Inside `torch_stream` it goes to torch's current stream. The tensors keep their memory and must outlive the launch. None is
+    an absent array; `block` is the number of threads a block on a GPU.
     """
     inputs = [
         wp.from_torch(value.detach(), dtype=arg.type.dtype, requires_grad=False, return_ctype=True) if isinstance(value, Tensor) else value
         for value, arg in zip(arguments, kernel.adj.args, strict=True)
     ]
-    wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device))
+    wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), block_dim=block)

@@ -422,8 +422,21 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
             qi = qi + bx
         a_x[p] = a_x_next[p] + (slope - wp.transpose(hB) * v_next[p]) / h
 
+    @adjoint_kernel
+    def trial_gradient(
+        scene: wp.array(dtype=wp.int32),
+        dt: wp.array(dtype=real),
+        F: wp.array(dtype=mat33),
+        C_next: wp.array(dtype=mat33),
+        F_trial: wp.array(dtype=mat33),
+    ):
+        """The trial gradient again, as `grid_to_particles` wrote it."""
+        p = wp.tid()
+        F_trial[p] = F[p] + dt[scene[p]] * (C_next[p] * F[p])
+
     return SimpleNamespace(
         module=name,
+        trial_gradient=trial_gradient,
         particles_to_grid=particles_to_grid,
         particles_to_grid_adjoint=particles_to_grid_adjoint,
         grid_to_particles=grid_to_particles,

@@ -4,7 +4,7 @@ A law serves S scenes at once (S = 1: one law for all particles). Elastic laws g
 deformation gradient of a trial one. Each has an engine form (`tensors`, `forward`, `adjoint`: no autograd) and a slow twin (`__call__`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 import torch
 from torch import Tensor
@@ -42,9 +42,40 @@ class Law:
         """Add the vector-Jacobian product to `grad_F` (P, 3, 3), contiguous, and to each of `grad_tensors` (None: not wanted)."""
         raise NotImplementedError
 
+    def engine(self, tensors: Sequence[Tensor], particles: Particles) -> "Engine":
+        """What runs this law in one rollout; a law with faster kernels for a device overrides it."""
+        return Engine(self, tensors, particles)
+
+    def key(self, tensors: Sequence[Tensor]) -> Hashable | None:
+        """What, beside the shapes of its tensors, decides its launches with them; None: they may not be captured in a graph."""
+        return None
+
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
         """The slow twin, differentiable by autograd. F (..., 3, 3) where S = 1, else (P, 3, 3) with its `particles`."""
         raise NotImplementedError
+
+
+class Engine:
+    """A law with its tensors and particles for the length of one rollout."""
+
+    def __init__(self, law: Law, tensors: Sequence[Tensor], particles: Particles):
+        self.law, self.tensors, self.particles = law, list(tensors), particles
+
+    def forward(self, F: Tensor, out: Tensor) -> None:
+        """`Law.forward`."""
+        self.law.forward(self.tensors, F, out, self.particles)
+
+    def start_adjoint(self, wanted: Sequence[bool]) -> None:
+        """Zero the gradients of the tensors that are wanted."""
+        self.grads = [torch.zeros_like(t) if want else None for t, want in zip(self.tensors, wanted, strict=True)]
+
+    def adjoint(self, F: Tensor, grad_out: Tensor, grad_F: Tensor) -> None:
+        """`Law.adjoint`, gathering the gradients of the tensors."""
+        self.law.adjoint(self.tensors, F, grad_out, grad_F, self.grads, self.particles)
+
+    def gradients(self) -> list[Tensor | None]:
+        """The gradients of the tensors, after the last `adjoint`."""
+        return self.grads
 
 
 class ElasticLaw(Law):

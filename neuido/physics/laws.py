@@ -2,7 +2,7 @@
 
 import math
 import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -113,6 +113,9 @@ class _Classical(Law):
             inputs.append(parameters)
         with torch_stream(F.device):
             launch(kernel, len(F), inputs, F.device)
+
+    def key(self, tensors: Sequence[Tensor]) -> Hashable:
+        return tuple(law.__name__ for law in self.scene_laws())
 
     def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
         self._launch("correct" if self._correct else "stress", tensors, [F, out], None, particles)

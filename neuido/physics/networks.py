@@ -12,15 +12,15 @@ recomputed in the adjoint. Calling a law runs its twin in plain torch, which aut
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics import network_kernels
-from neuido.physics.laws import ElasticLaw, PlasticLaw
+from neuido.physics import device, fused, network_kernels
+from neuido.physics.device import real_of, torch_stream
+from neuido.physics.law import ElasticLaw, Engine, PlasticLaw
 from neuido.physics.network_kernels import COARSE, DELTA, FINE, LINEAR, LODE
 from neuido.types import Particles
 
@@ -38,28 +38,14 @@ STRAIN_SCALE = 1e-2
 
 
 def launch(kernel, like: Tensor, *arguments) -> None:
-    """Launches a kernel of `network_kernels` over the rows of `like`, on torch's device and current stream.
-
-    Tensors of shape (P, 3, 3) are passed as arrays of matrices, others as they are; torch keeps their memory.
-    """
-    mat33 = wp.types.matrix(shape=(3, 3), dtype=_real(like))
-    inputs = [
-        wp.from_torch(a, dtype=mat33 if a.dim() == 3 else _real(like), requires_grad=False) if isinstance(a, Tensor) else a
-        for a in arguments
-    ]
-    if like.is_cuda:
-        wp.launch(kernel, dim=like.shape[0], inputs=inputs, stream=wp.stream_from_torch(torch.cuda.current_stream(like.device)))
-    else:
-        wp.launch(kernel, dim=like.shape[0], inputs=inputs, device="cpu")
+    """Launches a kernel of `network_kernels` over the rows of `like`, on torch's device and current stream."""
+    with torch_stream(like.device):
+        device.launch(kernel, like.shape[0], arguments, like.device)
 
 
 def kernels(like: Tensor):
     """The kernels for the scalar type of a tensor."""
-    return network_kernels.build(_real(like))
-
-
-def _real(like: Tensor) -> type:
-    return wp.float64 if like.dtype == torch.float64 else wp.float32
+    return network_kernels.build(real_of(like.dtype))
 
 
 # The twins in plain torch: any leading shape, differentiable by autograd.
@@ -206,6 +192,19 @@ class _Network:
     def tensors(self) -> tuple[Tensor, ...]:
         """(W1, b1, W2, b2, W3, b3); see the class."""
         return self.weights
+
+    def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
+        """The fused kernels on CUDA where they exist for this network, else the engine of every law."""
+        if self._fusable(tensors[0]):
+            return fused.FusedEngine(self, tensors, particles)
+        return Engine(self, tensors, particles)
+
+    def key(self, tensors: Sequence[Tensor]) -> Hashable | None:
+        """Only the fused kernels may be captured: the others keep their results in buffers that laws share."""
+        return (type(self).__name__, self.scale) if self._fusable(tensors[0]) else None
+
+    def _fusable(self, W1: Tensor) -> bool:
+        return W1.is_cuda and W1.dtype == torch.float32 and W1.shape[-2] in fused.WIDTHS and self.outputs < 9
 
     def _buffers(self, F: Tensor, hidden: int) -> _Workspace:
         return _workspace(F.shape[0], hidden, self.outputs, F.dtype, F.device)

@@ -7,7 +7,8 @@ import torch
 
 from neuido.physics.effects import Effects
 from neuido.physics.laws import DruckerPrager, FixedCorotated, Identity, NeoHookean, Sigma, VonMises, stack
-from neuido.physics.mpm import Simulator, _Plan, affine_velocity
+from neuido.physics.mpm import Simulator, affine_velocity
+from neuido.physics.rollout import Plan
 from neuido.types import AttachedMass, Body, Box, ParticleState, Plane, Scene, Walls
 from tests.physics.bodies import DEVICE, DEVICES, block, same
 
@@ -37,9 +38,9 @@ def test_a_substep_conserves_mass_momentum_and_spin(device):
     g = torch.Generator().manual_seed(0)
     F = sim.state.F + 0.1 * torch.randn(sim.state.F.shape, generator=g, dtype=torch.float64).to(device)
     start = sim.state._replace(F=F)
-    plan = _Plan(sim, SOFT, None, 1, 1)
+    plan = Plan(sim, SOFT, None, 1, 1)
     tau = SOFT(F)
-    grid = plan.to_grid(start.x, start.v, start.C, tau, sim.mass)
+    grid = plan.to_grid(start.x, start.v, start.C, tau, sim.mass, sim.scratch("grid"))
     assert torch.isclose(grid[..., 3].sum(), sim.mass.sum(), rtol=1e-13)
     m = sim.mass[:, None]
     frames = sim.rollout(5, SOFT, state=start)

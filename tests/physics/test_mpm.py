@@ -8,7 +8,8 @@ from neuido.errors import UserError
 from neuido.physics import kernels, reference
 from neuido.physics.effects import Effects
 from neuido.physics.laws import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
-from neuido.physics.mpm import Simulator, _Plan
+from neuido.physics.mpm import Simulator
+from neuido.physics.rollout import Plan
 from neuido.types import Body, Box, ParticleState, Plane, Scene, Walls
 from tests.physics.bodies import DEVICE, DEVICES, block, busy_scenes, same
 
@@ -97,7 +98,7 @@ class Stage:
     def __init__(self):
         p = Problem()
         self.sim, self.p = p.sim, p
-        self.plan = _Plan(p.sim, *p.laws(), 1, 1)
+        self.plan = Plan(p.sim, *p.laws(), 1, 1)
         g = torch.Generator().manual_seed(1)
         self.g = g
         self.state = [t.detach().clone() for t in p.state]
@@ -111,7 +112,7 @@ class Stage:
 
     def grid(self):
         x, v, C, _ = self.state
-        return self.plan.to_grid(x, v, C, self.tau, self.sim.mass).clone()
+        return self.plan.to_grid(x, v, C, self.tau, self.sim.mass, self.sim.scratch("grid")).clone()
 
 
 def kernel_cases(stage: Stage):

@@ -1,0 +1,283 @@
+"""The loops of a rollout, forward and backward: launches alone, so that they run eagerly or inside a CUDA graph.
+
+The forward pass leaves a tape: x, v, C and F of every substep, and where there is room stress and nodal momentum. The
+backward pass recomputes what the tape lacks and applies the hand-written adjoints of `kernels.py`, `grid_kernels.py` and of
+the laws, last substep first. One `torch.autograd.Function` spans the whole rollout.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics import kernels
+from neuido.physics.device import launch, torch_stream
+from neuido.physics.law import ElasticLaw, Engine, PlasticLaw
+
+if TYPE_CHECKING:
+    from neuido.physics.mpm import Simulator
+
+FIXED = 9
+"""Inputs before the tensors of the laws: x, v, C, F, mass, pull, force, friction, viscosity."""
+
+LARGE = 1 << 17
+"""Particles above which blocks of 256 threads beat blocks of 64 on a GPU; smaller bodies need more blocks to fill it."""
+
+
+class Tape(NamedTuple):
+    """What a forward pass writes; K frames, of every substep where a backward pass follows."""
+
+    x: Tensor
+    v: Tensor
+    C: Tensor
+    F: Tensor
+    status: Tensor
+    """Code, particle and substep of the first failure, (3,) int32."""
+    tau: Tensor | None
+    """Stress of each substep, (T, P, 3, 3), or None."""
+    grid: Tensor | None
+    """Nodal momentum and mass of each substep, (T, nodes, 4), or None."""
+
+    @property
+    def states(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self[:4]
+
+
+class Plan:
+    """What one rollout does, without its differentiable inputs.
+
+    Args:
+        simulator: Scenes, bodies and buffers.
+        elasticity: Elastic law.
+        plasticity: Plastic law or None.
+        steps: Substeps.
+        every: Substeps between frames.
+    """
+
+    def __init__(self, simulator: "Simulator", elasticity: ElasticLaw, plasticity: PlasticLaw | None, steps: int, every: int) -> None:
+        self.simulator, self.elasticity, self.steps, self.every = simulator, elasticity, steps, every
+        self.plasticity = None if plasticity is None or plasticity.identity else plasticity
+        self.block = 64 if len(simulator.mass) < LARGE else 256
+
+    def law_tensors(self) -> tuple[Tensor, ...]:
+        """Those of both laws, the elastic ones first."""
+        elastic = self.elasticity.tensors()
+        self.split = FIXED + len(elastic)
+        return (*elastic, *(() if self.plasticity is None else self.plasticity.tensors()))
+
+    def key(self, inputs: Sequence[Tensor]) -> tuple | None:
+        """What, beside the shapes of the inputs, decides the launches; None where they may not be captured."""
+        elastic = self.elasticity.key(inputs[FIXED : self.split])
+        plastic = "none" if self.plasticity is None else self.plasticity.key(inputs[self.split :])
+        return None if elastic is None or plastic is None else (self.steps, self.every, elastic, plastic)
+
+    def engines(self, inputs: Sequence[Tensor]) -> tuple[Engine, Engine | None]:
+        particles = self.simulator.particles
+        plastic = None if self.plasticity is None else self.plasticity.engine(inputs[self.split :], particles)
+        return self.elasticity.engine(inputs[FIXED : self.split], particles), plastic
+
+    def launch(self, kernel: wp.Kernel, dim: int, inputs: list, block: int = 256) -> None:
+        launch(kernel, dim, inputs, self.simulator.device, block=block)
+
+    # Forward.
+
+    def tape(self, keep_all: bool) -> Tape:
+        """Empty memory for a forward pass; `keep_all`: of every substep, for a backward pass."""
+        sim = self.simulator
+        count = self.steps if keep_all else self.steps // self.every
+        states = (t.new_empty(count + 1, *t.shape) for t in sim.state)
+        status = torch.zeros(3, dtype=torch.int32, device=sim.device)
+        more = keep_all and sim.keep_grid
+        tau = sim.state.F.new_empty(self.steps, *sim.state.F.shape) if more else None
+        return Tape(*states, status, tau, sim.mass.new_empty(self.steps, sim.node_count, 4) if more else None)
+
+    def forward(self, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
+        """Launch the substeps (all, or the first `steps`); checks nothing."""
+        sim = self.simulator
+        mass, pull, force, friction, viscosity = inputs[4:FIXED]
+        stride = self.steps // (len(tape.x) - 1)
+        for frame, t in zip(tape.states, inputs):
+            frame[0] = t
+        now = tuple(frame[0] for frame in tape.states)
+        spare = [tuple(torch.empty_like(t) for t in now) for _ in range(2)] if stride > 1 else []
+        scratch, trial = torch.empty_like(now[3]), torch.empty_like(now[3])
+        tape.status.zero_()
+        with torch_stream(sim.device):
+            elastic, plastic = self.engines(inputs)
+            for n in range(self.steps if steps is None else steps):
+                kept = (n + 1) % stride == 0
+                then = tuple(frame[(n + 1) // stride] for frame in tape.states) if kept else spare[n % 2]
+                x, v, C, F = now
+                tau = scratch if tape.tau is None else tape.tau[n]
+                self.stress(elastic, F, C, viscosity, tau)
+                grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid") if tape.grid is None else tape.grid[n])
+                velocity = self.on_grid(grid, pull, force, friction)
+                self.launch(sim.kernels.grid_to_particles, len(x),
+                            [sim.particles.scene, sim.held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
+                             then[3] if plastic is None else trial, n, tape.status], self.block)  # fmt: skip
+                if plastic is not None:
+                    plastic.forward(trial, then[3])
+                now = then
+
+    def stress(self, elastic: Engine, F: Tensor, C: Tensor, viscosity: Tensor, tau: Tensor) -> None:
+        sim = self.simulator
+        elastic.forward(F, tau)
+        if viscosity.numel():
+            self.launch(sim.kernels.add_viscous_stress, len(F), [sim.particles.scene, viscosity, C, F, tau])
+
+    def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> Tensor:
+        sim = self.simulator
+        arguments = [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.volume, x, v, C, tau, grid.zero_()]
+        self.launch(sim.kernels.particles_to_grid, len(x), arguments, self.block)
+        return grid
+
+    def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor) -> Tensor:
+        sim = self.simulator
+        velocity = sim.scratch("velocity")
+        self.launch(sim.kernels.update_grid, sim.node_count, [*self.grid_inputs(pull, force, friction), grid, velocity])
+        return velocity
+
+    def grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor) -> list:
+        sim = self.simulator
+        table = sim.colliders
+        return [sim.origin, sim.dx, sim.dt, pull, force, table.plane, table.kind, friction, sim.clamp_lower, sim.clamp_upper, sim.nodes]
+
+    def check(self, tape: Tape) -> None:
+        """Raise what the kernels found, or a last frame that is not finite.
+
+        Raises:
+            UserError: A particle lost, too fast, or not finite.
+        """
+        code, p, step = tape.status.tolist()
+        if code == 0 and bool(torch.isfinite(tape.F[-1]).all()):
+            return
+        if code == 0:
+            p, step = int((~torch.isfinite(tape.F[-1]).all(dim=(1, 2))).nonzero()[0]), self.steps - 1
+        s = int(self.simulator.particles.scene[p])
+        scene = self.simulator.scenes[s]
+        what = {
+            kernels.LOST: "left the domain; enlarge `lower`/`upper`, or close it with `walls`",
+            kernels.FAST: f"moved by more than a cell ({scene.dx:.4g} m) or became NaN; lower `dt` (now {scene.dt:g} s) or the stiffness",
+            0: f"has a deformation gradient that is not finite; lower `dt` (now {scene.dt:g} s) or check the law",
+        }[code]
+        raise UserError(f"particle {p} of scene {s} {what} (substep {step + 1} of {self.steps})")
+
+    # Backward.
+
+    def backward(
+        self, inputs: Sequence[Tensor], tape: Tape, gradients: Sequence[Tensor | None], wanted: Sequence[bool], steps: int | None = None
+    ) -> list[Tensor | None]:
+        """The adjoint of every input that is wanted, from the gradients of the frames of x, v, C and F (None: zero)."""
+        sim, k = self.simulator, self.simulator.kernels
+        mass, pull, force, friction, viscosity = inputs[4:FIXED]
+        a_mass, a_pull, a_force, a_friction, a_viscosity = (torch.zeros_like(t) for t in inputs[4:FIXED])
+        parameters = any(wanted[5:8])
+        now = [torch.zeros_like(t) for t in inputs[:4]]
+        then = [torch.empty_like(t) for t in now]
+        scratch, a_tau, trial, a_trial = (torch.empty_like(now[3]) for _ in range(4))
+        a_velocity, a_grid = sim.scratch("a_velocity"), sim.scratch("a_grid")
+        with torch_stream(sim.device):
+            elastic, plastic = self.engines(inputs)
+            elastic.start_adjoint(wanted[FIXED : self.split])
+            if plastic is not None:
+                plastic.start_adjoint(wanted[self.split :])
+            for n in reversed(range(self.steps if steps is None else steps)):
+                if (n + 1) % self.every == 0:
+                    _add(now, gradients, (n + 1) // self.every)
+                x, v, C, F = (t[n] for t in tape.states)
+                v_next, C_next = tape.v[n + 1], tape.C[n + 1]
+                tau = scratch if tape.tau is None else tape.tau[n]
+                if tape.tau is None:
+                    self.stress(elastic, F, C, viscosity, tau)
+                grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid")) if tape.grid is None else tape.grid[n]
+                velocity = self.on_grid(grid, pull, force, friction)
+                a_x, a_v, a_C, a_F = then
+                a_out = now[3]
+                if plastic is not None:
+                    self.trial(F, C_next, trial)
+                    plastic.adjoint(trial, now[3], a_trial.zero_())
+                    a_out = a_trial
+                self.launch(k.grid_to_particles_adjoint, len(x),
+                            [sim.particles.scene, sim.held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, v_next, C_next, *now[:3],
+                             a_out, a_velocity.zero_(), a_x, a_F], self.block)  # fmt: skip
+                self.launch(k.update_grid_adjoint, sim.node_count,
+                            [*self.grid_inputs(pull, force, friction), grid, a_velocity, a_grid, a_pull, a_force, a_friction, parameters])  # fmt: skip
+                self.launch(k.particles_to_grid_adjoint, len(x),
+                            [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.volume, x, v, C, tau, a_grid, a_mass,
+                             a_x, a_v, a_C, a_tau], self.block)  # fmt: skip
+                if viscosity.numel():
+                    self.launch(k.add_viscous_stress_adjoint, len(x),
+                                [sim.particles.scene, viscosity, C, F, a_tau, a_C, a_F, a_viscosity])  # fmt: skip
+                elastic.adjoint(F, a_tau, a_F)
+                now, then = then, now
+            _add(now, gradients, 0)
+            of_laws = [*elastic.gradients(), *(() if plastic is None else plastic.gradients())]
+        return [*now, a_mass, a_pull, a_force, a_friction, a_viscosity, *of_laws]
+
+    def trial(self, F: Tensor, C_next: Tensor, out: Tensor) -> None:
+        """F_tr = (I + dt C) F, as grid_to_particles wrote it."""
+        self.launch(self.simulator.kernels.trial_gradient, len(F), [self.simulator.particles.scene, self.simulator.dt, F, C_next, out])
+
+
+def _add(now: Sequence[Tensor], gradients: Sequence[Tensor | None], frame: int) -> None:
+    for a, gradient in zip(now, gradients):
+        if gradient is not None:
+            a.add_(gradient[frame])
+
+
+def run(plan: Plan, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Frames of x, v, C and F; differentiable where an input requires it.
+
+    Raises:
+        UserError: What `Plan.check` finds.
+    """
+    if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+        return _Rollout.apply(plan, *inputs)
+    inputs = tuple(t.detach() for t in inputs)
+    cache = plan.simulator.graphs
+    captured = None if cache is None else cache.find(plan, inputs, keep_all=False)
+    if captured is not None:
+        captured.forward(inputs)
+        plan.check(captured.tape)
+        return tuple(t.clone() for t in captured.tape.states)
+    tape = plan.tape(keep_all=False)
+    plan.forward(inputs, tape)
+    plan.check(tape)
+    return tape.states
+
+
+class _Rollout(torch.autograd.Function):
+    """Frames of x, v, C, F from the start, the parameters and the laws' tensors."""
+
+    @staticmethod
+    def forward(ctx: Any, plan: Plan, *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        inputs = tuple(t.detach() for t in inputs)
+        cache = plan.simulator.graphs
+        ctx.plan, ctx.captured = plan, None if cache is None else cache.find(plan, inputs, keep_all=True)
+        if ctx.captured is not None:
+            # the tape belongs to the graph: a later rollout may overwrite it, and the backward pass then replays this one
+            ctx.serial = ctx.captured.forward(inputs)
+            plan.check(ctx.captured.tape)
+            ctx.save_for_backward(*(t.clone() for t in inputs))
+            return tuple(t[:: plan.every].clone() for t in ctx.captured.tape.states)
+        tape = plan.tape(keep_all=True)
+        plan.forward(inputs, tape)
+        plan.check(tape)
+        ctx.more = tape[4:]
+        ctx.save_for_backward(*tape.states, *inputs)
+        return tape.states if plan.every == 1 else tuple(t[:: plan.every].clone() for t in tape.states)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        wanted = ctx.needs_input_grad[1:]
+        tensors = ctx.saved_tensors
+        if ctx.captured is not None:
+            out = ctx.captured.backward(tensors, ctx.serial, gradients, wanted)
+        else:
+            out = ctx.plan.backward(tensors[4:], Tape(*tensors[:4], *ctx.more), gradients, wanted)
+        return (None, *(g if want else None for g, want in zip(out, wanted, strict=True)))
