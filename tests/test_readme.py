@@ -1,0 +1,140 @@
+"""What the README says can be done can be done: its commands, its Python, its links, its tables."""
+
+import csv
+import math
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import neuido
+from neuido import cli
+
+ROOT = Path(neuido.__file__).parents[1]
+README = ROOT / "README.md"
+if not README.is_file():
+    pytest.skip("the README does not come with the installed package", allow_module_level=True)
+TEXT = README.read_text()
+CHEAP = ("--help", "--print_config", "--device cpu", "--trainer.max_steps", "doctor")
+"""A command that has one of these is run as it stands; another is only read by the command line that it is for."""
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", TEXT, flags=re.MULTILINE | re.DOTALL)
+
+
+def commands(program: str) -> list[str]:
+    lines = (line.split(" #")[0].strip() for block in blocks("bash") for line in block.splitlines())
+    return [line for line in lines if line.split()[:1] == [program]]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Where the commands run one after the other: they build on what the ones before have written."""
+    return tmp_path_factory.mktemp("readme")
+
+
+def test_there_are_commands():
+    assert len(commands("neuido")) > 10
+    assert sum(any(mark in command for mark in CHEAP) for command in commands("neuido")) >= 6
+    assert len(blocks("python")) >= 5
+
+
+@pytest.mark.parametrize("command", commands("neuido"))
+def test_command(command, folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("NEUIDO_DATA", raising=False)
+    args = shlex.split(command)[1:]
+    cheap = any(mark in command for mark in CHEAP)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(args if cheap else [*args, "--print_config"])
+    out, err = capsys.readouterr()
+    assert stop.value.code == 0, err
+    if not cheap:  # what the command line would run has the values of the README
+        for value in re.findall(r"--[\w.]+ ([\w.e-]+)$", command):
+            assert value in out
+
+
+def test_python(folder, monkeypatch):
+    """The snippets in their order, in one namespace, beside the YAML files that the README shows."""
+    monkeypatch.chdir(folder)
+    for block in blocks("yaml"):
+        name = re.match(r"# (\S+\.yaml)\n", block)
+        assert name is not None, "a YAML block starts with its file name"
+        Path(name[1]).write_text(block)
+    space: dict = {}
+    for snippet in blocks("python"):
+        exec(compile(snippet, "README.md", "exec"), space)
+        assert space["frames"].x.isfinite().all()
+    assert space["young"].grad.abs().item() > 0
+    assert space["heights"].diff().abs().min() > 0
+    assert space["stiffness"].grad.abs().item() > 0
+    assert space["frames"].x.shape[0] == 21
+
+
+@pytest.mark.parametrize("command", commands("python"))
+def test_benchmark(command):
+    script, *options = shlex.split(command)[1:]
+    answer = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True, cwd=ROOT, check=True)
+    for option in options:
+        assert not option.startswith("--") or option in answer.stdout
+
+
+def test_make_and_pip():
+    targets = re.search(r"^\.PHONY:(.*)$", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)[1].split()
+    for command in commands("make"):
+        assert command.split()[1] in targets
+    constraints = (ROOT / "constraints.txt").read_text().splitlines()
+    for command in commands("pip"):
+        words = shlex.split(command)
+        for word in words:
+            if "==" in word:
+                assert word in constraints
+            if word.endswith(".txt"):
+                assert (ROOT / word).is_file()
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "LOG.md", "neuido/models/weights/README.md"])
+def test_links(name):
+    text = (ROOT / name).read_text()
+    headings = {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)}
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if target.startswith("#"):
+            assert target[1:] in headings
+        elif not target.startswith("http"):
+            assert (ROOT / name).parent.joinpath(target).exists()
+
+
+def rows(title: str) -> list[list[str]]:
+    """The cells of the body of the table below a heading, without emphasis."""
+    section = TEXT.split(f"\n### {title}\n")[1].split("\n#")[0]
+    lines = [line for line in section.splitlines() if line.startswith("| ")][2:]
+    return [[cell.strip().strip("*") for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_stage1_table_is_the_measured_one():
+    measured = {}
+    for line in (ROOT / "benchmarks" / "results" / "stage1.md").read_text().splitlines()[2:]:
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        measured[tuple(cells[:3])] = [float(cell) for cell in cells[3:] if cell]
+    quoted = {tuple(cells[:3]): [float(cell) for cell in cells[3:] if cell] for cells in rows("Stage I")}
+    assert quoted.keys() == measured.keys()
+    for key, values in quoted.items():
+        assert values == pytest.approx(measured[key], rel=1e-2), key
+
+
+def test_law_table_is_the_measured_one():
+    with (ROOT / "benchmarks" / "results" / "laws.csv").open() as file:
+        measured = {(row["body"], row["material"]): (float(row["ours"]), float(row["nclaw"])) for row in csv.DictReader(file)}
+    *bodies, total = rows("The learned laws on real bodies")
+    assert len(bodies) == 10
+    for body, *cells in bodies:
+        expected = [value for material in ("jelly", "plasticine", "sand") for value in measured[body, material]]
+        assert [float(cell) for cell in cells] == pytest.approx(expected, rel=5e-3, abs=6e-4)
+    for i, material in enumerate(("jelly", "plasticine", "sand")):
+        for j in range(2):
+            squares = [pair[j] ** 2 for (_, name), pair in measured.items() if name == material]
+            assert float(total[1 + 2 * i + j]) == pytest.approx(math.sqrt(sum(squares) / 10), rel=5e-3, abs=6e-4)
