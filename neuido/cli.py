@@ -7,21 +7,20 @@ commands of the Lightning trainer (`fit`, `validate`, `test`, `predict`) build a
 Whatever the user can mend ends in one line on stderr and exit status 2. `NEUIDO_TRACEBACK=1` shows the traceback instead.
 """
 
-import argparse
 import importlib
 import logging
 import os
-import pickle
 import re
 import signal
 import sys
 import warnings
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import neuido
-from neuido.errors import UserError
+from neuido.errors import UserError, one_line
 
 if TYPE_CHECKING:
     from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -50,7 +49,7 @@ def main(args: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         _fail("interrupted", 128 + signal.SIGINT)
     except Exception as error:
-        line = None if os.environ.get("NEUIDO_TRACEBACK") else _one_line(error)
+        line = None if os.environ.get("NEUIDO_TRACEBACK") else one_line(error)
         if line is None:
             raise
         _fail(line, 2)
@@ -97,6 +96,10 @@ def run_lightning(args: list[str]) -> "LightningCLI":
         def add_arguments_to_parser(self, parser: "LightningArgumentParser") -> None:
             parser.link_arguments("data.trajectory_count", "model.init_args.trajectory_count", apply_on="instantiate")
 
+        def _parse_ckpt_path(self) -> None:  # Lightning reads the hyperparameters of the checkpoint here
+            _check_checkpoint(self.config[self.config.subcommand].get("ckpt_path"))
+            super()._parse_ckpt_path()
+
         def before_instantiate_classes(self) -> None:
             # Lightning loads a remote checkpoint with pickle unless told otherwise; here that takes an explicit `--weights_only false`.
             options = self.config[self.subcommand]
@@ -114,6 +117,15 @@ def run_lightning(args: list[str]) -> "LightningCLI":
         parser_kwargs={"prog": "neuido", "version": neuido.__version__, **parser, **{name: dict(parser) for name in HEAVY}},
         args=args,
     )
+
+
+def _check_checkpoint(given: str | None) -> None:
+    if given is None or given in ("best", "last", "hpc") or given.startswith("registry") or "://" in given:
+        return
+    if not Path(given).exists():
+        raise UserError(f"ckpt_path = {given}: there is no such file")
+    if Path(given).is_file() and not zipfile.is_zipfile(given):
+        raise UserError(f"ckpt_path = {given} is not a checkpoint, or is cut short")
 
 
 def _find_configs(args: list[str]) -> list[str]:
@@ -145,40 +157,6 @@ def _help() -> str:
     )
 
 
-def _one_line(error: BaseException) -> str | None:
-    """The line for the user, or None for an error that only a programmer can mend."""
-    cause: BaseException | None = error
-    while cause is not None:  # jsonargparse wraps what a constructor raises
-        if isinstance(cause, UserError):
-            return " ".join(str(cause).split())
-        cause = cause.__cause__
-    if isinstance(error, argparse.ArgumentError):
-        return _condense(str(error))
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.strerror}: '{error.filename}'"
-    if isinstance(error, pickle.UnpicklingError):
-        return "the checkpoint cannot be read weights-only: it is damaged, or holds objects that reading would execute"
-    if isinstance(error, FileNotFoundError) or type(error).__name__ == "MisconfigurationException":
-        return " ".join(str(error).split())
-    return None
-
-
-NOISE = re.compile(  # the lines of jsonargparse's messages that tell a user nothing
-    r"Does not validate|Subtypes:|Errors:|Given value type:|Given value: (Nest|Name|[{\[])|Expected a (<class 'None|path but)|$"
-)
-
-
-def _condense(message: str) -> str:
-    """Keep of jsonargparse's indented message what names the key, the fault and the value."""
-    lines = [line.strip().removeprefix("- ") for line in message.splitlines()]
-    text = ": ".join(dict.fromkeys(line.rstrip(":") for line in lines if not NOISE.match(line)))
-    text = re.sub(r"Parser key \"([\w.]+)\"", r"--\1", text)
-    text = re.sub(r"Problem with given class_path '(.+?)'", r"\1", text)
-    text = re.sub(r"Expected a dot import path string: (\S+): Given value: .*", r"no class '\1' is known; give its import path", text)
-    text = re.sub(r"Expected a <class '(\w+)'>", r"expected \1", text)
-    return re.sub(r"(: Given|\. Got) value: ", ", got ", text)
-
-
 def _fail(line: str, status: int) -> None:
     print(f"neuido: {line}", file=sys.stderr)
     sys.exit(status)
@@ -187,7 +165,7 @@ def _fail(line: str, status: int) -> None:
 def _quiet_lightning() -> None:
     """Drop lightning's advertisements and the warnings about its own code."""
     logging.getLogger("lightning.fabric.utilities.seed").setLevel(logging.WARNING)  # config.yaml states the seed
-    chatter = re.compile(r".*Tip: |TPU available")
+    chatter = re.compile(r".*Tip: |TPU available|GPU available: False")
     logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda record: not chatter.match(record.getMessage()))
     warnings.filterwarnings("ignore", message=r".*LightningCLI's args parameter is intended")  # sys.argv is passed on as it is
     warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).* is deprecated")

@@ -86,6 +86,10 @@ def test_light_wrong_type(capsys):
     assert_one_line(capsys, ["simulate", "--out", "x", "--instances", "many"], "instances", "int", "many")
 
 
+def test_light_missing_option(capsys):
+    assert_one_line(capsys, ["simulate"], "--out")
+
+
 def test_broken_yaml(capsys, tmp_path):
     path = tmp_path / "broken.yaml"
     path.write_text("out: [\n a: b: c\n")
@@ -167,6 +171,9 @@ class TestLightning:
     def test_wrong_model_type(self, capsys):
         assert_one_line(capsys, ["fit", "--config", STAGE1, "--model.latent_dim", "many"], "latent_dim", "int", "many")
 
+    def test_wrong_choice(self, capsys):
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--model.trunk", "cooked"], "trunk", "one of 'raw', 'objective'", "cooked")
+
     def test_wrong_trainer_option(self, capsys):
         assert_one_line(capsys, ["fit", "--config", STAGE1, "--trainer.max_epochz", "3"], "--trainer.max_epochz")
 
@@ -193,6 +200,19 @@ class TestLightning:
         torch.save({"state_dict": {}, "hyper_parameters": Evil()}, checkpoint)
         assert_one_line(capsys, ["fit", "--config", STAGE1, "--ckpt_path", str(checkpoint)], "weights-only")
         assert not victim.exists()
+
+    @pytest.mark.parametrize(("content", "word"), [(None, "no such file"), (b"junk", "not a checkpoint")])
+    def test_no_checkpoint(self, capsys, tmp_path, content, word):
+        path = tmp_path / "run.ckpt"
+        if content is not None:
+            path.write_bytes(content)
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--ckpt_path", str(path)], "ckpt_path", str(path), word)
+
+    def test_checkpoint_that_is_cut_short(self, capsys, tmp_path):
+        path = tmp_path / "run.ckpt"
+        torch.save({"state_dict": {"weight": torch.zeros(1000)}}, path)
+        path.write_bytes(path.read_bytes()[:2000])
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--ckpt_path", str(path)], "ckpt_path", "cut short")
 
     def test_help(self, capsys):
         status, out, _ = run(capsys, "fit", "--help")

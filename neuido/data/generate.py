@@ -250,7 +250,8 @@ def _check_ranges(family: str, ranges: dict[str, tuple[float, float]]) -> None:
             raise UserError(f"families.{family}.{name} runs backwards: [{low}, {high}]; put the smaller figure first")
         floor, ceiling = LIMITS[name]
         if not (floor < low and high < ceiling):
-            raise UserError(f"families.{family}.{name} = [{low}, {high}] is impossible: it must lie between {floor} and {ceiling}")
+            bounds = f"strictly between {floor:g} and {ceiling:g}"
+            raise UserError(f"families.{family}.{name} = [{low}, {high}] is impossible: it must lie {bounds}")
 
 
 def _device(name: str) -> torch.device:
