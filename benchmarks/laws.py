@@ -17,18 +17,13 @@ from pathlib import Path
 
 import torch
 
+from neuido.data.generate import PUBLISHED, laws
 from neuido.data.scenes import load_scene, scene_names
 from neuido.errors import UserError
 from neuido.models.baselines import nclaw
 from neuido.models.operator import IntrinsicDynamicsOperator
-from neuido.physics.laws import material
 from neuido.physics.mpm import Simulator
 
-MATERIALS = {
-    "jelly": ({"law": "fixed_corotated", "young": 1e5, "poisson": 0.2}, {"law": "identity"}),
-    "plasticine": ({"law": "sigma", "young": 3e5, "poisson": 0.25}, {"law": "von_mises", "yield_stress": 5e3}),
-    "sand": ({"law": "sigma", "young": 1e6, "poisson": 0.2}, {"law": "drucker_prager", "friction_angle": 25.0}),
-}
 COURANT = 0.6
 
 
@@ -50,8 +45,8 @@ def main() -> None:
     setups = [load_scene(name, options.data) for name in options.bodies]
     for cells in sorted({setup.scene.cells for setup in setups}):
         group = [(name, setup) for name, setup in zip(options.bodies, setups) if setup.scene.cells == cells]
-        for name, parts in MATERIALS.items():
-            classical = material(*parts)
+        for family, (name, parameters) in PUBLISHED.items():
+            classical = laws(family, [parameters])
             wave = math.sqrt(float(classical[0].modulus()) / 1000.0)
             scenes = []
             for _, setup in group:
@@ -63,12 +58,12 @@ def main() -> None:
             with torch.no_grad():
                 truth = sim.rollout(options.steps, *classical, every=5).x
                 errors = {}
-                for label, laws in (
+                for label, learned in (
                     ("ours", operator.laws(operator.latent(name))),
                     ("nclaw", nclaw(Path(options.data) / f"peers/nclaw-{name}.npz")),
                 ):
                     try:
-                        x = sim.rollout(options.steps, *laws, every=5).x
+                        x = sim.rollout(options.steps, *learned, every=5).x
                         errors[label] = (x - truth).square().sum(-1)
                     except UserError as error:
                         print(f"| {label} {name} failed: {error} |")
@@ -78,7 +73,7 @@ def main() -> None:
                 ours, theirs = (1e3 * float(errors[label][:, own].mean().sqrt()) for label in ("ours", "nclaw"))
                 rows.append({"body": body, "material": name, "dt": scenes[s].dt, "ours": ours, "nclaw": theirs, "ratio": ours / theirs})
                 print(f"| {body} | {name} | {scenes[s].dt:g} | {ours:.3f} | {theirs:.3f} | {ours / theirs:.3f} |", flush=True)
-    for name in MATERIALS:
+    for name, _ in PUBLISHED.values():
         own = [row for row in rows if row["material"] == name]
         ours, theirs = (math.sqrt(sum(row[key] ** 2 for row in own) / len(own)) for key in ("ours", "nclaw"))
         print(f"| all | {name} | | {ours:.3f} | {theirs:.3f} | {ours / theirs:.3f} |")

@@ -6,15 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from neuido.data.generate import PUBLISHED, laws
 from neuido.models.operator import PRETRAINED, IntrinsicDynamicsOperator
 from neuido.models.pretrain import PretrainModule
-from neuido.physics.laws import material
 
-MATERIALS = {
-    "jelly": ({"law": "fixed_corotated", "young": 1e5, "poisson": 0.2}, {"law": "identity"}),
-    "plasticine": ({"law": "sigma", "young": 3e5, "poisson": 0.25}, {"law": "von_mises", "yield_stress": 5e3}),
-    "sand": ({"law": "sigma", "young": 1e6, "poisson": 0.2}, {"law": "drucker_prager", "friction_angle": 25.0}),
-}
+FAMILY_OF = {name: family for family, (name, _) in PUBLISHED.items()}
 
 
 @pytest.fixture(scope="module")
@@ -28,15 +24,16 @@ def deformations(strain: float, count: int = 2000) -> torch.Tensor:
 
 def test_file(operator):
     assert PRETRAINED.stat().st_size < 4e6
-    assert set(MATERIALS) <= set(operator.latent_names)
+    assert set(FAMILY_OF) <= set(operator.latent_names)
     assert len(operator.latents) == 90
     assert operator.config["trunk"] == "objective" and operator.config["latent_dim"] == 128
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("name", FAMILY_OF)
 @torch.no_grad()
 def test_laws_are_near_the_classical_ones(operator, name):
-    classical, flow = material(*MATERIALS[name])
+    family = FAMILY_OF[name]
+    classical, flow = laws(family, [PUBLISHED[family][1]])
     elastic, plastic = operator.laws(operator.latent(name))
     assert elastic.modulus().item() == pytest.approx(classical.modulus().item(), rel=0.01)
     assert elastic(torch.eye(3)[None]).abs().max() == 0
@@ -58,7 +55,7 @@ def test_laws_are_near_the_classical_ones(operator, name):
 def test_materials_differ(operator):
     """The check above would pass for one law under three names if the names were mixed up; they are not."""
     F = deformations(1e-2)
-    stiffness = {name: operator.laws(operator.latent(name))[0](F).norm().item() for name in MATERIALS}
+    stiffness = {name: operator.laws(operator.latent(name))[0](F).norm().item() for name in FAMILY_OF}
     assert stiffness["jelly"] * 2 < stiffness["plasticine"] < stiffness["sand"] / 2
 
 
