@@ -31,50 +31,75 @@ CHUNK = 256
 BLOCK = 64
 """Threads a block: small bodies then still fill the multiprocessors."""
 
+UNROLL = 2
+"""Units of the first layer that a thread works on at a time."""
+
 ROW = 12
 """Floats of a unit's row in the packed first layer: nine weights, the bias, two of padding."""
 
-HIDDEN = """
+SIGMOID = """
+    #if defined(__CUDA_ARCH__)
+    #define NEUIDO_SIGMOID(a) __fdividef(1.0f, 1.0f + __expf(-(a)))
+    #define NEUIDO_LOAD4(p) __ldg(reinterpret_cast<const float4*>(p))
+    #else
+    struct quad {{ float x, y, z, w; }};
+    #define NEUIDO_SIGMOID(a) (1.0f / (1.0f + expf(-(a))))
+    #define NEUIDO_LOAD4(p) (*reinterpret_cast<const quad*>(p))
+    #endif
+    #define NEUIDO_UNIT \\
+        const auto q0 = NEUIDO_LOAD4(r), q1 = NEUIDO_LOAD4(r + 4), q2 = NEUIDO_LOAD4(r + 8); \\
+        const float a = ((q0.x * x[0] + q0.y * x[1]) + (q0.z * x[2] + q0.w * x[3])) + ((q1.x * x[4] + q1.y * x[5]) \\
+                        + (q1.z * x[6] + q1.w * x[7])) + (q2.x * x[8] + q2.y);
+"""
+"""Approximate exponential and division (relative error 1e-6), vector loads, and the sum of a unit of the first layer."""
+
+HIDDEN = (
+    SIGMOID
+    + """
     wp::vec_t<{H}, wp::float32> z;
     const float* w1 = &W1.data[shared * {H} * 12];
     const float* w2 = &W2.data[shared * {H} * {H}];
     const float* b2 = &B2.data[shared * {H}];
     #pragma unroll
-    for (int j = 0; j < {H}; ++j) z[j] = b2[j];
-    #pragma unroll 1
+    for (int j = 0; j < {H}; j += 4) {{
+        const auto q = NEUIDO_LOAD4(b2 + j);
+        z[j] = q.x; z[j + 1] = q.y; z[j + 2] = q.z; z[j + 3] = q.w;
+    }}
+    #pragma unroll {U}
     for (int k = 0; k < {H}; ++k) {{
         const float* r = w1 + 12 * k;
-        float a = r[9];
-        #pragma unroll
-        for (int i = 0; i < 9; ++i) a += r[i] * x[i];
-        const float h = a / (1.0f + expf(-a));
+        NEUIDO_UNIT
+        const float h = a * NEUIDO_SIGMOID(a);
         const float* c = w2 + {H} * k;
-    #if defined(__CUDA_ARCH__)
         #pragma unroll
         for (int j = 0; j < {H}; j += 4) {{
-            const float4 q = __ldg(reinterpret_cast<const float4*>(c + j));
+            const auto q = NEUIDO_LOAD4(c + j);
             z[j] += q.x * h; z[j + 1] += q.y * h; z[j + 2] += q.z * h; z[j + 3] += q.w * h;
         }}
-    #else
-        for (int j = 0; j < {H}; ++j) z[j] += c[j] * h;
-    #endif
     }}
     return z;
 """
+)
 
-READOUT = """
+READOUT = (
+    SIGMOID
+    + """
     const float* w3 = &W3.data[scene * {H} * 4];
-    const float* b3 = &B3.data[scene * 4];
-    wp::vec_t<4, wp::float32> y(b3[0], b3[1], b3[2], b3[3]);
+    const auto b = NEUIDO_LOAD4(&B3.data[scene * 4]);
+    wp::vec_t<4, wp::float32> y(b.x, b.y, b.z, b.w);
     #pragma unroll
     for (int j = 0; j < {H}; ++j) {{
-        const float h = z[j] / (1.0f + expf(-z[j]));
-        y[0] += w3[4 * j] * h; y[1] += w3[4 * j + 1] * h; y[2] += w3[4 * j + 2] * h; y[3] += w3[4 * j + 3] * h;
+        const auto q = NEUIDO_LOAD4(w3 + 4 * j);
+        const float h = z[j] * NEUIDO_SIGMOID(z[j]);
+        y[0] += q.x * h; y[1] += q.y * h; y[2] += q.z * h; y[3] += q.w * h;
     }}
     return y;
 """
+)
 
-BACK = """
+BACK = (
+    SIGMOID
+    + """
     const float* w1 = &W1.data[shared * {H} * 12];
     const float* w2 = &W2.data[shared * {H} * {H}];
     const float* w3 = &W3.data[scene * {H} * 4];
@@ -82,48 +107,38 @@ BACK = """
     #pragma unroll
     for (int i = 0; i < 9; ++i) gx[i] = 0.0f;
     wp::vec_t<{H}, wp::float32> g;
-    float* keep = H2.data ? &H2.data[row * {H}] : nullptr;
+    float* keep = H2.data ? &H2.data[(long long)row * {H}] : nullptr;
+    float* out = G2.data ? &G2.data[(long long)p * {H}] : nullptr;
     #pragma unroll
     for (int j = 0; j < {H}; ++j) {{
-        const float s = 1.0f / (1.0f + expf(-z[j]));
+        const auto q = NEUIDO_LOAD4(w3 + 4 * j);
+        const float s = NEUIDO_SIGMOID(z[j]);
         const float h = z[j] * s;
         if (keep) keep[j] = h;
-        const float a = w3[4 * j] * gy[0] + w3[4 * j + 1] * gy[1] + w3[4 * j + 2] * gy[2] + w3[4 * j + 3] * gy[3];
-        g[j] = a * (s + h * (1.0f - s));
+        g[j] = (q.x * gy[0] + q.y * gy[1] + q.z * gy[2] + q.w * gy[3]) * (s + h * (1.0f - s));
+        if (out) out[j] = g[j];
     }}
-    if (G2.data) {{
-        float* out = &G2.data[p * {H}];
-        #pragma unroll
-        for (int j = 0; j < {H}; ++j) out[j] = g[j];
-    }}
-    #pragma unroll 1
+    #pragma unroll {U}
     for (int k = 0; k < {H}; ++k) {{
         const float* r = w1 + 12 * k;
-        float a = r[9];
-        #pragma unroll
-        for (int i = 0; i < 9; ++i) a += r[i] * x[i];
-        const float s = 1.0f / (1.0f + expf(-a));
+        NEUIDO_UNIT
+        const float s = NEUIDO_SIGMOID(a);
         const float* c = w2 + {H} * k;
         float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f;
-    #if defined(__CUDA_ARCH__)
         #pragma unroll
         for (int j = 0; j < {H}; j += 4) {{
-            const float4 q = __ldg(reinterpret_cast<const float4*>(c + j));
+            const auto q = NEUIDO_LOAD4(c + j);
             s0 += q.x * g[j]; s1 += q.y * g[j + 1]; s2 += q.z * g[j + 2]; s3 += q.w * g[j + 3];
         }}
-    #else
-        for (int j = 0; j < {H}; j += 4) {{
-            s0 += c[j] * g[j]; s1 += c[j + 1] * g[j + 1]; s2 += c[j + 2] * g[j + 2]; s3 += c[j + 3] * g[j + 3];
-        }}
-    #endif
         const float h = a * s;
-        const float g1 = (s0 + s1 + s2 + s3) * (s + h * (1.0f - s));
-        if (G2.data) {{ H1.data[p * {H} + k] = h; G1.data[p * {H} + k] = g1; }}
-        #pragma unroll
-        for (int i = 0; i < 9; ++i) gx[i] += r[i] * g1;
+        const float g1 = ((s0 + s1) + (s2 + s3)) * (s + h * (1.0f - s));
+        if (out) {{ H1.data[(long long)p * {H} + k] = h; G1.data[(long long)p * {H} + k] = g1; }}
+        gx[0] += q0.x * g1; gx[1] += q0.y * g1; gx[2] += q0.z * g1; gx[3] += q0.w * g1; gx[4] += q1.x * g1;
+        gx[5] += q1.y * g1; gx[6] += q1.z * g1; gx[7] += q1.w * g1; gx[8] += q2.x * g1;
     }}
     return gx;
 """
+)
 
 
 @functools.cache
@@ -140,13 +155,13 @@ def build(width: int) -> SimpleNamespace:
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     floats = wp.array(dtype=wp.float32)
 
-    @wp.func_native(HIDDEN.format(H=width))
+    @wp.func_native(HIDDEN.format(H=width, U=UNROLL))
     def hidden(x: vec9, shared: int, W1: floats, W2: floats, B2: floats) -> vecH: ...
 
     @wp.func_native(READOUT.format(H=width))
     def readout(z: vecH, scene: int, W3: floats, B3: floats) -> vec4: ...
 
-    @wp.func_native(BACK.format(H=width))
+    @wp.func_native(BACK.format(H=width, U=UNROLL))
     def back(
         x: vec9, z: vecH, gy: vec4, shared: int, scene: int, W1: floats, W2: floats, W3: floats,
         H2: floats, row: int, H1: floats, G1: floats, G2: floats, p: int,
@@ -246,6 +261,13 @@ def build(width: int) -> SimpleNamespace:
                            reduce_last=reduce_last)  # fmt: skip
 
 
+@functools.lru_cache(maxsize=16)
+def _chunks(offsets: tuple[int, ...], device: torch.device) -> list[Tensor]:
+    """Scene, first and last particle of every chunk; kept, since a graph may not copy from the host while it is captured."""
+    table = [(s, p, min(p + CHUNK, j)) for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])) for p in range(i, j, CHUNK)]
+    return [torch.tensor(column, dtype=torch.int32, device=device) for column in zip(*table)]
+
+
 class FusedEngine(Engine):
     """An objective network for one rollout in float32; the same interface and results as its law's own engine."""
 
@@ -279,12 +301,7 @@ class FusedEngine(Engine):
         if self.last:
             self.H2, self.GY = like.new_empty(FLUSH * count * self.width), like.new_empty(FLUSH * count, 4)
             self.g_last, self.g_offset = like.new_zeros(self.rows[1] * self.width, 4), like.new_zeros(self.rows[1], 4)
-            table = [
-                (s, p, min(p + CHUNK, j))
-                for s, (i, j) in enumerate(zip(self.particles.offsets[:-1], self.particles.offsets[1:]))
-                for p in range(i, j, CHUNK)
-            ]
-            self.chunks = [torch.tensor(column, dtype=torch.int32).to(like.device) for column in zip(*table)]
+            self.chunks = _chunks(self.particles.offsets, like.device)
         if self.full:
             self.X = like.new_empty(count, 9)
             self.H1, self.G1, self.G2 = (like.new_empty(count * self.width) for _ in range(3))
