@@ -57,6 +57,38 @@ class TrajectoryBatch(NamedTuple):
     """Index of the trajectory that a sample comes from, (B,) int64."""
 
 
+class Cameras(NamedTuple):
+    """V pinhole cameras of one image size. Pixel (i, j) covers [j, j + 1) x [i, i + 1), so its centre lies at j + 0.5, i + 0.5."""
+
+    viewmats: Tensor
+    """World to camera in OpenCV axes (x right, y down, z forward) [m], (V, 4, 4)."""
+    Ks: Tensor
+    """Intrinsics [px], (V, 3, 3)."""
+    width: int
+    height: int
+
+
+class MultiViewBatch(NamedTuple):
+    """Images of one scene: V views in T frames."""
+
+    scene: int
+    """Index of the scene."""
+    name: str
+    """Its name."""
+    images: Tensor
+    """RGB in [0, 1] over the background, (V, T, H, W, 3) float32."""
+    masks: Tensor
+    """Share of the object in a pixel; one everywhere where nothing says it, (V, T, H, W) float32."""
+    cameras: Cameras
+    """The V cameras, for images of this size."""
+    times: Tensor
+    """Times of the frames [s], (T,) float64."""
+    held_out: Tensor
+    """Which of the views are for scoring only, (V,) bool."""
+    background: Tensor
+    """Its colour, (3,) float32."""
+
+
 @dataclass(frozen=True)
 class Plane:
     """A half-space collider: material is kept on the side that the normal points to.
@@ -123,3 +155,18 @@ class Scene:
     def nodes(self) -> tuple[int, int, int]:
         """Grid nodes along each axis, without padding."""
         return tuple(math.ceil((u - l) / self.dx - 1e-9) + 1 for l, u in zip(self.lower, self.upper))  # type: ignore[return-value]
+
+
+class Gaussians(NamedTuple):
+    """N Gaussians of one body, or K frames of them with a leading K on means, covariances and rotations."""
+
+    means: Tensor
+    """Centre [m], (N, 3)."""
+    covariances: Tensor
+    """Covariance [m^2], (N, 3, 3)."""
+    opacities: Tensor
+    """Opacity in 0..1, (N,)."""
+    harmonics: Tensor
+    """Spherical harmonics of the colour less one half, (N, (degree + 1)^2, 3); degree 0 to 3."""
+    rotations: Tensor | None = None
+    """By how much each Gaussian is rotated since its harmonics were fitted, (N, 3, 3); not at all where absent."""

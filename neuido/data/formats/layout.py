@@ -1,0 +1,243 @@
+"""What each reader returns, and the checks that all of them share. The files are not trusted."""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.data import cameras as convert
+from neuido.errors import UserError
+from neuido.types import Body, Cameras
+
+SAME_TIME = 1e-6  # s
+SAME_POSE = 1e-5  # absolute, of the entries of a world-to-camera matrix
+
+Grid = tuple[tuple[Path | None, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MultiView:
+    """One motion filmed by V cameras in T frames: where the images are, not the images."""
+
+    name: str
+    format: str
+    folder: Path
+    cameras: Cameras
+    views: tuple[str, ...]
+    """Names of the V views."""
+    times: Tensor
+    """Times of the frames [s], (T,) float64, rising."""
+    images: Grid
+    """Path of the image of each view and frame; none where there is no such image."""
+    masks: Grid | None = None
+    """Paths of separate masks; without them the alpha channel is the mask, where an image has one."""
+    held_out: tuple[int, ...] = ()
+    """Indices of the views that the format keeps for scoring."""
+    distortion: Tensor | None = None
+    """OpenCV's k1, k2, p1, p2, k3 of each view, (V, 5) float64; none: images of ideal pinholes."""
+    backgrounds: tuple[Path | None, ...] | None = None
+    """An image of the empty scene for each view."""
+    body: Body | None = None
+    """The particles at t = 0, where the format has them."""
+    gaussians: Path | None = None
+    """The first frame as a 3DGS PLY, where the format has one."""
+
+
+class Shot(NamedTuple):
+    """One image as a file describes it."""
+
+    view: str
+    time: float
+    image: Path
+    viewmat: Tensor
+    """OpenCV world-to-camera, (4, 4) float64."""
+    K: Tensor
+    """(3, 3) float64, in pixels of the full image."""
+    mask: Path | None = None
+    distortion: tuple[float, ...] = ()
+
+
+def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, folder: Path, **fields: Any) -> MultiView:
+    """Sort shots into views (in order of appearance) and frames (by time).
+
+    Args:
+        shots: All images of one motion.
+        size: Width and height [px] to which the intrinsics refer; none: those of the first image.
+        folder: The folder that holds them.
+        fields: The other fields of `MultiView`; `held_out` and `backgrounds` by name of view.
+
+    Raises:
+        UserError: No shot, a missing file, two images for one view and frame, or a view whose camera moves.
+    """
+    if not shots:
+        raise UserError(f"{folder} names no image")
+    missing = [path for shot in shots for path in (shot.image, shot.mask) if path is not None and not path.is_file()]
+    if missing:
+        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+        raise UserError(f"the image {missing[0]} is missing{more}; {folder} names it")
+    views = list(dict.fromkeys(shot.view for shot in shots))
+    times = [0.0]
+    for k, time in enumerate(sorted(shot.time for shot in shots)):
+        if k == 0:
+            times = [time]
+        elif time - times[-1] > SAME_TIME:
+            times.append(time)
+    at = np.searchsorted(np.array(times) + SAME_TIME, [shot.time for shot in shots])
+    first: dict[str, Shot] = {}
+    grid: dict[tuple[str, int], Shot] = {}
+    for shot, frame in zip(shots, at):
+        key = (shot.view, int(frame))
+        if key in grid:
+            raise UserError(f"view {shot.view} has two images at {shot.time:g} s: {grid[key].image.name} and {shot.image.name}")
+        grid[key] = shot
+        camera = first.setdefault(shot.view, shot)
+        if not (torch.allclose(camera.viewmat, shot.viewmat, rtol=0, atol=SAME_POSE) and torch.allclose(camera.K, shot.K)):
+            raise UserError(
+                f"view {shot.view} moves between {camera.image.name} and {shot.image.name}: give each pose of a camera a view of its own"
+            )
+    width, height = size or image_size(shots[0].image)
+    cameras = Cameras(
+        torch.stack([first[view].viewmat for view in views]).float(), torch.stack([first[view].K for view in views]).float(), width, height
+    )
+    distortion = torch.zeros(len(views), 5, dtype=torch.float64)
+    for v, view in enumerate(views):
+        given = first[view].distortion
+        distortion[v, : len(given)] = torch.tensor(given, dtype=torch.float64)
+    frames = range(len(times))
+    masks = None
+    if any(shot.mask is not None for shot in shots):
+        masks = tuple(tuple(grid[view, t].mask if (view, t) in grid else None for t in frames) for view in views)
+    backgrounds = fields.pop("backgrounds", None)
+    held_out = set(fields.pop("held_out", ()))
+    return MultiView(
+        folder=folder,
+        cameras=cameras,
+        views=tuple(views),
+        times=torch.tensor(times, dtype=torch.float64),
+        images=tuple(tuple(grid[view, t].image if (view, t) in grid else None for t in frames) for view in views),
+        masks=masks,
+        held_out=tuple(v for v, view in enumerate(views) if view in held_out),
+        distortion=distortion if bool(distortion.any()) else None,
+        backgrounds=tuple(backgrounds.get(view) for view in views) if backgrounds else None,
+        **fields,
+    )
+
+
+def inside(folder: Path, relative: Any, where: str) -> Path:
+    """The path that a file names, which must stay in the folder.
+
+    Raises:
+        UserError: Not text, absolute, with a `..` in it, or outside the folder by way of a link.
+    """
+    if not isinstance(relative, str) or not relative or "\0" in relative:
+        raise UserError(f"{where} must be the path of a file, got {relative!r}")
+    pure = PureWindowsPath(relative)  # which knows both kinds of slashes
+    if pure.drive or pure.root or ".." in pure.parts or not (folder / relative).resolve().is_relative_to(folder.resolve()):
+        raise UserError(f"{where} = {relative!r} leaves the folder {folder}")
+    return folder / PurePosixPath(relative)
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        UserError: The file is missing or is not JSON.
+    """
+    if not path.is_file():
+        raise UserError(f"{path} is missing")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not valid JSON: {error}") from error
+
+
+def listed(content: Any, where: str) -> list[dict[str, Any]]:
+    """A list of mappings that is not empty, as most formats are."""
+    if not isinstance(content, list) or not content or not all(isinstance(entry, dict) for entry in content):
+        raise UserError(f"{where} must be a list of frames, each a mapping of keys to values, and not empty")
+    return content
+
+
+def take(entry: dict[str, Any], key: str, where: str) -> Any:
+    """A key that must be there."""
+    if key not in entry:
+        raise UserError(f"{where} lacks the key {key!r}")
+    return entry[key]
+
+
+def matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
+    """Numbers of one of the shapes, float64.
+
+    Raises:
+        UserError: Another shape, text, a NaN or an infinity.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{where} must hold numbers, of shape {_or(shapes)}") from error
+    if array.shape not in shapes:
+        raise UserError(f"{where} must have the shape {_or(shapes)}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise UserError(f"{where} holds a NaN or an infinity")
+    return torch.from_numpy(array)
+
+
+def number(value: Any, where: str, *, least: float = -math.inf, above: float = -math.inf) -> float:
+    """A finite number within its range."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise UserError(f"{where} must be a finite number, got {value!r}")
+    if not (value >= least and value > above):
+        raise UserError(f"{where} must be {f'above {above:g}' if above > -math.inf else f'at least {least:g}'}, got {value!r}")
+    return float(value)
+
+
+def opengl(value: Any, where: str) -> Tensor:
+    """OpenCV world-to-camera (4, 4), float64, of a written OpenGL camera-to-world matrix (3, 4) or (4, 4).
+
+    Raises:
+        UserError: No such matrix, or a rotation that is sheared or mirrored.
+    """
+    c2w = matrix(value, where, (3, 4), (4, 4))
+    try:
+        return convert.from_opengl(c2w)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error
+
+
+def calibration(value: Any, where: str) -> Tensor:
+    """An intrinsic matrix K (3, 3).
+
+    Raises:
+        UserError: Not a matrix, a focal length that is not positive, or a skew.
+    """
+    K = matrix(value, where, (3, 3))
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise UserError(f"{where} has the focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they must be positive")
+    if K[0, 1] != 0 or not torch.equal(K[2], K.new_tensor([0.0, 0.0, 1.0])) or K[1, 0] != 0:
+        raise UserError(f"{where} is no pinhole's matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    return K
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height [px] of an image file."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if image is None:
+        raise UserError(f"{path} is missing or no image that OpenCV can read")
+    return image.shape[1], image.shape[0]
+
+
+def natural(text: str) -> list[tuple[int, str]]:
+    """A key that sorts `r_2` before `r_10`."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text) if part]
+
+
+def _or(shapes: tuple[tuple[int, ...], ...]) -> str:
+    return " or ".join(str(shape) for shape in shapes)

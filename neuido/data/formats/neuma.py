@@ -1,0 +1,208 @@
+"""NeuMA's data: a synthetic scene (`data_dynamic.json`, `eval_dynamic.json`), a real one (`dynamics/`), and its assets.
+
+Its synthetic rotations may carry a scale (0.41 in BouncyBall), which no projection sees; it is taken out.
+"""
+
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.data import cameras as convert
+from neuido.data.formats import colmap
+from neuido.data.formats.layout import (
+    MultiView,
+    Shot,
+    assemble,
+    calibration,
+    image_size,
+    inside,
+    listed,
+    matrix,
+    natural,
+    opengl,
+    read_json,
+    take,
+)
+from neuido.errors import UserError
+
+INTERVALS = {"bouncyball": 1e-3, "jellyduck": 1e-3, "claycat": 5e-4, "honeybottle": 5e-4, "rubberpawn": 5e-4, "sandfish": 5e-4}
+"""Seconds a frame of the six scenes, one substep of NeuMA's (its experiments/configs/synthetic)."""
+REAL_INTERVAL = 1 / 120
+"""The capture of the real scenes is Spring-Gaus's, at 120 Hz; NeuMA itself integrates 0.01 s a frame."""
+NAME = re.compile(r"^(.+)_(-?[0-9]+)$")
+
+
+class Assets(NamedTuple):
+    """What NeuMA keeps of a scene beside its images; none where a file is not there."""
+
+    x: Tensor | None = None
+    """Particles at t = 0 in the simulation's domain [m], (P, 3) float32."""
+    v: Tensor | None = None
+    """Their velocity [m/s], (P, 3) float32."""
+    volume: Tensor | None = None
+    """Their volume [m^3], (P,) float32."""
+    bindings: Tensor | None = None
+    """Weights of the particles of each Gaussian, sparse (K, P) float32."""
+    gaussians: Path | None = None
+    """`kernels.ply`, in the layout of 3DGS."""
+    particles: Path | None = None
+    """`particles.ply`, in the world of the images."""
+
+
+def read(path: Path, *, recording: str | None = None, frame_interval: float | None = None) -> MultiView:
+    """Read a synthetic or a real scene's folder; the views of `eval_dynamic.json` are held out.
+
+    Raises:
+        UserError: A missing key or file, a name of another form, a frame interval that is not known.
+    """
+    if (path / "data_dynamic.json").is_file():
+        return _synthetic(path, frame_interval)
+    return _real(path, frame_interval or REAL_INTERVAL)
+
+
+def read_assets(path: Path) -> Assets:
+    """Read `assets/<name>`: `init.pt`, `bindings.pt`, `particles.npz` and the PLY files, those that are there.
+
+    Raises:
+        UserError: A file that is malformed, or whose arrays do not fit.
+    """
+    if not path.is_dir():
+        raise UserError(f"there is no folder {path}")
+    x = v = volume = bindings = None
+    if (path / "init.pt").is_file():
+        file = path / "init.pt"
+        content = _load(file, ("init_x", "init_v"))
+        x, v = content["init_x"].float(), content["init_v"].float()
+        v = v.expand(len(x), 3).contiguous() if v.ndim == 1 and v.shape == (3,) and x.ndim == 2 else v
+        if x.ndim != 2 or x.shape[1] != 3 or v.shape != x.shape or not bool(torch.isfinite(x).all() & torch.isfinite(v).all()):
+            raise UserError(f"{file}: init_x and init_v must be finite (P, 3), got {tuple(x.shape)} and {tuple(v.shape)}")
+    if (path / "bindings.pt").is_file():
+        bindings = _bindings(path / "bindings.pt", None if x is None else len(x))
+    if (path / "particles.npz").is_file():
+        volume = _volume(path / "particles.npz", None if x is None else len(x))
+    gaussians, particles = ((path / name) if (path / name).is_file() else None for name in ("kernels.ply", "particles.ply"))
+    return Assets(x, v, volume, bindings, gaussians, particles)
+
+
+def _synthetic(path: Path, frame_interval: float | None) -> MultiView:
+    interval = frame_interval or INTERVALS.get(path.resolve().name.lower())
+    if interval is None:
+        raise UserError(f"the frames of {path.resolve().name} have no times: give the option frame_interval (s); NeuMA's own scenes are "
+                        f"{', '.join(INTERVALS)}")  # fmt: skip
+    shots, held_out = [], set()
+    for set_name in ("data_dynamic", "eval_dynamic"):
+        file = path / f"{set_name}.json"
+        if not file.is_file():
+            continue
+        part = []
+        for i, entry in enumerate(listed(read_json(file), str(file))):
+            where = f"{file.name}[{i}]"
+            image = inside(path, take(entry, "file_path", where), f"{where}.file_path")
+            view, step = _view_and_step(image, where)
+            if step < 0:
+                continue
+            viewmat = opengl(take(entry, "c2w", where), f"{where}.c2w")
+            K = calibration(take(entry, "intrinsic", where), f"{where}.intrinsic")
+            part.append(Shot(view, step * interval, image, viewmat, K))
+        part.sort(key=lambda shot: natural(shot.view))
+        shots += part
+        held_out |= {shot.view for shot in part} if set_name == "eval_dynamic" else set()
+    return assemble(shots, folder=path, name=path.resolve().name, format="neuma", held_out=held_out)
+
+
+def _real(path: Path, interval: float) -> MultiView:
+    lens = colmap.read_cameras(path / "sparse" / "0" / "cameras.bin")
+    calibrated = read_json(path / "cameras_calib.json")
+    if not isinstance(calibrated, dict):
+        raise UserError(f"{path / 'cameras_calib.json'} must be a mapping of views to rvecs and tvecs")
+    if not (path / "dynamics").is_dir():
+        raise UserError(f"{path} has neither data_dynamic.json nor the folder dynamics")
+    shots = []
+    images = sorted((file for file in (path / "dynamics").iterdir() if file.suffix == ".jpg"), key=lambda file: natural(file.name))
+    size = image_size(images[0]) if images else (1, 1)
+    K = dynamic_lens(next(iter(lens.values())), size)
+    for image in images:
+        view, step = _view_and_step(image, f"{path / 'dynamics'}")
+        if step < 0:
+            continue
+        viewmat = extrinsics(calibrated, view, path / "cameras_calib.json")
+        shots.append(Shot(view, step * interval, image, viewmat, K, path / "dynamic_masks" / f"{image.stem}.png"))
+    return assemble(shots, size=size, folder=path, name=path.resolve().name, format="neuma")
+
+
+def dynamic_lens(static: colmap.Camera, size: tuple[int, int]) -> Tensor:
+    """K of the video from the still camera's: its focal lengths scaled to the video's size, the principal point in the middle.
+
+    NeuMA and Spring-Gaus exchange the two focal lengths (which differ by 0.04 %); here they are not.
+    """
+    width, height = size
+    fx, fy = float(static.K[0, 0]) * width / static.width, float(static.K[1, 1]) * height / static.height
+    return torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float64)
+
+
+def extrinsics(calibrated: dict[str, Any], view: str, file: Path) -> Tensor:
+    """World-to-camera (4, 4) of a view's `rvecs` and `tvecs`, which OpenCV writes as (3,), (3, 1) or (1, 3)."""
+    entry = calibrated.get(view)
+    if not isinstance(entry, dict):
+        raise UserError(f"{file} lacks the view {view!r}")
+    vectors = [
+        matrix(take(entry, key, f"{file.name}: {view}"), f"{file.name}: {view}.{key}", (3,), (3, 1), (1, 3), (1, 3, 1)).flatten()
+        for key in ("rvecs", "tvecs")
+    ]
+    return convert.from_rodrigues(*vectors)
+
+
+def _view_and_step(image: Path, where: str) -> tuple[str, int]:
+    match = NAME.match(image.stem)
+    if match is None:
+        raise UserError(f"{where}: {image.name!r} is not of the form <view>_<step>{image.suffix}")
+    return match[1], int(match[2])
+
+
+def _load(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
+    """A file of torch.save with these keys, weights only."""
+    try:
+        with torch.serialization.safe_globals([torch.Size]):
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch names no one type for a file that is malformed or not safe
+        raise UserError(f"{path} is no file of tensors: {str(error).splitlines()[0] if str(error) else type(error).__name__}") from error
+    for key in keys:
+        if not isinstance(content, dict) or key not in content:
+            raise UserError(f"{path} lacks the entry {key!r}")
+        if key != "bindings_size" and not isinstance(content[key], Tensor):
+            raise UserError(f"{path}: {key} must be a tensor")
+    return content
+
+
+def _bindings(path: Path, particle_count: int | None) -> Tensor:
+    content = _load(path, ("bindings_ind", "bindings_val", "bindings_size"))
+    index, value, size = content["bindings_ind"], content["bindings_val"], tuple(int(n) for n in _flat(content["bindings_size"]))
+    if index.ndim != 2 or len(index) != 2 or value.shape != index.shape[1:] or len(size) != 2 or index.dtype != torch.int64:
+        raise UserError(f"{path}: bindings_ind {tuple(index.shape)}, bindings_val {tuple(value.shape)}, bindings_size {size} do not fit")
+    if bool((index < 0).any() | (index >= torch.tensor(size)[:, None]).any()) or particle_count not in (None, size[1]):
+        raise UserError(f"{path}: an index lies outside bindings_size {size}, or init.pt has another number of particles")
+    return torch.sparse_coo_tensor(index, value.float(), size, check_invariants=True).coalesce()
+
+
+def _flat(size: Any) -> Iterator[Any]:
+    if isinstance(size, Tensor | tuple | list):
+        yield from size
+
+
+def _volume(path: Path, particle_count: int | None) -> Tensor:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            points, volume = arrays["p_x"], np.asarray(arrays["vol"], dtype=np.float32)
+    except (ValueError, KeyError, IndexError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path} is no archive with p_x and vol: {error}") from error
+    if points.ndim != 2 or points.shape[1] != 3 or particle_count not in (None, len(points)):
+        raise UserError(f"{path}: p_x has the shape {points.shape}; it must be (P, 3), with the P of init.pt")
+    if volume.size not in (1, len(points)) or not (np.isfinite(volume).all() and (volume > 0).all()):
+        raise UserError(f"{path}: vol must be one positive volume, or one for each of {len(points)} particles")
+    return torch.from_numpy(np.broadcast_to(volume.reshape(-1), (len(points),)).copy())
