@@ -1,9 +1,12 @@
-"""Objective networks as one kernel a law, one thread a particle: features, network and read-out without a round trip to memory.
+"""Objective networks as one kernel a law: features, network and read-out without a round trip to memory (CUDA, float32).
 
-A thread keeps the second layer's 64 sums in registers and walks over the first layer's units; weights are read through the
-cache, four at a time, the same for all threads. That is plain float32 on the CUDA cores: at 10^4 to 10^5 particles the
-tensor cores' rate is out of reach anyway (LOG.md). The adjoint recomputes the sums; for the last layer it stores the hidden
-units, and a second kernel reduces several substeps of them at once. `networks.py` is the slow twin.
+A warp carries 32 particles of one scene, a lane one of them. Strain, features and read-out are a lane's own; the network's
+layers are matrix products of the warp on the tensor cores, in tf32 with the residues (three products for one, relative error
+1e-7: plain float32 would be bound by reading weights, tf32 alone is right to 1e-3). The columns that a lane holds of one
+layer's result are those that it must hold of the next layer's operand once the weights' rows are permuted, so activations
+never leave their registers. `networks.py` is the slow twin.
+
+    m16n8k8: a lane (g, t) = (lane / 4, lane % 4) holds rows g, g + 8 and columns 2t, 2t + 1 of a 16 x 8 result.
 """
 
 import functools
@@ -22,254 +25,419 @@ from neuido.types import Particles
 WIDTHS = (32, 64)
 """Hidden widths that are compiled."""
 
-FLUSH = 4
-"""Substeps whose hidden units wait for one reduction to the last layer's gradient."""
-
-CHUNK = 256
-"""Particles that one thread of that reduction sums."""
-
 BLOCK = 64
 """Threads a block: small bodies then still fill the multiprocessors."""
 
-UNROLL = 2
-"""Units of the first layer that a thread works on at a time."""
+INPUTS = 16
+"""Columns of the first operand: nine features, a one for the bias, padding."""
 
-ROW = 12
-"""Floats of a unit's row in the packed first layer: nine weights, the bias, two of padding."""
-
-SIGMOID = """
-    #if defined(__CUDA_ARCH__)
-    #define NEUIDO_SIGMOID(a) __fdividef(1.0f, 1.0f + __expf(-(a)))
-    #define NEUIDO_LOAD4(p) __ldg(reinterpret_cast<const float4*>(p))
-    #else
-    struct quad {{ float x, y, z, w; }};
-    #define NEUIDO_SIGMOID(a) (1.0f / (1.0f + expf(-(a))))
-    #define NEUIDO_LOAD4(p) (*reinterpret_cast<const quad*>(p))
-    #endif
-    #define NEUIDO_UNIT \\
-        const auto q0 = NEUIDO_LOAD4(r), q1 = NEUIDO_LOAD4(r + 4), q2 = NEUIDO_LOAD4(r + 8); \\
-        const float a = ((q0.x * x[0] + q0.y * x[1]) + (q0.z * x[2] + q0.w * x[3])) + ((q1.x * x[4] + q1.y * x[5]) \\
-                        + (q1.z * x[6] + q1.w * x[7])) + (q2.x * x[8] + q2.y);
-"""
-"""Approximate exponential and division (relative error 1e-6), vector loads, and the sum of a unit of the first layer."""
-
-HIDDEN = (
-    SIGMOID
-    + """
-    wp::vec_t<{H}, wp::float32> z;
-    const float* w1 = &W1.data[shared * {H} * 12];
-    const float* w2 = &W2.data[shared * {H} * {H}];
-    const float* b2 = &B2.data[shared * {H}];
-    #pragma unroll
-    for (int j = 0; j < {H}; j += 4) {{
-        const auto q = NEUIDO_LOAD4(b2 + j);
-        z[j] = q.x; z[j + 1] = q.y; z[j + 2] = q.z; z[j + 3] = q.w;
-    }}
-    #pragma unroll {U}
-    for (int k = 0; k < {H}; ++k) {{
-        const float* r = w1 + 12 * k;
-        NEUIDO_UNIT
-        const float h = a * NEUIDO_SIGMOID(a);
-        const float* c = w2 + {H} * k;
+TOOLS = """
+    const int lane = threadIdx.x & 31, g = lane >> 2, t = lane & 3;
+    const unsigned full = 0xffffffffu;
+    auto sigmoid = [](float a) {{ return __fdividef(1.0f, 1.0f + __expf(-a)); }};
+    auto weights = [lane](const wp::array_t<wp::float32>& W, int offset, int tile) {{
+        return __ldg(reinterpret_cast<const float4*>(W.data + offset) + tile * 32 + lane);
+    }};
+    // hi and lo of four values of a result, in the order of an operand
+    auto split = [](const float* c, float* hi, float* lo) {{
+        const float v[4] = {{c[0], c[2], c[1], c[3]}};
         #pragma unroll
-        for (int j = 0; j < {H}; j += 4) {{
-            const auto q = NEUIDO_LOAD4(c + j);
-            z[j] += q.x * h; z[j + 1] += q.y * h; z[j + 2] += q.z * h; z[j + 3] += q.w * h;
+        for (int i = 0; i < 4; ++i) {{
+            unsigned u;
+            asm("cvt.rna.tf32.f32 %0, %1;" : "=r"(u) : "f"(v[i]));
+            hi[i] = __uint_as_float(u);
+            lo[i] = v[i] - hi[i];
+        }}
+    }};
+    auto product = [](float* c, const float* a, float b0, float b1) {{
+        asm volatile("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {{%0,%1,%2,%3}}, {{%4,%5,%6,%7}}, {{%8,%9}}, {{%0,%1,%2,%3}};"
+            : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
+            : "r"(__float_as_uint(a[0])), "r"(__float_as_uint(a[1])), "r"(__float_as_uint(a[2])), "r"(__float_as_uint(a[3])),
+              "r"(__float_as_uint(b0)), "r"(__float_as_uint(b1)));
+    }};
+    auto exact = [&](float* c, const float* hi, const float* lo, float4 w) {{
+        product(c, lo, w.x, w.y);
+        product(c, hi, w.z, w.w);
+        product(c, hi, w.x, w.y);
+    }};
+    // the features of the warp's particles as operands, two tiles of 16 rows, two of 8 columns
+    float xh[2][2][4], xl[2][2][4];
+    #pragma unroll
+    for (int m = 0; m < 2; ++m) {{
+        float c[2][4] = {{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}};
+        #pragma unroll
+        for (int i = 0; i < 10; ++i) {{
+            const float v = i < 9 ? x[i < 9 ? i : 0] : 1.0f;
+            const float u0 = __shfl_sync(full, v, 16 * m + g), u1 = __shfl_sync(full, v, 16 * m + g + 8);
+            if (t == (i & 7) >> 1) {{ c[i >> 3][i & 1] = u0; c[i >> 3][2 + (i & 1)] = u1; }}
+        }}
+        #pragma unroll
+        for (int s = 0; s < 2; ++s) split(c[s], xh[m][s], xl[m][s]);
+    }}
+"""
+"""What both functions begin with: products, their operands' residues, and the features as operands."""
+
+FORWARD = (
+    "#if defined(__CUDA_ARCH__)"
+    + TOOLS
+    + """
+    const int one = shared * {SIZE1}, two = shared * {SIZE2}, three = scene * {SIZE3};
+    float z[2][{NT}][4];
+    #pragma unroll
+    for (int n = 0; n < {NT}; ++n) {{
+        const float2 b = *reinterpret_cast<const float2*>(B2.data + shared * {H} + 8 * n + 2 * t);
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{ z[m][n][0] = b.x; z[m][n][1] = b.y; z[m][n][2] = b.x; z[m][n][3] = b.y; }}
+    }}
+    #pragma unroll 1
+    for (int j = 0; j < {NT}; ++j) {{
+        const float4 w0 = weights(W1, one, j), w1 = weights(W1, one, {NT} + j);
+        float hi[2][4], lo[2][4];
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{
+            float c[4] = {{0, 0, 0, 0}};
+            exact(c, xh[m][0], xl[m][0], w0);
+            exact(c, xh[m][1], xl[m][1], w1);
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) c[i] *= sigmoid(c[i]);
+            split(c, hi[m], lo[m]);
+        }}
+        #pragma unroll
+        for (int n = 0; n < {NT}; ++n) {{
+            const float4 w = weights(W2, two, j * {NT} + n);
+            exact(z[0][n], hi[0], lo[0], w);
+            exact(z[1][n], hi[1], lo[1], w);
         }}
     }}
-    return z;
+    float y[2][4] = {{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}};
+    #pragma unroll
+    for (int j = 0; j < {NT}; ++j) {{
+        const float4 w = weights(W3, three, j);
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{
+            float c[4], hi[4], lo[4];
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) c[i] = z[m][j][i] * sigmoid(z[m][j][i]);
+            split(c, hi, lo);
+            exact(y[m], hi, lo, w);
+        }}
+    }}
+    wp::vec_t<{KEPT}, wp::float32> out;
+    #pragma unroll
+    for (int m = 0; m < 2; ++m)
+        #pragma unroll
+        for (int n = 0; n < {NT}; ++n)
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) out[(m * {NT} + n) * 4 + i] = z[m][n][i];
+    // the four outputs of a lane's own particle
+    #pragma unroll
+    for (int i = 0; i < 4; ++i) {{
+        float v = 0.0f;
+        #pragma unroll
+        for (int m = 0; m < 2; ++m)
+            #pragma unroll
+            for (int u = 0; u < 2; ++u) {{
+                const float q = __shfl_sync(full, y[m][2 * u + (i & 1)], 4 * (lane & 7) + (i >> 1));
+                if (m == lane >> 4 && u == ((lane >> 3) & 1)) v = q;
+            }}
+        out[{KEPT} - 4 + i] = v + B3.data[scene * 4 + i];
+    }}
+    return out;
+#else
+    return wp::vec_t<{KEPT}, wp::float32>();
+#endif
 """
 )
 
-READOUT = (
-    SIGMOID
+BACKWARD = (
+    "#if defined(__CUDA_ARCH__)"
+    + TOOLS
     + """
-    const float* w3 = &W3.data[scene * {H} * 4];
-    const auto b = NEUIDO_LOAD4(&B3.data[scene * 4]);
-    wp::vec_t<4, wp::float32> y(b.x, b.y, b.z, b.w);
+    const int one = shared * {SIZE1}, two = shared * {SIZE2}, three = scene * {SIZE3T};
+    float z[2][{NT}][4], gy_rows[2][2][4], gh[2][4], gl[2][4];
     #pragma unroll
-    for (int j = 0; j < {H}; ++j) {{
-        const auto q = NEUIDO_LOAD4(w3 + 4 * j);
-        const float h = z[j] * NEUIDO_SIGMOID(z[j]);
-        y[0] += q.x * h; y[1] += q.y * h; y[2] += q.z * h; y[3] += q.w * h;
-    }}
-    return y;
-"""
-)
-
-BACK = (
-    SIGMOID
-    + """
-    const float* w1 = &W1.data[shared * {H} * 12];
-    const float* w2 = &W2.data[shared * {H} * {H}];
-    const float* w3 = &W3.data[scene * {H} * 4];
-    wp::vec_t<9, wp::float32> gx;
-    #pragma unroll
-    for (int i = 0; i < 9; ++i) gx[i] = 0.0f;
-    wp::vec_t<{H}, wp::float32> g;
-    float* keep = H2.data ? &H2.data[(long long)row * {H}] : nullptr;
-    float* out = G2.data ? &G2.data[(long long)p * {H}] : nullptr;
-    #pragma unroll
-    for (int j = 0; j < {H}; ++j) {{
-        const auto q = NEUIDO_LOAD4(w3 + 4 * j);
-        const float s = NEUIDO_SIGMOID(z[j]);
-        const float h = z[j] * s;
-        if (keep) keep[j] = h;
-        g[j] = (q.x * gy[0] + q.y * gy[1] + q.z * gy[2] + q.w * gy[3]) * (s + h * (1.0f - s));
-        if (out) out[j] = g[j];
-    }}
-    #pragma unroll {U}
-    for (int k = 0; k < {H}; ++k) {{
-        const float* r = w1 + 12 * k;
-        NEUIDO_UNIT
-        const float s = NEUIDO_SIGMOID(a);
-        const float* c = w2 + {H} * k;
-        float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f;
+    for (int m = 0; m < 2; ++m) {{
         #pragma unroll
-        for (int j = 0; j < {H}; j += 4) {{
-            const auto q = NEUIDO_LOAD4(c + j);
-            s0 += q.x * g[j]; s1 += q.y * g[j + 1]; s2 += q.z * g[j + 2]; s3 += q.w * g[j + 3];
+        for (int n = 0; n < {NT}; ++n)
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) z[m][n][i] = kept[(m * {NT} + n) * 4 + i];
+        float c[4] = {{0, 0, 0, 0}};
+        #pragma unroll
+        for (int i = 0; i < 4; ++i) {{
+            gy_rows[m][0][i] = __shfl_sync(full, gy[i], 16 * m + g);
+            gy_rows[m][1][i] = __shfl_sync(full, gy[i], 16 * m + g + 8);
+            if (t == i >> 1) {{ c[i & 1] = gy_rows[m][0][i]; c[2 + (i & 1)] = gy_rows[m][1][i]; }}
         }}
-        const float h = a * s;
-        const float g1 = ((s0 + s1) + (s2 + s3)) * (s + h * (1.0f - s));
-        if (out) {{ H1.data[(long long)p * {H} + k] = h; G1.data[(long long)p * {H} + k] = g1; }}
-        gx[0] += q0.x * g1; gx[1] += q0.y * g1; gx[2] += q0.z * g1; gx[3] += q0.w * g1; gx[4] += q1.x * g1;
-        gx[5] += q1.y * g1; gx[6] += q1.z * g1; gx[7] += q1.w * g1; gx[8] += q2.x * g1;
+        split(c, gh[m], gl[m]);
     }}
-    return gx;
+    if (P3.data) {{
+        float b[4];
+        #pragma unroll
+        for (int i = 0; i < 4; ++i) {{
+            b[i] = gy[i];
+            #pragma unroll
+            for (int d = 16; d > 0; d >>= 1) b[i] += __shfl_xor_sync(full, b[i], d);
+        }}
+        if (lane < 4) PB.data[warp * 4 + lane] += lane == 0 ? b[0] : lane == 1 ? b[1] : lane == 2 ? b[2] : b[3];
+    }}
+    // second layer: adjoint of its sums, in place; what the last layer's gradient gets from this warp
+    #pragma unroll
+    for (int j = 0; j < {NT}; ++j) {{
+        const float4 w = weights(W3T, three, j);
+        float part[8] = {{0, 0, 0, 0, 0, 0, 0, 0}};
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{
+            float c[4] = {{0, 0, 0, 0}};
+            exact(c, gh[m], gl[m], w);
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) {{
+                const float s = sigmoid(z[m][j][i]), h = z[m][j][i] * s;
+                #pragma unroll
+                for (int o = 0; o < 4; ++o) part[(i & 1) * 4 + o] += h * gy_rows[m][i >> 1][o];
+                z[m][j][i] = c[i] * (s + h * (1.0f - s));
+            }}
+            if (G2.data) {{
+                #pragma unroll
+                for (int i = 0; i < 4; ++i) {{
+                    const int p = first + 16 * m + g + 8 * (i >> 1);
+                    if (p < last) G2.data[(long long)p * {H} + 8 * j + 2 * t + (i & 1)] = z[m][j][i];
+                }}
+            }}
+        }}
+        if (P3.data) {{
+            // sum over the eight lanes of a column: each keeps the half that its bit of g says
+            #pragma unroll
+            for (int b = 0; b < 3; ++b) {{
+                const int half = 4 >> b, bit = 16 >> b;
+                const bool upper = lane & bit;
+                #pragma unroll
+                for (int i = 0; i < 4; ++i)
+                    if (i < half) {{
+                        const float give = upper ? part[i] : part[i + half], keep = upper ? part[i + half] : part[i];
+                        part[i] = keep + __shfl_xor_sync(full, give, bit);
+                    }}
+            }}
+            P3.data[(warp * {NT} + j) * 32 + lane] += part[0];
+        }}
+    }}
+    float a[2][{NT}][4];
+    #pragma unroll
+    for (int n = 0; n < {NT}; ++n)
+        #pragma unroll
+        for (int m = 0; m < 2; ++m)
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) a[m][n][i] = 0.0f;
+    #pragma unroll
+    for (int j = 0; j < {NT}; ++j) {{
+        float hi[2][4], lo[2][4];
+        split(z[0][j], hi[0], lo[0]);
+        split(z[1][j], hi[1], lo[1]);
+        #pragma unroll
+        for (int n = 0; n < {NT}; ++n) {{
+            const float4 w = weights(W2T, two, j * {NT} + n);
+            exact(a[0][n], hi[0], lo[0], w);
+            exact(a[1][n], hi[1], lo[1], w);
+        }}
+    }}
+    float gx[2][2][4] = {{{{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}}, {{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}}}};
+    #pragma unroll
+    for (int n = 0; n < {NT}; ++n) {{
+        const float4 w0 = weights(W1, one, n), w1 = weights(W1, one, {NT} + n);
+        const float4 v0 = weights(W1T, one, 2 * n), v1 = weights(W1T, one, 2 * n + 1);
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{
+            float c[4] = {{0, 0, 0, 0}}, hi[4], lo[4];
+            exact(c, xh[m][0], xl[m][0], w0);
+            exact(c, xh[m][1], xl[m][1], w1);
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) {{
+                const float s = sigmoid(c[i]), h = c[i] * s;
+                c[i] = a[m][n][i] * (s + h * (1.0f - s));
+                const int p = first + 16 * m + g + 8 * (i >> 1);
+                if (G2.data && p < last) {{
+                    H1.data[(long long)p * {H} + 8 * n + 2 * t + (i & 1)] = h;
+                    G1.data[(long long)p * {H} + 8 * n + 2 * t + (i & 1)] = c[i];
+                }}
+            }}
+            split(c, hi, lo);
+            exact(gx[m][0], hi, lo, v0);
+            exact(gx[m][1], hi, lo, v1);
+        }}
+    }}
+    wp::vec_t<9, wp::float32> out;
+    #pragma unroll
+    for (int i = 0; i < 9; ++i) {{
+        float v = 0.0f;
+        #pragma unroll
+        for (int m = 0; m < 2; ++m)
+            #pragma unroll
+            for (int u = 0; u < 2; ++u) {{
+                const float q = __shfl_sync(full, gx[m][i >> 3][2 * u + (i & 1)], 4 * (lane & 7) + ((i & 7) >> 1));
+                if (m == lane >> 4 && u == ((lane >> 3) & 1)) v = q;
+            }}
+        out[i] = v;
+    }}
+    return out;
+#else
+    return wp::vec_t<9, wp::float32>();
+#endif
 """
 )
 
 
 @functools.cache
 def build(width: int) -> SimpleNamespace:
-    """The fused kernels for one hidden width (float32)."""
+    """The fused kernels for one hidden width."""
     start_warp()
+    tiles = width // 8
+    kept = 8 * tiles + 4
+    sizes = {
+        "H": width, "NT": tiles, "KEPT": kept, "SIZE1": 2 * tiles * 128, "SIZE2": tiles * tiles * 128, "SIZE3": tiles * 128,
+        "SIZE3T": tiles * 128,
+    }  # fmt: skip
     name = f"neuido.fused.{width}"
     own = network_kernels.functions(wp.float32, name)
     vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
-    vecH = wp.types.vector(length=width, dtype=wp.float32)
+    vecK = wp.types.vector(length=kept, dtype=wp.float32)
     measure, features_of, stress_of, stress_coefficients = own.measure, own.features_of, own.stress_of, own.stress_coefficients
     stress_gradient, correction_of = own.stress_gradient, own.correction_of
     correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    func = functools.partial(wp.func, module=name)
     floats = wp.array(dtype=wp.float32)
+    ints = wp.array(dtype=wp.int32)
 
-    @wp.func_native(HIDDEN.format(H=width, U=UNROLL))
-    def hidden(x: vec9, shared: int, W1: floats, W2: floats, B2: floats) -> vecH: ...
+    @wp.func_native(FORWARD.format(**sizes))
+    def network(x: vec9, shared: int, scene: int, W1: floats, W2: floats, B2: floats, W3: floats, B3: floats) -> vecK: ...
 
-    @wp.func_native(READOUT.format(H=width))
-    def readout(z: vecH, scene: int, W3: floats, B3: floats) -> vec4: ...
-
-    @wp.func_native(BACK.format(H=width, U=UNROLL))
-    def back(
-        x: vec9, z: vecH, gy: vec4, shared: int, scene: int, W1: floats, W2: floats, W3: floats,
-        H2: floats, row: int, H1: floats, G1: floats, G2: floats, p: int,
+    @wp.func_native(BACKWARD.format(**sizes))
+    def network_adjoint(
+        x: vec9, kept: vecK, gy: vec4, shared: int, scene: int, W1: floats, W2T: floats, W3T: floats, W1T: floats,
+        warp: int, first: int, last: int, P3: floats, PB: floats, H1: floats, G1: floats, G2: floats,
     ) -> vec9: ...  # fmt: skip
+
+    @func
+    def outputs(k: vecK):
+        return vec4(k[wp.static(kept - 4)], k[wp.static(kept - 3)], k[wp.static(kept - 2)], k[wp.static(kept - 1)])
 
     @kernel
     def stress(
-        F: wp.array(dtype=mat33), scene: wp.array(dtype=wp.int32), shared: int, own_rows: int,
+        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
         W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, tau: wp.array(dtype=mat33),
     ):  # fmt: skip
-        p = wp.tid()
-        N, h, l, A, q = measure(F[p])
-        z = hidden(features_of(l, A, q), wp.min(scene[p], shared - 1), W1, W2, B2)
-        tau[p] = stress_of(l, A, q, readout(z, wp.min(scene[p], own_rows - 1), W3, B3), scale)
+        tid = wp.tid()
+        warp = tid / 32
+        p = firsts[warp] + tid % 32
+        s = scenes[warp]
+        Fp = F[wp.min(p, lasts[warp] - 1)]
+        N, h, l, A, q = measure(Fp)
+        k = network(features_of(l, A, q), wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2, B2, W3, B3)
+        if p < lasts[warp]:
+            tau[p] = stress_of(l, A, q, outputs(k), scale)
 
     @kernel
     def correct(
-        F: wp.array(dtype=mat33), scene: wp.array(dtype=wp.int32), shared: int, own_rows: int,
+        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
         W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, out: wp.array(dtype=mat33),
     ):  # fmt: skip
-        p = wp.tid()
-        N, h, l, A, q = measure(F[p])
-        z = hidden(features_of(l, A, q), wp.min(scene[p], shared - 1), W1, W2, B2)
-        out[p] = correction_of(F[p], l, A, q, readout(z, wp.min(scene[p], own_rows - 1), W3, B3), scale)
+        tid = wp.tid()
+        warp = tid / 32
+        p = firsts[warp] + tid % 32
+        s = scenes[warp]
+        Fp = F[wp.min(p, lasts[warp] - 1)]
+        N, h, l, A, q = measure(Fp)
+        k = network(features_of(l, A, q), wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2, B2, W3, B3)
+        if p < lasts[warp]:
+            out[p] = correction_of(Fp, l, A, q, outputs(k), scale)
 
     @kernel
     def stress_adjoint(
-        F: wp.array(dtype=mat33), scene: wp.array(dtype=wp.int32), shared: int, own_rows: int,
-        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float,
+        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
+        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, W2T: floats, W3T: floats, W1T: floats,
         g_out: wp.array(dtype=mat33), g_F: wp.array(dtype=mat33),
-        H2: floats, GY: wp.array(dtype=vec4), first: int, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
+        P3: floats, PB: floats, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
     ):  # fmt: skip
-        """Adds to g_F; writes hidden units and output adjoints to rows first + p, and all of them where X is given."""
-        p = wp.tid()
-        N, h, l, A, q = measure(F[p])
+        """Adds to g_F, and to the warp's share of the last layer's gradient where P3 is given; writes units where X is."""
+        tid = wp.tid()
+        warp = tid / 32
+        last = lasts[warp]
+        p = firsts[warp] + tid % 32
+        s = wp.min(scenes[warp], shared - 1)
+        r = wp.min(scenes[warp], rows - 1)
+        pp = wp.min(p, last - 1)
+        g = g_out[pp]
+        N, h, l, A, q = measure(F[pp])
         x = features_of(l, A, q)
-        s = wp.min(scene[p], shared - 1)
-        r = wp.min(scene[p], own_rows - 1)
-        z = hidden(x, s, W1, W2, B2)
-        c = readout(z, r, W3, B3)
-        gy = stress_coefficients(l, A, q, scale, g_out[p])
-        gx = back(x, z, gy, s, r, W1, W2, W3, H2, first + p, H1, G1, G2, p)
-        if GY:
-            GY[first + p] = gy
-        if X:
-            X[p] = x
-        g_F[p] = g_F[p] + stress_gradient(F[p], N, h, l, A, q, c, scale, g_out[p], gx)
+        k = network(x, s, r, W1, W2, B2, W3, B3)
+        gy = stress_coefficients(l, A, q, scale, g)
+        if p >= last:
+            gy = vec4(0.0, 0.0, 0.0, 0.0)
+        gx = network_adjoint(x, k, gy, s, r, W1, W2T, W3T, W1T, warp, firsts[warp], last, P3, PB, H1, G1, G2)
+        if p < last:
+            if X:
+                X[p] = x
+            g_F[p] = g_F[p] + stress_gradient(F[p], N, h, l, A, q, outputs(k), scale, g, gx)
 
     @kernel
     def correct_adjoint(
-        F: wp.array(dtype=mat33), scene: wp.array(dtype=wp.int32), shared: int, own_rows: int,
-        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float,
+        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
+        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, W2T: floats, W3T: floats, W1T: floats,
         g_out: wp.array(dtype=mat33), g_F: wp.array(dtype=mat33),
-        H2: floats, GY: wp.array(dtype=vec4), first: int, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
+        P3: floats, PB: floats, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
     ):  # fmt: skip
         """As `stress_adjoint`."""
-        p = wp.tid()
-        N, h, l, A, q = measure(F[p])
-        x = features_of(l, A, q)
-        s = wp.min(scene[p], shared - 1)
-        r = wp.min(scene[p], own_rows - 1)
-        z = hidden(x, s, W1, W2, B2)
-        c = readout(z, r, W3, B3)
-        gy = correction_coefficients(F[p], l, A, q, c, scale, 0, g_out[p])
-        gx = back(x, z, gy, s, r, W1, W2, W3, H2, first + p, H1, G1, G2, p)
-        if GY:
-            GY[first + p] = gy
-        if X:
-            X[p] = x
-        g_F[p] = g_F[p] + correction_gradient(F[p], N, h, l, A, q, c, scale, g_out[p], gx)
-
-    @kernel
-    def reduce_last(
-        H2: floats, GY: wp.array(dtype=vec4), particles: int, chunk_scene: wp.array(dtype=wp.int32),
-        chunk_first: wp.array(dtype=wp.int32), chunk_last: wp.array(dtype=wp.int32), own_rows: int,
-        gW3: wp.array(dtype=vec4), gB3: wp.array(dtype=vec4),
-    ):  # fmt: skip
-        """Adds hidden unit times output adjoint, summed over a chunk of particles of one scene and substep."""
         tid = wp.tid()
-        j = tid % wp.static(width)
-        chunk = (tid / wp.static(width)) % chunk_scene.shape[0]
-        substep = tid / (wp.static(width) * chunk_scene.shape[0])
-        total = vec4(0.0, 0.0, 0.0, 0.0)
-        bias = vec4(0.0, 0.0, 0.0, 0.0)
-        for p in range(chunk_first[chunk], chunk_last[chunk]):
-            row = substep * particles + p
-            gy = GY[row]
-            total += H2[row * wp.static(width) + j] * gy
-            if j == 0:
-                bias += gy
-        s = wp.min(chunk_scene[chunk], own_rows - 1)
-        wp.atomic_add(gW3, s * wp.static(width) + j, total)
-        if j == 0:
-            wp.atomic_add(gB3, s, bias)
+        warp = tid / 32
+        last = lasts[warp]
+        p = firsts[warp] + tid % 32
+        s = wp.min(scenes[warp], shared - 1)
+        r = wp.min(scenes[warp], rows - 1)
+        pp = wp.min(p, last - 1)
+        g = g_out[pp]
+        N, h, l, A, q = measure(F[pp])
+        x = features_of(l, A, q)
+        k = network(x, s, r, W1, W2, B2, W3, B3)
+        gy = correction_coefficients(F[pp], l, A, q, outputs(k), scale, 0, g)
+        if p >= last:
+            gy = vec4(0.0, 0.0, 0.0, 0.0)
+        gx = network_adjoint(x, k, gy, s, r, W1, W2T, W3T, W1T, warp, firsts[warp], last, P3, PB, H1, G1, G2)
+        if p < last:
+            if X:
+                X[p] = x
+            g_F[p] = g_F[p] + correction_gradient(F[p], N, h, l, A, q, outputs(k), scale, g, gx)
 
-    return SimpleNamespace(stress=stress, correct=correct, stress_adjoint=stress_adjoint, correct_adjoint=correct_adjoint,
-                           reduce_last=reduce_last)  # fmt: skip
+    return SimpleNamespace(stress=stress, correct=correct, stress_adjoint=stress_adjoint, correct_adjoint=correct_adjoint)
 
 
 @functools.lru_cache(maxsize=16)
-def _chunks(offsets: tuple[int, ...], device: torch.device) -> list[Tensor]:
-    """Scene, first and last particle of every chunk; kept, since a graph may not copy from the host while it is captured."""
-    table = [(s, p, min(p + CHUNK, j)) for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])) for p in range(i, j, CHUNK)]
+def _warps(offsets: tuple[int, ...], device: torch.device) -> list[Tensor]:
+    """Scene, first and last particle of every warp; kept, since a graph may not copy from the host while it is captured."""
+    table = [(s, p, min(p + 32, j)) for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])) for p in range(i, j, 32)]
     return [torch.tensor(column, dtype=torch.int32, device=device) for column in zip(*table)]
 
 
+@functools.lru_cache(maxsize=16)
+def _order(rows: int, columns: int, device: torch.device) -> Tensor:
+    """Where the two entries of each lane's fragment stand in a (rows, columns) matrix, (tiles, 32 lanes, 2)."""
+    lane = torch.arange(32)
+    g, t = lane // 4, lane % 4
+    tiles = [
+        torch.stack([(8 * k + 2 * t + half) * columns + 8 * n + g for half in (0, 1)], dim=1)
+        for k in range(rows // 8)
+        for n in range(columns // 8)
+    ]
+    return torch.stack(tiles).to(device)
+
+
+def _fragments(W: Tensor) -> Tensor:
+    """(S, rows, columns) -> (S, tiles * 32 * 4): of each lane two entries rounded to tf32, then their residues."""
+    entries = W.flatten(1)[:, _order(W.shape[1], W.shape[2], W.device)]
+    high = ((entries.contiguous().view(torch.int32) + 0x1000) & ~0x1FFF).view(torch.float32)
+    return torch.cat([high, entries - high], dim=-1).flatten(1).contiguous()
+
+
 class FusedEngine(Engine):
-    """An objective network for one rollout in float32; the same interface and results as its law's own engine."""
+    """An objective network for one rollout; the same interface and results as its law's own engine."""
 
     def __init__(self, law, tensors: Sequence[Tensor], particles: Particles):
         super().__init__(law, tensors, particles)
@@ -279,44 +447,43 @@ class FusedEngine(Engine):
         elastic = self.outputs == network_kernels.STRESS_COEFFICIENTS
         self._forward = self.kernels.stress if elastic else self.kernels.correct
         self._adjoint = self.kernels.stress_adjoint if elastic else self.kernels.correct_adjoint
-        shared, own = max(W1.shape[0], W2.shape[0]), max(W3.shape[0], b3.shape[0])
-        first = W1.new_zeros(shared, self.width, ROW)
-        first[..., :9], first[..., 9] = W1, b1
-        last, offset = W1.new_zeros(own, self.width, 4), W1.new_zeros(own, 4)
-        last[..., : self.outputs], offset[..., : self.outputs] = W3.mT, b3
-        second = W2.mT.expand(shared, -1, -1).contiguous()
-        bias = b2.expand(shared, -1).contiguous()
+        shared, own = max(t.shape[0] for t in (W1, b1, W2, b2)), max(W3.shape[0], b3.shape[0])
+        first = W1.new_zeros(shared, INPUTS, self.width)
+        first[:, :9], first[:, 9] = W1.mT, b1
+        last, offset = W1.new_zeros(own, self.width, 8), W1.new_zeros(own, 4)
+        last[..., : self.outputs], offset[:, : self.outputs] = W3.mT, b3
+        second, bias = W2.mT.expand(shared, -1, -1), b2.expand(shared, -1).contiguous()
+        self.first, self.second, self.last = first, second, last
         self.rows = (shared, own)
-        self.packed = [first.view(-1), second.view(-1), bias.view(-1), last.view(-1), offset.view(-1)]
+        self.packed = [t.view(-1) for t in (_fragments(first), _fragments(second), bias, _fragments(last), offset)]
+        self.warps = _warps(particles.offsets, W1.device)
+
+    @property
+    def threads(self) -> int:
+        return 32 * len(self.warps[0])
 
     def forward(self, F: Tensor, out: Tensor) -> None:
-        arguments = [F, self.particles.scene, *self.rows, *self.packed, self.law.scale, out]
-        launch(self._forward, len(F), arguments, F.device, block=BLOCK)
+        arguments = [F, *self.warps, *self.rows, *self.packed, self.law.scale, out]
+        launch(self._forward, self.threads, arguments, F.device, block=BLOCK)
 
     def start_adjoint(self, wanted: Sequence[bool]) -> None:
         super().start_adjoint(wanted)
-        like, count = self.tensors[0], len(self.particles.scene)
-        self.full, self.last = any(wanted[:4]), any(wanted)
-        self.H2 = self.GY = self.X = self.H1 = self.G1 = self.G2 = None
-        if self.last:
-            self.H2, self.GY = like.new_empty(FLUSH * count * self.width), like.new_empty(FLUSH * count, 4)
-            self.g_last, self.g_offset = like.new_zeros(self.rows[1] * self.width, 4), like.new_zeros(self.rows[1], 4)
-            self.chunks = _chunks(self.particles.offsets, like.device)
+        like, count = self.first, self.particles.offsets[-1]
+        self.transposed = [_fragments(t.mT.contiguous()).view(-1) for t in (self.second, self.last, self.first)]
+        self.full, self.ends = any(wanted[:4]), any(wanted[4:])
+        self.P3 = self.PB = self.X = self.H1 = self.G1 = self.G2 = None
+        if self.ends:
+            self.P3, self.PB = like.new_zeros(self.threads * self.width // 8), like.new_zeros(len(self.warps[0]) * 4)
         if self.full:
             self.X = like.new_empty(count, 9)
             self.H1, self.G1, self.G2 = (like.new_empty(count * self.width) for _ in range(3))
-        self.waiting = 0
 
     def adjoint(self, F: Tensor, grad_out: Tensor, grad_F: Tensor) -> None:
-        count = len(F)
-        launch(self._adjoint, count, [F, self.particles.scene, *self.rows, *self.packed, self.law.scale, grad_out, grad_F, self.H2, self.GY,
-                                      self.waiting * count, self.X, self.H1, self.G1, self.G2], F.device, block=BLOCK)  # fmt: skip
+        arguments = [F, *self.warps, *self.rows, *self.packed, self.law.scale, *self.transposed, grad_out, grad_F,
+                     self.P3, self.PB, self.X, self.H1, self.G1, self.G2]  # fmt: skip
+        launch(self._adjoint, self.threads, arguments, F.device, block=BLOCK)
         if self.full:
-            self._reduce_first(count)
-        if self.last:
-            self.waiting += 1
-            if self.waiting == FLUSH:
-                self._flush()
+            self._reduce_first(len(F))
 
     def _reduce_first(self, count: int) -> None:
         """The gradients of the first two layers, shared by all scenes or one for each."""
@@ -333,18 +500,13 @@ class FusedEngine(Engine):
                 if target is not None:
                     target[min(s, len(target) - 1)].add_(d[i:j].sum(0))
 
-    def _flush(self) -> None:
-        if self.waiting:
-            count = len(self.particles.scene)
-            launch(self.kernels.reduce_last, self.waiting * len(self.chunks[0]) * self.width,
-                   [self.H2, self.GY, count, *self.chunks, self.rows[1], self.g_last, self.g_offset], self.H2.device, block=BLOCK)  # fmt: skip
-        self.waiting = 0
-
     def gradients(self) -> list[Tensor | None]:
-        if self.last:
-            self._flush()
-            last = self.g_last.view(self.rows[1], self.width, 4)[..., : self.outputs].mT
-            for target, value in ((self.grads[4], last), (self.grads[5], self.g_offset[:, : self.outputs])):
+        if self.ends:
+            # a warp's share: tile j, lane (g, t) holds output g % 4 of column 8 j + 2 t + g / 4
+            tiles = self.width // 8
+            share = self.P3.view(-1, tiles, 2, 4, 4).permute(0, 3, 1, 4, 2).reshape(-1, 4, self.width)
+            for target, value in ((self.grads[4], share), (self.grads[5], self.PB.view(-1, 4))):
                 if target is not None:
-                    target.add_(value if len(target) == len(value) else value.sum(0, keepdim=True))
+                    rows = self.warps[0].long().clamp(max=len(target) - 1)
+                    target.index_add_(0, rows, value[:, : self.outputs].contiguous())
         return self.grads

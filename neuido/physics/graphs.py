@@ -4,15 +4,18 @@ A captured rollout owns its inputs, its tape and its gradients; a replay overwri
 earlier replay says so by its serial number, and the forward graph is replayed first.
 """
 
+import gc
 from collections import OrderedDict
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
     from neuido.physics.rollout import Plan
+
+T = TypeVar("T")
 
 CAPACITY = 4
 """Graphs that a simulator keeps; each holds the tape of its rollout."""
@@ -28,10 +31,7 @@ class CapturedRollout:
         self.serial = 0
         self._backward: dict[tuple, tuple[torch.cuda.CUDAGraph, list, list]] = {}
         plan.forward(self.inputs, self.tape, steps=1)  # compiles and loads the kernels
-        torch.cuda.synchronize()
-        self.graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self.graph):
-            plan.forward(self.inputs, self.tape)
+        self.graph, _ = _capture(lambda: plan.forward(self.inputs, self.tape))
 
     def forward(self, inputs: Sequence[Tensor]) -> int:
         """Run with new inputs; returns the serial number of this run."""
@@ -49,7 +49,10 @@ class CapturedRollout:
             self.forward(inputs)
         key = (tuple(g is not None for g in gradients), tuple(wanted))
         if key not in self._backward:
-            self._backward[key] = self._capture(gradients, wanted)
+            own = [None if g is None else g.clone() for g in gradients]
+            self.plan.backward(self.inputs, self.tape, own, wanted, steps=1)
+            graph, out = _capture(lambda: self.plan.backward(self.inputs, self.tape, own, wanted))
+            self._backward[key] = (graph, own, out)
         graph, own_gradients, out = self._backward[key]
         for own, given in zip(own_gradients, gradients):
             if given is not None:
@@ -57,14 +60,21 @@ class CapturedRollout:
         graph.replay()
         return [None if t is None or not want else t.clone() for t, want in zip(out, wanted, strict=True)]
 
-    def _capture(self, gradients: Sequence[Tensor | None], wanted: Sequence[bool]) -> tuple[torch.cuda.CUDAGraph, list, list]:
-        own = [None if g is None else g.clone() for g in gradients]
-        self.plan.backward(self.inputs, self.tape, own, wanted, steps=1)
-        torch.cuda.synchronize()
-        graph = torch.cuda.CUDAGraph()
+
+def _capture(launches: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
+    """A graph of the launches, and what they returned. No garbage collection meanwhile: freeing another graph would break it."""
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    collecting = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
         with torch.cuda.graph(graph):
-            out = self.plan.backward(self.inputs, self.tape, own, wanted)
-        return graph, own, out
+            out = launches()
+    finally:
+        if collecting:
+            gc.enable()
+    return graph, out
 
 
 class GraphCache:
