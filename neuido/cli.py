@@ -138,14 +138,14 @@ def _find_configs(args: list[str]) -> list[str]:
     return found
 
 
-def find_config(name: str) -> str:
+def find_config(name: str, option: str = "--config") -> str:
     """The path of a configuration: a file here, or one that comes with neuido by its name."""
     if name.lstrip().startswith("{") or Path(name).is_file():  # jsonargparse accepts the content itself too
         return name
     own = neuido.configs_root() / (name.removeprefix("configs/").removesuffix(".yaml") + ".yaml")
     if own.is_file():
         return str(own)
-    raise UserError(f"no configuration file '{name}', neither here nor in {neuido.configs_root()}: change --config")
+    raise UserError(f"no configuration file '{name}', neither here nor in {neuido.configs_root()}: change {option}")
 
 
 def _help() -> str:

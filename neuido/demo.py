@@ -44,10 +44,10 @@ def demo(*, out: str = "runs/demo", settings: str = "quickstart") -> None:
     """
     from neuido.cli import find_config, run_lightning
 
-    folder = Path(out)
+    folder, config = Path(out), find_config(settings, "--settings")
     print(f"[1/2] neuido fit --config {settings} --data.root {folder / 'trajectories'}", flush=True)
     root = ["--data.root", str(folder / "trajectories"), "--trainer.default_root_dir", str(folder)]
-    trained = run_lightning(["fit", "--config", find_config(settings), *root])
+    trained = run_lightning(["fit", "--config", config, *root])
     print("[2/2] a falling ball under the true and under the learned laws", flush=True)
     data = trained.datamodule
     chosen: dict[str, tuple[str, dict[str, float]]] = {}

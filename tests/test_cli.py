@@ -109,6 +109,10 @@ def test_missing_configuration(capsys, command):
     assert_one_line(capsys, [command, "--config", "nowhere.yaml"], "nowhere.yaml", "--config")
 
 
+def test_missing_configuration_of_the_demo(capsys):
+    assert_one_line(capsys, ["demo", "--settings", "nowhere"], "nowhere", "--settings")
+
+
 def test_configurations_that_come_with_neuido_are_found_from_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("configs/stage1.yaml", "stage1.yaml", "stage1"):
