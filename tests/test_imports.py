@@ -12,7 +12,20 @@ MODULES = sorted(path.relative_to(PACKAGE.parent).with_suffix("").as_posix().rep
 
 ROOT = ("neuido.__version__", "neuido.configs_root")
 GROUND = ("neuido.types", "neuido.errors")
-NETS = ("neuido.models.operator", "neuido.models.encoder", "neuido.models.flow", "neuido.models.splatting", "neuido.models.baselines")
+NETS = tuple(
+    f"neuido.models.{name}"
+    for name in (
+        "operator",
+        "encoder",
+        "flow",
+        "splatting",
+        "splat_kernels",
+        "compose_kernels",
+        "splat_reference",
+        "gaussians",
+        "baselines",
+    )
+)
 ROOMS = {  # room: the parts of neuido that it may import, itself included
     "neuido.types": (),
     "neuido.errors": (),
