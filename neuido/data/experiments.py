@@ -119,6 +119,8 @@ def read_experiment(path: str | os.PathLike) -> Experiment:
                 raise UserError(f"recordings[{i}].name = {recordings[-1].name!r} is taken by another recording")
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
+    except OverflowError as error:
+        raise UserError(f"{file}: a number is too large: {error}") from error
     return Experiment(name, folder, scene, model, free, tuple(recordings))
 
 
@@ -176,6 +178,9 @@ def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
 def _model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
     given = scenes._mapping(given, "model")
     free = given.pop("free", [])
+    for part in ("elasticity", "plasticity"):
+        if isinstance(given.get(part), Mapping):
+            _text(given[part].get("law"), f"model.{part}.law")
     model = scenes.model_from_dict(given)
     known = ["density", *(key for part in ("elasticity", "plasticity") for key in model[part] if key != "law")]
     if not isinstance(free, list):
@@ -312,6 +317,8 @@ def _write_files(recording: Recording, folder: Path) -> None:
         np.savez_compressed(folder / "particles.npz", **given)  # type: ignore[arg-type]
     if recording.video is not None:
         source = recording.video.folder
+        if not (source / "transforms.json").is_file():
+            raise UserError(f"the video of {recording.name} is no folder with transforms.json: write its images with nerfstudio.write")
         for path in (path for grid in (recording.video.images, recording.video.masks or ()) for row in grid for path in row if path):
             target = folder / path.relative_to(source)
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -323,5 +330,5 @@ def _write_files(recording: Recording, folder: Path) -> None:
 
 def _text(given: Any, where: str) -> str:
     if not isinstance(given, str) or not given.strip():
-        raise UserError(f"{where} must be text, got {given!r}; put a number into quotation marks")
+        raise UserError(f"{where} must be text, got {given!r}")
     return given

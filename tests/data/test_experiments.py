@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from neuido.data.cameras import project
 from neuido.data.experiments import Experiment, Recording, read_experiment, scene_to_dict, write_experiment
+from neuido.data.formats import read
+from neuido.data.multiview import SceneViews
 from neuido.data.scenes import scene_from_dict
 from neuido.errors import UserError
 from neuido.physics.laws import material
@@ -91,6 +94,9 @@ def test_write_from_tensors(tmp_path):
     write_experiment(Experiment("made", tmp_path, scene, model, ("density",), (one, two)), tmp_path / "made")
     again = read_experiment(tmp_path / "made")
     assert again.scene == scene and again["b"].scene == two.scene and again["a"].noise == 0.0 and again.free == ("density",)
+    foreign = replace(one, video=read(samples.pacnerf(tmp_path / "pacnerf", S)))
+    with pytest.raises(UserError, match=r"no folder with transforms\.json"):
+        write_experiment(Experiment("made", tmp_path, scene, model, (), (foreign,)), tmp_path / "foreign")
     worse = replace(two, scene=replace(scene, cells=32))
     with pytest.raises(UserError, match="differs from the experiment in more than gravity"):
         write_experiment(Experiment("made", tmp_path, scene, model, (), (one, worse)), tmp_path / "other")
@@ -142,6 +148,9 @@ def test_scene_to_dict():
         ("box: [[0.3, 0.3, 0.3], [0.7, 0.35, 0.7]]", "box: [[0, 0, 0], [0.1, 0.1, 0.1]]", r"clamps\[0\].box = .* picks no particle"),
         ("domain: [[0, 0, 0], [1, 1, 1]]", "domain: [[0, 0, 0], [0.5, 1, 1]]", "particles of x0 lie outside scene.domain"),
         ("scene:\n", "scene: [\n", "is not valid YAML"),
+        ("density: 1000.0", f"density: {10**400}", "a number is too large"),
+        ("noise: 0.0005", f"noise: {10**400}", "noise must be a finite number"),
+        ("law: fixed_corotated", "law: [sigma]", "model.elasticity.law must be text"),
     ],
 )
 def test_malformed_yaml(folder, old, new, message):
@@ -196,6 +205,13 @@ def test_malformed_particles(folder, change, message):
     with pytest.raises(UserError, match=message) as caught:
         read_experiment(folder)
     assert "\n" not in str(caught.value) and "particles.npz" in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"a: " + b"[" * 20_000, b"", b"- 1", b"a: !!python/object/apply:os.getcwd []"])
+def test_what_is_no_yaml(folder, content):
+    (folder / "experiment.yaml").write_bytes(content)
+    with pytest.raises(UserError, match=r"not valid YAML|holds no mapping"):
+        read_experiment(folder)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"\x93NUMPY", b"text"])
@@ -296,10 +312,6 @@ def test_silicone_video(data_root):
 
 def test_silicone_video_camera_sees_the_body(data_root):
     """The particles at t = 0 fall on the mask of the first frame: the README gives an overlap of 0.95 with the free part."""
-    from neuido.data.cameras import project
-    from neuido.data.formats import read
-    from neuido.data.multiview import SceneViews
-
     found = read(data_root / "measured" / "silicone-video")
     assert found.format == "experiment" and found.name == "silicone-video-swing"
     images, masks = SceneViews(found, width=256, frame_count=1).load([0])

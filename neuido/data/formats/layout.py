@@ -181,7 +181,7 @@ def matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
     """
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{where} must hold numbers, of shape {_or(shapes)}") from error
     if array.shape not in shapes:
         raise UserError(f"{where} must have the shape {_or(shapes)}, got {array.shape}")
@@ -192,7 +192,11 @@ def matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
 
 def number(value: Any, where: str, *, least: float = -math.inf, above: float = -math.inf) -> float:
     """A finite number within its range."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    try:
+        wrong = isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value)
+    except OverflowError:  # a whole number that no float holds
+        wrong, value = True, "one too large"
+    if wrong:
         raise UserError(f"{where} must be a finite number, got {value!r}")
     if not (value >= least and value > above):
         raise UserError(f"{where} must be {f'above {above:g}' if above > -math.inf else f'at least {least:g}'}, got {value!r}")
