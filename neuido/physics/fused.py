@@ -25,8 +25,8 @@ from neuido.types import Particles
 WIDTHS = (32, 64)
 """Hidden widths that are compiled."""
 
-BLOCK = 64
-"""Threads a block: small bodies then still fill the multiprocessors."""
+BLOCK = 32
+"""Threads a block: the warps of a small body then spread most evenly over the multiprocessors."""
 
 INPUTS = 16
 """Columns of the first operand: nine features, a one for the bias, padding."""

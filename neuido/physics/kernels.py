@@ -28,16 +28,47 @@ PAD = 2
 LOST, FAST = 1, 2
 """Codes in status[0]: a particle outside the padded grid; one that moves by more than a cell a substep, or is not finite."""
 
+RUN = """
+#if defined(__CUDA_ARCH__)
+    const unsigned active = __activemask();
+    const int lane = threadIdx.x & 31;
+    const int before = __shfl_up_sync(active, node, 1);
+    const bool head = lane == 0 || before != node || !((active >> (lane - 1)) & 1u);
+    const unsigned above = __ballot_sync(active, head) & ~((2u << lane) - 1u);
+    const int last = above ? __ffs(above) - 2 : 31 - __clz(active);
+    const int left = last - lane;
+    const int most = __reduce_max_sync(active, left);
+    return left | (most << 8) | (head ? 1 << 16 : 0);
+#else
+    return 1 << 16;
+#endif
+"""
+"""Lanes left in this lane's run of particles with one and the same node, the longest such in the warp, and the first one's flag."""
+
 ADD4 = """
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
-    atomicAdd(reinterpret_cast<float4*>(&grid.data[node]), make_float4(value[0], value[1], value[2], value[3]));
-#elif defined(__CUDA_ARCH__)
-    for (int c = 0; c < 4; ++c) atomicAdd(&grid.data[node].c[c], value[c]);
+#if defined(__CUDA_ARCH__)
+    const unsigned active = __activemask();
+    const int left = run & 255, most = (run >> 8) & 255;
+    float v[4] = {value[0], value[1], value[2], value[3]};
+    for (int d = 1; d <= most; d *= 2) {
+        #pragma unroll
+        for (int c = 0; c < 4; ++c) {
+            const float u = __shfl_down_sync(active, v[c], d);
+            if (d <= left) v[c] += u;
+        }
+    }
+    if (run >> 16) {
+    #if __CUDA_ARCH__ >= 900
+        atomicAdd(reinterpret_cast<float4*>(&grid.data[node]), make_float4(v[0], v[1], v[2], v[3]));
+    #else
+        for (int c = 0; c < 4; ++c) atomicAdd(&grid.data[node].c[c], v[c]);
+    #endif
+    }
 #else
     for (int c = 0; c < 4; ++c) grid.data[node].c[c] += value[c];
 #endif
 """
-"""One vector reduction instead of four scalar ones: four times faster on a Hopper GPU."""
+"""The sum over a run of neighbouring lanes, then one vector reduction by its first: particles are sorted by cell at the start."""
 
 
 @functools.cache
@@ -62,13 +93,20 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
 
     if real is wp.float32 and not enable_backward:
 
+        @wp.func_native(RUN)
+        def run_of(node: int) -> int: ...
+
         @wp.func_native(ADD4)
-        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4): ...
+        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4, run: int): ...
 
     else:
 
         @func
-        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4):
+        def run_of(node: int):
+            return 0
+
+        @func
+        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4, run: int):
             wp.atomic_add(grid, node, value)
 
     @func
@@ -160,6 +198,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         az = column(hA, 2)
         bi = m * v[p] - hA * f
         node = flat(s, base, nodes)
+        run = run_of(node)
         for i in range(3):
             bj = bi
             for j in range(3):
@@ -168,7 +207,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                 row = node + (i * nodes[1] + j) * nodes[2]
                 for k in range(3):
                     w = wij * wz[k]
-                    add4(grid, row + k, vec4(w * bk[0], w * bk[1], w * bk[2], w * m))
+                    add4(grid, row + k, vec4(w * bk[0], w * bk[1], w * bk[2], w * m), run)
                     bk = bk + az
                 bj = bj + ay
             bi = bi + ax
@@ -374,10 +413,9 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         p = wp.tid()
         s = scene[p]
         h = dx[s]
+        free = real(1.0)  # a held particle takes part with nothing: the lanes of a warp add together
         if held[p] == wp.uint8(1):
-            a_x[p] = a_x_next[p]
-            a_F[p] = a_F_trial[p]
-            return
+            free = real(0.0)
         cells = (x[p] - origin[s]) / h
         base = first_node(cells, nodes)
         f = within(cells, base)
@@ -388,13 +426,14 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         gy = spline_slope(f[1])
         gz = spline_slope(f[2])
         aF = a_F_trial[p]
-        a_F[p] = aF + dt[s] * (wp.transpose(C_next[p]) * aF)
-        hB = (real(4.0) / h) * (a_C_next[p] + dt[s] * (aF * wp.transpose(F[p])))
+        a_F[p] = aF + (free * dt[s]) * (wp.transpose(C_next[p]) * aF)
+        hB = (free * real(4.0) / h) * (a_C_next[p] + dt[s] * (aF * wp.transpose(F[p])))
         bx = column(hB, 0)
         by = column(hB, 1)
         bz = column(hB, 2)
-        qi = a_v_next[p] + dt[s] * a_x_next[p] - hB * f
+        qi = free * (a_v_next[p] + dt[s] * a_x_next[p]) - hB * f
         node = flat(s, base, nodes)
+        run = run_of(node)
         slope = vec3(real(0.0), real(0.0), real(0.0))
         for i in range(3):
             qj = qi
@@ -412,7 +451,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                     phi = wp.dot(qk, velocity_of(velocity[row + k]))
                     pj += wz[k] * phi
                     pjz += gz[k] * phi
-                    add4(a_velocity, row + k, vec4(w * qk[0], w * qk[1], w * qk[2], real(0.0)))
+                    add4(a_velocity, row + k, vec4(w * qk[0], w * qk[1], w * qk[2], real(0.0)), run)
                     qk = qk + bz
                 pi += wy[j] * pj
                 piy += gy[j] * pj

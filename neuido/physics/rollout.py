@@ -38,6 +38,8 @@ class Tape(NamedTuple):
     """Code, particle and substep of the first failure, (3,) int32."""
     tau: Tensor | None
     """Stress of each substep, (T, P, 3, 3), or None."""
+    trial: Tensor | None
+    """Trial deformation gradient of each substep, (T, P, 3, 3), or None."""
     grid: Tensor | None
     """Nodal momentum and mass of each substep, (T, nodes, 4), or None."""
 
@@ -92,7 +94,8 @@ class Plan:
         status = torch.zeros(3, dtype=torch.int32, device=sim.device)
         more = keep_all and sim.keep_grid
         tau = sim.state.F.new_empty(self.steps, *sim.state.F.shape) if more else None
-        return Tape(*states, status, tau, sim.mass.new_empty(self.steps, sim.node_count, 4) if more else None)
+        trial = torch.empty_like(tau) if tau is not None and self.plasticity is not None else None
+        return Tape(*states, status, tau, trial, sim.mass.new_empty(self.steps, sim.node_count, 4) if more else None)
 
     def forward(self, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
         """Launch the substeps (all, or the first `steps`); checks nothing."""
@@ -103,7 +106,7 @@ class Plan:
             frame[0] = t
         now = tuple(frame[0] for frame in tape.states)
         spare = [tuple(torch.empty_like(t) for t in now) for _ in range(2)] if stride > 1 else []
-        scratch, trial = torch.empty_like(now[3]), torch.empty_like(now[3])
+        scratch, other = torch.empty_like(now[3]), torch.empty_like(now[3])
         tape.status.zero_()
         with torch_stream(sim.device):
             elastic, plastic = self.engines(inputs)
@@ -112,11 +115,12 @@ class Plan:
                 then = tuple(frame[(n + 1) // stride] for frame in tape.states) if kept else spare[n % 2]
                 x, v, C, F = now
                 tau = scratch if tape.tau is None else tape.tau[n]
+                trial = other if tape.trial is None else tape.trial[n]
                 self.stress(elastic, F, C, viscosity, tau)
                 grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid") if tape.grid is None else tape.grid[n])
                 velocity = self.on_grid(grid, pull, force, friction)
                 self.launch(sim.kernels.grid_to_particles, len(x),
-                            [sim.particles.scene, sim.held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
+                            [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
                              then[3] if plastic is None else trial, n, tape.status], self.block)  # fmt: skip
                 if plastic is not None:
                     plastic.forward(trial, then[3])
@@ -130,7 +134,7 @@ class Plan:
 
     def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> Tensor:
         sim = self.simulator
-        arguments = [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.volume, x, v, C, tau, grid.zero_()]
+        arguments = [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau, grid.zero_()]
         self.launch(sim.kernels.particles_to_grid, len(x), arguments, self.block)
         return grid
 
@@ -157,6 +161,7 @@ class Plan:
         if code == 0:
             p, step = int((~torch.isfinite(tape.F[-1]).all(dim=(1, 2))).nonzero()[0]), self.steps - 1
         s = int(self.simulator.particles.scene[p])
+        p = int(self.simulator.order[p])
         scene = self.simulator.scenes[s]
         what = {
             kernels.LOST: "left the domain; enlarge `lower`/`upper`, or close it with `walls`",
@@ -177,7 +182,7 @@ class Plan:
         parameters = any(wanted[5:8])
         now = [torch.zeros_like(t) for t in inputs[:4]]
         then = [torch.empty_like(t) for t in now]
-        scratch, a_tau, trial, a_trial = (torch.empty_like(now[3]) for _ in range(4))
+        scratch, a_tau, other, a_trial = (torch.empty_like(now[3]) for _ in range(4))
         a_velocity, a_grid = sim.scratch("a_velocity"), sim.scratch("a_grid")
         with torch_stream(sim.device):
             elastic, plastic = self.engines(inputs)
@@ -197,16 +202,16 @@ class Plan:
                 a_x, a_v, a_C, a_F = then
                 a_out = now[3]
                 if plastic is not None:
-                    self.trial(F, C_next, trial)
+                    trial = self.trial(F, C_next, other) if tape.trial is None else tape.trial[n]
                     plastic.adjoint(trial, now[3], a_trial.zero_())
                     a_out = a_trial
                 self.launch(k.grid_to_particles_adjoint, len(x),
-                            [sim.particles.scene, sim.held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, v_next, C_next, *now[:3],
+                            [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, v_next, C_next, *now[:3],
                              a_out, a_velocity.zero_(), a_x, a_F], self.block)  # fmt: skip
                 self.launch(k.update_grid_adjoint, sim.node_count,
                             [*self.grid_inputs(pull, force, friction), grid, a_velocity, a_grid, a_pull, a_force, a_friction, parameters])  # fmt: skip
                 self.launch(k.particles_to_grid_adjoint, len(x),
-                            [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.volume, x, v, C, tau, a_grid, a_mass,
+                            [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau, a_grid, a_mass,
                              a_x, a_v, a_C, a_tau], self.block)  # fmt: skip
                 if viscosity.numel():
                     self.launch(k.add_viscous_stress_adjoint, len(x),
@@ -217,9 +222,10 @@ class Plan:
             of_laws = [*elastic.gradients(), *(() if plastic is None else plastic.gradients())]
         return [*now, a_mass, a_pull, a_force, a_friction, a_viscosity, *of_laws]
 
-    def trial(self, F: Tensor, C_next: Tensor, out: Tensor) -> None:
+    def trial(self, F: Tensor, C_next: Tensor, out: Tensor) -> Tensor:
         """F_tr = (I + dt C) F, as grid_to_particles wrote it."""
         self.launch(self.simulator.kernels.trial_gradient, len(F), [self.simulator.particles.scene, self.simulator.dt, F, C_next, out])
+        return out
 
 
 def _add(now: Sequence[Tensor], gradients: Sequence[Tensor | None], frame: int) -> None:
