@@ -36,14 +36,17 @@ def demo(*, out: str = "runs/demo", settings: str = "quickstart") -> None:
     """Pre-train the operator on small simulated bodies, and compare the motion under its laws with that under the true ones.
 
     Runs `neuido fit --config quickstart` on trajectories of a thrown cube, then drops a ball that the operator has not seen,
-    prints a table and draws a picture. Takes a few minutes on two CPU cores; a second run reuses the trajectories.
+    prints a table and draws a picture. Takes about a minute on one CPU core; a second run reuses the trajectories.
 
     Args:
         out: Folder for the trajectories, the run and the picture.
         settings: Configuration to train with.
     """
+    import torch
+
     from neuido.cli import find_config, run_lightning
 
+    torch.set_num_threads(1)  # for matrices this small a second thread costs more than it brings
     folder, config = Path(out), find_config(settings, "--settings")
     print(f"[1/2] neuido fit --config {settings} --data.root {folder / 'trajectories'}", flush=True)
     root = ["--data.root", str(folder / "trajectories"), "--trainer.default_root_dir", str(folder)]
