@@ -7,7 +7,7 @@ import torch
 
 from neuido.errors import UserError
 from neuido.models import splat_reference, splatting
-from neuido.models.gaussians import harmonics_of
+from neuido.models.gaussians import deform, harmonics_of
 from neuido.models.splatting import Splatting, rasterize, render
 from neuido.types import Cameras, Gaussians
 
@@ -77,6 +77,7 @@ SCENES = {
     "behind and beside": (cloud(80, seed=4, spread=6.0), cameras(24, 32)),
     "many and opaque": (cloud(300, seed=5, spread=0.3, opacity=(0.9, 1.0)), cameras(24, 24)),
     "large": (cloud(30, seed=6, size=1.5), cameras(33, 33)),
+    "saturated": (cloud(12, seed=23, size=2.0, opacity=(1.0, 1.0)), cameras(33, 33)),  # alpha is clamped near the centres
     "tiny": (cloud(60, seed=7, size=1e-3), cameras(32, 32)),
     "faint": (cloud(60, seed=8, opacity=(0.0, 0.02)), cameras(32, 32)),
     "close": (cloud(60, seed=9, spread=1.5, size=0.2), cameras(32, 32, distance=0.5)),
@@ -221,6 +222,25 @@ def test_harmonics_and_rotations_carry_gradients(degree, device):
     fast = compare(scene, cameras(24, 24, device=device), sh_degree=degree, rotations=turns)
     plain = rasterize(*scene, *cameras(24, 24, device=device), sh_degree=degree)[0]
     assert torch.equal(plain, fast[0]) == (degree == 0)
+
+
+def test_a_body_and_a_camera_that_turn_together_leave_the_image_as_it_was():
+    """Frame indifference: means, covariances and harmonics all turn with F = Q."""
+    scene, view = cloud(40, seed=24), cameras(24, 24)
+    g = torch.Generator().manual_seed(4)
+    body = Gaussians(*scene[:3], 0.5 * torch.randn(40, 16, 3, generator=g).double())
+    Q = torch.linalg.qr(torch.randn(3, 3, generator=g).double()).Q
+    Q = Q * torch.linalg.det(Q).sign()
+    shift = torch.tensor([0.3, -2.0, 0.7], dtype=torch.float64)
+    before = render(body, view)[0]
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3], turn[:3, 3] = Q, shift
+    moved = deform(body, Q.expand(40, 3, 3), body.means @ Q.T + shift)
+    after = render(moved, view._replace(viewmats=view.viewmats @ torch.linalg.inv(turn)))[0]
+    assert torch.allclose(after, before, atol=1e-10)
+    assert (
+        render(moved._replace(rotations=None), view._replace(viewmats=view.viewmats @ torch.linalg.inv(turn)))[0] - before
+    ).abs().max() > 0.1
 
 
 @pytest.mark.parametrize("device", DEVICES)
