@@ -122,12 +122,9 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         return out
 
     @func
-    def place(node: int, origin: vec3, h: real, nodes: wp.vec3i):
-        """Position of a node [m]."""
-        k = node % nodes[2]
-        j = (node / nodes[2]) % nodes[1]
-        i = (node / (nodes[2] * nodes[1])) % nodes[0]
-        return origin + vec3(real(i), real(j), real(k)) * h
+    def place(c: wp.vec4i, origin: vec3, h: real):
+        """Position of a node [m] from its three indices."""
+        return origin + vec3(real(c[0]), real(c[1]), real(c[2])) * h
 
     @func
     def push(v0: vec3, x: vec3, dt: real, g: vec3, force: wp.array2d(dtype=real), row: int):
@@ -180,22 +177,24 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         friction: wp.array2d(dtype=real),
         lower: wp.array2d(dtype=vec3),
         upper: wp.array2d(dtype=vec3),
-        nodes: wp.vec3i,
+        index: wp.array(dtype=wp.vec4i),
+        chunk: int,
         grid: wp.array(dtype=vec4),
         velocity: wp.array(dtype=vec4),
     ):
         """(momentum, mass) -> (velocity, 0) of each node; an empty node gets zero."""
-        node = wp.tid()
-        g = grid[node]
-        out = vec3(real(0.0), real(0.0), real(0.0))
-        if g[3] > real(0.0):
-            s = node / (nodes[0] * nodes[1] * nodes[2])
-            x = place(node, origin[s], dx[s], nodes)
-            if not clamped(x, s, lower, upper):
-                v0 = vec3(g[0], g[1], g[2]) / g[3]
-                u = push(v0, x, dt[s], gravity[s], force, s)
-                out = collide(u, x, s, kind.shape[1], plane, kind, friction)
-        velocity[node] = vec4(out[0], out[1], out[2], real(0.0))
+        first = wp.tid() * chunk
+        for node in range(first, first + chunk):
+            g = grid[node]
+            out = vec3(real(0.0), real(0.0), real(0.0))
+            if g[3] > real(0.0):
+                s = index[node][3]
+                x = place(index[node], origin[s], dx[s])
+                if not clamped(x, s, lower, upper):
+                    v0 = vec3(g[0], g[1], g[2]) / g[3]
+                    u = push(v0, x, dt[s], gravity[s], force, s)
+                    out = collide(u, x, s, kind.shape[1], plane, kind, friction)
+            velocity[node] = vec4(out[0], out[1], out[2], real(0.0))
 
     @adjoint_kernel
     def update_grid_adjoint(
@@ -209,7 +208,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         friction: wp.array2d(dtype=real),
         lower: wp.array2d(dtype=vec3),
         upper: wp.array2d(dtype=vec3),
-        nodes: wp.vec3i,
+        index: wp.array(dtype=wp.vec4i),
+        chunk: int,
         grid: wp.array(dtype=vec4),
         a_velocity: wp.array(dtype=vec4),
         a_grid: wp.array(dtype=vec4),
@@ -219,46 +219,47 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         parameters: bool,
     ):
         """Writes a_grid; adds to the adjoints of gravity, body forces and friction where `parameters` is set."""
-        node = wp.tid()
-        g = grid[node]
-        out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
-        if g[3] > real(0.0):
-            s = node / (nodes[0] * nodes[1] * nodes[2])
-            x = place(node, origin[s], dx[s], nodes)
-            if not clamped(x, s, lower, upper):
-                v0 = vec3(g[0], g[1], g[2]) / g[3]
-                u = push(v0, x, dt[s], gravity[s], force, s)
-                av = a_velocity[node]
-                a = vec3(av[0], av[1], av[2])
-                planes = kind.shape[1]
-                for r in range(planes):
-                    c = planes - 1 - r
-                    n = normal_of(plane[s, c])
-                    if wp.dot(n, x) <= plane[s, c][3]:
-                        before = collide(u, x, s, c, plane, kind, friction)
-                        b = contact_adjoint(before, n, kind[s, c], friction[s, c], a)
-                        a = vec3(b[0], b[1], b[2])
-                        if parameters:
-                            wp.atomic_add(a_friction, s, c, b[3])
-                # the implicit drag: v = u / D, D = 1 + dt (c1 + c2 |u|)
-                centre = vec3(force[s, 3], force[s, 4], force[s, 5])
-                u = v0 + dt[s] * (gravity[s] - force[s, 2] * (x - centre))
-                speed = wp.length(u)
-                D = real(1.0) + dt[s] * (force[s, 0] + force[s, 1] * speed)
-                aD = -wp.dot(a, u) / (D * D)
-                au = a / D
-                if speed > real(0.0):
-                    au = au + (aD * dt[s] * force[s, 1] / speed) * u
-                if parameters:
-                    wp.atomic_add(a_gravity, s, dt[s] * au)
-                    wp.atomic_add(a_force, s, 0, dt[s] * aD)
-                    wp.atomic_add(a_force, s, 1, dt[s] * speed * aD)
-                    wp.atomic_add(a_force, s, 2, -dt[s] * wp.dot(au, x - centre))
-                    wp.atomic_add(a_force, s, 3, dt[s] * force[s, 2] * au[0])
-                    wp.atomic_add(a_force, s, 4, dt[s] * force[s, 2] * au[1])
-                    wp.atomic_add(a_force, s, 5, dt[s] * force[s, 2] * au[2])
-                out = vec4(au[0], au[1], au[2], -wp.dot(au, v0)) / g[3]
-        a_grid[node] = out
+        first = wp.tid() * chunk
+        for node in range(first, first + chunk):
+            g = grid[node]
+            out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
+            if g[3] > real(0.0):
+                s = index[node][3]
+                x = place(index[node], origin[s], dx[s])
+                if not clamped(x, s, lower, upper):
+                    v0 = vec3(g[0], g[1], g[2]) / g[3]
+                    u = push(v0, x, dt[s], gravity[s], force, s)
+                    av = a_velocity[node]
+                    a = vec3(av[0], av[1], av[2])
+                    planes = kind.shape[1]
+                    for r in range(planes):
+                        c = planes - 1 - r
+                        n = normal_of(plane[s, c])
+                        if wp.dot(n, x) <= plane[s, c][3]:
+                            before = collide(u, x, s, c, plane, kind, friction)
+                            b = contact_adjoint(before, n, kind[s, c], friction[s, c], a)
+                            a = vec3(b[0], b[1], b[2])
+                            if parameters:
+                                wp.atomic_add(a_friction, s, c, b[3])
+                    # the implicit drag: v = u / D, D = 1 + dt (c1 + c2 |u|)
+                    centre = vec3(force[s, 3], force[s, 4], force[s, 5])
+                    u = v0 + dt[s] * (gravity[s] - force[s, 2] * (x - centre))
+                    speed = wp.length(u)
+                    D = real(1.0) + dt[s] * (force[s, 0] + force[s, 1] * speed)
+                    aD = -wp.dot(a, u) / (D * D)
+                    au = a / D
+                    if speed > real(0.0):
+                        au = au + (aD * dt[s] * force[s, 1] / speed) * u
+                    if parameters:
+                        wp.atomic_add(a_gravity, s, dt[s] * au)
+                        wp.atomic_add(a_force, s, 0, dt[s] * aD)
+                        wp.atomic_add(a_force, s, 1, dt[s] * speed * aD)
+                        wp.atomic_add(a_force, s, 2, -dt[s] * wp.dot(au, x - centre))
+                        wp.atomic_add(a_force, s, 3, dt[s] * force[s, 2] * au[0])
+                        wp.atomic_add(a_force, s, 4, dt[s] * force[s, 2] * au[1])
+                        wp.atomic_add(a_force, s, 5, dt[s] * force[s, 2] * au[2])
+                    out = vec4(au[0], au[1], au[2], -wp.dot(au, v0)) / g[3]
+            a_grid[node] = out
 
     return SimpleNamespace(
         add_viscous_stress=add_viscous_stress,

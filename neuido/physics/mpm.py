@@ -108,6 +108,10 @@ class Simulator:
         self.nodes = wp.vec3i(*nodes)
         self.grid_shape = (len(self.scenes), *nodes)
         self.node_count = math.prod(self.grid_shape)
+        self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes a thread: on the CPU the call of a thread costs as much as a node
+        scene, *axes = (torch.arange(n, dtype=torch.int32) for n in self.grid_shape)
+        s, i, j, k = torch.meshgrid(scene, *axes, indexing="ij")
+        self.node_index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(self.device)
         self._sort()
         self.keep_grid = keep == "all" or (keep == "auto" and self.node_count <= 8 * len(self.mass))
         self.graphs = GraphCache() if graphs and self.device.type == "cuda" else None
@@ -229,6 +233,7 @@ class Simulator:
         friction: Tensor | None = None,
         mass: Tensor | None = None,
         every: int = 1,
+        segment: int | None = None,
         check: bool = True,
     ) -> ParticleState:
         """Run `steps` substeps.
@@ -245,6 +250,8 @@ class Simulator:
             friction: Coefficients of the colliders, (S, K) in the order colliders, walls.
             mass: [kg], (P,); density times volume where absent.
             every: Keep a frame every so many substeps.
+            segment: For a long rollout with gradients: keep only the state every so many substeps, and make the rest again in the
+                backward pass, piece by piece (a third more time). It must divide `steps` and be a multiple of `every`.
             check: Compare the step with the stability limit first.
 
         Returns:
@@ -255,6 +262,8 @@ class Simulator:
         """
         if steps < 1 or every < 1 or steps % every:
             raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
+        if segment is not None and (segment < 1 or steps % segment or segment % every):
+            raise UserError(f"segment is {segment}; it must divide steps ({steps}) and be a multiple of every ({every})")
         state = self.state if state is None else ParticleState(*(t.to(self.device, self.dtype).contiguous() for t in state))
         effects = Effects() if effects is None else effects
         base = self.gravity if gravity is None else gravity.to(self.device, self.dtype).expand(self.scene_count, 3)
@@ -272,7 +281,7 @@ class Simulator:
         plan = Plan(self, elasticity, plasticity, steps, every)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
         start = [t[self.order] for t in (*state, mass)]
-        frames = run(plan, (*start, pull, force, friction, viscosity.contiguous(), *law_tensors))
+        frames = run(plan, (*start, pull, force, friction, viscosity.contiguous(), *law_tensors), segment)
         return ParticleState(*(t[:, self.inverse] for t in frames))
 
 

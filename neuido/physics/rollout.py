@@ -141,13 +141,13 @@ class Plan:
     def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor) -> Tensor:
         sim = self.simulator
         velocity = sim.scratch("velocity")
-        self.launch(sim.kernels.update_grid, sim.node_count, [*self.grid_inputs(pull, force, friction), grid, velocity])
+        self.launch(sim.kernels.update_grid, sim.node_count // sim.chunk, [*self.grid_inputs(pull, force, friction), grid, velocity])
         return velocity
 
     def grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor) -> list:
         sim = self.simulator
         table = sim.colliders
-        return [sim.origin, sim.dx, sim.dt, pull, force, table.plane, table.kind, friction, sim.clamp_lower, sim.clamp_upper, sim.nodes]
+        return [sim.origin, sim.dx, sim.dt, pull, force, table.plane, table.kind, friction, sim.clamp_lower, sim.clamp_upper, sim.node_index, sim.chunk]
 
     def check(self, tape: Tape) -> None:
         """Raise what the kernels found, or a last frame that is not finite.
@@ -208,7 +208,7 @@ class Plan:
                 self.launch(k.grid_to_particles_adjoint, len(x),
                             [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, v_next, C_next, *now[:3],
                              a_out, a_velocity.zero_(), a_x, a_F], self.block)  # fmt: skip
-                self.launch(k.update_grid_adjoint, sim.node_count,
+                self.launch(k.update_grid_adjoint, sim.node_count // sim.chunk,
                             [*self.grid_inputs(pull, force, friction), grid, a_velocity, a_grid, a_pull, a_force, a_friction, parameters])  # fmt: skip
                 self.launch(k.particles_to_grid_adjoint, len(x),
                             [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau, a_grid, a_mass,
@@ -234,15 +234,26 @@ def _add(now: Sequence[Tensor], gradients: Sequence[Tensor | None], frame: int) 
             a.add_(gradient[frame])
 
 
-def run(plan: Plan, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+def run(plan: Plan, inputs: tuple[Tensor, ...], segment: int | None = None) -> tuple[Tensor, ...]:
     """Frames of x, v, C and F; differentiable where an input requires it.
+
+    Args:
+        plan: What to run.
+        inputs: State, mass, pull, force, friction, viscosity and the tensors of the laws.
+        segment: Substeps between checkpoints of a differentiable run; none: the tape spans the whole of it.
 
     Raises:
         UserError: What `Plan.check` finds.
     """
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+        if segment is not None and segment < plan.steps:
+            return _Segments.apply(plan, segment, *inputs)
         return _Rollout.apply(plan, *inputs)
-    inputs = tuple(t.detach() for t in inputs)
+    return _frames(plan, tuple(t.detach() for t in inputs))
+
+
+def _frames(plan: Plan, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """A run without a tape."""
     cache = plan.simulator.graphs
     captured = None if cache is None else cache.find(plan, inputs, keep_all=False)
     if captured is not None:
@@ -287,3 +298,54 @@ class _Rollout(torch.autograd.Function):
         else:
             out = ctx.plan.backward(tensors[4:], Tape(*tensors[:4], *ctx.more), gradients, wanted)
         return (None, *(g if want else None for g, want in zip(out, wanted, strict=True)))
+
+
+class _Segments(torch.autograd.Function):
+    """`_Rollout` in pieces: only the states between them are kept, and the backward pass makes the tape of one piece at a time."""
+
+    @staticmethod
+    def forward(ctx: Any, plan: Plan, segment: int, *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        inputs = tuple(t.detach() for t in inputs)
+        piece = Plan(plan.simulator, plan.elasticity, plan.plasticity, segment, plan.every)
+        piece.split = plan.split
+        ctx.piece, ctx.count = piece, plan.steps // segment
+        length = segment // plan.every
+        frames = tuple(t.new_empty(ctx.count * length + 1, *t.shape) for t in inputs[:4])
+        starts = [inputs[:4]]
+        for i in range(ctx.count):
+            for frame, part in zip(frames, _frames(piece, (*starts[i], *inputs[4:]))):
+                frame[i * length : (i + 1) * length + 1] = part
+            starts.append(tuple(frame[(i + 1) * length].clone() for frame in frames))
+        ctx.save_for_backward(*inputs[4:], *(t for start in starts[:-1] for t in start))
+        return frames
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        piece, wanted, tensors = ctx.piece, ctx.needs_input_grad[2:], ctx.saved_tensors
+        rest, starts = tensors[: len(wanted) - 4], tensors[len(wanted) - 4 :]
+        length = piece.steps // piece.every
+        cache = piece.simulator.graphs
+        carry = [torch.zeros_like(t) for t in starts[:4]]
+        total: list[Tensor | None] = [None] * (len(wanted) - 4)
+        for i in reversed(range(ctx.count)):
+            inputs = (*starts[4 * i : 4 * i + 4], *rest)
+            own = []
+            for a, gradient in zip(carry, gradients):
+                part = a.new_zeros(length + 1, *a.shape)
+                if gradient is not None:
+                    # a piece's first frame is the last one of the piece before
+                    part[0 if i == 0 else 1 :] = gradient[i * length + (0 if i == 0 else 1) : (i + 1) * length + 1]
+                part[-1] += a
+                own.append(part)
+            captured = None if cache is None else cache.find(piece, inputs, keep_all=True)
+            if captured is not None:
+                out = captured.backward(inputs, captured.forward(inputs), own, (True,) * 4 + tuple(wanted[4:]))
+            else:
+                tape = piece.tape(keep_all=True)
+                piece.forward(inputs, tape)
+                out = piece.backward(inputs, tape, own, (True,) * 4 + tuple(wanted[4:]))
+            carry = out[:4]
+            total = [t if new is None else new if t is None else t + new for t, new in zip(total, out[4:])]
+        return (None, None, *(g if want else None for g, want in zip([*carry, *total], wanted, strict=True)))

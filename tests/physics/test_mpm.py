@@ -44,7 +44,7 @@ class Problem:
             stack([VonMises(self.yield_stress, self.young, self.poisson), DruckerPrager(25.0, 2 * self.young, self.poisson)]),
         )
 
-    def loss(self, run, steps, every):
+    def loss(self, run, steps, every, **options):
         frames = run(
             steps,
             *self.laws(),
@@ -54,6 +54,7 @@ class Problem:
             friction=self.friction,
             effects=Effects(*self.effects),
             every=every,
+            **options,
         )
         total = 0.0
         for i, t in enumerate(frames):
@@ -139,7 +140,7 @@ def kernel_cases(stage: Stage):
             {"grid": torch.zeros_like(grid)},
         ),
         "update_grid": (
-            {**{k: place[k] for k in ("origin", "dx", "dt", "nodes")}, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
+            {**{k: place[k] for k in ("origin", "dx", "dt")}, "index": sim.node_index, "chunk": sim.chunk, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
              "friction": table.friction.clone(), "grid": grid},
             ["gravity", "force", "friction", "grid"],
             {"velocity": velocity},
@@ -153,7 +154,7 @@ def kernel_cases(stage: Stage):
 
 
 def launch(stage, kernel, values):
-    dim = stage.sim.node_count if "update_grid" in kernel.key else len(stage.sim.mass)
+    dim = stage.sim.node_count // stage.sim.chunk if "update_grid" in kernel.key else len(stage.sim.mass)
     stage.plan.launch(kernel, dim, [values[arg.label] for arg in kernel.adj.args])
 
 
@@ -218,7 +219,7 @@ def test_kernel_adjoint_equals_warp_autodiff(name):
             value = wp.from_torch(value.clone(), dtype=arg.type.dtype, requires_grad=arg.label in (*wanted, *outputs))
         arrays[arg.label] = value
     with wp.Tape() as tape:
-        dim = stage.sim.node_count if name == "update_grid" else len(stage.sim.mass)
+        dim = stage.sim.node_count // stage.sim.chunk if name == "update_grid" else len(stage.sim.mass)
         wp.launch(oracle, dim=dim, inputs=[arrays[arg.label] for arg in oracle.adj.args], device=DEVICE)
     tape.backward(grads={arrays[key]: wp.from_torch(weights[key].clone(), dtype=arrays[key].dtype) for key in outputs})
     for key in set(wanted) - ({"friction"} if name == "update_grid" else set()):
@@ -228,6 +229,19 @@ def test_kernel_adjoint_equals_warp_autodiff(name):
             full = (inputs["grid"][..., 3:] > 0).double().expand_as(expected)
         error = float(((analytic[key] - expected) * full).norm() / expected.norm())
         assert error <= 1e-10, f"{key}: {error:.2e}"
+
+
+@pytest.mark.parametrize("keep", ["state", "all"])
+def test_segments_and_tapes_do_not_change_the_gradient(keep):
+    p = Problem()
+    whole, frames = p.loss(p.sim.rollout, 12, 2)
+    expected = torch.autograd.grad(whole, p.leaves())
+    other = Simulator(*busy_scenes(), dtype=torch.float64, device=DEVICE, keep=keep)
+    for segment in (None, 4, 6):
+        parts, again = p.loss(other.rollout, 12, 2, segment=segment)
+        assert all(same(a, b) for a, b in zip(frames, again))
+        for name, a, b in zip(NAMES, torch.autograd.grad(parts, p.leaves()), expected, strict=True):
+            assert float((a - b).norm()) <= 1e-11 * float(b.norm()), f"{name} with {keep}, segment {segment}"
 
 
 def test_frames_do_not_depend_on_how_they_are_kept():
@@ -261,6 +275,7 @@ def test_float32_follows_float64():
         (dict(scene=Scene(walls=Walls("separate", -1.0))), "friction is -1"),
         (dict(density=-3.0), "density is -3"),
         (dict(steps=10, every=3), "multiple of every"),
+        (dict(steps=12, every=2, segment=5), "segment is 5"),
         (dict(effects=Effects(drag_linear=-1.0)), "drag_linear is -1"),
         (dict(effects=Effects(viscosity_shear=1e5)), "viscosity"),
         (dict(scene=Scene(walls=None), body=block((0.4, 0.0, 0.4), (0.6, 0.2, 0.6), (4, 4, 4), velocity=(0.0, -9.0, 0.0)), steps=100),
@@ -272,7 +287,8 @@ def test_bad_input_is_one_clear_line(change, message):
     body = change.get("body", block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (4, 4, 4)))
     with pytest.raises(UserError, match=message) as error:
         sim = Simulator(change.get("scene", Scene()), body, density=change.get("density", 1000.0), device=DEVICE)
-        sim.rollout(change.get("steps", 10), FixedCorotated(1e5, 0.3), effects=change.get("effects"), every=change.get("every", 1))
+        sim.rollout(change.get("steps", 10), FixedCorotated(1e5, 0.3), effects=change.get("effects"), every=change.get("every", 1),
+                    segment=change.get("segment"))  # fmt: skip
     assert "\n" not in str(error.value)
 
 
