@@ -376,7 +376,9 @@ def build(width: int) -> SimpleNamespace:
         if p < last:
             if X:
                 X[p] = x
-            g_F[p] = g_F[p] + stress_gradient(F[p], N, h, l, A, q, outputs(k), scale, g, gx)
+            # measured again: cheaper than the registers to remember it
+            N2, h2, l2, A2, q2 = measure(F[p])
+            g_F[p] = g_F[p] + stress_gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, g_out[p], gx)
 
     @kernel
     def correct_adjoint(
@@ -404,7 +406,8 @@ def build(width: int) -> SimpleNamespace:
         if p < last:
             if X:
                 X[p] = x
-            g_F[p] = g_F[p] + correction_gradient(F[p], N, h, l, A, q, outputs(k), scale, g, gx)
+            N2, h2, l2, A2, q2 = measure(F[p])  # as above
+            g_F[p] = g_F[p] + correction_gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, g_out[p], gx)
 
     return SimpleNamespace(stress=stress, correct=correct, stress_adjoint=stress_adjoint, correct_adjoint=correct_adjoint)
 
