@@ -28,6 +28,25 @@ PAD = 2
 LOST, FAST = 1, 2
 """Codes in status[0]: a particle outside the padded grid; one that moves by more than a cell a substep, or is not finite."""
 
+ARRANGE = """
+#if defined(__CUDA_ARCH__)
+    if (__activemask() != 0xffffffffu) return 0;
+    const int lane = threadIdx.x & 31;
+    int key = (node << 5) | lane;
+    #pragma unroll
+    for (int k = 2; k <= 32; k *= 2)
+        #pragma unroll
+        for (int j = k / 2; j > 0; j /= 2) {
+            const int other = __shfl_xor_sync(0xffffffffu, key, j);
+            key = ((lane & j) == 0) == ((lane & k) == 0) ? min(key, other) : max(key, other);
+        }
+    return (key & 31) - lane;
+#else
+    return 0;
+#endif
+"""
+"""Which particle of the warp a lane takes, as an offset, so that those with the same node are neighbours (bitonic sort)."""
+
 RUN = """
 #if defined(__CUDA_ARCH__)
     const unsigned active = __activemask();
@@ -93,6 +112,9 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
 
     if real is wp.float32 and not enable_backward:
 
+        @wp.func_native(ARRANGE)
+        def arrange(node: int) -> int: ...
+
         @wp.func_native(RUN)
         def run_of(node: int) -> int: ...
 
@@ -100,6 +122,10 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         def add4(grid: wp.array(dtype=vec4), node: int, value: vec4, run: int): ...
 
     else:
+
+        @func
+        def arrange(node: int):
+            return 0
 
         @func
         def run_of(node: int):
@@ -139,6 +165,10 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     @func
     def flat(s: int, node: wp.vec3i, nodes: wp.vec3i):
         return ((s * nodes[0] + node[0]) * nodes[1] + node[1]) * nodes[2] + node[2]
+
+    @func
+    def stencil(x: vec3, s: int, origin: wp.array(dtype=vec3), dx: wp.array(dtype=real), nodes: wp.vec3i):
+        return flat(s, first_node((x - origin[s]) / dx[s], nodes), nodes)
 
     @func
     def within(cells: vec3, base: wp.vec3i):
@@ -183,6 +213,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     ):
         """Nodes get (momentum [kg m/s], mass [kg]); `grid` must be zero before."""
         p = wp.tid()
+        p += arrange(stencil(x[p], scene[p], origin, dx, nodes))
         s = scene[p]
         h = dx[s]
         m = mass[p]
@@ -411,6 +442,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     ):
         """Adds to a_velocity (zero before); writes a_x and a_F."""
         p = wp.tid()
+        p += arrange(stencil(x[p], scene[p], origin, dx, nodes))
         s = scene[p]
         h = dx[s]
         free = real(1.0)  # a held particle takes part with nothing: the lanes of a warp add together

@@ -67,8 +67,8 @@ class Simulator:
         dtype: `torch.float32` for work, `torch.float64` for checks.
         graphs: On CUDA, capture a rollout's launches once for each shape and replay them after.
         keep: What the backward pass finds of each substep: `state` is x, v, C, F (96 bytes a particle in float32), and it
-            recomputes stress, trial and grid; `all` is these too (72 bytes more a particle, 16 a node) and faster; `auto` is
-            `all` where the nodes do not outnumber the particles by more than eight.
+            recomputes stress, trial and grid; `all` is these too (72 bytes more a particle, 32 a node) and faster; `auto` is
+            `all` where the nodes do not outnumber the particles by more than four.
 
     Raises:
         UserError: A body outside its domain, a clamp or an attached mass that picks no particle, a shape that does not fit.
@@ -113,7 +113,7 @@ class Simulator:
         s, i, j, k = torch.meshgrid(scene, *axes, indexing="ij")
         self.node_index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(self.device)
         self._sort()
-        self.keep_grid = keep == "all" or (keep == "auto" and self.node_count <= 8 * len(self.mass))
+        self.keep_grid = keep == "all" or (keep == "auto" and self.node_count <= 4 * len(self.mass))
         self.graphs = GraphCache() if graphs and self.device.type == "cuda" else None
         self._grid: dict[str, Tensor] = {}
 

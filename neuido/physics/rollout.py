@@ -24,7 +24,7 @@ FIXED = 9
 """Inputs before the tensors of the laws: x, v, C, F, mass, pull, force, friction, viscosity."""
 
 LARGE = 1 << 17
-"""Particles above which blocks of 256 threads beat blocks of 64 on a GPU; smaller bodies need more blocks to fill it."""
+"""Particles above which blocks of 256 threads do as well as blocks of 32 on a GPU; smaller bodies need more blocks to fill it."""
 
 
 class Tape(NamedTuple):
@@ -42,6 +42,8 @@ class Tape(NamedTuple):
     """Trial deformation gradient of each substep, (T, P, 3, 3), or None."""
     grid: Tensor | None
     """Nodal momentum and mass of each substep, (T, nodes, 4), or None."""
+    velocity: Tensor | None
+    """Nodal velocity of each substep, (T, nodes, 4), or None."""
 
     @property
     def states(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -62,7 +64,7 @@ class Plan:
     def __init__(self, simulator: "Simulator", elasticity: ElasticLaw, plasticity: PlasticLaw | None, steps: int, every: int) -> None:
         self.simulator, self.elasticity, self.steps, self.every = simulator, elasticity, steps, every
         self.plasticity = None if plasticity is None or plasticity.identity else plasticity
-        self.block = 64 if len(simulator.mass) < LARGE else 256
+        self.block = 32 if len(simulator.mass) < LARGE else 256
 
     def law_tensors(self) -> tuple[Tensor, ...]:
         """Those of both laws, the elastic ones first."""
@@ -95,7 +97,8 @@ class Plan:
         more = keep_all and sim.keep_grid
         tau = sim.state.F.new_empty(self.steps, *sim.state.F.shape) if more else None
         trial = torch.empty_like(tau) if tau is not None and self.plasticity is not None else None
-        return Tape(*states, status, tau, trial, sim.mass.new_empty(self.steps, sim.node_count, 4) if more else None)
+        nodal = [sim.mass.new_empty(self.steps, sim.node_count, 4) if more else None for _ in range(2)]
+        return Tape(*states, status, tau, trial, *nodal)
 
     def forward(self, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
         """Launch the substeps (all, or the first `steps`); checks nothing."""
@@ -118,7 +121,8 @@ class Plan:
                 trial = other if tape.trial is None else tape.trial[n]
                 self.stress(elastic, F, C, viscosity, tau)
                 grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid") if tape.grid is None else tape.grid[n])
-                velocity = self.on_grid(grid, pull, force, friction)
+                velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
+                self.on_grid(grid, pull, force, friction, velocity)
                 self.launch(sim.kernels.grid_to_particles, len(x),
                             [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
                              then[3] if plastic is None else trial, n, tape.status], self.block)  # fmt: skip
@@ -138,11 +142,9 @@ class Plan:
         self.launch(sim.kernels.particles_to_grid, len(x), arguments, self.block)
         return grid
 
-    def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor) -> Tensor:
+    def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor, velocity: Tensor) -> None:
         sim = self.simulator
-        velocity = sim.scratch("velocity")
         self.launch(sim.kernels.update_grid, sim.node_count // sim.chunk, [*self.grid_inputs(pull, force, friction), grid, velocity])
-        return velocity
 
     def grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor) -> list:
         sim = self.simulator
@@ -198,7 +200,9 @@ class Plan:
                 if tape.tau is None:
                     self.stress(elastic, F, C, viscosity, tau)
                 grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid")) if tape.grid is None else tape.grid[n]
-                velocity = self.on_grid(grid, pull, force, friction)
+                velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
+                if tape.velocity is None:
+                    self.on_grid(grid, pull, force, friction, velocity)
                 a_x, a_v, a_C, a_F = then
                 a_out = now[3]
                 if plastic is not None:
