@@ -4,6 +4,9 @@
 
 Real bodies come from the data folder (option --data or NEUIDO_DATA); without it balls of as many particles take their
 place, and the table says so. Weights of the neural law are random: their values do not change the work.
+
+Beside each case stands its floor, the larger of two times from rates measured in the same run (`floor`), and beside the neural
+BouncyBall cases a plain re-implementation of the published loops (`plain.py`), on fewer substeps, scaled.
 """
 
 import argparse
@@ -17,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import plain
 import torch
 
 from neuido.data.scenes import load_scene
@@ -30,6 +34,15 @@ SIX = {"bouncy-ball": 25744, "clay-cat": 23554, "honey-bottle": 20777, "jelly-du
 NEUMA = {"forward": 2.1, "both": 4.2, "bytes": 45e9}
 """NeuMA's own loop on one H200, BouncyBall, 400 substeps (measured 2026-11-20) [s], [s], [B]."""
 
+STATE = 24 * 4
+"""Bytes of x, v, C and F of a particle in float32."""
+
+KEPT = 2 * 9 * 4
+"""Bytes of stress and trial gradient of a particle, where the tape keeps them."""
+
+PLAIN_REPEAT = 5
+"""Repeats of the plain rollout, at most; the spread of a loop of milliseconds is small."""
+
 
 @dataclass
 class Case:
@@ -42,6 +55,79 @@ class Case:
     unit: str = "s"
     peer: float | None = None
     devices: tuple[str, ...] = ("cuda",)
+    plain: int = 0
+    """Substeps of the plain rollout measured beside it; none: 0."""
+
+
+@dataclass
+class Rates:
+    """What the device does at best, measured: bytes a second of a copy (read and written), and FLOPs a second of matrix products."""
+
+    copy: float
+    fp32: float
+    tf32x3: float = 0.0
+    """A third of the TF32 rate (CUDA): three such products make one to fp32's accuracy, as the fused networks do."""
+
+
+def best(run: Callable[[], object], device: torch.device, repeat: int = 10) -> float:
+    """The shortest time of a call after a first one [s]."""
+    return min(timed(run, device, repeat))
+
+
+def timed(run: Callable[[], object], device: torch.device, repeat: int) -> list[float]:
+    """Times of `repeat` calls after a first one, which compiles, captures and touches the memory [s]."""
+    cuda = device.type == "cuda"
+    times = []
+    for _ in range(repeat + 1):
+        if cuda:
+            torch.cuda.synchronize(device)
+        start = time.perf_counter()
+        run()
+        if cuda:
+            torch.cuda.synchronize(device)
+        times.append(time.perf_counter() - start)
+    return times[1:]
+
+
+def measure_rates(device: torch.device) -> Rates:
+    """Of a copy too large for any cache, and of square matrix products."""
+    cuda = device.type == "cuda"
+    source = torch.ones((1 << 28) if cuda else (1 << 25), device=device)  # 1 GiB, 128 MiB
+    target = torch.empty_like(source)
+    copy = 2 * 4 * source.numel() / best(lambda: target.copy_(source), device)
+    n = 8192 if cuda else 1024
+    a, b, out = (torch.randn(n, n, device=device) for _ in range(3))
+    rates = []
+    before = torch.backends.cuda.matmul.allow_tf32
+    for tf32 in (False, True) if cuda else (False,):
+        torch.backends.cuda.matmul.allow_tf32 = tf32
+        rates.append(2 * n**3 / best(lambda: torch.mm(a, b, out=out), device))
+    torch.backends.cuda.matmul.allow_tf32 = before
+    return Rates(copy, rates[0], rates[1] / 3 if cuda else 0.0)
+
+
+def network_flops(weights: tuple, gradient: bool) -> int:
+    """FLOPs of the three layers for a particle and substep, a product and its sum as two; `weights` as `tensors()` has them.
+
+    A backward pass adds the layers again (recomputed: reading activations back would take longer), the same for the gradient
+    of the input, and the last layer once more for the gradient of its weights.
+    """
+    first, second, last = (2 * weights[i].shape[-2] * weights[i].shape[-1] for i in (0, 2, 4))
+    layers = first + second + last
+    return 3 * layers + last if gradient else layers
+
+
+def floor(particles: int, flops: int, gradient: bool, kept: int, rates: Rates) -> tuple[float, str]:
+    """The least time of a substep [s], and what binds it: `bytes` or `FLOPs`.
+
+    Bytes: each particle's state read and written once a substep, by the backward pass the state read and its adjoint read and
+    written; what the tape keeps besides (`kept` bytes a substep) written and read. FLOPs: of the two networks, at the better of the
+    measured rates. The work of the transfers and the grid's traffic come on top; a body that fits a cache may beat the bytes.
+    """
+    moved = particles * STATE * (5 if gradient else 2) + (2 * kept if gradient else 0)
+    times = {"bytes": moved / rates.copy, "FLOPs": particles * flops / max(rates.fp32, rates.tf32x3)}
+    binding = max(times, key=times.__getitem__)
+    return times[binding], binding
 
 
 def bodies(names: list[str], data: Path | None) -> tuple[list[Scene], list[Body]]:
@@ -100,13 +186,13 @@ def block_case(per_side: int, cells: int, steps: int, law: Callable) -> Callable
 
 
 CASES = [
-    Case("bouncy-ball, neural law, forward", scene_case(["bouncy-ball"], 400), False, 16e-3, "s", NEUMA["forward"]),
-    Case("bouncy-ball, neural law, forward + backward", scene_case(["bouncy-ball"], 400), True, 50e-3, "s", NEUMA["both"]),
+    Case("bouncy-ball, neural law, forward", scene_case(["bouncy-ball"], 400), False, 16e-3, "s", NEUMA["forward"], plain=100),
+    Case("bouncy-ball, neural law, forward + backward", scene_case(["bouncy-ball"], 400), True, 50e-3, "s", NEUMA["both"], plain=100),
     Case("six scenes at once, neural law, forward", scene_case(list(SIX), 400), False),
     Case("six scenes at once, neural law, forward + backward", scene_case(list(SIX), 400), True, 3.5, "x one scene"),
     Case("1M particles, 70^3, fixed corotated, forward", block_case(100, 70, 100, FixedCorotated), False, 2e9, "p-s/s"),
-    Case("bouncy-ball, neural law, forward", scene_case(["bouncy-ball"], 10), False, devices=("cpu",)),
-    Case("bouncy-ball, neural law, forward + backward", scene_case(["bouncy-ball"], 10), True, devices=("cpu",)),
+    Case("bouncy-ball, neural law, forward", scene_case(["bouncy-ball"], 10), False, devices=("cpu",), plain=3),
+    Case("bouncy-ball, neural law, forward + backward", scene_case(["bouncy-ball"], 10), True, devices=("cpu",), plain=3),
     Case("10k particles, 32^3, neo-Hookean (no SVD), forward", block_case(22, 32, 50, NeoHookean), False, 6e6, "p-s/s", devices=("cpu",)),
     Case(
         "10k particles, 32^3, neo-Hookean, forward + backward", block_case(22, 32, 50, NeoHookean), True, 1.8e6, "p-s/s", devices=("cpu",)
@@ -116,37 +202,48 @@ CASES = [
 ]
 
 
-def measure(case: Case, device: torch.device, data: Path | None, repeat: int) -> dict:
-    """Median seconds, particle-substeps a second and bytes of one case."""
+def measure(case: Case, device: torch.device, data: Path | None, repeat: int, rates: Rates) -> dict:
+    """Median seconds, particle-substeps a second, bytes and floor of one case, and the plain rollout's figures where it has one."""
     sim, (elastic, plastic, leaves), steps = case.make(device, data)
     weight = torch.randn(len(sim.mass), 3, device=device)
     cuda = device.type == "cuda"
 
-    def run() -> None:
-        with torch.set_grad_enabled(case.gradient):
-            frames = sim.rollout(steps, elastic, plastic, every=max(1, steps // 80), check=False)
-            if case.gradient:
-                torch.autograd.grad((frames.x[-1] * weight).sum(), leaves, retain_graph=True)
+    def differentiated(positions: Callable[[], torch.Tensor]) -> Callable[[], None]:
+        def run() -> None:
+            with torch.set_grad_enabled(case.gradient):
+                x = positions()
+                if case.gradient:
+                    torch.autograd.grad((x[-1] * weight).sum(), leaves, retain_graph=True)
 
-    run()
-    if cuda:
-        torch.cuda.synchronize()
-        torch.cuda.reset_peak_memory_stats()
-    base = torch.cuda.memory_allocated() if cuda else 0
-    times = []
-    for _ in range(repeat):
-        start = time.perf_counter()
+        return run
+
+    def figures(run: Callable[[], None], repeat: int) -> tuple[list[float], int, int]:
+        """Times, peak bytes, and bytes held between the calls."""
         run()
         if cuda:
-            torch.cuda.synchronize()
-        times.append(time.perf_counter() - start)
+            torch.cuda.reset_peak_memory_stats(device)
+        held = torch.cuda.memory_allocated(device) if cuda else 0
+        times = timed(run, device, repeat)
+        return times, torch.cuda.max_memory_allocated(device) if cuda else 0, held
+
+    ours = differentiated(lambda: sim.rollout(steps, elastic, plastic, every=max(1, steps // 80), check=False).x)
+    times, peak, held = figures(ours, repeat)
     seconds = statistics.median(times)
     # what a backward pass needs of every substep: x, v, C, F of each particle
-    saved = 24 * 4 * len(sim.mass) * (steps + 1) if case.gradient else 0
-    peak = torch.cuda.max_memory_allocated() if cuda else 0
-    return {"case": case.name, "particles": len(sim.mass), "substeps": steps, "seconds": seconds, "spread": max(times) - min(times),
-            "microseconds_per_substep": 1e6 * seconds / steps, "rate": len(sim.mass) * steps / seconds,
-            "peak_bytes": peak, "trajectory_bytes": saved, "held_bytes": base}  # fmt: skip
+    saved = STATE * len(sim.mass) * (steps + 1) if case.gradient else 0
+    row = {"case": case.name, "particles": len(sim.mass), "substeps": steps, "seconds": seconds, "spread": max(times) - min(times),
+           "microseconds_per_substep": 1e6 * seconds / steps, "rate": len(sim.mass) * steps / seconds,
+           "peak_bytes": peak, "trajectory_bytes": saved, "held_bytes": held}  # fmt: skip
+    flops = sum(network_flops(law.tensors(), case.gradient) for law in (elastic, plastic) if hasattr(law, "weights"))
+    kept = (len(sim.mass) * (KEPT if plastic else KEPT // 2) + 16 * sim.node_count) if sim.keep_grid else 0
+    least, binding = floor(len(sim.mass), flops, case.gradient, kept, rates)
+    row |= {"floor_microseconds": 1e6 * least, "floor_of": binding, "over_floor": seconds / steps / least}
+    row |= {"plain_substeps": case.plain, "plain_microseconds": "", "plain_over_ours": "", "plain_peak_bytes": ""}
+    if case.plain:
+        peer, peak, _ = figures(differentiated(lambda: plain.rollout(sim, case.plain, elastic, plastic)), min(repeat, PLAIN_REPEAT))
+        each = statistics.median(peer) / case.plain
+        row |= {"plain_microseconds": 1e6 * each, "plain_over_ours": each * steps / seconds, "plain_peak_bytes": peak}
+    return row
 
 
 def verdict(case: Case, row: dict, one_scene: float | None) -> tuple[str, str]:
@@ -174,21 +271,29 @@ def main() -> None:
     if device.type == "cpu":
         torch.set_num_threads(1)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.processor() or platform.machine()}, one thread"
-    print(f"{name}, torch {torch.__version__}, median of {options.repeat}, bodies: {'real' if data else 'balls (no data folder)'}\n")
-    print("| case | particles | substeps | ms | us/substep | p-substeps/s | trajectory MB | peak MB | goal | better by | peer / ours |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    rates = measure_rates(device)
+    chosen = [case for case in CASES if device.type in case.devices]
+    short = max(case.plain for case in chosen)
+    print(f"{name}, torch {torch.__version__}, median of {options.repeat}, bodies: {'real' if data else 'balls (no data folder)'}")
+    print(f"measured: copy {rates.copy / 1e9:.0f} GB/s, fp32 {rates.fp32 / 1e12:.3g} TFLOP/s"
+          + (f", TF32 in three products {rates.tf32x3 / 1e12:.3g} TFLOP/s" if rates.tf32x3 else ""))  # fmt: skip
+    print(f"plain: a re-implementation of the published loops, no part of neuido; {short} substeps, median of "
+          f"{min(options.repeat, PLAIN_REPEAT)}, scaled to one substep\n")  # fmt: skip
+    head = ["case", "particles", "substeps", "ms", "us/substep", "p-substeps/s", "trajectory MB", "peak MB", "goal", "better by",
+            "NeuMA / ours", "floor us/substep", "ours / floor", "plain us/substep", "plain / ours"]  # fmt: skip
+    print("| " + " | ".join(head) + " |\n| " + " | ".join("---" for _ in head) + " |")
     rows, one_scene = [], None
-    for case in CASES:
-        if device.type not in case.devices:
-            continue
-        row = measure(case, device, data, options.repeat)
+    for case in chosen:
+        row = measure(case, device, data, options.repeat, rates)
         if case.gradient and case.name.startswith("bouncy"):
             one_scene = row["seconds"]
         goal, ratio = verdict(case, row, one_scene)
         peer = f"{case.peer / row['seconds']:.0f}" if case.peer else ""
         cells = [case.name, f"{row['particles']:,}", str(row["substeps"]), f"{1e3 * row['seconds']:.1f}",
                  f"{row['microseconds_per_substep']:.0f}", f"{row['rate']:.2e}", f"{row['trajectory_bytes'] / 1e6:.0f}",
-                 f"{row['peak_bytes'] / 1e6:.0f}", goal, ratio, peer]  # fmt: skip
+                 f"{row['peak_bytes'] / 1e6:.0f}", goal, ratio, peer,
+                 f"{row['floor_microseconds']:.3g} ({row['floor_of']})", f"{row['over_floor']:.1f}",
+                 *((f"{row['plain_microseconds']:.0f}", f"{row['plain_over_ours']:.1f}") if case.plain else ("", ""))]  # fmt: skip
         print("| " + " | ".join(cells) + " |")
         sys.stdout.flush()
         rows.append(row | {"goal": goal, "better_by": ratio, "peer_over_ours": peer})
