@@ -46,6 +46,10 @@ class Law:
         """What runs this law in one rollout; a law with faster kernels for a device overrides it."""
         return Engine(self, tensors, particles)
 
+    def alone(self, s: int) -> "Law":
+        """This law for scene s alone, whose rows of the tensors `forward` then gets."""
+        return self
+
     def key(self, tensors: Sequence[Tensor]) -> Hashable | None:
         """What, beside the shapes of its tensors, decides its launches with them; None: they may not be captured in a graph."""
         return None

@@ -114,6 +114,10 @@ class _Classical(Law):
         with torch_stream(F.device):
             launch(kernel, len(F), inputs, F.device)
 
+    def alone(self, s: int) -> Law:
+        laws = self.scene_laws()
+        return _OfScene(laws[min(s, len(laws) - 1)], self._correct)
+
     def key(self, tensors: Sequence[Tensor]) -> Hashable:
         return tuple(law.__name__ for law in self.scene_laws())
 
@@ -151,6 +155,18 @@ class _Classical(Law):
             (index,) = torch.nonzero(kinds == law.kind, as_tuple=True)
             out = out.index_copy(0, index, law.twin(F[index], parameters[scene[index]]))
         return out
+
+
+class _OfScene(_Classical):
+    """The kernels' side of one scene of a law: its kind, with tensors from elsewhere."""
+
+    identity = False
+
+    def __init__(self, law: type[_Classical], correct: bool):
+        self._law, self._correct = law, correct
+
+    def scene_laws(self) -> tuple[type[_Classical], ...]:
+        return (self._law,)
 
 
 class _ClassicalElastic(_Classical, ElasticLaw):

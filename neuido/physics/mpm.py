@@ -21,6 +21,7 @@ from neuido.physics.effects import Effects
 from neuido.physics.graphs import GraphCache
 from neuido.physics.law import ElasticLaw, PlasticLaw
 from neuido.physics.rollout import Plan, run
+from neuido.physics.threads import pool
 from neuido.types import Body, Particles, ParticleState, Scene
 
 COURANT_LIMIT = 1.0
@@ -65,6 +66,7 @@ class Simulator:
         density: [kg/m^3], one number or one for each scene.
         device: Where it runs.
         dtype: `torch.float32` for work, `torch.float64` for checks.
+        threads: On the CPU, run several scenes in as many threads as there are cores.
         graphs: On CUDA, capture a rollout's launches once for each shape and replay them after.
         keep: What the backward pass finds of each substep: `state` is x, v, C, F (96 bytes a particle in float32), and it
             recomputes stress, trial and grid; `all` is these too (72 bytes more a particle, 32 a node) and faster; `auto` is
@@ -88,6 +90,7 @@ class Simulator:
         density: float | Sequence[float] = 1000.0,
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
+        threads: bool = True,
         graphs: bool = True,
         keep: Literal["state", "all", "auto"] = "auto",
     ) -> None:
@@ -115,6 +118,9 @@ class Simulator:
         self._sort()
         self.keep_grid = keep == "all" or (keep == "auto" and self.node_count <= 4 * len(self.mass))
         self.graphs = GraphCache() if graphs and self.device.type == "cuda" else None
+        self.pool = pool() if threads and self.device.type == "cpu" and len(self.scenes) > 1 else None
+        self.first_scene = self.first_particle = 0
+        self._alone: dict[int, Simulator] = {}
         self._grid: dict[str, Tensor] = {}
 
     def _load_scenes(self) -> None:
@@ -181,6 +187,19 @@ class Simulator:
         self.order = torch.argsort(key, stable=True)
         self.inverse = torch.argsort(self.order)
         self.sorted_volume, self.sorted_held = self.volume[self.order].contiguous(), self.held[self.order].contiguous()
+
+    def alone(self, s: int) -> "Simulator":
+        """The simulator of one scene, with this one's particles in this one's order."""
+        if s not in self._alone:
+            own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
+            body = Body(self.state.x[own], self.state.v[own], self.volume[own], self.state.F[own])
+            one = Simulator(self.scenes[s], body, device=self.device, dtype=self.dtype)
+            one.keep_grid = self.keep_grid
+            one.order = self.order[own] - own.start
+            one.sorted_volume, one.sorted_held = self.sorted_volume[own], self.sorted_held[own]
+            one.first_scene, one.first_particle = s, own.start
+            self._alone[s] = one
+        return self._alone[s]
 
     @property
     def scene_count(self) -> int:

@@ -12,6 +12,7 @@ recomputed in the adjoint. Calling a law runs its twin in plain torch, which aut
 """
 
 import functools
+import threading
 from collections.abc import Hashable, Sequence
 
 import torch
@@ -119,9 +120,9 @@ def return_map(F: Tensor, c: Tensor, scale: float = STRAIN_SCALE) -> Tensor:
 
 
 class _Workspace:
-    """Intermediate results of one network for P particles, and their adjoints."""
+    """Intermediate results of one network for P particles, and their adjoints; of one thread alone."""
 
-    def __init__(self, rows: int, hidden: int, outputs: int, dtype: torch.dtype, device: torch.device):
+    def __init__(self, rows: int, hidden: int, outputs: int, dtype: torch.dtype, device: torch.device, thread: int):
         def empty(columns: int) -> Tensor:
             return torch.empty(rows, columns, dtype=dtype, device=device)
 
@@ -207,7 +208,7 @@ class _Network:
         return W1.is_cuda and W1.dtype == torch.float32 and W1.shape[-2] in fused.WIDTHS and self.outputs < 9
 
     def _buffers(self, F: Tensor, hidden: int) -> _Workspace:
-        return _workspace(F.shape[0], hidden, self.outputs, F.dtype, F.device)
+        return _workspace(F.shape[0], hidden, self.outputs, F.dtype, F.device, threading.get_ident())
 
     def _evaluate(self, tensors: Sequence[Tensor], F: Tensor, particles: Particles | None) -> _Workspace:
         """Runs the network; every intermediate result is in the workspace."""

@@ -16,6 +16,7 @@ from neuido.errors import UserError
 from neuido.physics import kernels
 from neuido.physics.device import launch, torch_stream
 from neuido.physics.law import ElasticLaw, Engine, PlasticLaw
+from neuido.physics.threads import Scenes, ThreadedRollout
 
 if TYPE_CHECKING:
     from neuido.physics.mpm import Simulator
@@ -82,6 +83,13 @@ class Plan:
         particles = self.simulator.particles
         plastic = None if self.plasticity is None else self.plasticity.engine(inputs[self.split :], particles)
         return self.elasticity.engine(inputs[FIXED : self.split], particles), plastic
+
+    def alone(self, s: int) -> "Plan":
+        """The plan of one scene."""
+        plastic = None if self.plasticity is None else self.plasticity.alone(s)
+        plan = Plan(self.simulator.alone(s), self.elasticity.alone(s), plastic, self.steps, self.every)
+        plan.split = self.split
+        return plan
 
     def launch(self, kernel: wp.Kernel, dim: int, inputs: list, block: int = 256) -> None:
         launch(kernel, dim, inputs, self.simulator.device, block=block)
@@ -162,9 +170,11 @@ class Plan:
             return
         if code == 0:
             p, step = int((~torch.isfinite(tape.F[-1]).all(dim=(1, 2))).nonzero()[0]), self.steps - 1
-        s = int(self.simulator.particles.scene[p])
-        p = int(self.simulator.order[p])
-        scene = self.simulator.scenes[s]
+        sim = self.simulator
+        s = int(sim.particles.scene[p])
+        p = int(sim.order[p]) + sim.first_particle
+        scene = sim.scenes[s]
+        s += sim.first_scene
         what = {
             kernels.LOST: "left the domain; enlarge `lower`/`upper`, or close it with `walls`",
             kernels.FAST: f"moved by more than a cell ({scene.dx:.4g} m) or became NaN; lower `dt` (now {scene.dt:g} s) or the stiffness",
@@ -249,9 +259,12 @@ def run(plan: Plan, inputs: tuple[Tensor, ...], segment: int | None = None) -> t
     Raises:
         UserError: What `Plan.check` finds.
     """
-    if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-        if segment is not None and segment < plan.steps:
-            return _Segments.apply(plan, segment, *inputs)
+    differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    if differentiable and segment is not None and segment < plan.steps:
+        return _Segments.apply(plan, segment, *inputs)
+    if plan.simulator.pool is not None:
+        return ThreadedRollout.apply(Scenes(plan), differentiable, *inputs)
+    if differentiable:
         return _Rollout.apply(plan, *inputs)
     return _frames(plan, tuple(t.detach() for t in inputs))
 

@@ -10,7 +10,7 @@ from neuido.physics.laws import DruckerPrager, FixedCorotated, Identity, NeoHook
 from neuido.physics.mpm import Simulator, affine_velocity
 from neuido.physics.rollout import Plan
 from neuido.types import AttachedMass, Body, Box, ParticleState, Plane, Scene, Walls
-from tests.physics.bodies import DEVICE, DEVICES, block, same
+from tests.physics.bodies import DEVICE, DEVICES, block, busy_scenes, same
 
 NO_GRAVITY = (0.0, 0.0, 0.0)
 SOFT = FixedCorotated(1e5, 0.3)
@@ -203,6 +203,27 @@ def test_one_launch_of_three_scenes_equals_three_launches(device):
         own = slice(together.particles.offsets[s], together.particles.offsets[s + 1])
         for name, a, b in zip("xvCF", frames, alone):
             assert torch.allclose(a[:, own], b, rtol=1e-10, atol=1e-9), name
+
+
+@pytest.mark.skipif(DEVICE != "cpu", reason="threads are the CPU's")
+def test_threads_do_not_change_a_bit_of_the_motion_nor_the_gradient():
+    scenes, bodies = busy_scenes()
+    young = torch.tensor([4e4, 6e4], dtype=torch.float64, requires_grad=True)
+    viscosity = torch.tensor([3.0, 5.0], dtype=torch.float64, requires_grad=True)
+    results = []
+    for threads in (False, True):
+        sim = simulator(scenes, bodies, threads=threads)
+        start = sim.state._replace(v=sim.state.v.clone().requires_grad_())
+        effects = Effects(viscosity_shear=viscosity, drag_linear=0.3)
+        friction = sim.colliders.friction.clone().requires_grad_()
+        shared = torch.tensor(2e3, dtype=torch.float64, requires_grad=True)
+        frames = sim.rollout(12, Sigma(young, 0.3), VonMises(shared, 5e4, 0.3), state=start, effects=effects, friction=friction, every=3)
+        with torch.no_grad():
+            again = sim.rollout(12, Sigma(young, 0.3), VonMises(shared, 5e4, 0.3), effects=effects, every=3)
+        loss = frames.x.square().sum() + frames.F[2].square().sum()
+        results.append((*frames, *again, *torch.autograd.grad(loss, (start.v, young, viscosity, friction, shared))))
+    for a, b in zip(*results, strict=True):
+        assert torch.allclose(a, b, rtol=1e-12, atol=1e-300), float((a - b).abs().max())
 
 
 def test_a_parameter_batch_of_one_scene_equals_single_runs():
