@@ -11,6 +11,7 @@ BouncyBall cases a plain re-implementation of the published loops (`plain.py`), 
 
 import argparse
 import csv
+import gc
 import os
 import platform
 import statistics
@@ -204,6 +205,9 @@ CASES = [
 
 def measure(case: Case, device: torch.device, data: Path | None, repeat: int, rates: Rates) -> dict:
     """Median seconds, particle-substeps a second, bytes and floor of one case, and the plain rollout's figures where it has one."""
+    gc.collect()  # a simulator and its kept rollouts refer to each other
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
     sim, (elastic, plastic, leaves), steps = case.make(device, data)
     weight = torch.randn(len(sim.mass), 3, device=device)
     cuda = device.type == "cuda"

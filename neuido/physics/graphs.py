@@ -1,7 +1,8 @@
-"""Rollouts as CUDA graphs: captured once for each shape, replayed after, no allocation and no Python in the loop.
+"""Rollouts that keep their memory: on a GPU as CUDA graphs, captured once for each shape and replayed after; on the CPU as a tape.
 
-A captured rollout owns its inputs, its tape and its gradients; a replay overwrites them. Whoever wants the gradient of an
-earlier replay says so by its serial number, and the forward graph is replayed first.
+A kept rollout owns its tape, a captured one its inputs and gradients too; the next run of the same shape overwrites them.
+Whoever wants the gradient of an earlier run says so by its serial number, and its forward pass is run again first. (On the
+CPU the page faults of a fresh tape cost more than the substeps.)
 """
 
 import gc
@@ -18,23 +19,43 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 CAPACITY = 4
-"""Graphs that a simulator keeps; each holds the tape of its rollout."""
+"""Rollouts that a simulator keeps; each holds its tape."""
 
 
-class CapturedRollout:
+class KeptRollout:
+    """A tape for rollouts of one shape, eagerly run."""
+
+    def __init__(self, plan: "Plan", keep_all: bool) -> None:
+        self.tape = plan.tape(keep_all)
+        self.serial = 0
+
+    def forward(self, plan: "Plan", inputs: Sequence[Tensor]) -> int:
+        """Run with new inputs; returns the serial number of this run."""
+        plan.forward(inputs, self.tape)
+        self.serial += 1
+        return self.serial
+
+    def backward(
+        self, plan: "Plan", inputs: Sequence[Tensor], serial: int, gradients: Sequence[Tensor | None], wanted: Sequence[bool]
+    ) -> list[Tensor | None]:
+        """The adjoint of the run `serial` with these inputs."""
+        if serial != self.serial:
+            self.forward(plan, inputs)
+        return plan.backward(inputs, self.tape, gradients, wanted)
+
+
+class CapturedRollout(KeptRollout):
     """The forward graph of a plan, and a backward graph for each set of wanted gradients."""
 
     def __init__(self, plan: "Plan", inputs: Sequence[Tensor], keep_all: bool) -> None:
+        super().__init__(plan, keep_all)
         self.plan = plan
         self.inputs = [t.clone() for t in inputs]
-        self.tape = plan.tape(keep_all)
-        self.serial = 0
         self._backward: dict[tuple, tuple[torch.cuda.CUDAGraph, list, list]] = {}
         plan.forward(self.inputs, self.tape, steps=1)  # compiles and loads the kernels
         self.graph, _ = _capture(lambda: plan.forward(self.inputs, self.tape))
 
-    def forward(self, inputs: Sequence[Tensor]) -> int:
-        """Run with new inputs; returns the serial number of this run."""
+    def forward(self, plan: "Plan", inputs: Sequence[Tensor]) -> int:
         for own, given in zip(self.inputs, inputs, strict=True):
             own.copy_(given)
         self.graph.replay()
@@ -42,11 +63,10 @@ class CapturedRollout:
         return self.serial
 
     def backward(
-        self, inputs: Sequence[Tensor], serial: int, gradients: Sequence[Tensor | None], wanted: Sequence[bool]
+        self, plan: "Plan", inputs: Sequence[Tensor], serial: int, gradients: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
-        """The adjoint of the run `serial` with these inputs."""
         if serial != self.serial:
-            self.forward(inputs)
+            self.forward(plan, inputs)
         key = (tuple(g is not None for g in gradients), tuple(wanted))
         if key not in self._backward:
             own = [None if g is None else g.clone() for g in gradients]
@@ -77,21 +97,20 @@ def _capture(launches: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
     return graph, out
 
 
-class GraphCache:
-    """The captured rollouts of a simulator, the least recently used dropped first."""
+class RolloutCache:
+    """The kept rollouts of a simulator, the least recently used dropped first."""
 
-    def __init__(self) -> None:
-        self._kept: OrderedDict[tuple, CapturedRollout] = OrderedDict()
+    def __init__(self, graphs: bool) -> None:
+        self.graphs = graphs
+        self._kept: OrderedDict[tuple, KeptRollout] = OrderedDict()
 
-    def find(self, plan: "Plan", inputs: Sequence[Tensor], keep_all: bool) -> CapturedRollout | None:
-        """The captured rollout of a plan with inputs of these shapes; None where its laws may not be captured."""
-        own = plan.key(inputs)
-        if own is None:
-            return None
-        key = (*own, keep_all, *(tuple(t.shape) for t in inputs))
+    def find(self, plan: "Plan", inputs: Sequence[Tensor], keep_all: bool) -> KeptRollout:
+        """The kept rollout for a plan with inputs of these shapes; captured where graphs are on and its laws may be captured."""
+        own = plan.key(inputs) if self.graphs else None
+        key = (own, plan.steps, plan.every, plan.plasticity is None, keep_all, *(tuple(t.shape) for t in inputs))
         if key not in self._kept:
             while len(self._kept) >= CAPACITY:
                 self._kept.popitem(last=False)
-            self._kept[key] = CapturedRollout(plan, inputs, keep_all)
+            self._kept[key] = KeptRollout(plan, keep_all) if own is None else CapturedRollout(plan, inputs, keep_all)
         self._kept.move_to_end(key)
         return self._kept[key]

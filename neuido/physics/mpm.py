@@ -18,7 +18,7 @@ from neuido.physics import kernels
 from neuido.physics.colliders import clamp_table, collider_table, inside_box
 from neuido.physics.device import real_of
 from neuido.physics.effects import Effects
-from neuido.physics.graphs import GraphCache
+from neuido.physics.graphs import RolloutCache
 from neuido.physics.law import ElasticLaw, PlasticLaw
 from neuido.physics.rollout import Plan, run
 from neuido.physics.threads import pool
@@ -111,13 +111,13 @@ class Simulator:
         self.nodes = wp.vec3i(*nodes)
         self.grid_shape = (len(self.scenes), *nodes)
         self.node_count = math.prod(self.grid_shape)
-        self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes a thread: on the CPU the call of a thread costs as much as a node
+        self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes a thread: on the CPU its call costs as much as a node
         scene, *axes = (torch.arange(n, dtype=torch.int32) for n in self.grid_shape)
         s, i, j, k = torch.meshgrid(scene, *axes, indexing="ij")
         self.node_index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(self.device)
         self._sort()
         self.keep_grid = keep == "all" or (keep == "auto" and self.node_count <= 4 * len(self.mass))
-        self.graphs = GraphCache() if graphs and self.device.type == "cuda" else None
+        self.cache = RolloutCache(graphs and self.device.type == "cuda")
         self.pool = pool() if threads and self.device.type == "cpu" and len(self.scenes) > 1 else None
         self.first_scene = self.first_particle = 0
         self._alone: dict[int, Simulator] = {}
@@ -233,8 +233,8 @@ class Simulator:
                 eta, zeta = viscosity.detach()[s].double().tolist()
                 limit = COURANT_LIMIT * scene.dx**2 * density / max(2.0 * (4.0 / 3.0 * eta + zeta), 1e-30)
                 if scene.dt > limit:
-                    raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit:.3g} s of a viscosity of {eta:g}, {zeta:g} Pa s; "
-                                    "lower `dt` or the viscosity")  # fmt: skip
+                    raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit:.3g} s of a viscosity of {eta:g}, "
+                                    f"{zeta:g} Pa s; lower `dt` or the viscosity")  # fmt: skip
             speed = float(self.state.v[own].norm(dim=1).max())
             if speed * scene.dt >= scene.dx:
                 raise UserError(f"the body of scene {s} starts with {speed:.4g} m/s and crosses a cell of {scene.dx:.4g} m in a step of "

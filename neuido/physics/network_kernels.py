@@ -234,9 +234,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
         return -wp.ddot(gM, A), -s * wp.ddot(g, E * F) / real(3.0), gM, s * E * g
 
     @func
-    def correction_coefficients(
-        F: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, straight_through: int, g_out: mat33
-    ):
+    def correction_coefficients(F: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, straight_through: int, g_out: mat33):
         """Adjoint of c; `straight_through` lets it pass a clamp where descent leads back into the range."""
         x, f, u = flow(l, q, c, scale)
         gf, gu, gM, gF = flow_adjoint(F, A, f, u, g_out)

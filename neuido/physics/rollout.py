@@ -157,7 +157,20 @@ class Plan:
     def grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor) -> list:
         sim = self.simulator
         table = sim.colliders
-        return [sim.origin, sim.dx, sim.dt, pull, force, table.plane, table.kind, friction, sim.clamp_lower, sim.clamp_upper, sim.node_index, sim.chunk]
+        return [
+            sim.origin,
+            sim.dx,
+            sim.dt,
+            pull,
+            force,
+            table.plane,
+            table.kind,
+            friction,
+            sim.clamp_lower,
+            sim.clamp_upper,
+            sim.node_index,
+            sim.chunk,
+        ]
 
     def check(self, tape: Tape) -> None:
         """Raise what the kernels found, or a last frame that is not finite.
@@ -220,13 +233,13 @@ class Plan:
                     plastic.adjoint(trial, now[3], a_trial.zero_())
                     a_out = a_trial
                 self.launch(k.grid_to_particles_adjoint, len(x),
-                            [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, v_next, C_next, *now[:3],
-                             a_out, a_velocity.zero_(), a_x, a_F], self.block)  # fmt: skip
-                self.launch(k.update_grid_adjoint, sim.node_count // sim.chunk,
-                            [*self.grid_inputs(pull, force, friction), grid, a_velocity, a_grid, a_pull, a_force, a_friction, parameters])  # fmt: skip
+                            [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, v_next,
+                             C_next, *now[:3], a_out, a_velocity.zero_(), a_x, a_F], self.block)  # fmt: skip
+                arguments = [grid, a_velocity, a_grid, a_pull, a_force, a_friction, parameters]
+                self.launch(k.update_grid_adjoint, sim.node_count // sim.chunk, [*self.grid_inputs(pull, force, friction), *arguments])
                 self.launch(k.particles_to_grid_adjoint, len(x),
-                            [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau, a_grid, a_mass,
-                             a_x, a_v, a_C, a_tau], self.block)  # fmt: skip
+                            [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau,
+                             a_grid, a_mass, a_x, a_v, a_C, a_tau], self.block)  # fmt: skip
                 if viscosity.numel():
                     self.launch(k.add_viscous_stress_adjoint, len(x),
                                 [sim.particles.scene, viscosity, C, F, a_tau, a_C, a_F, a_viscosity])  # fmt: skip
@@ -271,16 +284,10 @@ def run(plan: Plan, inputs: tuple[Tensor, ...], segment: int | None = None) -> t
 
 def _frames(plan: Plan, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     """A run without a tape."""
-    cache = plan.simulator.graphs
-    captured = None if cache is None else cache.find(plan, inputs, keep_all=False)
-    if captured is not None:
-        captured.forward(inputs)
-        plan.check(captured.tape)
-        return tuple(t.clone() for t in captured.tape.states)
-    tape = plan.tape(keep_all=False)
-    plan.forward(inputs, tape)
-    plan.check(tape)
-    return tape.states
+    kept = plan.simulator.cache.find(plan, inputs, keep_all=False)
+    kept.forward(plan, inputs)
+    plan.check(kept.tape)
+    return tuple(t.clone() for t in kept.tape.states)
 
 
 class _Rollout(torch.autograd.Function):
@@ -290,30 +297,18 @@ class _Rollout(torch.autograd.Function):
     def forward(ctx: Any, plan: Plan, *inputs: Tensor) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         inputs = tuple(t.detach() for t in inputs)
-        cache = plan.simulator.graphs
-        ctx.plan, ctx.captured = plan, None if cache is None else cache.find(plan, inputs, keep_all=True)
-        if ctx.captured is not None:
-            # the tape belongs to the graph: a later rollout may overwrite it, and the backward pass then replays this one
-            ctx.serial = ctx.captured.forward(inputs)
-            plan.check(ctx.captured.tape)
-            ctx.save_for_backward(*(t.clone() for t in inputs))
-            return tuple(t[:: plan.every].clone() for t in ctx.captured.tape.states)
-        tape = plan.tape(keep_all=True)
-        plan.forward(inputs, tape)
-        plan.check(tape)
-        ctx.more = tape[4:]
-        ctx.save_for_backward(*tape.states, *inputs)
-        return tape.states if plan.every == 1 else tuple(t[:: plan.every].clone() for t in tape.states)
+        # the tape belongs to the simulator: a later rollout may overwrite it, and the backward pass then runs this one again
+        ctx.plan, ctx.kept = plan, plan.simulator.cache.find(plan, inputs, keep_all=True)
+        ctx.serial = ctx.kept.forward(plan, inputs)
+        plan.check(ctx.kept.tape)
+        ctx.save_for_backward(*(t.clone() for t in inputs))
+        return tuple(t[:: plan.every].clone() for t in ctx.kept.tape.states)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         wanted = ctx.needs_input_grad[1:]
-        tensors = ctx.saved_tensors
-        if ctx.captured is not None:
-            out = ctx.captured.backward(tensors, ctx.serial, gradients, wanted)
-        else:
-            out = ctx.plan.backward(tensors[4:], Tape(*tensors[:4], *ctx.more), gradients, wanted)
+        out = ctx.kept.backward(ctx.plan, ctx.saved_tensors, ctx.serial, gradients, wanted)
         return (None, *(g if want else None for g, want in zip(out, wanted, strict=True)))
 
 
@@ -343,7 +338,7 @@ class _Segments(torch.autograd.Function):
         piece, wanted, tensors = ctx.piece, ctx.needs_input_grad[2:], ctx.saved_tensors
         rest, starts = tensors[: len(wanted) - 4], tensors[len(wanted) - 4 :]
         length = piece.steps // piece.every
-        cache = piece.simulator.graphs
+        cache = piece.simulator.cache
         carry = [torch.zeros_like(t) for t in starts[:4]]
         total: list[Tensor | None] = [None] * (len(wanted) - 4)
         for i in reversed(range(ctx.count)):
@@ -356,13 +351,9 @@ class _Segments(torch.autograd.Function):
                     part[0 if i == 0 else 1 :] = gradient[i * length + (0 if i == 0 else 1) : (i + 1) * length + 1]
                 part[-1] += a
                 own.append(part)
-            captured = None if cache is None else cache.find(piece, inputs, keep_all=True)
-            if captured is not None:
-                out = captured.backward(inputs, captured.forward(inputs), own, (True,) * 4 + tuple(wanted[4:]))
-            else:
-                tape = piece.tape(keep_all=True)
-                piece.forward(inputs, tape)
-                out = piece.backward(inputs, tape, own, (True,) * 4 + tuple(wanted[4:]))
+            kept = cache.find(piece, inputs, keep_all=True)
+            serial = kept.forward(piece, inputs)
+            out = kept.backward(piece, inputs, serial, own, (True,) * 4 + tuple(wanted[4:]))
             carry = out[:4]
             total = [t if new is None else new if t is None else t + new for t, new in zip(total, out[4:])]
         return (None, None, *(g if want else None for g, want in zip([*carry, *total], wanted, strict=True)))

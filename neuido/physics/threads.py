@@ -84,17 +84,16 @@ class ThreadedRollout(torch.autograd.Function):
         ctx.scenes = scenes
 
         def one(s: int):
-            plan = scenes.plans[s]
-            tape = plan.tape(keep_all)
-            plan.forward(scenes.part(inputs, s), tape)
-            plan.check(tape)
-            return tape
+            plan, part = scenes.plans[s], scenes.part(inputs, s)
+            kept = plan.simulator.cache.find(plan, part, keep_all)
+            serial = kept.forward(plan, part)
+            plan.check(kept.tape)
+            return kept, serial
 
-        tapes = scenes.each(one)
-        ctx.tapes = tapes if keep_all else None
-        ctx.save_for_backward(*inputs)
+        ctx.kept = scenes.each(one)
+        ctx.save_for_backward(*(t.clone() for t in inputs))
         stride = scenes.whole.every if keep_all else 1
-        return tuple(torch.cat([tape.states[n][::stride] for tape in tapes], dim=1) for n in range(4))
+        return tuple(torch.cat([kept.tape.states[n][::stride] for kept, _ in ctx.kept], dim=1) for n in range(4))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -104,7 +103,8 @@ class ThreadedRollout(torch.autograd.Function):
         def one(s: int):
             i, j = scenes.ranges[s]
             own = [None if g is None else g[:, i:j] for g in gradients]
-            return scenes.plans[s].backward(scenes.part(inputs, s), ctx.tapes[s], own, wanted)
+            kept, serial = ctx.kept[s]
+            return kept.backward(scenes.plans[s], scenes.part(inputs, s), serial, own, wanted)
 
         out = scenes.whole_gradient(inputs, scenes.each(one))
         return (None, None, *(g if want else None for g, want in zip(out, wanted, strict=True)))

@@ -140,7 +140,8 @@ def kernel_cases(stage: Stage):
             {"grid": torch.zeros_like(grid)},
         ),
         "update_grid": (
-            {**{k: place[k] for k in ("origin", "dx", "dt")}, "index": sim.node_index, "chunk": sim.chunk, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
+            {**{k: place[k] for k in ("origin", "dx", "dt")}, "index": sim.node_index,
+             "chunk": sim.chunk, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
              "friction": table.friction.clone(), "grid": grid},
             ["gravity", "force", "friction", "grid"],
             {"velocity": velocity},
@@ -242,6 +243,22 @@ def test_segments_and_tapes_do_not_change_the_gradient(keep):
         assert all(same(a, b) for a, b in zip(frames, again))
         for name, a, b in zip(NAMES, torch.autograd.grad(parts, p.leaves()), expected, strict=True):
             assert float((a - b).norm()) <= 1e-11 * float(b.norm()), f"{name} with {keep}, segment {segment}"
+
+
+def test_a_later_rollout_does_not_spoil_an_earlier_ones_gradient():
+    """Rollouts of one shape share a tape: the earlier one is run again when its gradient is wanted."""
+    p = Problem()
+    first = p.loss(p.sim.rollout, 8, 2)[0]
+    with torch.no_grad():
+        expected = first.clone()
+    p2 = Problem()
+    p2.sim, p2.mass = p.sim, leaf(1.3 * p.sim.mass)
+    second = p2.loss(p.sim.rollout, 8, 2)[0]
+    a = torch.autograd.grad(first, p.leaves())
+    b = torch.autograd.grad(p.loss(p.sim.rollout, 8, 2)[0], p.leaves())
+    assert float(second.detach()) != float(expected)
+    for name, one, other in zip(NAMES, a, b, strict=True):
+        assert float((one - other).norm()) <= 1e-11 * float(other.norm()), name
 
 
 def test_frames_do_not_depend_on_how_they_are_kept():
