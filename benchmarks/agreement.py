@@ -51,9 +51,8 @@ def main() -> None:
         "slow, float64": run(False, torch.float64),
     }
     pairs = [("fast", "slow"), ("slow, start moved by one ulp", "slow"), ("fast", "slow, float64"), ("slow", "slow, float64")]
-    print(
-        f"{options.steps} substeps, {len(body[0].x):,} particles, {torch.cuda.get_device_name(device) if device.type == 'cuda' else 'CPU'}\n"
-    )
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+    print(f"{options.steps} substeps, {len(body[0].x):,} particles, {name}\n")
     print("| run | against | motion | elastic W3 | elastic b3 | plastic W3 | plastic b3 |\n| --- | --- | --- | --- | --- | --- | --- |")
     for a, b in pairs:
         cells = [f"{float((p - q).norm() / q.norm().clamp(min=1e-30)):.1e}" for p, q in zip(runs[a], runs[b])]

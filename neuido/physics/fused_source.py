@@ -1,0 +1,260 @@
+"""CUDA source of the fused networks: three layers of a warp's 32 particles on the tensor cores, and their adjoint.
+
+    m16n8k8: a lane (g, t) = (lane / 4, lane % 4) holds rows g, g + 8 and columns 2t, 2t + 1 of a 16 x 8 result,
+    and of the next operand the same columns, once the rows of its weights are permuted (`fused._order`).
+
+`FORWARD` and `BACKWARD` are bodies of Warp functions (`fused.build` fills in the sizes); on the CPU they are empty.
+"""
+
+TOOLS = """
+    const int lane = threadIdx.x & 31, g = lane >> 2, t = lane & 3;
+    const unsigned full = 0xffffffffu;
+    auto sigmoid = [](float a) {{ return __fdividef(1.0f, 1.0f + __expf(-a)); }};
+    auto weights = [lane](const wp::array_t<wp::float32>& W, int offset, int tile) {{
+        return __ldg(reinterpret_cast<const float4*>(W.data + offset) + tile * 32 + lane);
+    }};
+    // hi and lo of four values of a result, in the order of an operand
+    auto split = [](const float* c, float* hi, float* lo) {{
+        const float v[4] = {{c[0], c[2], c[1], c[3]}};
+        #pragma unroll
+        for (int i = 0; i < 4; ++i) {{
+            unsigned u;
+            asm("cvt.rna.tf32.f32 %0, %1;" : "=r"(u) : "f"(v[i]));
+            hi[i] = __uint_as_float(u);
+            lo[i] = v[i] - hi[i];
+        }}
+    }};
+    auto product = [](float* c, const float* a, float b0, float b1) {{
+        asm volatile("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {{%0,%1,%2,%3}}, {{%4,%5,%6,%7}}, {{%8,%9}}, {{%0,%1,%2,%3}};"
+            : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
+            : "r"(__float_as_uint(a[0])), "r"(__float_as_uint(a[1])), "r"(__float_as_uint(a[2])), "r"(__float_as_uint(a[3])),
+              "r"(__float_as_uint(b0)), "r"(__float_as_uint(b1)));
+    }};
+    auto exact = [&](float* c, const float* hi, const float* lo, float4 w) {{
+        product(c, lo, w.x, w.y);
+        product(c, hi, w.z, w.w);
+        product(c, hi, w.x, w.y);
+    }};
+    // the features of the warp's particles as operands, two tiles of 16 rows, two of 8 columns
+    float xh[2][2][4], xl[2][2][4];
+    #pragma unroll
+    for (int m = 0; m < 2; ++m) {{
+        float c[2][4] = {{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}};
+        #pragma unroll
+        for (int i = 0; i < 10; ++i) {{
+            const float v = i < 9 ? x[i < 9 ? i : 0] : 1.0f;
+            const float u0 = __shfl_sync(full, v, 16 * m + g), u1 = __shfl_sync(full, v, 16 * m + g + 8);
+            if (t == (i & 7) >> 1) {{ c[i >> 3][i & 1] = u0; c[i >> 3][2 + (i & 1)] = u1; }}
+        }}
+        #pragma unroll
+        for (int s = 0; s < 2; ++s) split(c[s], xh[m][s], xl[m][s]);
+    }}
+"""
+"""What both functions begin with: products, their operands' residues, and the features as operands."""
+
+FORWARD = (
+    "#if defined(__CUDA_ARCH__)"
+    + TOOLS
+    + """
+    const int one = shared * {SIZE1}, two = shared * {SIZE2}, three = scene * {SIZE3};
+    float z[2][{NT}][4];
+    #pragma unroll
+    for (int n = 0; n < {NT}; ++n) {{
+        const float2 b = *reinterpret_cast<const float2*>(B2.data + shared * {H} + 8 * n + 2 * t);
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{ z[m][n][0] = b.x; z[m][n][1] = b.y; z[m][n][2] = b.x; z[m][n][3] = b.y; }}
+    }}
+    #pragma unroll 1
+    for (int j = 0; j < {NT}; ++j) {{
+        const float4 w0 = weights(W1, one, j), w1 = weights(W1, one, {NT} + j);
+        float hi[2][4], lo[2][4];
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{
+            float c[4] = {{0, 0, 0, 0}};
+            exact(c, xh[m][0], xl[m][0], w0);
+            exact(c, xh[m][1], xl[m][1], w1);
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) c[i] *= sigmoid(c[i]);
+            split(c, hi[m], lo[m]);
+        }}
+        #pragma unroll
+        for (int n = 0; n < {NT}; ++n) {{
+            const float4 w = weights(W2, two, j * {NT} + n);
+            exact(z[0][n], hi[0], lo[0], w);
+            exact(z[1][n], hi[1], lo[1], w);
+        }}
+    }}
+    float y[2][4] = {{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}};
+    #pragma unroll
+    for (int j = 0; j < {NT}; ++j) {{
+        const float4 w = weights(W3, three, j);
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{
+            float c[4], hi[4], lo[4];
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) c[i] = z[m][j][i] * sigmoid(z[m][j][i]);
+            split(c, hi, lo);
+            exact(y[m], hi, lo, w);
+        }}
+    }}
+    wp::vec_t<{KEPT}, wp::float32> out;
+    #pragma unroll
+    for (int m = 0; m < 2; ++m)
+        #pragma unroll
+        for (int n = 0; n < {NT}; ++n)
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) out[(m * {NT} + n) * 4 + i] = z[m][n][i];
+    // the four outputs of a lane's own particle
+    #pragma unroll
+    for (int i = 0; i < 4; ++i) {{
+        float v = 0.0f;
+        #pragma unroll
+        for (int m = 0; m < 2; ++m)
+            #pragma unroll
+            for (int u = 0; u < 2; ++u) {{
+                const float q = __shfl_sync(full, y[m][2 * u + (i & 1)], 4 * (lane & 7) + (i >> 1));
+                if (m == lane >> 4 && u == ((lane >> 3) & 1)) v = q;
+            }}
+        out[{KEPT} - 4 + i] = v + B3.data[scene * 4 + i];
+    }}
+    return out;
+#else
+    return wp::vec_t<{KEPT}, wp::float32>();
+#endif
+"""
+)
+
+BACKWARD = (
+    "#if defined(__CUDA_ARCH__)"
+    + TOOLS
+    + """
+    const int one = shared * {SIZE1}, two = shared * {SIZE2}, three = scene * {SIZE3T};
+    float z[2][{NT}][4], gy_rows[2][2][4], gh[2][4], gl[2][4];
+    #pragma unroll
+    for (int m = 0; m < 2; ++m) {{
+        #pragma unroll
+        for (int n = 0; n < {NT}; ++n)
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) z[m][n][i] = kept[(m * {NT} + n) * 4 + i];
+        float c[4] = {{0, 0, 0, 0}};
+        #pragma unroll
+        for (int i = 0; i < 4; ++i) {{
+            gy_rows[m][0][i] = __shfl_sync(full, gy[i], 16 * m + g);
+            gy_rows[m][1][i] = __shfl_sync(full, gy[i], 16 * m + g + 8);
+            if (t == i >> 1) {{ c[i & 1] = gy_rows[m][0][i]; c[2 + (i & 1)] = gy_rows[m][1][i]; }}
+        }}
+        split(c, gh[m], gl[m]);
+    }}
+    if (P3.data) {{
+        float b[4];
+        #pragma unroll
+        for (int i = 0; i < 4; ++i) {{
+            b[i] = gy[i];
+            #pragma unroll
+            for (int d = 16; d > 0; d >>= 1) b[i] += __shfl_xor_sync(full, b[i], d);
+        }}
+        if (lane < 4) PB.data[warp * 4 + lane] += lane == 0 ? b[0] : lane == 1 ? b[1] : lane == 2 ? b[2] : b[3];
+    }}
+    // second layer: adjoint of its sums, in place; what the last layer's gradient gets from this warp
+    #pragma unroll
+    for (int j = 0; j < {NT}; ++j) {{
+        const float4 w = weights(W3T, three, j);
+        float part[8] = {{0, 0, 0, 0, 0, 0, 0, 0}};
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{
+            float c[4] = {{0, 0, 0, 0}};
+            exact(c, gh[m], gl[m], w);
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) {{
+                const float s = sigmoid(z[m][j][i]), h = z[m][j][i] * s;
+                #pragma unroll
+                for (int o = 0; o < 4; ++o) part[(i & 1) * 4 + o] += h * gy_rows[m][i >> 1][o];
+                z[m][j][i] = c[i] * (s + h * (1.0f - s));
+            }}
+            if (G2.data) {{
+                #pragma unroll
+                for (int i = 0; i < 4; ++i) {{
+                    const int p = first + 16 * m + g + 8 * (i >> 1);
+                    if (p < last) G2.data[(long long)p * {H} + 8 * j + 2 * t + (i & 1)] = z[m][j][i];
+                }}
+            }}
+        }}
+        if (P3.data) {{
+            // sum over the eight lanes of a column: each keeps the half that its bit of g says
+            #pragma unroll
+            for (int b = 0; b < 3; ++b) {{
+                const int half = 4 >> b, bit = 16 >> b;
+                const bool upper = lane & bit;
+                #pragma unroll
+                for (int i = 0; i < 4; ++i)
+                    if (i < half) {{
+                        const float give = upper ? part[i] : part[i + half], keep = upper ? part[i + half] : part[i];
+                        part[i] = keep + __shfl_xor_sync(full, give, bit);
+                    }}
+            }}
+            P3.data[(warp * {NT} + j) * 32 + lane] += part[0];
+        }}
+    }}
+    float a[2][{NT}][4];
+    #pragma unroll
+    for (int n = 0; n < {NT}; ++n)
+        #pragma unroll
+        for (int m = 0; m < 2; ++m)
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) a[m][n][i] = 0.0f;
+    #pragma unroll
+    for (int j = 0; j < {NT}; ++j) {{
+        float hi[2][4], lo[2][4];
+        split(z[0][j], hi[0], lo[0]);
+        split(z[1][j], hi[1], lo[1]);
+        #pragma unroll
+        for (int n = 0; n < {NT}; ++n) {{
+            const float4 w = weights(W2T, two, j * {NT} + n);
+            exact(a[0][n], hi[0], lo[0], w);
+            exact(a[1][n], hi[1], lo[1], w);
+        }}
+    }}
+    float gx[2][2][4] = {{{{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}}, {{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}}}};
+    #pragma unroll
+    for (int n = 0; n < {NT}; ++n) {{
+        const float4 w0 = weights(W1, one, n), w1 = weights(W1, one, {NT} + n);
+        const float4 v0 = weights(W1T, one, 2 * n), v1 = weights(W1T, one, 2 * n + 1);
+        #pragma unroll
+        for (int m = 0; m < 2; ++m) {{
+            float c[4] = {{0, 0, 0, 0}}, hi[4], lo[4];
+            exact(c, xh[m][0], xl[m][0], w0);
+            exact(c, xh[m][1], xl[m][1], w1);
+            #pragma unroll
+            for (int i = 0; i < 4; ++i) {{
+                const float s = sigmoid(c[i]), h = c[i] * s;
+                c[i] = a[m][n][i] * (s + h * (1.0f - s));
+                const int p = first + 16 * m + g + 8 * (i >> 1);
+                if (G2.data && p < last) {{
+                    H1.data[(long long)p * {H} + 8 * n + 2 * t + (i & 1)] = h;
+                    G1.data[(long long)p * {H} + 8 * n + 2 * t + (i & 1)] = c[i];
+                }}
+            }}
+            split(c, hi, lo);
+            exact(gx[m][0], hi, lo, v0);
+            exact(gx[m][1], hi, lo, v1);
+        }}
+    }}
+    wp::vec_t<9, wp::float32> out;
+    #pragma unroll
+    for (int i = 0; i < 9; ++i) {{
+        float v = 0.0f;
+        #pragma unroll
+        for (int m = 0; m < 2; ++m)
+            #pragma unroll
+            for (int u = 0; u < 2; ++u) {{
+                const float q = __shfl_sync(full, gx[m][i >> 3][2 * u + (i & 1)], 4 * (lane & 7) + ((i & 7) >> 1));
+                if (m == lane >> 4 && u == ((lane >> 3) & 1)) v = q;
+            }}
+        out[i] = v;
+    }}
+    return out;
+#else
+    return wp::vec_t<9, wp::float32>();
+#endif
+"""
+)
