@@ -44,9 +44,10 @@ test-slow: export OMP_NUM_THREADS = 1
 test-slow: $(installed)
 	$(bin)/python -m pytest -m slow
 
-# The same tests of physics and networks with every array on the GPU.
+# The rollout's tests with every array on the GPU, then the tests that need one (fused laws, graphs, splatting).
 test-gpu: $(installed)
 	NEUIDO_TEST_DEVICE=cuda $(bin)/python -m pytest tests/physics/test_mpm.py tests/physics/test_invariants.py
+	$(bin)/python -m pytest -m gpu
 
 lint: $(installed)
 	$(bin)/ruff check .

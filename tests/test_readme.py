@@ -1,5 +1,6 @@
 """What the README says can be done can be done: its commands, its Python, its links, its tables."""
 
+import ast
 import csv
 import math
 import re
@@ -67,12 +68,20 @@ def test_python(folder, monkeypatch):
         Path(name[1]).write_text(block)
     space: dict = {}
     for snippet in blocks("python"):
+        if snippet.startswith("# needs data"):  # then what it imports must be there
+            body = [node for node in ast.parse(snippet).body if isinstance(node, ast.ImportFrom)]
+            assert body
+            exec(compile(ast.Module(body, []), "README.md", "exec"), {})
+            continue
         exec(compile(snippet, "README.md", "exec"), space)
         assert space["frames"].x.isfinite().all()
     assert space["young"].grad.abs().item() > 0
     assert space["heights"].diff().abs().min() > 0
     assert space["stiffness"].grad.abs().item() > 0
     assert space["frames"].x.shape[0] == 21
+    assert space["moduli"].grad.abs().min() > 0
+    assert space["images"].shape == (21, 2, 100, 100, 3)
+    assert space["alphas"].max() > 0.5
 
 
 @pytest.mark.parametrize("command", commands("python"))
@@ -138,3 +147,23 @@ def test_law_table_is_the_measured_one():
         for j in range(2):
             squares = [pair[j] ** 2 for (_, name), pair in measured.items() if name == material]
             assert float(total[1 + 2 * i + j]) == pytest.approx(math.sqrt(sum(squares) / 10), rel=5e-3, abs=6e-4)
+
+
+def test_rollout_table_is_the_measured_one():
+    with (ROOT / "benchmarks" / "results" / "rollout.csv").open() as file:
+        measured = {row["case"]: row for row in csv.DictReader(file)}
+    quoted = rows("Rollout speed")
+    assert [cells[0] for cells in quoted] == list(measured)
+    for case, _, ms, _, rate, peak, _, factor, neuma, _, floors, _ in quoted:
+        row = measured[case]
+        assert float(ms) == pytest.approx(1e3 * float(row["seconds"]), rel=5e-3)
+        assert float(rate) == pytest.approx(float(row["rate"]), rel=5e-3)
+        assert float(peak) == pytest.approx(1e-6 * float(row["peak_bytes"]), rel=5e-3)
+        assert float(floors) == pytest.approx(float(row["over_floor"]), rel=1e-2)
+        assert (factor, neuma) == (row["better_by"], row["peer_over_ours"])
+
+
+def test_render_table_is_the_measured_one():
+    text = (ROOT / "benchmarks" / "results" / "render.md").read_text().replace("^2", "²")
+    measured = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("| ")][2:]
+    assert rows("Rendering speed")[: len(measured)] == measured
