@@ -262,7 +262,7 @@ def _add(now: Sequence[Tensor], gradients: Sequence[Tensor | None], frame: int) 
 
 
 def run(plan: Plan, inputs: tuple[Tensor, ...], segment: int | None = None) -> tuple[Tensor, ...]:
-    """Frames of x, v, C and F; differentiable where an input requires it.
+    """Frames of x, v, C and F, in memory that the next rollout overwrites; differentiable where an input requires it.
 
     Args:
         plan: What to run.
@@ -287,7 +287,7 @@ def _frames(plan: Plan, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     kept = plan.simulator.cache.find(plan, inputs, keep_all=False)
     kept.forward(plan, inputs)
     plan.check(kept.tape)
-    return tuple(t.clone() for t in kept.tape.states)
+    return kept.tape.states
 
 
 class _Rollout(torch.autograd.Function):
@@ -302,7 +302,7 @@ class _Rollout(torch.autograd.Function):
         ctx.serial = ctx.kept.forward(plan, inputs)
         plan.check(ctx.kept.tape)
         ctx.save_for_backward(*(t.clone() for t in inputs))
-        return tuple(t[:: plan.every].clone() for t in ctx.kept.tape.states)
+        return tuple(t[:: plan.every] for t in ctx.kept.tape.states)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
