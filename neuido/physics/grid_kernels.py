@@ -17,7 +17,8 @@ CONTACTS = {"sticky": STICKY, "slip": SLIP, "separate": SEPARATE}
 def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     """The kernels for one scalar type; arguments as in `kernels.build`.
 
-    Body forces come as a table (S, 6): linear drag [1/s], quadratic drag [1/m], pull [1/s^2], its centre x, y, z [m].
+    Body forces come as a table (S, 6): linear drag [1/s], quadratic drag [1/m], pull [1/s^2], its centre x, y, z [m]. With five
+    columns more it holds Magnus' vector [1/s], stick and restitution [1/s] (`effects.Effects.force_table`).
     """
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -127,10 +128,35 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         return origin + vec3(real(c[0]), real(c[1]), real(c[2])) * h
 
     @func
+    def turn(v: vec3, q: vec3):
+        """v turned by Cayley's rotation of q, half the angle's vector: a force across v that does no work."""
+        t = wp.cross(q, v)
+        return v + (real(2.0) / (real(1.0) + wp.dot(q, q))) * (t + wp.cross(q, t))
+
+    @func
+    def turn_adjoint(v: vec3, q: vec3, a: vec3):
+        """Adjoint of q; that of v is `turn(a, -q)`."""
+        s = real(2.0) / (real(1.0) + wp.dot(q, q))
+        t = wp.cross(q, v)
+        both = wp.dot(a, t + wp.cross(q, t))
+        return s * (wp.cross(v, a) + wp.cross(t, a) + wp.cross(v, wp.cross(a, q))) - (s * s * both) * q
+
+    @func
+    def lose(v: vec3, n: vec3, dt: real, force: wp.array2d(dtype=real), row: int):
+        """Stick and restitution: what a node in a collider keeps of its velocity."""
+        out = wp.exp(-dt * force[row, 9]) * v
+        vn = wp.dot(out, n)
+        if vn > real(0.0):
+            out = out + ((wp.exp(-dt * force[row, 10]) - real(1.0)) * vn) * n
+        return out
+
+    @func
     def push(v0: vec3, x: vec3, dt: real, g: vec3, force: wp.array2d(dtype=real), row: int):
         """Nodal velocity after gravity and the body forces; drag is implicit in its size, so any coefficient is stable."""
         centre = vec3(force[row, 3], force[row, 4], force[row, 5])
         u = v0 + dt * (g - force[row, 2] * (x - centre))
+        if force.shape[1] > 6:
+            u = turn(u, real(0.5) * dt * vec3(force[row, 6], force[row, 7], force[row, 8]))
         return u / (real(1.0) + dt * (force[row, 0] + force[row, 1] * wp.length(u)))
 
     @func
@@ -156,6 +182,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         plane: wp.array2d(dtype=vec4),
         kind: wp.array2d(dtype=wp.int32),
         friction: wp.array2d(dtype=real),
+        dt: real,
+        force: wp.array2d(dtype=real),
     ):
         """The velocity after the first `count` colliders, in their order."""
         out = v
@@ -163,6 +191,9 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
             n = normal_of(plane[s, c])
             if wp.dot(n, x) <= plane[s, c][3]:
                 out = contact(out, n, kind[s, c], friction[s, c])
+                if force.shape[1] > 6:
+                    if kind[s, c] > 0:
+                        out = lose(out, n, dt, force, s)
         return out
 
     @kernel
@@ -193,7 +224,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                 if not clamped(x, s, lower, upper):
                     v0 = vec3(g[0], g[1], g[2]) / g[3]
                     u = push(v0, x, dt[s], gravity[s], force, s)
-                    out = collide(u, x, s, kind.shape[1], plane, kind, friction)
+                    out = collide(u, x, s, kind.shape[1], plane, kind, friction, dt[s], force)
             velocity[node] = vec4(out[0], out[1], out[2], real(0.0))
 
     @adjoint_kernel
@@ -236,7 +267,23 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                         c = planes - 1 - r
                         n = normal_of(plane[s, c])
                         if wp.dot(n, x) <= plane[s, c][3]:
-                            before = collide(u, x, s, c, plane, kind, friction)
+                            before = collide(u, x, s, c, plane, kind, friction, dt[s], force)
+                            if force.shape[1] > 6:
+                                if kind[s, c] > 0:
+                                    met = contact(before, n, kind[s, c], friction[s, c])
+                                    keep = wp.exp(-dt[s] * force[s, 9])
+                                    bounce = wp.exp(-dt[s] * force[s, 10])
+                                    vn = wp.dot(met, n)
+                                    an = wp.dot(a, n)
+                                    lost = wp.dot(a, met)
+                                    if vn > real(0.0):
+                                        lost = lost + (bounce - real(1.0)) * vn * an
+                                        a = a + ((bounce - real(1.0)) * an) * n
+                                        if parameters:
+                                            wp.atomic_add(a_force, s, 10, -dt[s] * keep * bounce * vn * an)
+                                    a = keep * a
+                                    if parameters:
+                                        wp.atomic_add(a_force, s, 9, -dt[s] * keep * lost)
                             b = contact_adjoint(before, n, kind[s, c], friction[s, c], a)
                             a = vec3(b[0], b[1], b[2])
                             if parameters:
@@ -244,12 +291,24 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                     # the implicit drag: v = u / D, D = 1 + dt (c1 + c2 |u|)
                     centre = vec3(force[s, 3], force[s, 4], force[s, 5])
                     u = v0 + dt[s] * (gravity[s] - force[s, 2] * (x - centre))
+                    q = vec3(real(0.0), real(0.0), real(0.0))
+                    straight = u
+                    if force.shape[1] > 6:
+                        q = real(0.5) * dt[s] * vec3(force[s, 6], force[s, 7], force[s, 8])
+                        u = turn(u, q)
                     speed = wp.length(u)
                     D = real(1.0) + dt[s] * (force[s, 0] + force[s, 1] * speed)
                     aD = -wp.dot(a, u) / (D * D)
                     au = a / D
                     if speed > real(0.0):
                         au = au + (aD * dt[s] * force[s, 1] / speed) * u
+                    if force.shape[1] > 6:
+                        if parameters:
+                            aq = real(0.5) * dt[s] * turn_adjoint(straight, q, au)
+                            wp.atomic_add(a_force, s, 6, aq[0])
+                            wp.atomic_add(a_force, s, 7, aq[1])
+                            wp.atomic_add(a_force, s, 8, aq[2])
+                        au = turn(au, -q)
                     if parameters:
                         wp.atomic_add(a_gravity, s, dt[s] * au)
                         wp.atomic_add(a_force, s, 0, dt[s] * aD)
@@ -266,4 +325,5 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         add_viscous_stress_adjoint=add_viscous_stress_adjoint,
         update_grid=update_grid,
         update_grid_adjoint=update_grid_adjoint,
+        functions=SimpleNamespace(push=push, contact=contact, lose=lose),
     )

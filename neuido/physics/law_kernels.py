@@ -13,12 +13,13 @@ import warp as wp
 
 from neuido.physics import warp_linalg
 from neuido.physics.device import start_warp
+from neuido.physics.warp_linalg import FLOOR
 
 FIXED_COROTATED, SIGMA, NEO_HOOKEAN = 0, 1, 2
 IDENTITY, VON_MISES, DRUCKER_PRAGER = 0, 1, 2
 
-FLOOR = 1e-3
-"""Lower bound of a principal stretch (of J in neo-Hookean) in a logarithm; below it the logarithm is constant, its gradient zero."""
+LOCKED = 0.05
+"""Least share of its extensibility that `strain_stiffening` leaves a body: 1 - k (I1bar - 3) is bounded below by it."""
 GAP = 1e-6
 """Lower bound of sigma_i + sigma_j in a denominator; only an inverted F can come near it."""
 
@@ -54,43 +55,10 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
     two = wp.constant(real(2.0))
-    log1p, log_slope, exp_slope, strain, volume_change, cofactor, frame, compose = warp_linalg.functions(real, builtin_svd=builtin_svd)
-
-    @wp.func
-    def bounded(x: real):
-        """max(x, FLOOR - 1), but NaN stays NaN."""
-        result = x
-        if x < floor - one:
-            result = floor - one
-        return result
-
-    @wp.func
-    def hencky(excess: vec):
-        """Logarithms of the principal stretches, bounded below."""
-        return vec(log1p(bounded(excess[0])), log1p(bounded(excess[1])), log1p(bounded(excess[2])))
-
-    @wp.func
-    def inverse_stretch(excess: vec):
-        """The derivative of `hencky`."""
-        result = vec(zero, zero, zero)
-        for i in range(3):
-            if one + excess[i] > floor:
-                result[i] = one / (one + excess[i])
-        return result
-
-    @wp.func
-    def log_difference(x: real, y: real):
-        """(ln(1 + y) - ln(1 + x)) / (y - x) of the bounded logarithm."""
-        low = floor - one
-        cx = bounded(x)
-        cy = bounded(y)
-        slope = log_slope((cy - cx) / (one + cx)) / (one + cx)
-        share = one
-        if x < low or y < low:
-            share = zero
-            if x > low or y > low:
-                share = (cy - cx) / (y - x)
-        return slope * share
+    own = warp_linalg.functions(real, builtin_svd=builtin_svd)
+    log1p, exp_slope, strain, volume_change, cofactor = own.log1p, own.exp_slope, own.strain, own.volume_change, own.cofactor
+    frame, compose, bounded, hencky = own.frame, own.compose, own.bounded, own.hencky
+    inverse_stretch, log_difference = own.inverse_stretch, own.log_difference
 
     @wp.kernel(enable_backward=enable_backward, module="unique")
     def stress(

@@ -1,8 +1,8 @@
 """The differentiable material point method: one autograd function for a whole rollout, several scenes in one launch.
 
-Here are the set-up, the checks before a start, and the call; `rollout.py` holds the loops and `graphs.py` captures them on a
-GPU. The order of a substep is the paper's (appendix, "Material Point Method"): P2G with tau(F), grid, G2P,
-F_tr = (I + dt C) F, F = F_hat(F_tr). The slow twin is `reference.py`.
+Here are the set-up, the checks before a start, and the call; `rollout.py` holds the loops, `autograd.py` makes one function of them, and
+`graphs.py` captures them on a GPU. The order of a substep is the paper's (appendix, "Material Point Method"): P2G with tau(F), grid,
+G2P, F_tr = (I + dt C) F, F = F_hat(F_tr). The slow twin is `reference.py`.
 """
 
 import math
@@ -14,13 +14,14 @@ import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics import kernels
+from neuido.physics import effect_tables, kernels
+from neuido.physics.autograd import run
 from neuido.physics.colliders import clamp_table, collider_table, inside_box
 from neuido.physics.device import real_of
 from neuido.physics.effects import Effects
 from neuido.physics.graphs import RolloutCache
 from neuido.physics.law import ElasticLaw, PlasticLaw
-from neuido.physics.rollout import Plan, run
+from neuido.physics.rollout import Plan
 from neuido.physics.threads import pool
 from neuido.types import Body, Particles, ParticleState, Scene
 
@@ -211,13 +212,27 @@ class Simulator:
             self._grid[name] = torch.empty(self.node_count, 4, dtype=self.dtype, device=self.device)
         return self._grid[name]
 
-    def check_step(self, elasticity: ElasticLaw, viscosity: Tensor | None = None, mass: Tensor | None = None) -> None:
+    def check_step(
+        self,
+        elasticity: ElasticLaw,
+        viscosity: Tensor | None = None,
+        mass: Tensor | None = None,
+        stiffer: tuple[Tensor, Tensor] | None = None,
+    ) -> None:
         """Compare the time step with the fastest wave and the initial speed.
+
+        Args:
+            elasticity: Its modulus is that of the wave.
+            viscosity: Shear and bulk [Pa s], (S, 2).
+            mass: [kg], (P,).
+            stiffer: What effects add to the modulus [Pa] and their largest factor on it, (S,) each.
 
         Raises:
             UserError: dt c / dx above `COURANT_LIMIT`, too viscous for an explicit step, or a body faster than a cell a step.
         """
         modulus = elasticity.modulus().detach().to(self.device, torch.float64).expand(self.scene_count)
+        if stiffer is not None:
+            modulus = (modulus + stiffer[0]) * stiffer[1]
         rho = (self.mass if mass is None else mass.detach()).double() / self.volume.double()
         for s, scene in enumerate(self.scenes):
             own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
@@ -286,22 +301,46 @@ class Simulator:
         state = self.state if state is None else ParticleState(*(t.to(self.device, self.dtype).contiguous() for t in state))
         effects = Effects() if effects is None else effects
         base = self.gravity if gravity is None else gravity.to(self.device, self.dtype).expand(self.scene_count, 3)
-        pull = (base + effects.acceleration(self.scene_count, self.mass)).contiguous()
+        pull = effects.accelerations(base, self.dt, steps).contiguous()
         force = effects.force_table(self.scene_count, self.mass).contiguous()
         viscosity = effects.viscosity(self.scene_count, self.mass)
         friction = self.colliders.friction if friction is None else friction.to(self.device, self.dtype).contiguous()
+        if effects.friction is not None:
+            friction = (friction + effects.rows("friction", self.scene_count, self.mass)).clamp(min=0.0)
         if friction.shape != self.colliders.friction.shape:
             raise UserError(f"friction has shape {tuple(friction.shape)}; it must be {tuple(self.colliders.friction.shape)}")
         mass = self.mass if mass is None else mass.to(self.device, self.dtype).contiguous()
+        if effects.added_mass is not None:
+            mass = mass * (1 + effects.rows("added_mass", self.scene_count, mass)[self.particles.scene.long(), 0])
+        empty = mass.new_empty(0)
+        tables, stiffness, growth = None, empty, None
+        if effects.of_material:
+            tables = effect_tables.tables(effects, elasticity, plasticity, self.scene_count, self.mass)
+            if effects.stiffness is not None:
+                stiffness = effects.particle_stiffness(len(mass), mass)
+            growth = effects.growth(self.dt, steps)
         if check:
-            self.check_step(elasticity, viscosity, mass)
-        if viscosity is None:
-            viscosity = mass.new_empty(0)
-        plan = Plan(self, elasticity, plasticity, steps, every)
+            stiffer = None if tables is None else self._stiffening(tables.stiffening, stiffness, growth)
+            self.check_step(elasticity, viscosity, mass, stiffer)
+        plan = Plan(self, elasticity, plasticity, steps, every, tables)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
-        start = [t[self.order] for t in (*state, mass)]
-        frames = run(plan, (*start, pull, force, friction, viscosity.contiguous(), *law_tensors), segment)
-        return ParticleState(*(t[:, self.inverse] for t in frames))
+        history = mass.new_zeros(len(mass), plan.layout.width)
+        start = [t[self.order] for t in (*state, history, mass)]
+        optional = [viscosity, stiffness[self.order] if len(stiffness) else None, growth]
+        optional += [None] * 3 if tables is None else [tables.material, tables.branches, tables.flow]
+        optional = [empty if t is None else t.contiguous() for t in optional]
+        frames = run(plan, (*start, pull, force, friction.contiguous(), *optional, *law_tensors), segment)
+        return ParticleState(*(t[:, self.inverse] for t in frames[:4]))
+
+    def _stiffening(self, added: Tensor, stiffness: Tensor, growth: Tensor | None) -> tuple[Tensor, Tensor]:
+        """What the effects add to each scene's P-wave modulus [Pa], and the largest factor on the sum."""
+        factor = torch.ones(self.scene_count, dtype=torch.float64, device=self.device)
+        if len(stiffness):
+            parts = zip(self.particles.offsets[:-1], self.particles.offsets[1:])
+            factor = torch.stack([stiffness[i:j].detach().double().max() for i, j in parts])
+        if growth is not None:
+            factor = factor * growth.detach().double().amax(dim=0)
+        return added.double(), factor
 
 
 def _short(t: Tensor) -> list[float]:

@@ -1,14 +1,16 @@
 """The slow twin of `mpm.py`: the same substep in plain torch, differentiable by autograd. An oracle for tests and benchmarks.
 
-Written from the equations, not from the kernels: nothing is shared with them but the tables of colliders and clamps.
+Written from the equations, not from the kernels: nothing is shared with them but the tables of colliders and clamps, and those of the
+effects' parameters. The material is `constitutive.Constitutive`.
 """
 
 import torch
 from torch import Tensor
 
+from neuido.physics.constitutive import Constitutive, History
 from neuido.physics.effects import Effects
 from neuido.physics.grid_kernels import SEPARATE, SLIP, STICKY
-from neuido.physics.laws import Law
+from neuido.physics.law import ElasticLaw, PlasticLaw
 from neuido.physics.mpm import Simulator
 from neuido.types import ParticleState
 
@@ -39,33 +41,40 @@ def _contact(v: Tensor, normal: Tensor, kind: int, friction: Tensor) -> Tensor:
 def substep(
     sim: Simulator,
     state: ParticleState,
-    elasticity: Law,
-    plasticity: Law | None = None,
+    material: Constitutive,
+    history: History,
+    pull: Tensor,
     *,
-    effects: Effects | None = None,
-    gravity: Tensor | None = None,
+    time: Tensor | float = 0.0,
     friction: Tensor | None = None,
     mass: Tensor | None = None,
-) -> ParticleState:
-    """One substep of all scenes; arguments as in `Simulator.rollout`."""
-    effects = Effects() if effects is None else effects
-    gravity = (sim.gravity if gravity is None else gravity) + effects.acceleration(sim.scene_count, sim.mass)
+) -> tuple[ParticleState, History]:
+    """One substep of all scenes.
+
+    Args:
+        sim: The scenes.
+        state: Before the substep.
+        material: Laws and effects.
+        history: Before the substep.
+        pull: Gravity and the other uniform accelerations [m/s^2], (S, 3).
+        time: At the start [s], a number or one for each particle.
+        friction: As in `Simulator.rollout`.
+        mass: As in `Simulator.rollout`, added mass included.
+    """
+    effects = material.effects
     friction = sim.colliders.friction if friction is None else friction
     mass = sim.mass if mass is None else mass
     force = effects.force_table(sim.scene_count, sim.mass)
-    viscosity = effects.viscosity(sim.scene_count, sim.mass)
+    if force.shape[1] == 6:
+        force = torch.cat([force, force.new_zeros(sim.scene_count, 5)], dim=1)
     eye = torch.eye(3, dtype=sim.dtype, device=sim.device)
     parts = []
-    tau_all = elasticity(state.F, sim.particles)
+    tau_all = material.stress(state.F, state.C, history, time)
     for s in range(sim.scene_count):
         own = slice(sim.particles.offsets[s], sim.particles.offsets[s + 1])
         x, v, C, F = (t[own] for t in state)
         tau, m, volume = tau_all[own], mass[own], sim.volume[own]
         dx, dt = sim.dx[s], sim.dt[s]
-        if viscosity is not None:
-            D = 0.5 * (C + C.transpose(1, 2))
-            t = D.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
-            tau = tau + torch.linalg.det(F)[:, None, None] * (2.0 * viscosity[s, 0] * (D - t / 3.0 * eye) + viscosity[s, 1] * t * eye)
         base, w = _splines((x - sim.origin[s]) / dx)
         offsets = torch.cartesian_prod(*[torch.arange(3, device=sim.device)] * 3)
         nodes = base[:, None, :] + offsets
@@ -83,7 +92,9 @@ def substep(
         u = grid_p / torch.where(full, grid_m, 1.0)[:, None]
         index = torch.cartesian_prod(*[torch.arange(n, device=sim.device) for n in shape])
         place = sim.origin[s] + index * dx
-        u = u + dt * (gravity[s] - force[s, 2] * (place - force[s, 3:]))
+        u = u + dt * (pull[s] - force[s, 2] * (place - force[s, 3:6]))
+        w = 0.5 * dt * torch.linalg.cross(force[s, 6:9].expand(3, 3), eye).mT  # half of w x, for Cayley's rotation
+        u = u @ torch.linalg.solve(eye - w, eye + w).mT
         speed = torch.where(full[:, None], u, 1.0).norm(dim=1, keepdim=True)
         u = u / (1.0 + dt * (force[s, 0] + force[s, 1] * speed))
         for c in range(sim.colliders.kind.shape[1]):
@@ -91,7 +102,10 @@ def substep(
             if kind:
                 normal, offset = sim.colliders.plane[s, c, :3], sim.colliders.plane[s, c, 3]
                 inside = place @ normal <= offset
-                u = torch.where((inside & full)[:, None], _contact(torch.where(full[:, None], u, 1.0), normal, kind, friction[s, c]), u)
+                met = _contact(torch.where(full[:, None], u, 1.0), normal, kind, friction[s, c]) * torch.exp(-dt * force[s, 9])
+                outward = (met @ normal).clamp(min=0.0)[:, None] * normal
+                met = met - (1.0 - torch.exp(-dt * force[s, 10])) * outward
+                u = torch.where((inside & full)[:, None], met, u)
         for lower, upper in zip(sim.clamp_lower[s], sim.clamp_upper[s]):
             u = torch.where(((place >= lower) & (place <= upper)).all(1, keepdim=True), 0.0, u)
         u = torch.where(full[:, None], u, 0.0)[flat].reshape(len(x), 27, 3)
@@ -101,16 +115,41 @@ def substep(
         C_next = torch.where(held[:, None, None], 0.0, C_next)
         parts.append((x + dt * v_next, v_next, C_next, (eye + dt * C_next) @ F))
     x, v, C, trial = (torch.cat(t) for t in zip(*parts))
-    return ParticleState(x, v, C, trial if plasticity is None else plasticity(trial, sim.particles))
+    F, history = material.advance(trial, C, history, sim.dt[sim.particles.scene.long()], time)
+    return ParticleState(x, v, C, F), history
 
 
-def rollout(sim: Simulator, steps: int, elasticity: Law, plasticity: Law | None = None, *, state: ParticleState | None = None,
-            every: int = 1, **options) -> ParticleState:  # fmt: skip
+def rollout(
+    sim: Simulator,
+    steps: int,
+    elasticity: ElasticLaw,
+    plasticity: PlasticLaw | None = None,
+    *,
+    state: ParticleState | None = None,
+    effects: Effects | None = None,
+    gravity: Tensor | None = None,
+    friction: Tensor | None = None,
+    mass: Tensor | None = None,
+    every: int = 1,
+) -> ParticleState:
     """Frames of `steps` substeps, shaped as `Simulator.rollout` shapes them."""
     state = sim.state if state is None else state
+    effects = Effects() if effects is None else effects
+    mass = sim.mass if mass is None else mass
+    scene = sim.particles.scene.long()
+    material = Constitutive(elasticity, plasticity, effects, count=len(mass), dtype=sim.dtype, particles=sim.particles)
+    history = material.start()
+    pull = effects.accelerations(sim.gravity if gravity is None else gravity, sim.dt, steps)
+    if effects.added_mass is not None:
+        mass = mass * (1 + effects.rows("added_mass", sim.scene_count, mass)[scene, 0])
+    if effects.friction is not None:
+        friction = sim.colliders.friction if friction is None else friction
+        friction = (friction + effects.rows("friction", sim.scene_count, mass)).clamp(min=0.0)
     frames = [state]
     for n in range(steps):
-        state = substep(sim, state, elasticity, plasticity, **options)
+        state, history = substep(
+            sim, state, material, history, pull[n if len(pull) > 1 else 0], time=n * sim.dt[scene], friction=friction, mass=mass
+        )
         if (n + 1) % every == 0:
             frames.append(state)
     return ParticleState(*(torch.stack(parts) for parts in zip(*frames)))

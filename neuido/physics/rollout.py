@@ -1,28 +1,34 @@
 """The loops of a rollout, forward and backward: launches alone, so that they run eagerly or inside a CUDA graph.
 
-The forward pass leaves a tape: x, v, C and F of every substep, and where there is room stress and nodal momentum. The
+The forward pass leaves a tape: x, v, C, F and the history of every substep, and where there is room stress and nodal momentum. The
 backward pass recomputes what the tape lacks and applies the hand-written adjoints of `kernels.py`, `grid_kernels.py` and of
-the laws, last substep first. One `torch.autograd.Function` spans the whole rollout.
+the laws, last substep first. `autograd.py` makes one `torch.autograd.Function` of a whole rollout.
 """
 
+import copy
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics import kernels
-from neuido.physics.device import launch, torch_stream
+from neuido.physics import effect_kernels, kernels
+from neuido.physics.device import launch, real_of, torch_stream
+from neuido.physics.effect_tables import Layout, Tables
 from neuido.physics.law import ElasticLaw, Engine, PlasticLaw
-from neuido.physics.threads import Scenes, ThreadedRollout
 
 if TYPE_CHECKING:
     from neuido.physics.mpm import Simulator
 
-FIXED = 9
-"""Inputs before the tensors of the laws: x, v, C, F, mass, pull, force, friction, viscosity."""
+STATES = 5
+"""Inputs that are the start: x, v, C, F and the history (no columns where no effect remembers)."""
+KINDS = ("particle",) * 6 + ("time",) + ("scene",) * 3 + ("particle", "time") + ("scene",) * 3
+"""What an input before the tensors of the laws has a row for: the start, mass, pull, force, friction, viscosity, and of the effects
+on the material stiffness, growth, material, branches, flow. Those over time are (T, S, ...), or (1, S, ...) where constant; an absent
+one has no elements."""
+FIXED = len(KINDS)
 
 LARGE = 1 << 17
 """Particles above which blocks of 256 threads do as well as blocks of 32 on a GPU; smaller bodies need more blocks to fill it."""
@@ -35,6 +41,7 @@ class Tape(NamedTuple):
     v: Tensor
     C: Tensor
     F: Tensor
+    history: Tensor
     status: Tensor
     """Code, particle and substep of the first failure, (3,) int32."""
     tau: Tensor | None
@@ -47,8 +54,18 @@ class Tape(NamedTuple):
     """Nodal velocity of each substep, (T, nodes, 4), or None."""
 
     @property
-    def states(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self[:4]
+    def states(self) -> tuple[Tensor, ...]:
+        return self[:STATES]
+
+
+class Material(NamedTuple):
+    """The inputs of the effects on the material in one substep; None where absent."""
+
+    stiffness: Tensor | None
+    growth: Tensor | None
+    material: Tensor | None
+    branches: Tensor | None
+    flow: Tensor | None
 
 
 class Plan:
@@ -60,11 +77,28 @@ class Plan:
         plasticity: Plastic law or None.
         steps: Substeps.
         every: Substeps between frames.
+        tables: What the effects of the material need; of it the plan keeps what decides its launches.
     """
 
-    def __init__(self, simulator: "Simulator", elasticity: ElasticLaw, plasticity: PlasticLaw | None, steps: int, every: int) -> None:
+    def __init__(
+        self,
+        simulator: "Simulator",
+        elasticity: ElasticLaw,
+        plasticity: PlasticLaw | None,
+        steps: int,
+        every: int,
+        tables: Tables | None = None,
+    ) -> None:
         self.simulator, self.elasticity, self.steps, self.every = simulator, elasticity, steps, every
-        self.plasticity = None if plasticity is None or plasticity.identity else plasticity
+        self.layout = Layout() if tables is None else tables.layout
+        self.spectral = tables is not None and tables.spectral
+        self.flow_kinds = () if tables is None else tables.kinds
+        self.tables = tables
+        if plasticity is None or plasticity.identity or self.flow_kinds:
+            plasticity = None
+        self.plasticity = plasticity
+        self.kinds = torch.tensor(self.flow_kinds, dtype=torch.int32, device=simulator.device)
+        self.effects = None if tables is None else effect_kernels.build(real_of(simulator.dtype))
         self.block = 32 if len(simulator.mass) < LARGE else 256
 
     def law_tensors(self) -> tuple[Tensor, ...]:
@@ -77,7 +111,14 @@ class Plan:
         """What, beside the shapes of the inputs, decides the launches; None where they may not be captured."""
         elastic = self.elasticity.key(inputs[FIXED : self.split])
         plastic = "none" if self.plasticity is None else self.plasticity.key(inputs[self.split :])
-        return None if elastic is None or plastic is None else (self.steps, self.every, elastic, plastic)
+        own = (self.steps, self.every, self.layout, self.spectral, self.flow_kinds)
+        return None if elastic is None or plastic is None else (*own, elastic, plastic)
+
+    def piece(self, steps: int) -> "Plan":
+        """The same for fewer substeps."""
+        plan = copy.copy(self)
+        plan.steps = steps
+        return plan
 
     def engines(self, inputs: Sequence[Tensor]) -> tuple[Engine, Engine | None]:
         particles = self.simulator.particles
@@ -87,12 +128,25 @@ class Plan:
     def alone(self, s: int) -> "Plan":
         """The plan of one scene."""
         plastic = None if self.plasticity is None else self.plasticity.alone(s)
-        plan = Plan(self.simulator.alone(s), self.elasticity.alone(s), plastic, self.steps, self.every)
+        tables = None if self.tables is None else self.tables._replace(kinds=self.flow_kinds[s : s + 1])
+        plan = Plan(self.simulator.alone(s), self.elasticity.alone(s), plastic, self.steps, self.every, tables)
         plan.split = self.split
         return plan
 
     def launch(self, kernel: wp.Kernel, dim: int, inputs: list, block: int = 256) -> None:
         launch(kernel, dim, inputs, self.simulator.device, block=block)
+
+    @property
+    def corrects(self) -> bool:
+        """Whether the trial gradient is corrected, by a law or by an effect."""
+        return self.plasticity is not None or bool(self.flow_kinds)
+
+    def material(self, inputs: Sequence[Tensor], n: int) -> Material | None:
+        """What the kernels of the effects read in substep n."""
+        if self.tables is None:
+            return None
+        stiffness, growth, *tables = inputs[STATES + 5 : FIXED]
+        return Material(*(t if t.numel() else None for t in (stiffness, at_step(growth, n), *tables)))
 
     # Forward.
 
@@ -100,18 +154,19 @@ class Plan:
         """Empty memory for a forward pass; `keep_all`: of every substep, for a backward pass."""
         sim = self.simulator
         count = self.steps if keep_all else self.steps // self.every
-        states = (t.new_empty(count + 1, *t.shape) for t in sim.state)
+        history = sim.mass.new_empty(len(sim.mass), self.layout.width)
+        states = (t.new_empty(count + 1, *t.shape) for t in (*sim.state, history))
         status = torch.zeros(3, dtype=torch.int32, device=sim.device)
         more = keep_all and sim.keep_grid
         tau = sim.state.F.new_empty(self.steps, *sim.state.F.shape) if more else None
-        trial = torch.empty_like(tau) if tau is not None and self.plasticity is not None else None
+        trial = torch.empty_like(tau) if tau is not None and self.corrects else None
         nodal = [sim.mass.new_empty(self.steps, sim.node_count, 4) if more else None for _ in range(2)]
         return Tape(*states, status, tau, trial, *nodal)
 
     def forward(self, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
         """Launch the substeps (all, or the first `steps`); checks nothing."""
         sim = self.simulator
-        mass, pull, force, friction, viscosity = inputs[4:FIXED]
+        mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
         stride = self.steps // (len(tape.x) - 1)
         for frame, t in zip(tape.states, inputs):
             frame[0] = t
@@ -124,25 +179,50 @@ class Plan:
             for n in range(self.steps if steps is None else steps):
                 kept = (n + 1) % stride == 0
                 then = tuple(frame[(n + 1) // stride] for frame in tape.states) if kept else spare[n % 2]
-                x, v, C, F = now
+                x, v, C, F, history = now
                 tau = scratch if tape.tau is None else tape.tau[n]
                 trial = other if tape.trial is None else tape.trial[n]
-                self.stress(elastic, F, C, viscosity, tau)
+                material = self.material(inputs, n)
+                self.stress(elastic, F, C, history, viscosity, material, tau)
                 grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid") if tape.grid is None else tape.grid[n])
                 velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
-                self.on_grid(grid, pull, force, friction, velocity)
+                self.on_grid(grid, at_step(pull, n), force, friction, velocity)
                 self.launch(sim.kernels.grid_to_particles, len(x),
                             [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
-                             then[3] if plastic is None else trial, n, tape.status], self.block)  # fmt: skip
+                             trial if self.corrects else then[3], n, tape.status], self.block)  # fmt: skip
                 if plastic is not None:
                     plastic.forward(trial, then[3])
+                if material is not None:
+                    self.remember(material, trial, then[2], history, then[3], then[4])
                 now = then
 
-    def stress(self, elastic: Engine, F: Tensor, C: Tensor, viscosity: Tensor, tau: Tensor) -> None:
+    def stress(
+        self, elastic: Engine, F: Tensor, C: Tensor, history: Tensor, viscosity: Tensor, material: Material | None, tau: Tensor
+    ) -> None:
         sim = self.simulator
         elastic.forward(F, tau)
+        if material is not None:
+            self.launch(self.effects.add_effect_stress, len(F), [*self.stress_inputs(material), F, history, tau])
         if viscosity.numel():
             self.launch(sim.kernels.add_viscous_stress, len(F), [sim.particles.scene, viscosity, C, F, tau])
+
+    def stress_inputs(self, material: Material) -> list:
+        return [self.simulator.particles.scene, *material[:4], self.spectral, self.layout.at_e_max]
+
+    def flow_inputs(self, material: Material) -> list:
+        sim, layout = self.simulator, self.layout
+        table = [sim.particles.scene, sim.dt, self.kinds, material.flow, material.stiffness, material.growth]
+        return [*table, layout.at_alpha, layout.at_backstress]
+
+    def remember(self, material: Material, trial: Tensor, C: Tensor, history: Tensor, F: Tensor, history_next: Tensor) -> None:
+        """The history of the next substep, and its F where an effect makes it of the trial one."""
+        sim, k = self.simulator, self.effects
+        if material.branches is not None:
+            self.launch(k.relax, len(F), [sim.particles.scene, sim.dt, material.branches, C, history, history_next])
+        if material.flow is not None:
+            self.launch(k.flow, len(F), [*self.flow_inputs(material), trial, C, history, F, history_next])
+        if self.layout.e_max:
+            self.launch(k.remember, len(F), [F, self.layout.at_e_max, history, history_next])
 
     def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> Tensor:
         sim = self.simulator
@@ -202,10 +282,11 @@ class Plan:
     ) -> list[Tensor | None]:
         """The adjoint of every input that is wanted, from the gradients of the frames of x, v, C and F (None: zero)."""
         sim, k = self.simulator, self.simulator.kernels
-        mass, pull, force, friction, viscosity = inputs[4:FIXED]
-        a_mass, a_pull, a_force, a_friction, a_viscosity = (torch.zeros_like(t) for t in inputs[4:FIXED])
-        parameters = any(wanted[5:8])
-        now = [torch.zeros_like(t) for t in inputs[:4]]
+        mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
+        a_fixed = [torch.zeros_like(t) for t in inputs[STATES:FIXED]]
+        a_mass, a_pull, a_force, a_friction, a_viscosity = a_fixed[:5]
+        parameters = any(wanted[STATES + 1 : STATES + 4])
+        now = [torch.zeros_like(t) for t in inputs[:STATES]]
         then = [torch.empty_like(t) for t in now]
         scratch, a_tau, other, a_trial = (torch.empty_like(now[3]) for _ in range(4))
         a_velocity, a_grid = sim.scratch("a_velocity"), sim.scratch("a_grid")
@@ -217,37 +298,72 @@ class Plan:
             for n in reversed(range(self.steps if steps is None else steps)):
                 if (n + 1) % self.every == 0:
                     _add(now, gradients, (n + 1) // self.every)
-                x, v, C, F = (t[n] for t in tape.states)
-                v_next, C_next = tape.v[n + 1], tape.C[n + 1]
+                x, v, C, F, history = (t[n] for t in tape.states)
+                v_next, C_next, F_next = tape.v[n + 1], tape.C[n + 1], tape.F[n + 1]
+                material, a_material = self.material(inputs, n), self.material((*inputs[:STATES], *a_fixed), n)
                 tau = scratch if tape.tau is None else tape.tau[n]
                 if tape.tau is None:
-                    self.stress(elastic, F, C, viscosity, tau)
+                    self.stress(elastic, F, C, history, viscosity, material, tau)
                 grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid")) if tape.grid is None else tape.grid[n]
                 velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
                 if tape.velocity is None:
-                    self.on_grid(grid, pull, force, friction, velocity)
-                a_x, a_v, a_C, a_F = then
+                    self.on_grid(grid, at_step(pull, n), force, friction, velocity)
+                a_x, a_v, a_C, a_F, a_history = then
                 a_out = now[3]
-                if plastic is not None:
+                trial = None
+                if self.corrects:
                     trial = self.trial(F, C_next, other) if tape.trial is None else tape.trial[n]
-                    plastic.adjoint(trial, now[3], a_trial.zero_())
-                    a_out = a_trial
+                    a_out = a_trial.zero_()
+                if material is not None:
+                    self.remember_adjoint(material, a_material, trial, C_next, history, F_next, now, a_out, a_history.zero_())
+                if plastic is not None:
+                    plastic.adjoint(trial, now[3], a_trial)
                 self.launch(k.grid_to_particles_adjoint, len(x),
                             [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, v_next,
                              C_next, *now[:3], a_out, a_velocity.zero_(), a_x, a_F], self.block)  # fmt: skip
-                arguments = [grid, a_velocity, a_grid, a_pull, a_force, a_friction, parameters]
-                self.launch(k.update_grid_adjoint, sim.node_count // sim.chunk, [*self.grid_inputs(pull, force, friction), *arguments])
+                arguments = [grid, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters]
+                inputs_n = self.grid_inputs(at_step(pull, n), force, friction)
+                self.launch(k.update_grid_adjoint, sim.node_count // sim.chunk, [*inputs_n, *arguments])
                 self.launch(k.particles_to_grid_adjoint, len(x),
                             [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau,
                              a_grid, a_mass, a_x, a_v, a_C, a_tau], self.block)  # fmt: skip
                 if viscosity.numel():
                     self.launch(k.add_viscous_stress_adjoint, len(x),
                                 [sim.particles.scene, viscosity, C, F, a_tau, a_C, a_F, a_viscosity])  # fmt: skip
+                if material is not None:
+                    if material.stiffness is not None or material.growth is not None or self.layout.e_max:
+                        elastic.forward(F, other)
+                    self.launch(self.effects.add_effect_stress_adjoint, len(x),
+                                [*self.stress_inputs(material), F, history, other, a_tau, a_F, a_history, *a_material[:4]])  # fmt: skip
                 elastic.adjoint(F, a_tau, a_F)
                 now, then = then, now
             _add(now, gradients, 0)
             of_laws = [*elastic.gradients(), *(() if plastic is None else plastic.gradients())]
-        return [*now, a_mass, a_pull, a_force, a_friction, a_viscosity, *of_laws]
+        return [*now, *a_fixed, *of_laws]
+
+    def remember_adjoint(
+        self,
+        material: Material,
+        a_material: Material,
+        trial: Tensor | None,
+        C: Tensor,
+        history: Tensor,
+        F: Tensor,
+        a_next: Sequence[Tensor],
+        a_trial: Tensor,
+        a_history: Tensor,
+    ) -> None:
+        """Adds to the adjoints of C and F after the substep (in `a_next`), of the trial gradient and of the history before."""
+        sim, k = self.simulator, self.effects
+        a_C, a_F, a_history_next = a_next[2:]
+        if self.layout.e_max:
+            self.launch(k.remember_adjoint, len(F), [F, self.layout.at_e_max, history, a_history_next, a_F, a_history])
+        if material.flow is not None:
+            adjoints = [a_F, a_history_next, a_trial, a_C, a_history, a_material.flow, a_material.stiffness, a_material.growth]
+            self.launch(k.flow_adjoint, len(F), [*self.flow_inputs(material), trial, C, history, *adjoints])
+        if material.branches is not None:
+            arguments = [C, history, a_history_next, a_C, a_history, a_material.branches]
+            self.launch(k.relax_adjoint, len(F), [sim.particles.scene, sim.dt, material.branches, *arguments])
 
     def trial(self, F: Tensor, C_next: Tensor, out: Tensor) -> Tensor:
         """F_tr = (I + dt C) F, as grid_to_particles wrote it."""
@@ -261,99 +377,6 @@ def _add(now: Sequence[Tensor], gradients: Sequence[Tensor | None], frame: int) 
             a.add_(gradient[frame])
 
 
-def run(plan: Plan, inputs: tuple[Tensor, ...], segment: int | None = None) -> tuple[Tensor, ...]:
-    """Frames of x, v, C and F, in memory that the next rollout overwrites; differentiable where an input requires it.
-
-    Args:
-        plan: What to run.
-        inputs: State, mass, pull, force, friction, viscosity and the tensors of the laws.
-        segment: Substeps between checkpoints of a differentiable run; none: the tape spans the whole of it.
-
-    Raises:
-        UserError: What `Plan.check` finds.
-    """
-    differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-    if differentiable and segment is not None and segment < plan.steps:
-        return _Segments.apply(plan, segment, *inputs)
-    if plan.simulator.pool is not None:
-        return ThreadedRollout.apply(Scenes(plan), differentiable, *inputs)
-    if differentiable:
-        return _Rollout.apply(plan, *inputs)
-    return _frames(plan, tuple(t.detach() for t in inputs))
-
-
-def _frames(plan: Plan, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """A run without a tape."""
-    kept = plan.simulator.cache.find(plan, inputs, keep_all=False)
-    kept.forward(plan, inputs)
-    plan.check(kept.tape)
-    return kept.tape.states
-
-
-class _Rollout(torch.autograd.Function):
-    """Frames of x, v, C, F from the start, the parameters and the laws' tensors."""
-
-    @staticmethod
-    def forward(ctx: Any, plan: Plan, *inputs: Tensor) -> tuple[Tensor, ...]:
-        ctx.set_materialize_grads(False)
-        inputs = tuple(t.detach() for t in inputs)
-        # the tape belongs to the simulator: a later rollout may overwrite it, and the backward pass then runs this one again
-        ctx.plan, ctx.kept = plan, plan.simulator.cache.find(plan, inputs, keep_all=True)
-        ctx.serial = ctx.kept.forward(plan, inputs)
-        plan.check(ctx.kept.tape)
-        ctx.save_for_backward(*(t.clone() for t in inputs))
-        return tuple(t[:: plan.every] for t in ctx.kept.tape.states)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        wanted = ctx.needs_input_grad[1:]
-        out = ctx.kept.backward(ctx.plan, ctx.saved_tensors, ctx.serial, gradients, wanted)
-        return (None, *(g if want else None for g, want in zip(out, wanted, strict=True)))
-
-
-class _Segments(torch.autograd.Function):
-    """`_Rollout` in pieces: only the states between them are kept, and the backward pass makes the tape of one piece at a time."""
-
-    @staticmethod
-    def forward(ctx: Any, plan: Plan, segment: int, *inputs: Tensor) -> tuple[Tensor, ...]:
-        ctx.set_materialize_grads(False)
-        inputs = tuple(t.detach() for t in inputs)
-        piece = Plan(plan.simulator, plan.elasticity, plan.plasticity, segment, plan.every)
-        piece.split = plan.split
-        ctx.piece, ctx.count = piece, plan.steps // segment
-        length = segment // plan.every
-        frames = tuple(t.new_empty(ctx.count * length + 1, *t.shape) for t in inputs[:4])
-        starts = [inputs[:4]]
-        for i in range(ctx.count):
-            for frame, part in zip(frames, _frames(piece, (*starts[i], *inputs[4:]))):
-                frame[i * length : (i + 1) * length + 1] = part
-            starts.append(tuple(frame[(i + 1) * length].clone() for frame in frames))
-        ctx.save_for_backward(*inputs[4:], *(t for start in starts[:-1] for t in start))
-        return frames
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        piece, wanted, tensors = ctx.piece, ctx.needs_input_grad[2:], ctx.saved_tensors
-        rest, starts = tensors[: len(wanted) - 4], tensors[len(wanted) - 4 :]
-        length = piece.steps // piece.every
-        cache = piece.simulator.cache
-        carry = [torch.zeros_like(t) for t in starts[:4]]
-        total: list[Tensor | None] = [None] * (len(wanted) - 4)
-        for i in reversed(range(ctx.count)):
-            inputs = (*starts[4 * i : 4 * i + 4], *rest)
-            own = []
-            for a, gradient in zip(carry, gradients):
-                part = a.new_zeros(length + 1, *a.shape)
-                if gradient is not None:
-                    # a piece's first frame is the last one of the piece before
-                    part[0 if i == 0 else 1 :] = gradient[i * length + (0 if i == 0 else 1) : (i + 1) * length + 1]
-                part[-1] += a
-                own.append(part)
-            kept = cache.find(piece, inputs, keep_all=True)
-            serial = kept.forward(piece, inputs)
-            out = kept.backward(piece, inputs, serial, own, (True,) * 4 + tuple(wanted[4:]))
-            carry = out[:4]
-            total = [t if new is None else new if t is None else t + new for t, new in zip(total, out[4:])]
-        return (None, None, *(g if want else None for g, want in zip([*carry, *total], wanted, strict=True)))
+def at_step(t: Tensor, n: int) -> Tensor:
+    """The row of an input over time that substep n reads."""
+    return t[n if len(t) > 1 else 0] if t.numel() else t

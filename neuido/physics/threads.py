@@ -4,15 +4,17 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from neuido.physics.rollout import Plan
+from neuido.physics.rollout import FIXED, KINDS, Plan
 
 T = TypeVar("T")
+
+FRICTION = 8
+"""Which input the friction is; each scene has its own number of colliders."""
 
 
 @contextmanager
@@ -29,7 +31,7 @@ def _one_thread_each() -> Iterator[None]:
 class Scenes:
     """The plans of single scenes that together do what one plan does; their inputs are its inputs' parts."""
 
-    def __init__(self, plan: "Plan") -> None:
+    def __init__(self, plan: Plan) -> None:
         self.whole = plan
         sim = plan.simulator
         self.plans = [plan.alone(s) for s in range(sim.scene_count)]
@@ -38,11 +40,18 @@ class Scenes:
     def part(self, inputs: Sequence[Tensor], s: int) -> tuple[Tensor, ...]:
         """The inputs of scene s: its particles, its row of the scenes' tables, its row of a law (or the one that all share)."""
         i, j = self.ranges[s]
-        *particles, pull, force, friction, viscosity = inputs[:9]
-        width = self.plans[s].simulator.colliders.friction.shape[1]
-        rows = [pull[s : s + 1], force[s : s + 1], friction[s : s + 1, :width], viscosity[s : s + 1] if viscosity.numel() else viscosity]
-        laws = [t if len(t) == 1 else t[s : s + 1] for t in inputs[9:]]
-        return tuple(t.contiguous() for t in (*(t[i:j] for t in particles), *rows, *laws))
+        parts = []
+        for n, t in enumerate(inputs):
+            kind = KINDS[n] if n < FIXED else "law"
+            if kind == "particle" and len(t):
+                t = t[i:j]
+            elif kind == "time" and t.numel():
+                t = t[:, s : s + 1]
+            elif (kind == "scene" or len(t) > 1) and t.numel():
+                t = t[s : s + 1]
+            parts.append(t)
+        parts[FRICTION] = parts[FRICTION][:, : self.plans[s].simulator.colliders.friction.shape[1]]
+        return tuple(t.contiguous() for t in parts)
 
     def whole_gradient(self, inputs: Sequence[Tensor], parts: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
         """The gradients of the whole's inputs from those of the scenes."""
@@ -51,12 +60,17 @@ class Scenes:
             if parts[0][n] is None:
                 out.append(None)
                 continue
+            kind = KINDS[n] if n < FIXED else "law"
             total = torch.zeros_like(t)
             for s, (i, j) in enumerate(self.ranges):
                 part = parts[s][n]
-                if n < 5:
+                if not t.numel():
+                    continue
+                if kind == "particle":
                     total[i:j] = part
-                elif t.numel():
+                elif kind == "time":
+                    total[:, s : s + 1] += part
+                else:
                     row = total[0:1] if len(t) == 1 else total[s : s + 1]
                     row[:, : part.shape[1]] += part
             out.append(total)
@@ -75,7 +89,7 @@ def pool() -> ThreadPoolExecutor:
 
 
 class ThreadedRollout(torch.autograd.Function):
-    """`rollout._Rollout` of several scenes on the CPU."""
+    """`autograd._Rollout` of several scenes on the CPU."""
 
     @staticmethod
     def forward(ctx: Any, scenes: Scenes, keep_all: bool, *inputs: Tensor) -> tuple[Tensor, ...]:

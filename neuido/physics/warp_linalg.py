@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+FLOOR = 1e-3
+"""Lower bound of a principal stretch (of J in neo-Hookean) in a logarithm; below it the logarithm is constant, its gradient zero."""
+
 
 class Functions(NamedTuple):
     """Warp functions for one scalar type; none carries an adjoint of its own."""
@@ -30,6 +33,16 @@ class Functions(NamedTuple):
     """F -> (U, sigma - 1, V): rotations U and V, sigma descending, sigma_3 with the sign of det F"""
     compose: Any
     """(U, d) -> U diag(d) U^T, exactly symmetric"""
+    eigen: Any
+    """symmetric A -> (values, U), in no order"""
+    hencky: Any
+    """sigma - 1 -> ln sigma, sigma bounded below by FLOOR"""
+    inverse_stretch: Any
+    """Its derivative, 1 / sigma, or zero below FLOOR"""
+    log_difference: Any
+    """(x, y) -> (ln(1 + y) - ln(1 + x)) / (y - x) of the bounded logarithm"""
+    bounded: Any
+    """max(x, FLOOR - 1), NaN kept"""
 
 
 @functools.cache
@@ -47,6 +60,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
     zero = wp.constant(real(0.0))
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
+    floor = wp.constant(real(FLOOR))
 
     @wp.func
     def log1p(x: real):
@@ -110,8 +124,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         return wp.matrix_from_rows(wp.cross(r1, r2), wp.cross(r2, r0), wp.cross(r0, r1))
 
     @wp.func
-    def jacobi_frame(F: mat):
-        E = strain(F)
+    def eigen(E: mat):
         a = E[0, 0]
         b = E[1, 1]
         c = E[2, 2]
@@ -156,7 +169,17 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
             u2 = sn * u1 + cs * u2
             u1 = u
             sweep += 1
+        return vec(a, b, c), wp.matrix_from_cols(u0, u1, u2)
 
+    @wp.func
+    def jacobi_frame(F: mat):
+        values, vectors = eigen(strain(F))
+        a = values[0]
+        b = values[1]
+        c = values[2]
+        u0 = vec(vectors[0, 0], vectors[1, 0], vectors[2, 0])
+        u1 = vec(vectors[0, 1], vectors[1, 1], vectors[2, 1])
+        u2 = vec(vectors[0, 2], vectors[1, 2], vectors[2, 2])
         if a < b:
             x = a
             a = b
@@ -221,4 +244,54 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         u2 = vec(U[0, 2], U[1, 2], U[2, 2])
         return wp.outer(u0, u0) * d[0] + wp.outer(u1, u1) * d[1] + wp.outer(u2, u2) * d[2]
 
-    return Functions(log1p, log_slope, exp_slope, strain, volume_change, cofactor, frame, compose)
+    @wp.func
+    def bounded(x: real):
+        """max(x, FLOOR - 1), but NaN stays NaN."""
+        result = x
+        if x < floor - one:
+            result = floor - one
+        return result
+
+    @wp.func
+    def hencky(excess: vec):
+        """Logarithms of the principal stretches, bounded below."""
+        return vec(log1p(bounded(excess[0])), log1p(bounded(excess[1])), log1p(bounded(excess[2])))
+
+    @wp.func
+    def inverse_stretch(excess: vec):
+        """The derivative of `hencky`."""
+        result = vec(zero, zero, zero)
+        for i in range(3):
+            if one + excess[i] > floor:
+                result[i] = one / (one + excess[i])
+        return result
+
+    @wp.func
+    def log_difference(x: real, y: real):
+        """(ln(1 + y) - ln(1 + x)) / (y - x) of the bounded logarithm."""
+        low = floor - one
+        cx = bounded(x)
+        cy = bounded(y)
+        slope = log_slope((cy - cx) / (one + cx)) / (one + cx)
+        share = one
+        if x < low or y < low:
+            share = zero
+            if x > low or y > low:
+                share = (cy - cx) / (y - x)
+        return slope * share
+
+    return Functions(
+        log1p,
+        log_slope,
+        exp_slope,
+        strain,
+        volume_change,
+        cofactor,
+        frame,
+        compose,
+        eigen,
+        hencky,
+        inverse_stretch,
+        log_difference,
+        bounded,
+    )

@@ -1,0 +1,242 @@
+"""Warp kernels of the effects that act on the stress, with hand-written adjoints; those of the history are in `history_kernels`.
+
+Columns of the tables are those of `effect_tables.Tables`; an absent array is None. Every term but one is a rational function
+of E = F F^T - I and needs no principal frame.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from neuido.physics import history_kernels, warp_linalg
+from neuido.physics.device import start_warp
+from neuido.physics.history_tools import tools
+from neuido.physics.law_kernels import GAP, LOCKED
+
+
+@functools.cache
+def build(real: type) -> SimpleNamespace:
+    """The kernels for `wp.float32` or `wp.float64`, those of `history_kernels` included."""
+    start_warp()
+    vec3 = wp.types.vector(length=3, dtype=real)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+    name = f"neuido.effects.{real.__name__}"
+    func = functools.partial(wp.func, module=name)
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    own = warp_linalg.functions(real)
+    log1p, exp_slope, strain, volume_change, cofactor = own.log1p, own.exp_slope, own.strain, own.volume_change, own.cofactor
+    frame, compose, hencky = own.frame, own.compose, own.hencky
+    inverse_stretch, log_difference = own.inverse_stretch, own.log_difference
+    zero = wp.constant(real(0.0))
+    one = wp.constant(real(1.0))
+    two = wp.constant(real(2.0))
+    three = wp.constant(real(3.0))
+    four = wp.constant(real(4.0))
+    six = wp.constant(real(6.0))
+    locked = wp.constant(real(LOCKED))
+    gap = wp.constant(real(GAP))
+    shared = tools(real, name)
+    load, spread, deviator = shared.load, shared.spread, shared.deviator
+
+    @func
+    def volume_factor(F: mat33):
+        """J^(-2/3) - 1"""
+        x = -two / three * log1p(volume_change(F))
+        return x * exp_slope(x)
+
+    @func
+    def negative(e: vec3):
+        return wp.min(e, vec3(zero, zero, zero))
+
+    @func
+    def negative_difference(x: real, y: real):
+        """(min(ln(1 + y), 0) - min(ln(1 + x), 0)) / (y - x)"""
+        out = zero
+        if x < zero and y < zero:
+            out = log_difference(x, y)
+        elif x < zero:
+            out = log_difference(x, zero) * x / (x - y)
+        elif y < zero:
+            out = log_difference(y, zero) * y / (y - x)
+        return out
+
+    @func
+    def extra_stress(F: mat33, material: wp.array2d(dtype=real), s: int, spectral: bool):
+        """What strain stiffening, the second invariant, fibres and the asymmetry add [Pa]."""
+        E = strain(F)
+        jm = volume_factor(F)
+        j = one + jm
+        tr = wp.trace(E)
+        k = material[s, 0]
+        c = material[s, 1]
+        x = three * jm + j * tr
+        gain = x / wp.max(one - material[s, 8] * x, locked)
+        m = six * c / (six + four * tr + tr * tr - wp.ddot(E, E))
+        tau = deviator((k * gain * j + m * (one + tr)) * E - m * (E * E))
+        fibre = material[s, 3]
+        n = F * vec3(material[s, 4], material[s, 5], material[s, 6])
+        tau = tau + (fibre * (wp.dot(n, n) - one)) * wp.outer(n, n)
+        if spectral:
+            U, d, _V = frame(F)
+            tau = tau + compose(U, material[s, 2] * negative(hencky(d)))
+        return tau
+
+    @func
+    def scale_of(
+        p: int,
+        s: int,
+        stiffness: wp.array(dtype=real),
+        growth: wp.array(dtype=real),
+        material: wp.array2d(dtype=real),
+        history: wp.array2d(dtype=real),
+        at_e_max: int,
+    ):
+        out = one
+        if stiffness:
+            out = out * stiffness[p]
+        if growth:
+            out = out * growth[s]
+        if at_e_max >= 0:
+            out = out * wp.exp(-material[s, 7] * history[p, at_e_max])
+        return out
+
+    @kernel
+    def add_effect_stress(
+        scene: wp.array(dtype=wp.int32),
+        stiffness: wp.array(dtype=real),
+        growth: wp.array(dtype=real),
+        material: wp.array2d(dtype=real),
+        branches: wp.array3d(dtype=real),
+        spectral: bool,
+        at_e_max: int,
+        F: wp.array(dtype=mat33),
+        history: wp.array2d(dtype=real),
+        tau: wp.array(dtype=mat33),
+    ):
+        """tau = scale (tau + extra(F) + sum of the branches)."""
+        p = wp.tid()
+        s = scene[p]
+        t = tau[p]
+        if material:
+            t = t + extra_stress(F[p], material, s, spectral)
+        if branches:
+            for b in range(branches.shape[1]):
+                t = t + branches[s, b, 0] * load(history, p, 6 * b)
+        tau[p] = scale_of(p, s, stiffness, growth, material, history, at_e_max) * t
+
+    @kernel
+    def add_effect_stress_adjoint(
+        scene: wp.array(dtype=wp.int32),
+        stiffness: wp.array(dtype=real),
+        growth: wp.array(dtype=real),
+        material: wp.array2d(dtype=real),
+        branches: wp.array3d(dtype=real),
+        spectral: bool,
+        at_e_max: int,
+        F: wp.array(dtype=mat33),
+        history: wp.array2d(dtype=real),
+        base: wp.array(dtype=mat33),
+        a_tau: wp.array(dtype=mat33),
+        a_F: wp.array(dtype=mat33),
+        a_history: wp.array2d(dtype=real),
+        a_stiffness: wp.array(dtype=real),
+        a_growth: wp.array(dtype=real),
+        a_material: wp.array2d(dtype=real),
+        a_branches: wp.array3d(dtype=real),
+    ):
+        """Turns a_tau into the adjoint of the base law's stress and adds to the others; `base`, that stress, is read if scaled."""
+        p = wp.tid()
+        s = scene[p]
+        A = a_tau[p]
+        scale = scale_of(p, s, stiffness, growth, material, history, at_e_max)
+        G = (real(0.5) * scale) * (A + wp.transpose(A))
+        if stiffness or growth or at_e_max >= 0:
+            t = base[p]
+            if material:
+                t = t + extra_stress(F[p], material, s, spectral)
+            if branches:
+                for b in range(branches.shape[1]):
+                    t = t + branches[s, b, 0] * load(history, p, 6 * b)
+            a_log = scale * wp.ddot(A, t)
+            if stiffness:
+                a_stiffness[p] = a_stiffness[p] + a_log / stiffness[p]
+            if growth:
+                wp.atomic_add(a_growth, s, a_log / growth[s])
+            if at_e_max >= 0:
+                wp.atomic_add(a_material, s, 7, -a_log * history[p, at_e_max])
+                a_history[p, at_e_max] = a_history[p, at_e_max] - a_log * material[s, 7]
+        if branches:
+            for b in range(branches.shape[1]):
+                wp.atomic_add(a_branches, s, b, 0, wp.ddot(G, load(history, p, 6 * b)))
+                spread(a_history, p, 6 * b, branches[s, b, 0] * G)
+        if material:
+            Fp = F[p]
+            E = strain(Fp)
+            jm = volume_factor(Fp)
+            j = one + jm
+            tr = wp.trace(E)
+            k = material[s, 0]
+            c = material[s, 1]
+            D = deviator(G)
+            DE = D * E
+            d1 = wp.trace(DE)
+            d2 = wp.ddot(DE, E)
+            x = three * jm + j * tr
+            left = one - material[s, 8] * x
+            gain = x / wp.max(left, locked)
+            slope = one / locked
+            by_lock = zero
+            if left > locked:
+                slope = one / (left * left)
+                by_lock = gain * gain
+            q = six + four * tr + tr * tr - wp.ddot(E, E)
+            m = six * c / q
+            second = (one + tr) * d1 - d2
+            a_j = k * (gain + slope * j * (three + tr)) * d1
+            a_E = (k * gain * j + m * (one + tr)) * D - m * (DE + wp.transpose(DE)) + (two * m * second / q) * E
+            a_E = a_E + (k * slope * j * j * d1 + m * d1 - m * second * (four + two * tr) / q) * wp.identity(n=3, dtype=real)
+            J = one + volume_change(Fp)
+            grad = two * (a_E * Fp) - (two / three * a_j * j / J) * cofactor(Fp)
+            wp.atomic_add(a_material, s, 0, gain * j * d1)
+            wp.atomic_add(a_material, s, 1, six / q * second)
+            wp.atomic_add(a_material, s, 8, k * by_lock * j * d1)
+
+            fibre = material[s, 3]
+            a0 = vec3(material[s, 4], material[s, 5], material[s, 6])
+            n = Fp * a0
+            Gn = G * n
+            along = wp.dot(n, Gn)
+            excess = wp.dot(n, n) - one
+            a_n = (two * fibre) * (along * n + excess * Gn)
+            grad = grad + wp.outer(a_n, a0)
+            a_a0 = wp.transpose(Fp) * a_n
+            wp.atomic_add(a_material, s, 3, excess * along)
+            wp.atomic_add(a_material, s, 4, a_a0[0])
+            wp.atomic_add(a_material, s, 5, a_a0[1])
+            wp.atomic_add(a_material, s, 6, a_a0[2])
+
+            if spectral:
+                U, d, V = frame(Fp)
+                B = wp.transpose(U) * G * U
+                e = negative(hencky(d))
+                inv = inverse_stretch(d)
+                r = material[s, 2]
+                M = mat33()
+                for i in range(3):
+                    if d[i] < zero:
+                        M[i, i] = r * B[i, i] * inv[i]
+                    for l in range(3):
+                        if i != l:
+                            total = wp.max(two + d[i] + d[l], gap)
+                            M[i, l] = two * B[i, l] * (one + d[l]) * r * negative_difference(d[i], d[l]) / total
+                grad = grad + U * M * wp.transpose(V)
+                wp.atomic_add(a_material, s, 2, B[0, 0] * e[0] + B[1, 1] * e[1] + B[2, 2] * e[2])
+            a_F[p] = a_F[p] + grad
+        a_tau[p] = scale * A
+
+    return SimpleNamespace(
+        add_effect_stress=add_effect_stress,
+        add_effect_stress_adjoint=add_effect_stress_adjoint,
+        **vars(history_kernels.build(real)),
+    )

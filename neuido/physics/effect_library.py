@@ -1,0 +1,279 @@
+"""The library of effects: what a model may lack, one entry for each name of the vocabulary of `diagnosis.json`.
+
+Ranges are physical priors for bodies of centimetres to a metre that move for seconds (stresses: of 1e4 to 1e6 Pa); a value outside is
+a reason to reject an explanation. Confusions are those measured on refitted bodies in a pilot, or seen in recordings.
+"""
+
+from typing import NamedTuple
+
+
+class Parameter(NamedTuple):
+    """One parameter of an effect, "<effect>.<name>"."""
+
+    name: str
+    field: str
+    """The field of `Effects` that it sets (or a part of)."""
+    unit: str
+    low: float
+    """Physical range, inclusive; signed parameters reach from -high."""
+    high: float
+    signed: bool = False
+
+
+class Entry(NamedTuple):
+    """One effect."""
+
+    name: str
+    equation: str
+    parameters: tuple[Parameter, ...]
+    stage: str
+    """Where it shows: flight, rotation, internal modes, contact, rest or power."""
+    confusions: tuple[str, ...]
+    source: str
+
+
+def _vector(field: str, unit: str, size: float, names: str = "xyz") -> tuple[Parameter, ...]:
+    return tuple(Parameter(name, field, unit, -size, size, True) for name in names)
+
+
+KNOTS = 5
+"""Knots of `time_force` that the library lists; `Effects.of` takes any number."""
+
+LIBRARY = (
+    Entry(
+        "gravity",
+        "a += dg g/|g|",
+        (Parameter("g", "gravity", "m/s^2", -3.0, 3.0, True),),
+        "flight",
+        ("uniform_acceleration", "added_mass"),
+        "Newton's second law",
+    ),
+    Entry(
+        "uniform_acceleration",
+        "a += w",
+        _vector("uniform_acceleration", "m/s^2", 3.0),
+        "flight",
+        ("gravity", "position_force", "time_force"),
+        "Newton's second law in a tilted frame",
+    ),
+    Entry(
+        "drag_linear",
+        "a -= k v",
+        (Parameter("k", "drag_linear", "1/s", 0.0, 5.0),),
+        "flight",
+        ("drag_quadratic", "viscosity_shear", "added_mass"),
+        "Stokes 1851",
+    ),
+    Entry(
+        "drag_quadratic",
+        "a -= k |v| v",
+        (Parameter("k", "drag_quadratic", "1/m", 0.0, 2.0),),
+        "flight",
+        ("drag_linear", "viscosity_shear"),
+        "Newton; Landau and Lifshitz, Fluid Mechanics, 45",
+    ),
+    Entry(
+        "magnus",
+        "a += w x v",
+        _vector("magnus", "1/s", 5.0),
+        "flight",
+        ("uniform_acceleration",),
+        "Rubinow and Keller 1961, eq. 1: lift of a spinning sphere",
+    ),
+    Entry(
+        "position_force",
+        "a -= k (x - c)",
+        (
+            Parameter("k", "position_force", "1/s^2", -30.0, 30.0, True),
+            *_vector("position_centre", "m", 2.0),
+        ),
+        "flight",
+        ("uniform_acceleration", "gravity"),
+        "Hooke; the first term of a magnet's field gradient",
+    ),
+    Entry(
+        "time_force",
+        "a += b(t), linear between knots",
+        (
+            *(Parameter(f"{a}{j}", "time_force", "m/s^2", -5.0, 5.0, True) for j in range(KNOTS) for a in "xyz"),
+            Parameter("interval", "time_force_interval", "s", 1e-3, 2.0),
+        ),
+        "flight",
+        ("uniform_acceleration",),
+        "Newton's second law in a shaken frame",
+    ),
+    Entry(
+        "viscosity_shear",
+        "sigma += 2 eta dev D",
+        (Parameter("eta", "viscosity_shear", "Pa s", 0.0, 1e3),),
+        "internal modes",
+        ("maxwell", "hysteresis", "viscosity_bulk", "restitution", "drag_linear"),
+        "Kelvin 1865, Voigt 1892",
+    ),
+    Entry(
+        "viscosity_bulk",
+        "sigma += zeta tr(D) I",
+        (Parameter("zeta", "viscosity_bulk", "Pa s", 0.0, 1e3),),
+        "internal modes",
+        ("viscosity_shear", "restitution", "hysteresis"),
+        "Landau and Lifshitz, Theory of Elasticity, 34",
+    ),
+    Entry(
+        "maxwell",
+        "tau += 2 g mu e, e' = dev D + W e - e W - e/T",
+        (
+            Parameter("ratio", "maxwell_ratio", "1", 0.0, 3.0),
+            Parameter("time", "maxwell_time", "s", 1e-3, 10.0),
+        ),
+        "internal modes",
+        ("viscosity_shear", "hysteresis"),
+        "Maxwell 1867; Simo and Hughes, Computational Inelasticity, 10",
+    ),
+    Entry(
+        "hysteresis",
+        "six Maxwell branches, weights (2 eta/pi) G'(1/T) dln T: loss factor eta over 0.5-200 Hz",
+        (Parameter("eta", "hysteresis", "1", 0.0, 0.5),),
+        "internal modes",
+        ("viscosity_shear", "maxwell"),
+        "Findley, Lai and Onaran 1976; Biot 1958",
+    ),
+    Entry(
+        "strain_stiffening",
+        "tau += mu k x/(1 - k x) dev bbar, x = I1bar - 3",
+        (Parameter("k", "strain_stiffening", "1", -0.2, 10.0, True),),
+        "internal modes",
+        ("second_invariant", "tension_compression"),
+        "Gent 1996, with 1/k for J_m; its first order is the second term of Yeoh 1990",
+    ),
+    Entry(
+        "second_invariant",
+        "W += 3/2 mu c ln(I2bar/3)",
+        (Parameter("c", "second_invariant", "1", -0.3, 2.0, True),),
+        "internal modes",
+        ("strain_stiffening", "tension_compression"),
+        "Gent and Thomas 1958; beside Gent's first term Pucci and Saccomandi 2002",
+    ),
+    Entry(
+        "tension_compression",
+        "tau += 2 mu r sum min(e_i, 0) n_i n_i",
+        (Parameter("r", "tension_compression", "1", -0.7, 3.0, True),),
+        "internal modes",
+        ("strain_stiffening", "second_invariant"),
+        "Ambartsumyan 1965, in Hencky strain",
+    ),
+    Entry(
+        "fibre",
+        "W += c/4 (I4 - 1)^2, I4 = |F a0|^2",
+        (
+            Parameter("c", "fibre", "Pa", 0.0, 1e6),
+            Parameter("azimuth", "fibre_direction", "rad", -3.15, 3.15, True),
+            Parameter("elevation", "fibre_direction", "rad", -1.58, 1.58, True),
+        ),
+        "internal modes",
+        ("stiffness_gradient",),
+        "Holzapfel, Gasser and Ogden 2000 (the standard reinforcing model)",
+    ),
+    Entry(
+        "yield",
+        "|2 mu dev ln V| <= 1/inverse",
+        (Parameter("inverse", "yield_inverse", "1/Pa", 0.0, 1e-2),),
+        "rest",
+        ("viscosity_shear", "rate_yield", "softening"),
+        "von Mises 1913; paper, appendix, Von Mises Plasticity",
+    ),
+    Entry(
+        "hardening",
+        "yield stress + H alpha",
+        (Parameter("h", "hardening", "Pa", 0.0, 1e6),),
+        "rest",
+        ("kinematic_hardening", "rate_yield"),
+        "Simo and Hughes, Computational Inelasticity, 2",
+    ),
+    Entry(
+        "softening",
+        "yield stress times exp(-s alpha); where nothing yields elastic stress times exp(-s e_max)",
+        (Parameter("s", "softening", "1", 0.0, 30.0),),
+        "internal modes",
+        ("stiffness_change", "yield"),
+        "Simo 1987 (damage by the largest strain)",
+    ),
+    Entry(
+        "kinematic_hardening",
+        "backstress' = H_k plastic strain rate + W b - b W",
+        (Parameter("h", "kinematic_hardening", "Pa", 0.0, 1e6),),
+        "rest",
+        ("hardening",),
+        "Prager 1956",
+    ),
+    Entry(
+        "rate_yield",
+        "plastic rate = <|s| - yield stress>/eta",
+        (Parameter("eta", "rate_yield", "Pa s", 0.0, 1e4),),
+        "rest",
+        ("hardening", "viscosity_shear", "yield"),
+        "Perzyna 1963",
+    ),
+    Entry(
+        "stiffness_gradient",
+        "elastic stress times exp(s . (X - mean)/L), or times exp(log_ratio) in a ball",
+        (
+            *_vector("stiffness", "1", 3.0),
+            Parameter("log_ratio", "stiffness", "1", -4.0, 4.0, True),
+            Parameter("radius", "stiffness", "m", 0.0, 1.0),
+            *_vector("stiffness", "m", 1.0, ("cx", "cy", "cz")),
+            Parameter("width", "stiffness", "m", 0.0, 0.5),
+        ),
+        "internal modes",
+        ("fibre",),
+        "functionally graded elasticity",
+    ),
+    Entry(
+        "stiffness_change",
+        "elastic stress times exp(r t)",
+        (Parameter("rate", "stiffness_change", "1/s", -3.0, 3.0, True),),
+        "internal modes",
+        ("softening", "strain_stiffening"),
+        "first-order ageing",
+    ),
+    Entry(
+        "friction",
+        "|v_t| falls by (mu + dmu) |v_n| in contact",
+        (Parameter("mu", "friction", "1", -1.0, 1.0, True),),
+        "contact",
+        ("stick", "drag_linear"),
+        "Coulomb 1785",
+    ),
+    Entry(
+        "stick",
+        "v of a node in contact times exp(-k dt)",
+        (Parameter("rate", "stick", "1/s", 0.0, 1e4),),
+        "contact",
+        ("restitution", "friction"),
+        "a viscous film on the collider",
+    ),
+    Entry(
+        "restitution",
+        "outward normal v of a node in contact times exp(-k dt)",
+        (Parameter("rate", "restitution", "1/s", 0.0, 1e4),),
+        "contact",
+        ("stick", "viscosity_shear", "viscosity_bulk"),
+        "a dashpot under the collider",
+    ),
+    Entry(
+        "cohesion",
+        "|dev tau| <= -alpha (tr tau - 3 c cot phi)",
+        (Parameter("c", "cohesion", "Pa", 0.0, 5e3),),
+        "rest",
+        ("friction", "stick"),
+        "Drucker and Prager 1952, the tip of Mohr and Coulomb's cone; without cohesion Klar et al. 2016",
+    ),
+    Entry(
+        "added_mass",
+        "mass (1 + c), weight unchanged",
+        (Parameter("c", "added_mass", "1", -0.5, 2.0, True),),
+        "flight",
+        ("gravity", "drag_linear"),
+        "Lamb, Hydrodynamics, 92",
+    ),
+)
+"""One entry for each effect, in the order of the vocabulary by kind."""

@@ -1,0 +1,277 @@
+"""Explicit finite elements beside the material point method: the same scenes, laws, effects and call, another discretisation.
+
+Linear tetrahedra with lumped masses, symplectic Euler in time, contact of the nodes at the exact planes. Forward only. The body
+of particles is meshed (`meshing`), and the motion is given back at the particles. A step is cut into as many equal inner steps as
+the smallest element and the fastest wave ask for.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics import effect_tables, element_kernels
+from neuido.physics.assembly import Assembly, Inputs, Piece, piece_of
+from neuido.physics.device import real_of
+from neuido.physics.effects import Effects
+from neuido.physics.law import ElasticLaw, PlasticLaw
+from neuido.physics.meshing import Mesh, mesh_body
+from neuido.physics.mpm import Simulator
+from neuido.physics.threads import _one_thread_each, pool
+from neuido.types import Body, ParticleState, Scene
+
+SAFETY = 0.5
+"""Inner step over the stable step of the undeformed mesh: elements get thinner while a body is pressed."""
+MOST_INNER = 2000
+"""Inner steps a step at most; more is an error."""
+
+
+class FiniteElements:
+    """Explicit finite elements of one or several scenes, each with one body; used as `mpm.Simulator` is.
+
+    Args:
+        scenes: One scene or a list of them; the grid (`cells`) plays no part.
+        bodies: As many bodies.
+        density: [kg/m^3], one number or one for each scene.
+        device: Where it runs.
+        dtype: `torch.float32` for work, `torch.float64` for checks.
+        threads: On the CPU, run several scenes in as many threads as there are cores.
+        elements: About how many elements a body gets; see `meshing.mesh_body`.
+        tetrahedra: A lattice cell is cut into 5 or 6.
+        smoothing: `none`, or `nodal`: the volume change of an element is the mean of its nodes' means, against the locking of
+            nearly incompressible bodies (average nodal pressure, Bonet and Burton 1998).
+        meshes: Meshes in place of the ones made here, one a body or one for all.
+
+    Raises:
+        UserError: As `mpm.Simulator`, and a body that cannot be meshed.
+
+    Attributes:
+        state: `ParticleState` at t = 0.
+        mass: Particle masses [kg], (P,), attached masses included.
+        volume: Initial volumes [m^3], (P,).
+        particles: `Particles`, which scene each particle belongs to.
+        meshes: The `Mesh` of each scene.
+    """
+
+    def __init__(
+        self,
+        scenes: Scene | Sequence[Scene],
+        bodies: Body | Sequence[Body],
+        *,
+        density: float | Sequence[float] = 1000.0,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float32,
+        threads: bool = True,
+        elements: int | None = None,
+        tetrahedra: int = 5,
+        smoothing: Literal["none", "nodal"] = "none",
+        meshes: Mesh | Sequence[Mesh] | None = None,
+    ) -> None:
+        if smoothing not in ("none", "nodal"):
+            raise UserError(f"smoothing is {smoothing!r}; choose none or nodal")
+        loaded = Simulator(scenes, bodies, density=density, device=device, dtype=dtype, threads=False, graphs=False)
+        self.scenes, self.device, self.dtype, self.smoothing = loaded.scenes, loaded.device, loaded.dtype, smoothing
+        self.particles, self.state, self.mass, self.volume = loaded.particles, loaded.state, loaded.mass, loaded.volume
+        self.dt, self.gravity, self.colliders = loaded.dt, loaded.gravity, loaded.colliders
+        self.held = loaded.held.bool()
+        self.kernels = element_kernels.build(real_of(dtype))
+        bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
+        if meshes is not None:
+            meshes = (meshes,) * len(bodies) if isinstance(meshes, Mesh) else tuple(meshes)
+            if len(meshes) != len(bodies):
+                raise UserError(f"{len(meshes)} meshes for {len(bodies)} bodies; give one mesh a body, or one for all")
+        made: dict[tuple[int, ...], tuple[Mesh, Piece]] = {}
+        pieces = []
+        self.meshes: tuple[Mesh, ...] = ()
+        for s, body in enumerate(bodies):
+            given = None if meshes is None else meshes[s]
+            key = (id(body.x), id(body.volume), id(given))  # copies of one body share their mesh
+            if key not in made:
+                x, volume = torch.as_tensor(body.x).double().cpu(), torch.as_tensor(body.volume).double().cpu()
+                mesh = mesh_body(x, volume, elements=elements, kind=tetrahedra) if given is None else given
+                made[key] = (mesh, piece_of(mesh, x, volume, self.device, self.dtype))
+            mesh, piece = made[key]
+            self.meshes += (mesh,)
+            pieces.append(piece)
+        # on the CPU a scene is an assembly of its own, which a thread runs; on a GPU all scenes share their launches
+        count = len(self.scenes)
+        ranges = [(s, s + 1) for s in range(count)] if self.device.type == "cpu" else [(0, count)]
+        self.assemblies = [Assembly(self, pieces[a:b], a, b) for a, b in ranges]
+        self.pool = pool() if threads and len(self.assemblies) > 1 else None
+
+    @property
+    def scene_count(self) -> int:
+        return len(self.scenes)
+
+    def inner_steps(
+        self,
+        elasticity: ElasticLaw,
+        viscosity: Tensor | None = None,
+        mass: Tensor | None = None,
+        stiffening: tuple[Tensor, Tensor] | None = None,
+    ) -> list[int]:
+        """Inner steps a step that each scene needs, by 2/omega of the worst element (a bound: Belytschko et al., sec. 6.2).
+
+        Args:
+            elasticity: The law, for its P-wave modulus.
+            viscosity: Shear and bulk viscosity [Pa s], (S, 2), or None; it acts with the velocity of half a step before.
+            mass: Particle masses [kg], (P,).
+            stiffening: What effects add to each scene's modulus [Pa], and the largest factor on the sum, (S,) each.
+
+        Raises:
+            UserError: A modulus that is negative, or more than `MOST_INNER`.
+        """
+        modulus = elasticity.modulus().detach().to(self.device, torch.float64).expand(self.scene_count)
+        if stiffening is not None:
+            modulus = (modulus + stiffening[0]) * stiffening[1]
+        rho = (self.mass if mass is None else mass.detach()).double() / self.volume.double()
+        out = []
+        for assembly in self.assemblies:
+            need = 1
+            for s in range(assembly.a, assembly.b):
+                if not float(modulus[s]) >= 0.0:
+                    raise UserError(
+                        f"the law of scene {s} has a P-wave modulus of {float(modulus[s]):g} Pa at rest; it must not be negative"
+                    )
+                own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
+                density = float(rho[own].min())
+                steep = float(assembly.pieces[s - assembly.a].steepest.max())
+                omega = 2.0 * math.sqrt(float(modulus[s]) / density * steep)
+                damping = 0.0
+                if viscosity is not None:
+                    eta, zeta = viscosity.detach()[s].double().tolist()
+                    damping = 4.0 * steep * (4.0 / 3.0 * eta + zeta) / density
+                # the root of (omega dt)^2 + 2 damping dt = 4
+                step = 4.0 / (damping + math.sqrt(damping**2 + 4.0 * omega**2)) if omega + damping > 0 else math.inf
+                need = max(need, math.ceil(self.scenes[s].dt / (SAFETY * step) - 1e-9))
+                if need > MOST_INNER:
+                    raise UserError(f"dt of scene {s} needs {need} inner steps of its smallest element; lower the stiffness, the viscosity "
+                                    "or `elements`")  # fmt: skip
+            out += [need] * (assembly.b - assembly.a)
+        return out
+
+    def rollout(
+        self,
+        steps: int,
+        elasticity: ElasticLaw,
+        plasticity: PlasticLaw | None = None,
+        *,
+        state: ParticleState | None = None,
+        effects: Effects | None = None,
+        gravity: Tensor | None = None,
+        friction: Tensor | None = None,
+        mass: Tensor | None = None,
+        every: int = 1,
+        segment: int | None = None,
+        check: bool = True,
+        inner: int | None = None,
+    ) -> ParticleState:
+        """Run `steps` steps of the scenes; arguments and result are those of `mpm.Simulator.rollout`, without gradients.
+
+        Args:
+            steps: Number of steps.
+            elasticity: F -> Kirchhoff stress.
+            plasticity: Trial F -> corrected F; none: purely elastic.
+            state: Start, (P, ...): its difference from the bodies as loaded, or from the end of the last rollout where that is where the
+                particles are, is interpolated to nodes and elements; F is the elastic strain of the start, whatever its positions.
+            effects: Further effects.
+            gravity: [m/s^2], (S, 3); the scenes' own where absent.
+            friction: Coefficients of the colliders, (S, K) in the order colliders, walls.
+            mass: [kg], (P,); density times volume where absent.
+            every: Keep a frame every so many steps.
+            segment: Not read; there is no tape.
+            check: Not read; the inner steps are always stable for the undeformed mesh.
+            inner: Inner steps a step, in place of `inner_steps`.
+
+        Returns:
+            Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1: x and v interpolated in the element of
+            each particle, C and F of that element. Frame 0 is the start.
+
+        Raises:
+            UserError: Before the start, as `inner_steps`; afterwards a motion that is not finite.
+        """
+        if steps < 1 or every < 1 or steps % every:
+            raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
+        with torch.no_grad():
+            return self._rollout(steps, elasticity, plasticity, state, effects or Effects(), gravity, friction, mass, every, inner)
+
+    def _rollout(
+        self,
+        steps: int,
+        elasticity: ElasticLaw,
+        plasticity: PlasticLaw | None,
+        state: ParticleState | None,
+        effects: Effects,
+        gravity: Tensor | None,
+        friction: Tensor | None,
+        mass: Tensor | None,
+        every: int,
+        inner: int | None,
+    ) -> ParticleState:
+        count, like = self.scene_count, self.mass
+        state = self.state if state is None else ParticleState(*(t.detach().to(self.device, self.dtype) for t in state))
+        base = self.gravity if gravity is None else gravity.to(self.device, self.dtype).expand(count, 3)
+        force, viscosity = effects.force_table(count, like).contiguous(), effects.viscosity(count, like)
+        friction = self.colliders.friction if friction is None else friction.to(self.device, self.dtype)
+        if friction.shape != self.colliders.friction.shape:
+            raise UserError(f"friction has shape {tuple(friction.shape)}; it must be {tuple(self.colliders.friction.shape)}")
+        if effects.friction is not None:
+            friction = (friction + effects.rows("friction", count, like)).clamp(min=0.0)
+        mass = self.mass if mass is None else mass.to(self.device, self.dtype)
+        if effects.added_mass is not None:
+            mass = mass * (1 + effects.rows("added_mass", count, mass)[self.particles.scene.long(), 0])
+        tables = effect_tables.tables(effects, elasticity, plasticity, count, like) if effects.of_material else None
+        stiffness = None if effects.stiffness is None else effects.particle_stiffness(len(mass), mass)
+        stiffening = None
+        if tables is not None:
+            factor = torch.ones(count, dtype=torch.float64, device=self.device)
+            if stiffness is not None:
+                parts = zip(self.particles.offsets[:-1], self.particles.offsets[1:])
+                factor = torch.stack([stiffness[i:j].double().max() for i, j in parts])
+            growth = effects.growth(self.dt, steps)
+            stiffening = (tables.stiffening.double(), factor if growth is None else factor * growth.double().amax(dim=0))
+        inner_of = [inner] * count if inner is not None else self.inner_steps(elasticity, viscosity, mass, stiffening)
+        frames = ParticleState(*(t.new_empty(steps // every + 1, *t.shape) for t in state))
+
+        def one(assembly: Assembly) -> None:
+            a, b = assembly.a, assembly.b
+            n = inner_of[a]
+            scenes, own = slice(a, b), slice(self.particles.offsets[a], self.particles.offsets[b])
+            dt = self.dt[scenes] / n
+            growth = effects.growth(self.dt / n, steps * n)
+            inputs = Inputs(
+                ParticleState(*(t[own] for t in state)),
+                mass[own],
+                effects.accelerations(base, self.dt / n, steps * n)[:, scenes].contiguous(),
+                force[scenes].contiguous(),
+                friction[scenes].contiguous(),
+                None if viscosity is None else viscosity[scenes].contiguous(),
+                None if tables is None else assembly.rows(tables),
+                None if stiffness is None else stiffness[own],
+                None if growth is None else growth[:, scenes].contiguous(),
+                dt.contiguous(),
+            )
+            assembly.run(steps, every, n, elasticity, plasticity, inputs, ParticleState(*(t[:, own] for t in frames)))
+
+        if self.pool is None:
+            for assembly in self.assemblies:
+                one(assembly)
+        else:
+            with _one_thread_each():
+                list(self.pool.map(one, self.assemblies))
+        self._check(frames, steps, every, inner_of)
+        return frames
+
+    def _check(self, frames: ParticleState, steps: int, every: int, inner: list[int]) -> None:
+        """Raise where a motion is not finite, or so fast that a body crosses its own size in a step."""
+        for s, (i, j) in enumerate(zip(self.particles.offsets[:-1], self.particles.offsets[1:])):
+            dt = self.scenes[s].dt / inner[s]
+            size = float((self.state.x[i:j].amax(dim=0) - self.state.x[i:j].amin(dim=0)).norm())
+            fine = torch.isfinite(frames.x[:, i:j]).all(dim=2) & (frames.v[:, i:j].norm(dim=2) * dt <= size)
+            if not bool(fine.all()):
+                frame = int((~fine.all(dim=1)).nonzero()[0])
+                raise UserError(f"the motion of scene {s} is not finite from step {max(frame - 1, 0) * every} of {steps} on; lower `dt` "
+                                f"(now {self.scenes[s].dt:g} s in {inner[s]} inner steps) or the stiffness")  # fmt: skip

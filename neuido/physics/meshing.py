@@ -1,0 +1,370 @@
+"""From a body of particles to a mesh of linear tetrahedra: a lattice of cells in the body's own axes, five or six tetrahedra a cell.
+
+Particles on a regular lattice give its cells. Others are spread over cubes of their volume, and a cell that is half full belongs to
+the body; the number of cells along each axis is the one that leaves the fewest cells half full, so that plane faces stay planes. Where
+many are half full all the same the body is curved, and the outer nodes move to its surface.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+
+PER_PARTICLE = 1.0
+"""Elements a particle where no number of elements is given."""
+LOOSE = 1.1
+"""Where the mesh's volume and that of the particles differ by more than this factor, each keeps its own."""
+CURVED = 0.12
+"""Share of cells half full above which a body is taken to be curved, and the stairs of its surface are smoothed."""
+STEEP = 2.5
+"""How much `steepest` may rise by that: the square of the cost in inner steps."""
+EVEN = ((0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1))
+
+
+class Mesh(NamedTuple):
+    """Linear tetrahedra."""
+
+    nodes: Tensor
+    """Positions in the body at t = 0 [m], (N, 3) float64."""
+    elements: Tensor
+    """Nodes of each element, positively oriented, (E, 4) int64."""
+
+    @property
+    def volume(self) -> Tensor:
+        """Volume of each element [m^3], (E,)."""
+        corners = self.nodes[self.elements]
+        return torch.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
+
+    @property
+    def gradients(self) -> Tensor:
+        """Gradients of the shape functions of each element's corners [1/m], (E, 4, 3)."""
+        corners = self.nodes[self.elements]
+        last = torch.linalg.inv(corners[:, 1:] - corners[:, :1]).mT
+        return torch.cat([-last.sum(dim=1, keepdim=True), last], dim=1)
+
+
+def tetrahedra_of(cells: np.ndarray, kind: int) -> np.ndarray:
+    """Corners of the tetrahedra of lattice cells, (n, kind, 4, 3) int, from the cells' indices (n, 3).
+
+    Five: a large one inside and one on each of four corners, mirrored from cell to cell so that faces fit. Six: Kuhn's, all around
+    one diagonal (Freudenthal 1942).
+    """
+    if kind == 6:
+        rows = []
+        for order in itertools.permutations(range(3)):
+            path = np.zeros((4, 3), dtype=np.int64)
+            for n, axis in enumerate(order):
+                path[n + 1] = path[n]
+                path[n + 1, axis] += 1
+            rows.append(path)
+        pattern = np.repeat(np.stack(rows)[None], 2, axis=0)
+    elif kind == 5:
+        pattern = np.stack([_five(parity) for parity in (0, 1)])
+    else:
+        raise UserError(f"tetrahedra is {kind}; a cell is cut into 5 or 6")
+    return pattern[cells.sum(axis=1) % 2] + cells[:, None, None]
+
+
+def _five(parity: int) -> np.ndarray:
+    inner = [tuple((c + parity) % 2 for c in corner) for corner in EVEN]
+    rows = [inner]
+    for corner in itertools.product((0, 1), repeat=3):
+        if corner not in inner:
+            rows.append([corner, *(other for other in inner if sum(a != b for a, b in zip(corner, other)) == 1)])
+    return np.array(rows)
+
+
+def steepest(mesh: Mesh) -> Tensor:
+    """Largest eigenvalue of sum grad N grad N^T of each element [1/m^2], (E,): what bounds the stable step."""
+    gradients = mesh.gradients
+    return torch.linalg.eigvalsh(gradients.mT @ gradients)[:, -1]
+
+
+def mesh_of_cells(cells: np.ndarray, origin: np.ndarray, axes: np.ndarray, kind: int = 5) -> Mesh:
+    """The mesh of lattice cells.
+
+    Args:
+        cells: Indices of the cells, (n, 3).
+        origin: Of the lattice [m], (3,).
+        axes: Edge vectors of a cell as rows [m], (3, 3).
+        kind: Tetrahedra a cell, 5 or 6.
+    """
+    corners = tetrahedra_of(cells - cells.min(axis=0), kind).reshape(-1, 3)
+    places, index = np.unique(corners, axis=0, return_inverse=True)
+    nodes = torch.from_numpy(origin + (places + cells.min(axis=0)) @ axes)
+    return oriented(nodes, torch.from_numpy(index.reshape(-1, 4)))
+
+
+def oriented(nodes: Tensor, elements: Tensor) -> Mesh:
+    """A mesh whose elements are turned where their volume is negative.
+
+    Raises:
+        UserError: An element without volume, or a node that is in no element.
+    """
+    nodes, elements = nodes.double(), elements.long()
+    volume = Mesh(nodes, elements).volume
+    flat = volume.abs() <= 1e-6 * volume.abs().mean()
+    if bool(flat.any()):
+        raise UserError(f"element {int(flat.nonzero()[0])} of the mesh has no volume; mesh the body again, or take the element out")
+    if len(torch.unique(elements)) != len(nodes):
+        raise UserError(f"{len(nodes) - len(torch.unique(elements))} nodes of the mesh belong to no element; take them out")
+    return Mesh(nodes, torch.where((volume < 0)[:, None], elements[:, [0, 1, 3, 2]], elements))
+
+
+def mesh_body(x: Tensor, volume: Tensor, *, elements: int | None = None, kind: int = 5) -> Mesh:
+    """A mesh of the body that particles fill. Its volume is theirs, unless theirs leave gaps between them (`LOOSE`).
+
+    Args:
+        x: Positions [m], (P, 3).
+        volume: Volumes [m^3], (P,).
+        elements: About how many elements; where absent `PER_PARTICLE` times the particles, and the particles' own cells where they
+            lie on a lattice and there are no more of them than that.
+        kind: Tetrahedra a cell, 5 or 6.
+
+    Raises:
+        UserError: No particles, or a body that is no volume.
+    """
+    points, weight = x.double().cpu().numpy(), volume.double().cpu().numpy()
+    if not len(points):
+        raise UserError("a body without particles has no mesh")
+    wanted = PER_PARTICLE * len(points) if elements is None else float(elements)
+    if not wanted >= kind:
+        raise UserError(f"elements is {elements}; a mesh needs at least {kind}")
+    total = weight.sum()
+    edge = (kind * total / wanted) ** (1 / 3)
+    lattice = lattice_of(points)
+    if lattice is not None:
+        origin, axes, index = lattice
+        size = np.linalg.norm(axes, axis=1)
+        if kind * len(points) <= 1.05 * wanted:
+            return _scaled(mesh_of_cells(index, origin - 0.5 * axes.sum(axis=0), axes, kind), total)
+        turn = axes / size[:, None]
+        lower, upper = (index.min(axis=0) - 0.5) * size + turn @ origin, (index.max(axis=0) + 0.5) * size + turn @ origin
+        spread = np.broadcast_to(size, points.shape)
+    else:
+        turn = box_axes(points)
+        # where cells are hardly larger than particles, wider cubes keep their number of particles even
+        wide = min(max(2.2 - 0.8 * edge / np.cbrt(weight.mean()), 1.0), 2.0)
+        spread = np.repeat(wide * np.cbrt(weight)[:, None], 3, axis=1)
+        lower, upper = _faces(points @ turn.T, weight)
+    q = points @ turn.T
+    counts, filled, misfit = _best_counts(q, weight, spread, lower, upper, edge)
+    size = (upper - lower) / counts
+    occupied = filled.sum() * size.prod()
+    if occupied > LOOSE * total:  # particles whose volumes leave gaps between them: half of their density inside, not half of one
+        counts, filled, misfit = _best_counts(q, weight, spread, lower, upper, edge, level=0.5 * total / occupied)
+        size = (upper - lower) / counts
+    cells = np.argwhere(filled)
+    mesh = mesh_of_cells(cells, lower @ turn, size[:, None] * turn, kind)
+    if misfit > CURVED:
+        level = 0.5 * min(total / occupied, 1.0) if occupied > LOOSE * total else 0.5
+        mesh = _onto_surface(mesh, torch.from_numpy(points), torch.from_numpy(weight), level, float(size.max()))
+    return _scaled(mesh, total)
+
+
+def _onto_surface(mesh: Mesh, x: Tensor, volume: Tensor, level: float, edge: float) -> Mesh:
+    """The outer nodes moved to where the density of the particles, smoothed over half a cell, is `level`: stairs become slopes."""
+    order = mesh.elements[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3).sort(dim=1).values
+    face, count = torch.unique(order, dim=0, return_counts=True)
+    outer = torch.unique(face[count == 1])
+    start, sigma = mesh.nodes[outer], 0.5 * edge
+    place = start.clone()
+    for _ in range(6):
+        for own in torch.arange(len(outer)).split(512):
+            arm = (place[own, None] - x) / sigma
+            density = volume * torch.exp(-0.5 * arm.square().sum(dim=-1)) / (sigma * (2 * np.pi) ** 0.5) ** 3
+            slope = -(density[..., None] * arm).sum(dim=1) / sigma
+            move = (level - density.sum(dim=1))[:, None] * slope / slope.square().sum(dim=1, keepdim=True).clamp(min=1e-30)
+            place[own] += move * (0.25 * edge / move.norm(dim=1, keepdim=True)).clamp(max=1.0)
+    shift = torch.zeros_like(mesh.nodes)
+    shift[outer] = (place - start) * (0.7 * edge / (place - start).norm(dim=1, keepdim=True)).clamp(max=1.0)
+    limit = STEEP * steepest(mesh).max()
+    for _ in range(12):  # no element may be flattened for it, which would cost inner steps
+        moved = mesh._replace(nodes=mesh.nodes + shift)
+        thin = (steepest(moved) > limit) | (moved.volume <= 0)
+        if not bool(thin.any()):
+            return moved
+        shift[torch.unique(mesh.elements[thin])] *= 0.6
+    return mesh
+
+
+def _scaled(mesh: Mesh, total: float) -> Mesh:
+    """The mesh about its centre, of the given volume; as it is where that is far from its own."""
+    volume = mesh.volume
+    if not 1 / LOOSE <= float(volume.sum()) / total <= LOOSE:
+        return mesh
+    centre = (volume[:, None] * mesh.nodes[mesh.elements].mean(dim=1)).sum(dim=0) / volume.sum()
+    return mesh._replace(nodes=centre + (mesh.nodes - centre) * float(total / volume.sum()) ** (1 / 3))
+
+
+def lattice_of(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The rectangular lattice on which points lie to 2 % of its spacing: origin (3,), axes as rows (3, 3), indices (P, 3); or None."""
+    if len(x) < 8:
+        return None
+    middle = x[np.argmin(((x - x.mean(axis=0)) ** 2).sum(axis=1))]
+    d = x - middle
+    near = d[np.argsort((d**2).sum(axis=1))[1:40]]
+    axes: list[np.ndarray] = []
+    for v in near:
+        if all(abs(v @ a) <= 0.02 * np.linalg.norm(v) * np.linalg.norm(a) for a in axes):
+            axes.append(v)
+        if len(axes) == 3:
+            break
+    if len(axes) < 3:
+        return None
+    basis, origin = np.stack(axes), middle
+    order = np.argsort((d**2).sum(axis=1))
+    for share in (0.02, 0.2, 1.0):  # first near the middle, where rounding to the lattice is safe
+        own = order[: max(27, int(share * len(x)))]
+        index = np.rint((x[own] - origin) @ np.linalg.inv(basis))
+        if np.linalg.matrix_rank(index - index.mean(axis=0)) < 3:
+            continue
+        fit, *_ = np.linalg.lstsq(np.column_stack([index, np.ones(len(own))]), x[own], rcond=None)
+        basis, origin = fit[:3], fit[3]
+    place = (x - origin) @ np.linalg.inv(basis)
+    index = np.rint(place)
+    cosines = basis @ basis.T / np.outer(*[np.linalg.norm(basis, axis=1)] * 2)
+    if np.abs(place - index).max() > 0.02 or np.abs(cosines - np.eye(3)).max() > 0.01:
+        return None
+    if len(np.unique(index, axis=0)) < len(x):
+        return None
+    index = index.astype(np.int64)
+    return origin + index.min(axis=0) @ basis, basis, index - index.min(axis=0)
+
+
+def box_axes(x: np.ndarray) -> np.ndarray:
+    """Orthonormal rows along the smallest box around points, (3, 3), by turning about one axis at a time from several starts."""
+    generator = np.random.default_rng(0)
+    d = x - x.mean(axis=0)
+    starts = [np.eye(3), np.linalg.svd(d.T @ d)[2], *(np.linalg.qr(generator.standard_normal((3, 3)))[0] for _ in range(6))]
+    if len(d) > 4000:  # only the outermost count
+        directions = generator.standard_normal((2000, 3))
+        d = d[np.unique(np.argmax(d @ directions.T, axis=0))]
+    best, smallest = np.eye(3), np.inf
+    for axes in starts:
+        width = np.pi / 4
+        for _ in range(24):
+            for a in range(3):
+                i, j = (a + 1) % 3, (a + 2) % 3
+                angle = np.linspace(-width, width, 61)
+                u, v = d @ axes[i], d @ axes[j]
+                area = np.ptp(np.outer(np.cos(angle), u) + np.outer(np.sin(angle), v), axis=1)
+                area = area * np.ptp(np.outer(np.cos(angle), v) - np.outer(np.sin(angle), u), axis=1)
+                t = angle[np.argmin(area)]
+                axes = axes.copy()
+                axes[[i, j]] = np.cos(t) * axes[i] + np.sin(t) * axes[j], np.cos(t) * axes[j] - np.sin(t) * axes[i]
+            width = max(0.7 * width, 1e-4)
+        size = np.prod(np.ptp(d @ axes.T, axis=0))
+        if size < smallest * (1 - 1e-6):
+            best, smallest = axes, size
+    return best
+
+
+def _faces(q: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the body begins and ends along each axis: the volume beyond a place, extended from the outer layer down to nothing."""
+    out = np.empty((2, 3))
+    h = np.cbrt(weight.mean())
+    for a in range(3):
+        for side, sign in enumerate((1.0, -1.0)):
+            place = sign * q[:, a]
+            order = np.argsort(place)
+            place, mass = place[order], weight[order]
+            beyond = np.cumsum(mass) - 0.5 * mass
+            layer = place <= place[0] + min(6.0 * h, 0.4 * (place[-1] - place[0]))
+            end = place[0] - 0.4 * h
+            if layer.sum() >= 8:
+                slope, offset = np.polyfit(place[layer], beyond[layer], 1)
+                end = np.clip(-offset / slope, place[0] - 0.8 * h, place[0]) if slope > 0 else end
+            out[side, a] = sign * end
+    return out[0], out[1]
+
+
+def _best_counts(
+    q: np.ndarray, weight: np.ndarray, spread: np.ndarray, lower: np.ndarray, upper: np.ndarray, edge: float, level: float = 0.5
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Cells along each axis, which of them are full: near `edge`, and with the fewest cells half full."""
+    steps = (np.arange(4) + 0.5) / 4 - 0.5
+    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = (q[:, None] + offsets * spread[:, None]).reshape(-1, 3)
+    share = np.repeat(weight / len(offsets), len(offsets))
+    extent = upper - lower
+    options = [sorted({max(1, round(float(e) / edge * f)) for f in (0.85, 0.93, 1.0, 1.07, 1.15)}) for e in extent]
+    place = (points - lower) / extent
+    best = None
+    for counts in itertools.product(*options):
+        n = np.array(counts)
+        cell = np.clip((place * n).astype(np.int64), 0, n - 1)
+        fill = np.bincount(np.ravel_multi_index(tuple(cell.T), counts), share, minlength=int(n.prod())) / (extent / n).prod()
+        full = _without_holes((fill >= level).reshape(counts)).ravel()
+        misfit = np.abs(np.minimum(fill / (2 * level), 1.0) - full).sum() / max(full.sum(), 1)
+        shape = np.log(extent / n / edge)
+        cost = 3.0 * misfit + 0.3 * np.abs(shape).max() + np.abs(shape.mean())
+        if full.any() and (best is None or cost < best[0]):
+            best = (cost, n, full.reshape(counts), misfit)
+    if best is None:
+        raise UserError("the particles fill no cell of the mesh; raise `elements`")
+    return best[1:]
+
+
+def _without_holes(full: np.ndarray) -> np.ndarray:
+    """Cells with five or six full neighbours are full: where particles are sparse a cell inside may hold less than half its share."""
+    padded = np.pad(full, 1).astype(np.int64)
+    middle = slice(1, -1)
+    around = sum(
+        padded[tuple(slice(1 + d, padded.shape[b] - 1 + d) if b == a else middle for b in range(3))] for a in range(3) for d in (-1, 1)
+    )
+    return full | (around >= 5)
+
+
+def locate(mesh: Mesh, points: Tensor, *, near: int = 24, chunk: int = 1024) -> tuple[Tensor, Tensor]:
+    """The element of each point and its barycentric weights: (n,), (n, 4); a point outside is extrapolated from the nearest element.
+
+    Args:
+        mesh: The mesh.
+        points: Places in the body at t = 0 [m], (n, 3).
+        near: Elements that are tried, those of the nearest centroids.
+        chunk: Points at a time.
+    """
+    corners = mesh.nodes[mesh.elements]
+    centroid, gradients = corners.mean(dim=1), mesh.gradients
+    found, weights = [], []
+    for part in points.to(mesh.nodes).split(chunk):
+        index = torch.cdist(part, centroid).topk(min(near, len(centroid)), largest=False).indices
+        last = torch.einsum("nkac,nkc->nka", gradients[index][:, :, 1:], part[:, None] - corners[index][:, :, 0])
+        each = torch.cat([1.0 - last.sum(dim=-1, keepdim=True), last], dim=-1)
+        best = each.amin(dim=-1).argmax(dim=1, keepdim=True)
+        found.append(index.gather(1, best)[:, 0])
+        weights.append(each.gather(1, best[..., None].expand(-1, 1, 4))[:, 0])
+    return torch.cat(found), torch.cat(weights)
+
+
+def follow(x: Tensor, places: Tensor, *, near: int = 16, degree: int = 1, chunk: int = 1024) -> tuple[Tensor, Tensor]:
+    """Particles (n, k) and weights (n, k) for each place; their sums take a field from the particles there.
+
+    Args:
+        x: Particles [m], (P, 3).
+        places: [m], (n, 3).
+        near: Particles k that take part, at most.
+        degree: 1 reproduces every affine field (moving least squares); 0 is a positive mean.
+        chunk: Places at a time.
+    """
+    k = min(near, len(x))
+    out = []
+    for part in places.split(chunk):
+        distance, index = torch.cdist(part, x).topk(k, largest=False)
+        scale = distance[:, -1:].clamp(min=1e-12)
+        kernel = torch.exp(-3.0 * (distance / scale) ** 2)
+        if degree == 0:
+            out.append((index, kernel / kernel.sum(dim=1, keepdim=True)))
+            continue
+        arm = (x[index] - part[:, None]) / scale[..., None]
+        basis = torch.cat([torch.ones_like(arm[..., :1]), arm], dim=-1)
+        normal = torch.einsum("nk,nka,nkb->nab", kernel, basis, basis) + 1e-9 * torch.eye(4, dtype=x.dtype, device=x.device)
+        first = torch.zeros(len(part), 4, 1, dtype=x.dtype, device=x.device)
+        first[:, 0] = 1.0
+        out.append((index, kernel * (basis @ torch.linalg.solve(normal, first))[..., 0]))
+    return torch.cat([index for index, _ in out]), torch.cat([weight for _, weight in out])
