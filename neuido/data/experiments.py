@@ -16,7 +16,9 @@ from torch import Tensor
 from neuido.data import scenes
 from neuido.data.formats import nerfstudio
 from neuido.data.formats.layout import MultiView, inside, number
+from neuido.data.measured import read_effects
 from neuido.errors import UserError
+from neuido.physics.effects import LIBRARY
 from neuido.types import Body, Box, Plane, Scene, Walls
 
 FORMAT = "neuido-experiment/1"
@@ -69,7 +71,8 @@ class Experiment:
     folder: Path
     scene: Scene
     model: dict[str, Any]
-    """What the experimenter believes: density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them)."""
+    """What the experimenter believes: density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them), and perhaps
+    `effects`, flat figures such as {"viscosity_shear.eta": 12.0}."""
     free: tuple[str, ...]
     """The parameters of the model that are to be fitted; every other figure is trusted."""
     recordings: tuple[Recording, ...]
@@ -86,8 +89,12 @@ class Experiment:
         return tuple(recording for recording in self.recordings if recording.role == role)
 
 
-def read_experiment(path: str | os.PathLike) -> Experiment:
+def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None = None) -> Experiment:
     """Read an experiment's folder, or its `experiment.yaml`.
+
+    Args:
+        path: The folder or the file.
+        model: Takes the place of the file's own key `model`.
 
     Raises:
         UserError: An unknown or missing key, a missing file, a figure outside its physical range, a shape that does not fit, a box
@@ -108,7 +115,7 @@ def read_experiment(path: str | os.PathLike) -> Experiment:
             raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
         name = _text(content["name"], "name")
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
-        model, free = _model(content["model"])
+        believed, free = _model(content["model"] if model is None else model)
         entries = content["recordings"]
         if not isinstance(entries, list) or not entries:
             raise UserError(f"recordings must be a list of at least one recording, got {entries!r}")
@@ -121,7 +128,7 @@ def read_experiment(path: str | os.PathLike) -> Experiment:
         raise UserError(f"{file}: {error}") from error
     except OverflowError as error:
         raise UserError(f"{file}: a number is too large: {error}") from error
-    return Experiment(name, folder, scene, model, free, tuple(recordings))
+    return Experiment(name, folder, scene, believed, free, tuple(recordings))
 
 
 def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
@@ -178,6 +185,7 @@ def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
 def _model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
     given = scenes._mapping(given, "model")
     free = given.pop("free", [])
+    effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY))
     for part in ("elasticity", "plasticity"):
         if isinstance(given.get(part), Mapping):
             _text(given[part].get("law"), f"model.{part}.law")
@@ -190,6 +198,8 @@ def _model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
             raise UserError(f"model.free has {key!r}, which the model lacks; one of {', '.join(known)}")
     if len(set(free)) < len(free):
         raise UserError(f"model.free names a parameter twice: {free}")
+    if effects:
+        model["effects"] = effects
     return model, tuple(free)
 
 

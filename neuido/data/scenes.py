@@ -50,8 +50,8 @@ def data_root(option: str | os.PathLike | None = None) -> Path:
 
 
 def scene_names() -> list[str]:
-    """Names that `load_scene` knows: the files of configs/scenes."""
-    return sorted(path.stem for path in _folder().glob("*.yaml"))
+    """Names that `load_scene` knows: the files of configs/scenes of its format (others hold lists of scenes for `neuido simulate`)."""
+    return sorted(path.stem for path in _folder().glob("*.yaml") if f"\nformat: {FORMAT}\n" in path.read_text())
 
 
 def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -> SceneSetup:

@@ -1,0 +1,1 @@
+"""The closed loop: from measured data to the effect that a model lacks."""

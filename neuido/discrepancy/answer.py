@@ -1,0 +1,357 @@
+"""What a diagnosis leaves behind: diagnosis.json (`neuido-diagnosis/1`), model_after.yaml, trace.json, the predicted motion, the report."""
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+import neuido
+from neuido.data.storage import write as write_text
+from neuido.discrepancy import ceiling, next_experiment, report, residual
+from neuido.discrepancy.attribution import ALPHA, Diagnosis, Round, Trial
+from neuido.discrepancy.problem import Problem
+
+FORMAT = "neuido-diagnosis/1"
+VERSION = neuido.__version__
+Found = Sequence[tuple[Diagnosis, float]]
+
+
+@dataclass(eq=False)
+class Details:
+    """What is computed from a diagnosis for its report."""
+
+    content: dict[str, Any]
+    """Of diagnosis.json."""
+    motion: dict[str, dict[str, np.ndarray]]
+    """Arrays of each recording: measured, before, after, and what they are over."""
+    stages: dict[str, list[residual.Series]] = field(default_factory=dict)
+    """Of each recording of a body."""
+    ceilings: dict[str, ceiling.Ceiling] = field(default_factory=dict)
+    """`before` and `after`."""
+
+
+def write(
+    out: Path,
+    found: Found,
+    *,
+    kind: str,
+    device: str,
+    seed: int = 0,
+    seconds: float | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> None:
+    """Write all files; each appears when it is whole, diagnosis.json last.
+
+    Args:
+        out: Folder.
+        found: Diagnoses with the seconds that each took; several are the bodies of a track folder.
+        kind: `experiment`, `material test` or `track`.
+        device: Where it ran.
+        seed: Of the ceiling's network.
+        seconds: In place of the measured ones.
+        tell: Called with a line of progress.
+    """
+    tell = tell or (lambda line: None)
+    details = []
+    for diagnosis, spent in found:
+        begun = time.monotonic()
+        made = describe(diagnosis, device=device, seed=seed, tell=tell)
+        made.content["seconds"] = round(spent + time.monotonic() - begun, 1) if seconds is None else seconds
+        details.append(made)
+    tell("writing")
+    for made in details:
+        for name, arrays in made.motion.items():
+            _save(out / "predicted" / f"{name}.npz", arrays)
+    models = {_body(d): d.problem.model_after(d.after, [t.candidate.name for t in d.effects]) for d, _ in found}
+    model = {"bodies": models} if len(found) > 1 else next(iter(models.values()))
+    write_text(out / "model_after.yaml", yaml.safe_dump(_plain(model), sort_keys=False, default_flow_style=None))
+    traces = [trace(d) for d, _ in found]
+    write_json(out / "trace.json", {"bodies": traces} if len(found) > 1 else traces[0])
+    content = [made.content for made in details]
+    if len(found) > 1:
+        name = found[0][0].problem.name.rpartition(": ")[0]
+        whole: dict[str, Any] = {"format": FORMAT, "experiment": name, "bodies": content}
+    else:
+        whole = content[0]
+    write_text(out / "report.html", report.page(details, [d for d, _ in found], kind=kind))
+    write_json(out / "diagnosis.json", whole)
+
+
+def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], None] | None = None) -> Details:
+    """The content of diagnosis.json and what the report shows beside it."""
+    tell = tell or (lambda line: None)
+    tell("motion before and after")
+    motion = motions(d)
+    series = {name: _stages(d, name, arrays) for name, arrays in motion.items() if "positions" in arrays}
+    tell("ceiling")
+    ceilings = {when: ceiling.of(d, point, seed=seed) for when, point in (("before", d.before), ("after", d.after))}
+    tell("next experiment")
+    content = {
+        "format": FORMAT,
+        "experiment": d.problem.name,
+        "answer": d.answer,
+        "effects": [_effect(d, r, series) for r in d.rounds if r.chosen is not None],
+        "declared": _declared(d, d.before, d.declared_intervals),
+        "after": _declared(d, d.after, d.intervals),
+        "error": {
+            "measure": d.problem.measure,
+            "unit": d.problem.unit,
+            "noise_floor": d.floors["noise"],
+            "discretisation_floor": d.floors["discretisation"],
+            **{when: errors(d, when) for when in ("before", "after")},
+        },
+        "rejected": rejected(d),
+        "next_experiment": next_experiment.propose(d),
+        "ceiling": {when: {"held_out": c.held_out, "fit": c.fit} for when, c in ceilings.items()},
+        "solver": d.problem.setting_name(d.setting),
+        "seconds": 0.0,
+        "device": device,
+        "version": VERSION,
+    }
+    if "body" in d.problem.labels:
+        content["body"] = d.problem.labels["body"]
+    return Details(_plain(content), motion, series, ceilings)
+
+
+def errors(d: Diagnosis, when: str) -> dict[str, Any]:
+    """Errors of the parts that are fitted, of those that are held out, and by recording; joined ones weigh each datum alike."""
+    own = d.errors[when]
+
+    def joined(fitted: bool) -> float | None:
+        parts = [p for p in d.parts if p.fitted == fitted]
+        counts = [np.count_nonzero(p.rows) for p in parts]
+        return math.sqrt(sum(n * own[p.name] ** 2 for n, p in zip(counts, parts)) / sum(counts)) if parts else None
+
+    return {"fit": joined(True), "held_out": joined(False), "by_recording": dict(own)}
+
+
+def rejected(d: Diagnosis) -> list[dict[str, str]]:
+    """Every candidate that is neither an effect nor in the class of one, with the reason of the round that weighed it best."""
+    kept = {t.candidate.name for r in d.rounds for t in (r.members if r.chosen is not None else [])}
+    reasons: dict[str, str] = {}
+    behind = "its direction in the data stays behind those of the effects that were fitted in full"
+    for r in d.rounds:
+        for t in r.trials:
+            name = t.candidate.name
+            if name not in kept and name not in reasons and t.reason:
+                reasons[name] = t.reason
+    for c in d.problem.candidates:
+        if c.name not in kept and c.name not in reasons:
+            reasons[c.name] = behind if any(r.trials for r in d.rounds) else "nothing but noise is left without it"
+    out = [{"name": name, "reason": reason} for name, reason in reasons.items()]
+    return out + [{"name": name, "reason": reason} for name, reason in d.problem.labels.get("excluded", {}).items()]
+
+
+def _effect(d: Diagnosis, r: Round, series: Mapping[str, list[residual.Series]]) -> dict[str, Any]:
+    """One entry of `effects`."""
+    c = r.chosen.candidate
+    parameters = {}
+    for p in c.parameters:
+        value = d.after.get(p.name, p.value)
+        low, high = d.intervals.get(p.name, (value, value))
+        parameters[p.name.partition(".")[2]] = {"value": value, "unit": p.unit, "interval90": [low, high]}
+    names = list(dict.fromkeys([c.name, *(t.candidate.name for t in r.members)]))
+    out = {
+        "name": c.name,
+        "class": names,
+        "parameters": _derived(d, c.name, parameters),
+        "p_value": r.p_value,
+        "where": _where(c.where, series),
+    }
+    if c.form:
+        out["form"] = c.form
+    return out
+
+
+def _derived(d: Diagnosis, name: str, own: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The parameters, and those figures of them that people use."""
+
+    def mapped(key: str, unit: str, f: Callable[[float], float]) -> dict[str, Any]:
+        ends = sorted(f(v) for v in own[key]["interval90"])
+        return {"value": f(own[key]["value"]), "unit": unit, "interval90": ends}
+
+    more: dict[str, dict[str, Any]] = {}
+    if name == "yield" and all(v > 0 for v in own["inverse"]["interval90"]):
+        more["yield_stress"] = mapped("inverse", "Pa", lambda v: 1.0 / v)
+    if name == "hysteresis":
+        more["damping_ratio"] = mapped("eta", "1", lambda v: 0.5 * v)
+    if name == "friction":
+        declared = {p.friction for r in getattr(d.problem, "measured", ()) for p in r.scene.colliders}
+        if len(declared) == 1:
+            more["coefficient"] = mapped("mu", "1", lambda v: v + next(iter(declared)))
+    if "log_ratio" in own:
+        more["ratio"] = mapped("log_ratio", "1", math.exp)
+        radius = own["radius"]
+        more["centre"] = {"value": [own[k]["value"] for k in ("cx", "cy", "cz")], "unit": "m",
+                          "interval90": [[own[k]["interval90"][i] for k in ("cx", "cy", "cz")] for i in (0, 1)],
+                          "of": "the centre of the body at t = 0"}  # fmt: skip
+        more["radius"] = radius
+    return own | more
+
+
+def _where(stage: str, series: Mapping[str, list[residual.Series]]) -> str:
+    """The stage, and the place in time where the residual stood out most."""
+    best = None
+    for name, rows in series.items():
+        s = residual.telling(rows)
+        if s is None:
+            continue
+        i = int(np.argmax(s.before / np.maximum(s.noise, 1e-300)))
+        over = float(s.before[i] / max(s.noise[i], 1e-300))
+        if best is None or over > best[0]:
+            best = (over, s.name, float(s.times[i]), name)
+    if best is None or best[0] < 2:
+        return stage
+    return f"{stage}; the residual stands out most in the stage {best[1]} of {best[3]}, {best[0]:.0f} times its noise at {best[2]:.3g} s"
+
+
+def _declared(d: Diagnosis, point: Mapping[str, float], intervals: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    out = {}
+    for p in d.problem.declared:
+        value = point.get(p.name, p.value)
+        out[p.name] = {"value": value, "unit": p.unit, "interval90": list(intervals.get(p.name, (value, value)))}
+    return out
+
+
+def motions(d: Diagnosis) -> dict[str, dict[str, np.ndarray]]:
+    """What was measured and what is predicted before and after, for each recording, as the errors of the diagnosis count it.
+
+    Bodies: `positions` (1), `measured`, `before` and `after` (T, N, 3) [m], the clock, the ruler and the launch at their most probable
+    values, `before_model` and `after_model` without that, `t` (T,). Others: the data as vectors, with `times` and `groups` (which
+    channel a row is of).
+    """
+    out = {}
+    problem: Problem = d.problem
+    for n, recording in enumerate(problem.recordings):
+        own = {when: ceiling.as_seen(d, point, n) for when, point in (("before", d.before), ("after", d.after))}
+        if not hasattr(problem, "motion"):
+            out[recording.name] = {"times": recording.times, "groups": recording.groups, "measured": recording.y, **own}
+            continue
+        r = problem.measured[n]
+        arrays = {"positions": np.array(1), "t": r.t.numpy(), "measured": r.x.double().numpy()}
+        seen = r.seen.numpy()
+        for when, point in (("before", d.before), ("after", d.after)):
+            model = problem.motion(point, n, d.setting)
+            shown = model.copy()
+            shown[1:][seen[1:]] = own[when].reshape(-1, 3)
+            arrays |= {when: shown, f"{when}_model": model}
+        out[recording.name] = arrays
+    return out
+
+
+def _stages(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> list[residual.Series]:
+    n = [r.name for r in d.problem.recordings].index(name)
+    r = d.problem.measured[n]
+    mass = float(r.body.volume.double().sum()) * float(d.after.get("density", d.problem.experiment.model["density"]))
+    first = d.rounds[0].floor
+    return residual.stages(arrays["measured"], arrays["t"], arrays["before"], arrays["after"], mass=mass, sigma=first.noise[n],
+                           planes=r.scene.colliders, margin=1.5 * r.scene.dx)  # fmt: skip
+
+
+def trace(d: Diagnosis) -> dict[str, Any]:
+    """Every figure that the decisions rest on, for benchmarks and ablations."""
+    names = [
+        {"name": p.name, "recording": d.problem.recordings[p.recording].name, "fitted": p.fitted, "rows": int(p.rows.sum())}
+        for p in d.parts
+    ]
+    return _plain({
+        "format": "neuido-trace/1",
+        "experiment": d.problem.name,
+        "answer": d.answer,
+        "parts": names,
+        "simulations": d.evaluations,
+        "setting": d.setting,
+        "alpha": ALPHA,
+        "rounds": [_round(d, r) for r in d.rounds],
+        "before": dict(d.before),
+        "after": dict(d.after),
+    })  # fmt: skip
+
+
+def _round(d: Diagnosis, r: Round) -> dict[str, Any]:
+    quantiles = (0.5, 0.9, 0.95, 0.99)
+    null = np.asarray(r.null)
+    return {
+        "base": dict(r.base),
+        "mean_squares": list(r.errors),
+        "noise": [r.floor.noise[p.recording] for p in d.parts],
+        "discretisation": [float(np.sqrt(np.mean(r.floor.spread[p.recording][p.rows] ** 2))) for p in d.parts],
+        "p_value": r.p_value,
+        "chosen": r.chosen.candidate.key if r.chosen else None,
+        "members": [t.candidate.key for t in r.members],
+        "null": {"quantiles": {str(q): float(np.quantile(null, q)) for q in quantiles} if len(null) else {}, "sample": list(null)},
+        "trials": [_trial(r, t) for t in r.trials],
+    }
+
+
+def _trial(r: Round, t: Trial) -> dict[str, Any]:
+    c = t.candidate
+    return {
+        "key": c.key,
+        "name": c.name,
+        "point": dict(t.fit.point),
+        "parameters": len(c.parameters),
+        "cost": t.fit.cost,
+        "data": len(t.fit.residual),
+        "evaluations": t.fit.evaluations,
+        "converged": t.fit.converged,
+        "mean_squares": list(t.errors),
+        "gain": t.gain,
+        "score": t.score,
+        "cosine": r.cosines.get(c.key),
+        "reason": t.reason,
+    }
+
+
+def summary(found: Found) -> str:
+    """One line for the terminal."""
+    lines = []
+    for d, _ in found:
+        after = errors(d, "after")
+        before = errors(d, "before")
+        key = "held_out" if after["held_out"] is not None else "fit"
+        names = " and ".join("|".join(dict.fromkeys(t.candidate.name for t in r.members)) for r in d.rounds if r.chosen is not None)
+        what = f"{d.answer}: {names}" if names else d.answer
+        where = f"{d.problem.labels['body']}: " if "body" in d.problem.labels and len(found) > 1 else ""
+        lines.append(f"{where}{what}; {'held-out' if key == 'held_out' else 'fitted'} error {before[key]:.3g} -> {after[key]:.3g} {d.problem.unit} "
+                     f"(floor {math.hypot(d.floors['noise'], d.floors['discretisation']):.2g})")  # fmt: skip
+    return "\n".join(lines)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON all at once; figures that are not finite become null."""
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def _body(d: Diagnosis) -> str:
+    return d.problem.labels.get("body", d.problem.name)
+
+
+def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hidden = path.with_name(f".{path.name}.tmp")
+    with hidden.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)
+    os.replace(hidden, path)
+
+
+def _plain(value: Any) -> Any:
+    """The same with Python's own numbers; what is not finite becomes null."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(v) for v in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value

@@ -1,0 +1,375 @@
+"""The MPM body as a `Problem`: tracked points of a deforming body, its declared law, and the effects that it may lack.
+
+Points that follow a particle are compared with that particle; points with an anchor move with the material around it, by a
+moving least-squares map of the nearest particles that reproduces every affine motion exactly.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.data.experiments import Experiment
+from neuido.data.experiments import Recording as Measured
+from neuido.discrepancy.library import KNOTS, active_effects, body_candidates, effects_of, present
+from neuido.discrepancy.problem import Parameter, Point, Problem, Recording
+from neuido.errors import UserError
+from neuido.physics.finite_elements import FiniteElements
+from neuido.physics.laws import material
+from neuido.physics.mpm import Simulator
+from neuido.types import Body, ParticleState, Scene
+
+LOG_STEPS = {"young": 0.1, "density": 0.05, "yield_stress": 0.1}
+RANGES = {"young": (1e2, 1e13), "poisson": (0.0, 0.495), "density": (1.0, 3e4), "yield_stress": (1e-2, 1e12), "friction_angle": (1.0, 80.0)}
+UNITS = {"young": "Pa", "poisson": "1", "density": "kg/m^3", "yield_stress": "Pa", "friction_angle": "degrees"}
+STEPS = {"poisson": 0.03, "friction_angle": 2.0}
+
+NUISANCES = (  # name, unit, prior standard deviation; of the frame interval, of one, of the speed
+    ("release_time", "s", 0.1),
+    ("time_base", "1", 0.003),
+    ("length_scale", "1", 0.003),
+    ("velocity_x", "m/s", 0.005),
+    ("velocity_y", "m/s", 0.005),
+    ("velocity_z", "m/s", 0.005),
+    ("spin_x", "rad/s", 0.01),
+    ("spin_y", "rad/s", 0.01),
+    ("spin_z", "rad/s", 0.01),
+)
+NEIGHBOURS = 12
+WINDOWS = 6
+"""In time, of the patterns of an unknown discretisation error."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One discretisation."""
+
+    cells: float
+    """Factor of the suggested number of cells."""
+    dt: float
+    """Factor of the suggested step."""
+    solver: str = "material_points"
+    """`material_points` or `finite_elements`."""
+
+
+SETTINGS = (Setting(1.0, 1.0), Setting(1.0, 0.5), Setting(0.85, 1.0), Setting(1.2, 0.5), Setting(1.0, 1.0, "finite_elements"))
+
+
+@dataclass(frozen=True, eq=False)
+class BodyProblem(Problem):
+    """An experiment folder with tracked points."""
+
+    experiment: Experiment = None  # type: ignore[assignment]
+    measured: tuple[Measured, ...] = ()
+    device: str = "cpu"
+    batch: int = 0
+    """Parameter sets in a launch; 0: as the device likes."""
+    _simulators: dict[Any, Simulator] = field(default_factory=dict, repr=False)
+    _maps: dict[int, Any] = field(default_factory=dict, repr=False)
+
+    def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
+        # instruments alone need no further run: points that move alike share one
+        name = self.measured[recording].name
+        instruments = tuple(f"{kind}:{name}" for kind in ("release_time", "time_base", "length_scale"))
+        unique: dict[tuple, list[int]] = {}
+        for i, point in enumerate(points):
+            key = tuple(sorted((k, v) for k, v in point.items() if k not in instruments and (":" not in k or k.endswith(f":{name}"))))
+            unique.setdefault(key, []).append(i)
+        groups = list(unique.values())
+        # on the CPU a launch pays for the effects of all its points: those of a kind go together
+        cpu = self.device == "cpu"
+        size = self.batch or (4 if cpu else 96)
+        kinds = [active_effects(points[g[0]]) for g in groups]
+        order = sorted(range(len(groups)), key=lambda i: sorted(kinds[i]) if cpu else i)
+        out = np.empty((len(points), len(self.recordings[recording].y)))
+        at = 0
+        while at < len(order):
+            end = at + 1
+            while end < min(at + size, len(order)) and (not cpu or kinds[order[end]] == kinds[order[at]]):
+                end += 1
+            own = [groups[i] for i in order[at:end]]
+            self._predict(points, own, recording, setting, out)
+            at = end
+        return out
+
+    def error(self, residual: np.ndarray, recording: int) -> float:
+        return float(np.sqrt(3.0 * np.mean(residual**2)))
+
+    def directions(self, recording: int) -> np.ndarray:
+        """Affine motions of the body in windows of time: where the part of the discretisation error may lie that no setting shows."""
+        r = self.measured[recording]
+        seen = r.seen.numpy()[1:]
+        place = r.x.double().numpy()[0]
+        mean, size = np.nanmean(place, axis=0), np.nanstd(place, axis=0)
+        X = np.where(np.isfinite(place), (place - mean) / np.maximum(size, 1e-9), 0.0)
+        space = np.concatenate([np.ones((len(X), 1)), X], axis=1)
+        t = r.t.numpy()[1:]
+        knots = np.linspace(t[0], t[-1], WINDOWS)
+        bumps = np.maximum(0.0, 1.0 - np.abs(t[:, None] - knots) / (knots[1] - knots[0]))
+        columns = np.einsum("tk,ns,ab->tnakbs", bumps, space, np.eye(3)).reshape(*seen.shape, 3, -1)[seen].reshape(-1, WINDOWS * 12)
+        return columns / np.sqrt(np.mean(np.sum(columns**2, axis=1)))
+
+    @property
+    def duration(self) -> float:
+        """Over which the knots of a force in time spread, in every recording [s]: the longest one that is fitted."""
+        return max(float(r.t[-1]) for r in self.measured if r.role == "fit")
+
+    def motion(self, point: Point, recording: int, setting: int = 0) -> np.ndarray:
+        """Predicted tracked points [m], (T, N, 3)."""
+        x, _ = self._roll([point], recording, setting)
+        return x[0]
+
+    def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
+        model = {key: dict(value) if isinstance(value, Mapping) else value for key, value in self.experiment.model.items()}
+        for p in self.declared:
+            _place(model, p.name, values.get(p.name, p.value))
+        own = {key: float(value) for key, value in values.items() if key.split(".")[0] in effects}
+        if "time_force" in effects:
+            own.setdefault("time_force.interval", self.duration / (KNOTS - 1))
+        model["free"] = list(self.experiment.free)
+        if own:
+            model["effects"] = {**model.get("effects", {}), **own}
+        return model
+
+    # Forward runs.
+
+    def _predict(self, points: Sequence[Point], groups: Sequence[list[int]], recording: int, setting: int, out: np.ndarray) -> None:
+        """Fill the rows of groups of points that move alike."""
+        try:
+            x, v = self._roll([points[g[0]] for g in groups], recording, setting)
+        except UserError:
+            if len(groups) > 1:
+                for g in groups:
+                    self._predict(points, [g], recording, setting, out)
+            else:
+                out[groups[0]] = np.nan
+            return
+        seen = self.measured[recording].seen.numpy()
+        for g, xs, vs in zip(groups, x, v, strict=True):
+            for i in g:
+                out[i] = self._as_seen(points[i], recording, xs, vs)[1:][seen[1:]].reshape(-1)
+
+    def _as_seen(self, point: Point, recording: int, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Positions as the instruments see them: clock and ruler may be off."""
+        r = self.measured[recording]
+        value = {name: point.get(f"{name}:{r.name}", 0.0) for name in ("release_time", "time_base", "length_scale")}
+        if not any(value.values()):
+            return x
+        t = r.t.numpy()[:, None, None]
+        centre = x[0].mean(axis=0)
+        return centre + (1.0 + value["length_scale"]) * (x + (value["release_time"] + value["time_base"] * t) * v - centre)
+
+    def _roll(self, points: Sequence[Point], recording: int, setting: int) -> tuple[np.ndarray, np.ndarray]:
+        r = self.measured[recording]
+        wanted = len(points)
+        if self.device != "cpu":  # few sizes: each has buffers of its own
+            size = next((n for n in (1, 4, 12, 32, 96) if n >= wanted), wanted)
+            points = [*points, *[points[-1]] * (size - wanted)]
+        simulator = self.simulator(recording, setting, len(points))
+        scene = simulator.scenes[0]
+        full = [{p.name: p.value for p in self.declared} | self.experiment.model.get("effects", {}) | dict(point) for point in points]
+        elasticity, plasticity = self.laws(full)
+        always = () if self.device == "cpu" or len(points) == 1 else [p.name for c in self.candidates for p in c.parameters]
+        effects = effects_of(full, simulator.state.x, simulator.particles.scene, self.duration, always=always)
+        every, steps, exact = _frames(r, scene.dt)
+        with torch.no_grad():
+            out = simulator.rollout(
+                steps, elasticity, plasticity, state=self._start(simulator, full, recording), every=every, effects=effects
+            )
+        index, weight = self._map(recording)
+        count = len(r.body.x)
+        xs, vs = [], []
+        for s in range(wanted):
+            x, v = (t[:, s * count : (s + 1) * count] for t in (out.x, out.v))
+            x, v = (_gather(t, index, weight) for t in (x, v))
+            if not exact:
+                x, v = _at_times(x, v, every * scene.dt, r.t.to(x))
+            xs.append(x.double().cpu().numpy())
+            vs.append(v.double().cpu().numpy())
+        return np.stack(xs), np.stack(vs)
+
+    def laws(self, points: Sequence[Mapping[str, float]]):
+        """The declared laws of several points, a row each."""
+
+        def filled(part: str) -> dict[str, Any]:
+            given = dict(self.experiment.model[part])
+            for p in self.declared:
+                if p.name in given:
+                    given[p.name] = torch.tensor([point[p.name] for point in points], dtype=torch.float64)
+            return given
+
+        elasticity, plasticity = filled("elasticity"), filled("plasticity")
+        return material(elasticity, plasticity)
+
+    def simulator(self, recording: int, setting: int, count: int) -> Simulator:
+        """`count` copies of a recording's scene, kept for the next call."""
+        key = (recording, setting, count)
+        if key not in self._simulators:
+            r, s = self.measured[recording], SETTINGS[setting]
+            scene = replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)
+            if len(self._simulators) > 12:  # they hold buffers
+                self._simulators.pop(next(iter(self._simulators)))
+            options = {"density": self.experiment.model["density"], "device": self.device}
+            if s.solver == "finite_elements":
+                self._simulators[key] = FiniteElements([scene] * count, [r.body] * count, **options)
+            else:
+                self._simulators[key] = Simulator([scene] * count, [r.body] * count, **options)
+        return self._simulators[key]
+
+    def _start(self, simulator: Simulator, points: Sequence[Point], recording: int) -> ParticleState:
+        """The start with the velocities and spins of each point."""
+        name = self.measured[recording].name
+        shift = [[p.get(f"{kind}_{a}:{name}", 0.0) for a in "xyz"] for kind in ("velocity", "spin") for p in points]
+        if not any(any(row) for row in shift):
+            return simulator.state
+        change = torch.tensor(shift, dtype=simulator.dtype, device=simulator.device).reshape(2, len(points), 3)
+        scene = simulator.particles.scene.long()
+        x, v, C, F = simulator.state
+        count = len(x) // len(points)
+        centre = x[:count].mean(dim=0)
+        w = change[1]
+        skew = torch.zeros(len(points), 3, 3, dtype=x.dtype, device=x.device)
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            skew[:, k, j], skew[:, j, k] = w[:, i], -w[:, i]
+        v = v + change[0][scene] + torch.einsum("pab,pb->pa", skew[scene], x - centre)
+        return ParticleState(x, v, C + skew[scene], F)
+
+    def _map(self, recording: int) -> tuple[Tensor, Tensor]:
+        """Particles (N, k) and weights (N, k) of each tracked point."""
+        if recording not in self._maps:
+            r = self.measured[recording]
+            x = r.body.x.double()
+            if r.anchor is not None:
+                places, known = r.anchor.double(), torch.full((len(r.anchor),), -1)
+            else:
+                places, known = _first_seen(r), r.track
+            index, weight = _follow(x, places)
+            for n in torch.nonzero(known >= 0)[:, 0].tolist():
+                index[n], weight[n] = known[n], 0.0
+                weight[n, 0] = 1.0
+            self._maps[recording] = (index.to(self.device), weight.float().to(self.device))
+        return self._maps[recording]
+
+
+def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0) -> BodyProblem:
+    """The problem of an experiment whose recordings have tracked points.
+
+    Raises:
+        UserError: A recording without particles, or no recording to fit.
+    """
+    measured = experiment.recordings
+    for r in measured:
+        if r.x is None:
+            raise UserError(f"recording {r.name} has no particles.npz: its tracked points are what is compared")
+        if len(r.t) < 4:
+            raise UserError(f"recording {r.name} has {len(r.t)} frames; a diagnosis needs at least 4")
+    if not any(r.role == "fit" for r in measured):
+        raise UserError("no recording has the role fit: set it on at least one in experiment.yaml")
+    declared = []
+    for name in experiment.free:
+        value = next(part[name] for part in (experiment.model["elasticity"], experiment.model["plasticity"], experiment.model) if name in part)
+        log = name in LOG_STEPS
+        declared.append(Parameter(name, UNITS[name], float(value), LOG_STEPS.get(name, STEPS.get(name, 1.0)), *RANGES[name], log=log))
+    nuisances = []
+    for r in measured:
+        speed, spin = _typical(r)
+        for name, unit, relative in NUISANCES:
+            unit_size = {"release_time": r.frame_interval, "velocity": speed, "spin": spin}.get(name.split("_")[0] if name != "release_time" else name, 1.0)
+            scale = relative * unit_size
+            nuisances.append(Parameter(f"{name}:{r.name}", unit, 0.0, scale, -8 * scale, 8 * scale, prior=1.0))
+    return BodyProblem(
+        name=experiment.name,
+        measure="rmse",
+        unit="m",
+        declared=tuple(declared),
+        nuisances=tuple(nuisances),
+        candidates=present(body_candidates(experiment), experiment.model.get("effects", {})),
+        recordings=tuple(_recording(r) for r in measured),
+        settings=len(SETTINGS),
+        solvers=(0, 4),
+        experiment=experiment,
+        measured=tuple(measured),
+        device=device,
+        batch=batch,
+    )
+
+
+def _recording(r: Measured) -> Recording:
+    seen = r.seen.numpy()
+    y = r.x.double().numpy()[1:][seen[1:]].reshape(-1)
+    frame, point = np.nonzero(seen[1:])
+    groups = (point[:, None] * 3 + np.arange(3)).reshape(-1)
+    times = np.repeat(r.t.numpy()[1:][frame], 3)
+    return Recording(r.name, r.role, y, r.noise, groups, times)
+
+
+def _typical(r: Measured) -> tuple[float, float]:
+    """A speed [m/s] and a spin [rad/s] of the recording: of its motion over its length, at the least."""
+    x = r.x.double().numpy()
+    step = np.linalg.norm(np.diff(np.nanmean(x, axis=1), axis=0), axis=1) / np.diff(r.t.numpy())
+    speed = float(np.nanmax(step))
+    extent = float(np.ptp(r.body.x.double().numpy(), axis=0).max())
+    return max(speed, 1e-3), max(speed / extent, 1e-2)
+
+
+def _frames(r: Measured, dt: float) -> tuple[int, int, bool]:
+    """Substeps between kept frames, substeps in all, and whether the kept frames are the recorded ones."""
+    t = r.t.double().numpy()
+    every = round(r.frame_interval / dt)
+    if every >= 1 and np.allclose(t, np.arange(len(t)) * every * dt, rtol=0.0, atol=1e-3 * r.frame_interval):
+        return every, every * (len(t) - 1), True
+    every = max(1, round(float(np.diff(t).min()) / dt / 6))
+    return every, every * int(np.ceil(t[-1] / (every * dt) + 1e-9)), False
+
+
+def _gather(x: Tensor, index: Tensor, weight: Tensor) -> Tensor:
+    """Weighted sums over particles, (K, P, 3) -> (K, N, 3)."""
+    if bool((weight[:, 1:] == 0).all()):
+        return x[:, index[:, 0]]
+    return torch.einsum("nk,tnkc->tnc", weight.to(x), x[:, index])
+
+
+def _at_times(x: Tensor, v: Tensor, step: float, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Cubic Hermite interpolation of frames that are `step` apart."""
+    k = (t / step).floor().long().clamp(max=len(x) - 2)
+    u = (t / step - k)[:, None, None]
+    x0, x1, v0, v1 = x[k], x[k + 1], v[k] * step, v[k + 1] * step
+    place = (1 + 2 * u) * (1 - u) ** 2 * x0 + u * (1 - u) ** 2 * v0 + u**2 * (3 - 2 * u) * x1 + u**2 * (u - 1) * v1
+    return place, ((1 - u) * v0 + u * v1) / step
+
+
+def _first_seen(r: Measured) -> Tensor:
+    """Where each point is in the body at t = 0: its first frame, by the mean motion where that is a later one."""
+    x = r.x.double()
+    seen = r.seen
+    first = seen.int().argmax(dim=0)
+    place = x[first, torch.arange(x.shape[1])]
+    centre = torch.stack([x[k][seen[k] & seen[0]].mean(dim=0) if bool((seen[k] & seen[0]).any()) else x.new_full((3,), torch.nan) for k in range(len(x))])
+    shift = centre[first] - centre[0]
+    place = place - torch.where(shift.isnan(), 0.0, shift)
+    return torch.where(place.isnan(), r.body.x.double().mean(dim=0), place)
+
+
+def _follow(x: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Nearest particles (N, k) and weights (N, k) by moving least squares of degree one: affine motions are reproduced."""
+    k = min(NEIGHBOURS, len(x))
+    distance, index = torch.cdist(places, x).topk(k, largest=False)
+    arm = x[index] - places[:, None]
+    scale = distance[:, -1:, None].clamp(min=1e-12)
+    basis = torch.cat([torch.ones_like(arm[..., :1]), arm / scale], dim=-1)
+    kernel = torch.exp(-2.0 * (distance / scale[:, :, 0]) ** 2)
+    normal = torch.einsum("nk,nka,nkb->nab", kernel, basis, basis) + 1e-9 * torch.eye(4, dtype=x.dtype)
+    first = torch.linalg.solve(normal, torch.eye(4, dtype=x.dtype)[:, :1].expand(len(places), 4, 1))
+    return index, kernel * (basis @ first)[..., 0]
+
+
+def _place(model: dict[str, Any], name: str, value: float) -> None:
+    for part in (model["elasticity"], model["plasticity"], model):
+        if name in part:
+            part[name] = float(value)
+
+
+__all__ = ["Body", "BodyProblem", "Scene", "body_problem"]

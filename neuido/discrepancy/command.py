@@ -1,0 +1,227 @@
+"""The `diagnose` command: signature, help and order of work; `--help` loads no torch."""
+
+import csv
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neuido.errors import UserError
+
+if TYPE_CHECKING:
+    from neuido.discrepancy.attribution import Diagnosis
+    from neuido.discrepancy.problem import Problem
+
+KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}
+
+
+def diagnose(
+    folder: str,
+    *,
+    out: str,
+    model: str | None = None,
+    effects: str | None = None,
+    draws: int = 199,
+    seed: int = 0,
+    most: int = 3,
+    device: str = "auto",
+    resume: bool = True,
+    progress: bool = True,
+) -> None:
+    """Find the physical effect that a declared model lacks, from measured motion; add it and report the error before and after.
+
+    The answer is an effect, a class of effects that the data cannot tell apart, none, unknown, or insufficient. A run that was killed
+    goes on where it stopped when the same command is given again.
+
+    Args:
+        folder: Measured data: a folder with experiment.yaml, test.yaml or track.yaml.
+        out: Folder to write: diagnosis.json, report.html, model_after.yaml, trace.json, log.csv and the predicted motion.
+        model: File with a model in place of the folder's own, for example an earlier model_after.yaml.
+        effects: Names of the effects to consider, with commas; all that make sense where absent.
+        draws: Draws of the parametric bootstrap; p-values come in steps of 1 / (draws + 1).
+        seed: Seed of the draws.
+        most: Effects that may be added, 1 to 3.
+        device: auto, cpu or cuda.
+        resume: Go on with the predictions that a killed run left in DIR/.work.
+        progress: Show a line of progress.
+
+    Raises:
+        UserError: The folder is no measured data in one of the three formats, or an option is out of range.
+    """
+    begun = time.monotonic()
+    if draws < 19:
+        raise UserError(f"draws = {draws} is too few for a level of 5 %: give at least 19")
+    if not 1 <= most <= 3:
+        raise UserError(f"most = {most} must be 1, 2 or 3")
+    kind, place = kind_of(folder)
+    target = Path(out).expanduser()
+    if target.exists() and not target.is_dir():
+        raise UserError(f"out = {out} is a file: give a folder")
+
+    from neuido.discrepancy import answer
+    from neuido.discrepancy import resume as store
+    from neuido.discrepancy.attribution import diagnose as infer
+
+    chosen = choose_device(device)
+    problems = [restricted(problem, effects) for problem in problems_of(kind, place, model, chosen)]
+    options = {"model": Path(model).expanduser().read_text() if model else None, "effects": effects, "draws": draws, "seed": seed, "most": most,
+               "device": chosen, "version": answer.VERSION}  # fmt: skip
+    plan = store.plan_of(place, options, out=target)
+    target.mkdir(parents=True, exist_ok=True)
+    work = store.workplace(target, plan, resume=resume)
+    log = Log(target / "log.csv", shown=progress, begun=begun)
+    found: list[tuple[Diagnosis, float]] = []
+    for i, problem in enumerate(problems):
+        started = time.monotonic()
+        cached = store.CachedProblem(problem, work / str(i), tick=log.tick)
+        log.name = problem.name if len(problems) > 1 else ""
+        log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
+        found.append((infer(cached, draws=draws, seed=seed, most=most, tell=log), time.monotonic() - started))
+    log.name = ""
+    answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
+    store.clear(target)
+    log.close(answer.summary(found))
+
+
+def kind_of(folder: str) -> tuple[str, Path]:
+    """Which of the three formats a folder has, and the folder.
+
+    Raises:
+        UserError: It is missing, or holds none of the three files or several.
+    """
+    given = Path(folder).expanduser()
+    if given.is_file() and given.name in KINDS:
+        given = given.parent
+    if not given.is_dir():
+        raise UserError(f"folder = {folder}: there is no such folder")
+    there = [name for name in KINDS if (given / name).is_file()]
+    if len(there) != 1:
+        what = f"both {there[0]} and {there[1]}" if there else "neither experiment.yaml nor test.yaml nor track.yaml"
+        raise UserError(f"folder = {folder} holds {what}: a diagnosis takes one of the three")
+    return KINDS[there[0]], given
+
+
+def problems_of(kind: str, folder: Path, model: str | None, device: str) -> "Sequence[Problem]":
+    """The problems of a folder: one, or one for each body of a track folder.
+
+    Raises:
+        UserError: The folder or the model's file is not as its format says.
+    """
+    given = None if model is None else _model_file(model)
+    if kind == "experiment":
+        from neuido.data.experiments import read_experiment
+        from neuido.discrepancy.body import body_problem
+
+        return [body_problem(read_experiment(folder, model=given), device=device)]
+    if kind == "material test":
+        from neuido.data.material_tests import read_material_tests
+        from neuido.discrepancy.material import MaterialProblem
+
+        return [MaterialProblem(read_material_tests(folder, model=given))]
+    from neuido.data.tracks import read_tracks
+    from neuido.discrepancy.track import TrackProblem, track_problems
+
+    if given is None or set(given) != {"bodies"}:
+        return track_problems(read_tracks(folder, model=given))
+    bodies = read_tracks(folder).bodies
+    if not isinstance(given["bodies"], dict) or set(given["bodies"]) != set(bodies):
+        raise UserError(f"model = {model}: bodies must name {', '.join(bodies)}")
+    return [TrackProblem(read_tracks(folder, model=given["bodies"][body]), body) for body in bodies]
+
+
+def _model_file(path: str) -> dict[str, Any]:
+    from neuido.data.scenes import read_yaml
+
+    file = Path(path).expanduser()
+    if not file.is_file():
+        raise UserError(f"model = {path}: there is no such file")
+    try:
+        content = read_yaml(file)
+    except (UnicodeDecodeError, RecursionError) as error:
+        raise UserError(f"model = {path} is not valid YAML: {error}") from error
+    return content["model"] if set(content) == {"model"} and isinstance(content["model"], dict) else content
+
+
+def restricted(problem: "Problem", effects: str | None) -> "Problem":
+    """The problem with the named candidates alone.
+
+    Raises:
+        UserError: A name that is no effect, or none that this problem could show.
+    """
+    if effects is None:
+        return problem
+    from neuido.physics.effect_library import LIBRARY
+
+    names = [name.strip() for name in effects.split(",") if name.strip()]
+    known = [entry.name for entry in LIBRARY]
+    for name in names:
+        if name not in known:
+            raise UserError(f"effects: {name!r} is not known; choose from {', '.join(known)}")
+    left = tuple(c for c in problem.candidates if c.name in names)
+    if not left:
+        able = dict.fromkeys(c.name for c in problem.candidates)
+        raise UserError(f"effects = {effects}: {problem.name} can show none of them; it can show {', '.join(able)}")
+    object.__setattr__(problem, "candidates", left)
+    return problem
+
+
+def choose_device(device: str) -> str:
+    """`cpu` or `cuda`.
+
+    Raises:
+        UserError: Another name, or cuda where there is none.
+    """
+    import torch
+
+    if device not in ("auto", "cpu", "cuda") and not device.startswith("cuda:"):
+        raise UserError(f"device = {device!r} is not known; use auto, cpu or cuda")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"device = {device}: torch finds no CUDA device here; use cpu")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+
+
+class Log:
+    """One updating line of progress on stderr, and each stage as a row of log.csv.
+
+    Args:
+        path: The CSV file; a resumed run adds to it.
+        shown: Whether the line is shown; it needs a terminal.
+        begun: When the work began, in `time.monotonic`.
+    """
+
+    def __init__(self, path: Path, *, shown: bool, begun: float) -> None:
+        self.begun, self.count, self.stage, self.name, self.last = begun, 0, "", "", 0.0
+        self.shown, self.terminal = shown, sys.stderr.isatty()
+        fresh = not path.is_file() or not path.stat().st_size
+        self.file = path.open("a", newline="")
+        self.rows = csv.writer(self.file)
+        if fresh:
+            self.rows.writerow(["seconds", "body", "stage", "simulations"])
+
+    def tick(self, count: int) -> None:
+        """So many more points were simulated."""
+        self.count += count
+        if time.monotonic() - self.last > 0.2:
+            self._show()
+
+    def __call__(self, stage: str) -> None:
+        if not stage.endswith(" simulations") and stage != self.stage:  # counts are shown anyway
+            self.stage = stage
+            self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, stage, self.count])
+            self.file.flush()
+            self._show()
+
+    def _show(self) -> None:
+        self.last = time.monotonic()
+        if self.shown and self.terminal:
+            line = f"{self.last - self.begun:6.0f} s  {self.count:5d} simulations  {self.name}{': ' if self.name else ''}{self.stage}"
+            print(f"\r\x1b[K{line[:118]}", end="", file=sys.stderr, flush=True)
+
+    def close(self, line: str) -> None:
+        """The last line, on stdout."""
+        self("written")
+        self.file.close()
+        if self.shown and self.terminal:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        print(line)

@@ -1,0 +1,126 @@
+"""How far chance, the nuisances and the discretisation alone would go: a linear model of the fits and its parametric bootstrap.
+
+All directions (declared parameters, nuisances, discretisation, candidates) are brought to one orthonormal basis, so that a draw
+costs a few small products. Reference: Westfall and Young, Resampling-Based Multiple Testing, 1993 (the maximum over candidates).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Directions in the data of one recording, each (n, k)."""
+
+    weight: np.ndarray
+    """Of each datum in the fit, one over its standard deviation, (n,)."""
+    noise: float
+    declared: np.ndarray
+    nuisances: np.ndarray
+    """Times their prior standard deviations."""
+    discretisation: np.ndarray
+    """Differences of settings after the declared parameters' refit."""
+    smooth: np.ndarray
+    """Patterns of an unknown part of it, times its size."""
+    candidates: Mapping[str, np.ndarray]
+
+
+class LinearModel:
+    """Fits of the base and of each candidate to draws from the null hypothesis.
+
+    Args:
+        fit: Columns of the recordings that are fitted.
+        held_out: Of those that are only scored.
+        seed: Of the draws.
+    """
+
+    def __init__(self, fit: Sequence[Columns], held_out: Sequence[Columns], *, seed: int = 0) -> None:
+        self.keys = list(fit[0].candidates)
+        self.parts = [_Part(c, True) for c in fit] + [_Part(c, False) for c in held_out]
+        self.rng = np.random.default_rng(seed)
+        names = [(None, ())] + [(key, (key,)) for key in self.keys]
+        self.solvers = {name: _solver([p for p in self.parts if p.fitted], keys) for name, keys in names}
+
+    def draw(self) -> list[np.ndarray]:
+        """One residual of each part under the null, in its basis."""
+        return [p.draw(self.rng) for p in self.parts]
+
+    def errors(self, draw: Sequence[np.ndarray]) -> dict[str | None, np.ndarray]:
+        """Mean squares of each part after the fit of the base (None) and of each candidate, (parts,)."""
+        out = {}
+        fitted = np.concatenate([p.weighted(r) for p, r in zip(self.parts, draw, strict=True) if p.fitted])
+        for name, solve in self.solvers.items():
+            keys = () if name is None else (name,)
+            q = solve @ fitted
+            out[name] = np.array([p.square(r - p.design(keys) @ q) for p, r in zip(self.parts, draw, strict=True)])
+        return out
+
+    def null(self, count: int = 199) -> np.ndarray:
+        """The largest gain over the candidates in each of `count` draws; see `gain`."""
+        return np.array([self._largest(self.errors(self.draw())) for _ in range(count)])
+
+    def _largest(self, errors: Mapping[str | None, np.ndarray]) -> float:
+        base = errors[None]
+        return max((gain(base, errors[key], [p.fitted for p in self.parts]) for key in self.keys), default=0.0)
+
+    def cosine(self, a: str, b: str) -> float:
+        """Cosine of two candidates in the fit's metric, the declared parameters projected out (largest over their planes)."""
+        parts = [p for p in self.parts if p.fitted]
+        base = np.concatenate([p.design(()) * p.scale[:, None] for p in parts])
+        A, B = (np.concatenate([p.candidates[k] * p.scale[:, None] for p in parts]) for k in (a, b))
+        q, _ = np.linalg.qr(base)
+        A, B = (np.linalg.qr(M - q @ (q.T @ M))[0] for M in (A, B))
+        return float(np.linalg.svd(A.T @ B, compute_uv=False).max(initial=0.0))
+
+
+def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool]) -> float:
+    """Logarithm of the ratio of errors, before over after: the smaller of those of the fitted and of the held-out recordings."""
+    fitted = np.array(fitted)
+    groups = [g for g in (fitted, ~fitted) if g.any()]
+    return min(0.5 * float(np.log(before[g].mean() / max(after[g].mean(), 1e-300))) for g in groups)
+
+
+class _Part:
+    """Columns of one recording in an orthonormal basis of their span; what is outside is noise alone."""
+
+    def __init__(self, columns: Columns, fitted: bool) -> None:
+        self.fitted = fitted
+        everything = np.concatenate(
+            [columns.declared, columns.nuisances, columns.discretisation, columns.smooth, *columns.candidates.values()], axis=1
+        )
+        values, vectors = np.linalg.eigh(everything.T @ everything)
+        keep = values > 1e-10 * max(values.max(initial=0.0), 1e-300)
+        basis = (everything @ vectors[:, keep]) / np.sqrt(values[keep])
+        self.count, self.noise = len(everything), columns.noise
+        self.outside = max(self.count - basis.shape[1], 0)
+        self.declared = basis.T @ columns.declared
+        self.nuisances = basis.T @ columns.nuisances
+        self.discretisation = basis.T @ columns.discretisation
+        self.smooth = basis.T @ columns.smooth
+        self.candidates = {key: basis.T @ value for key, value in columns.candidates.items()}
+        # the weights vary slowly over the data: in the basis each direction gets its own mean weight
+        self.scale = np.sqrt(np.maximum((basis**2).T @ columns.weight**2, 1e-300))
+
+    def design(self, keys: Sequence[str]) -> np.ndarray:
+        return np.concatenate([self.declared, *(self.candidates[key] for key in keys)], axis=1)
+
+    def weighted(self, r: np.ndarray) -> np.ndarray:
+        return r[: len(self.scale)] * self.scale
+
+    def draw(self, rng: np.random.Generator) -> np.ndarray:
+        k = len(self.scale)
+        r = self.noise * rng.standard_normal(k)
+        for columns in (self.nuisances, self.discretisation, self.smooth):
+            r = r + columns @ rng.standard_normal(columns.shape[1])
+        self.rest = self.noise**2 * (rng.chisquare(self.outside) if self.outside else 0.0)
+        return r
+
+    def square(self, r: np.ndarray) -> float:
+        """Mean square over all data of the recording."""
+        return (float(r @ r) + self.rest) / self.count
+
+
+def _solver(parts: Sequence[_Part], keys: Sequence[str]) -> np.ndarray:
+    return np.linalg.pinv(np.concatenate([p.design(keys) * p.scale[:, None] for p in parts]), rcond=1e-8)

@@ -1,0 +1,184 @@
+"""Least squares through a simulator: a covariance of few directions, and Levenberg-Marquardt fits that share their launches."""
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from neuido.discrepancy.problem import Parameter, Point, Problem
+
+STEP = 0.02
+"""Difference step, in typical steps of a parameter."""
+DAMPINGS = (0.1, 1.0, 10.0)
+"""Tried at once, as factors of the present damping."""
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """sigma^2 I + U diag(s^2) U^T of the data of one recording, with orthonormal columns U (n, k)."""
+
+    sigma: float
+    directions: np.ndarray
+    spread: np.ndarray
+
+    @classmethod
+    def of(cls, sigma: float, columns: np.ndarray) -> "Covariance":
+        """sigma^2 I + L L^T for columns L (n, k)."""
+        if not columns.size:
+            return cls(sigma, np.empty((columns.shape[0], 0)), np.empty(0))
+        values, vectors = np.linalg.eigh(columns.T @ columns)
+        keep = values > max(1e-12 * values.max(), 1e-300)
+        spread = np.sqrt(values[keep])
+        return cls(sigma, (columns @ vectors[:, keep]) / spread, spread)
+
+    def whiten(self, r: np.ndarray) -> np.ndarray:
+        """Residuals (n,) or (n, m) in units of their standard deviation."""
+        inside = self.directions.T @ r
+        factor = 1.0 - self.sigma / np.sqrt(self.sigma**2 + self.spread**2)
+        return (r - self.directions @ (factor[:, None] * inside if r.ndim == 2 else factor * inside)) / self.sigma
+
+    def log_determinant(self) -> float:
+        """ln det of the covariance over sigma^2."""
+        return float(np.sum(np.log1p((self.spread / self.sigma) ** 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The end of a fit."""
+
+    point: Mapping[str, float]
+    names: tuple[str, ...]
+    cost: float
+    """Sum of squares of the whitened residuals, priors included."""
+    jacobian: np.ndarray
+    """Of the whitened residuals by the fit's coordinates at the end, (n, p)."""
+    residual: np.ndarray
+    """Whitened, (n,), priors included."""
+    evaluations: int
+    converged: bool
+
+
+Request = Generator[list[Point], list[np.ndarray | None], Fit]
+
+
+def levenberg_marquardt(
+    parameters: Sequence[Parameter], start: Point, *, iterations: int = 12, tolerance: float = 2e-3, damping: float = 1e-2
+) -> Request:
+    """One fit as a generator: it yields the points that it wants and receives their whitened residuals (None: not runnable)."""
+    names = tuple(p.name for p in parameters)
+    fixed = {k: v for k, v in start.items() if k not in names}
+    q = np.array([p.coordinate(start.get(p.name, p.value)) for p in parameters])
+    low = np.array([_bound(p, p.lower) for p in parameters])
+    high = np.array([_bound(p, p.upper) for p in parameters])
+
+    def point(q: np.ndarray) -> Point:
+        return fixed | {p.name: p.physical(v) for p, v in zip(parameters, q, strict=True)}
+
+    def with_priors(r: np.ndarray | None, q: np.ndarray) -> np.ndarray | None:
+        if r is None:
+            return None
+        priors = [(v - p.coordinate(p.value)) / p.prior for p, v in zip(parameters, q, strict=True) if p.prior is not None]
+        return np.concatenate([r, priors]) if priors else r
+
+    (r,) = yield [point(q)]
+    r = with_priors(r, q)
+    count = 1
+    if r is None or not len(names):
+        return Fit(point(q), names, np.inf if r is None else float(r @ r), np.empty((0 if r is None else len(r), 0)), r, count, r is not None)
+    cost = float(r @ r)
+    J, converged = None, False
+    for _ in range(iterations):
+        steps = np.where(q + STEP > high, -STEP, STEP)
+        asked = [q + np.eye(len(q))[i] * steps[i] for i in range(len(q))]
+        answers = yield [point(a) for a in asked]
+        count += len(asked)
+        columns = [with_priors(answer, a) for answer, a in zip(answers, asked, strict=True)]
+        J = np.stack([np.zeros_like(r) if c is None else (c - r) / s for c, s in zip(columns, steps, strict=True)], axis=1)
+        A, g = J.T @ J, J.T @ r
+        scale = np.maximum(np.diag(A), 1e-12 * max(A.diagonal().max(), 1e-300))
+        tried = []
+        for factor in DAMPINGS:
+            move = -np.linalg.lstsq(A + damping * factor * np.diag(scale), g, rcond=None)[0]
+            move *= min(1.0, 5.0 / max(np.abs(move).max(), 1e-30))  # at most five typical steps at once
+            tried.append(np.clip(q + move, low, high))
+        answers = yield [point(t) for t in tried]
+        count += len(tried)
+        found = [with_priors(answer, t) for answer, t in zip(answers, tried, strict=True)]
+        costs = [np.inf if f is None else float(f @ f) for f in found]
+        best = int(np.argmin(costs))
+        if costs[best] < cost:
+            gain, moved = (cost - costs[best]) / cost, np.abs(tried[best] - q).max()
+            q, r, cost = tried[best], found[best], costs[best]
+            damping = max(damping * DAMPINGS[best], 1e-6)
+            if gain < tolerance and moved < 0.5:
+                converged = True
+                break
+        else:
+            if damping > 1e3:
+                converged = True
+                break
+            damping *= 30.0
+            if np.abs(tried[0] - q).max() < 1e-3:
+                converged = True
+                break
+    return Fit(point(q), names, cost, J, r, count, converged)
+
+
+def _bound(p: Parameter, value: float) -> float:
+    return p.coordinate(value) if not (p.log and value <= 0) else -np.inf
+
+
+def run(
+    problem: Problem,
+    requests: Sequence[Request],
+    whiten: Callable[[np.ndarray, int], np.ndarray],
+    recordings: Sequence[int],
+    *,
+    setting: int = 0,
+    tick: Callable[[int], None] | None = None,
+) -> list[Fit]:
+    """Run several fits side by side: what they ask for at one time goes into one call of `predict` for each recording.
+
+    Args:
+        problem: What predicts.
+        requests: The fits.
+        whiten: (residual (n,) of a recording, its number) -> whitened residual.
+        recordings: Numbers of the recordings that are fitted.
+        setting: Setting of the discretisation.
+        tick: Called with the number of points of each round.
+    """
+    results: list[Fit | None] = [None] * len(requests)
+    wanted: dict[int, list[Point]] = {}
+    for i, request in enumerate(requests):
+        wanted[i] = next(request)
+    while wanted:
+        points = [p for asked in wanted.values() for p in asked]
+        answers = residuals(problem, points, whiten, recordings, setting)
+        if tick is not None:
+            tick(len(points))
+        at, after = 0, {}
+        for i, asked in wanted.items():
+            part = answers[at : at + len(asked)]
+            at += len(asked)
+            try:
+                after[i] = requests[i].send(part)
+            except StopIteration as end:
+                results[i] = end.value
+        wanted = after
+    return results  # type: ignore[return-value]
+
+
+def residuals(
+    problem: Problem, points: Sequence[Point], whiten: Callable[[np.ndarray, int], np.ndarray], recordings: Sequence[int], setting: int = 0
+) -> list[np.ndarray | None]:
+    """Whitened residuals of each point over the recordings, joined; None where one of them cannot run."""
+    parts: list[list[np.ndarray]] = [[] for _ in points]
+    good = [True] * len(points)
+    for n in recordings:
+        y = problem.recordings[n].y
+        for i, row in enumerate(problem.predict(points, n, setting)):
+            if np.isfinite(row).all():
+                parts[i].append(whiten(row - y, n))
+            else:
+                good[i] = False
+    return [np.concatenate(part) if ok else None for part, ok in zip(parts, good, strict=True)]

@@ -1,0 +1,140 @@
+"""What the closed loop asks of a forward model: its parameters, the effects it may lack, its recordings, and a prediction.
+
+The bodies of the material point method, the material point and the point mass all answer to `Problem`; the inference
+(`fit.py`, `attribution.py`) and the report know nothing else of them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+Point = Mapping[str, float]
+"""Physical values of parameters by name; those that are absent take their `Parameter.value`."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A figure that a fit may move."""
+
+    name: str
+    """Such as `young`, `release_time:drop`; that of an effect is `<effect>.<parameter>`, as `viscosity_shear.eta`."""
+    unit: str
+    value: float
+    """Where the fit starts; for an effect what it takes where the effect is absent."""
+    scale: float
+    """A typical step: relative where `log`, else in the unit."""
+    lower: float
+    upper: float
+    """Physical range, inclusive; a fit that ends at a bound of an effect counts as unphysical."""
+    log: bool = False
+    """The fit moves the logarithm."""
+    prior: float | None = None
+    """Standard deviation of a Gaussian prior about `value`, in the coordinate of the fit; none: flat."""
+
+    def coordinate(self, value: float) -> float:
+        """The coordinate of the fit, of order one for a typical change."""
+        return float(np.log(value) if self.log else value) / self.scale
+
+    def physical(self, coordinate: float) -> float:
+        """The inverse of `coordinate`, clipped to the range."""
+        value = float(np.exp(coordinate * self.scale) if self.log else coordinate * self.scale)
+        return min(max(value, self.lower), self.upper)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that the model may lack."""
+
+    name: str
+    """Of the vocabulary of `neuido-diagnosis/1`."""
+    parameters: tuple[Parameter, ...]
+    starts: tuple[Mapping[str, float], ...]
+    """Values of its parameters that the screening probes and that full fits start from."""
+    where: str
+    """The stage of the motion that gives it away."""
+    form: str = ""
+    """Where an effect has several forms (a gradient, an inclusion), which one this is."""
+    sizes: tuple[str, ...] = ()
+    """Names of the parameters whose zero is the effect's absence; the others give its shape. Empty: all are."""
+    linear: bool = True
+    """Whether small sizes act in proportion; a yield stress does not."""
+
+    @property
+    def key(self) -> str:
+        """Name and form."""
+        return f"{self.name}:{self.form}" if self.form else self.name
+
+    @property
+    def size_parameters(self) -> tuple[Parameter, ...]:
+        """The parameters that vanish with the effect."""
+        return tuple(p for p in self.parameters if not self.sizes or p.name in self.sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Measured data of one recording as one vector."""
+
+    name: str
+    role: str
+    """`fit`, or `held_out`: only ever scored."""
+    y: np.ndarray
+    """(n,) float64 without NaN."""
+    noise: float | None
+    """Standard deviation of its independent part; none: not known."""
+    groups: np.ndarray
+    """(n,) whole numbers; rows of one group are samples of one quantity in the order of time."""
+    times: np.ndarray
+    """(n,) time [s] of each row, or its order where there is no time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A model with its data. Subclasses implement `predict` and `model_after`."""
+
+    name: str
+    measure: str
+    unit: str
+    declared: tuple[Parameter, ...]
+    nuisances: tuple[Parameter, ...]
+    candidates: tuple[Candidate, ...]
+    recordings: tuple[Recording, ...]
+    settings: int = 1
+    """Settings of the discretisation; 0 is the suggested one, and 1 of them means that nothing is discretised."""
+    solvers: tuple[int, ...] = (0,)
+    """The settings that are methods of their own: the data choose among them."""
+    labels: dict[str, Any] = field(default_factory=dict)
+    """What the report says beside the figures."""
+
+    def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
+        """The data that each point predicts, (len(points), n); a row of NaN where the model cannot run there."""
+        raise NotImplementedError
+
+    def directions(self, recording: int) -> np.ndarray:
+        """Smooth patterns in which an unknown part of the discretisation error may lie, (n, k), of mean square one together."""
+        return np.empty((len(self.recordings[recording].y), 0))
+
+    def error(self, residual: np.ndarray, recording: int) -> float:
+        """A residual (n,) as one figure in `unit`."""
+        return float(np.sqrt(np.mean(residual**2)))
+
+    def setting_name(self, setting: int) -> str:
+        """What a setting is, for the report."""
+        return "suggested" if setting == 0 else f"setting {setting}"
+
+    def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
+        """The content of `model_after.yaml`: the folder's model with these values and effects."""
+        raise NotImplementedError
+
+    @property
+    def roles(self) -> dict[str, list[int]]:
+        """Numbers of the recordings by role."""
+        return {role: [i for i, r in enumerate(self.recordings) if r.role == role] for role in ("fit", "held_out")}
+
+    def parameter(self, name: str) -> Parameter:
+        """The parameter of a name."""
+        for p in (*self.declared, *self.nuisances, *(p for c in self.candidates for p in c.parameters)):
+            if p.name == name:
+                return p
+        raise KeyError(name)

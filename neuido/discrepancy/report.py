@@ -1,0 +1,182 @@
+"""The report of a diagnosis: one self-contained HTML page. Without matplotlib it has the tables and the player of the motion alone."""
+
+import html
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neuido.discrepancy import next_experiment
+from neuido.discrepancy import report_figures as draw
+from neuido.discrepancy.attribution import ALPHA, Diagnosis
+
+if TYPE_CHECKING:
+    from neuido.discrepancy.answer import Details
+
+STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:1120px;margin:2em auto;padding:0 1em}
+h1{font-size:1.5em}h2{font-size:1.15em;margin-top:1.8em;border-bottom:1px solid #ddd}
+table{border-collapse:collapse;margin:.6em 0}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #eee;font-size:.93em}
+td.n{text-align:right;font-variant-numeric:tabular-nums}.answer{font-size:1.2em;padding:.6em 1em;background:#f3f6f9;border-left:4px solid #1f77b4}
+svg{max-width:100%;height:auto}canvas{border:1px solid #ddd;background:#fff;touch-action:none;max-width:100%}
+.player label{margin-right:.8em}.b{color:#c0392b}.a{color:#1f77b4}.note{color:#666;font-size:.9em}"""
+SENTENCES = {
+    "effect": "The declared model lacks {names}.",
+    "class": "The declared model lacks an effect; these recordings cannot tell {names} apart.",
+    "none": "Nothing is missing: what remains is what noise, nuisances and the discretisation bring.",
+    "unknown": "Something is missing that none of the known effects explains.",
+    "insufficient": "The recordings are too few, too short or too noisy to say.",
+}
+
+
+def page(details: "Sequence[Details]", diagnoses: Sequence[Diagnosis], *, kind: str) -> str:
+    """The whole page.
+
+    Args:
+        details: What `answer.describe` made of each diagnosis.
+        diagnoses: The diagnoses.
+        kind: `experiment`, `material test` or `track`.
+    """
+    name = diagnoses[0].problem.name if len(diagnoses) == 1 else diagnoses[0].problem.name.rpartition(": ")[0]
+    parts = [f"<h1>Diagnosis of the {_text(kind)} {_text(name)}</h1>"]
+    for made, d in zip(details, diagnoses, strict=True):
+        if len(diagnoses) > 1:
+            parts.append(f"<h1>{_text(made.content.get('body', d.problem.name))}</h1>")
+        parts += _one(made, d)
+    seconds = sum(made.content["seconds"] for made in details)
+    parts.append(f'<p class="note">neuido {_text(details[0].content["version"])}, {seconds:.0f} s on {_text(details[0].content["device"])}, '
+                 f"{sum(d.evaluations for d in diagnoses)} simulations.</p>")  # fmt: skip
+    return f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{_text(name)}</title><style>{STYLE}</style></head><body>\n' + "\n".join(
+        part for part in parts if part
+    ) + "\n</body></html>\n"  # fmt: skip
+
+
+def _one(made: "Details", d: Diagnosis) -> list[str]:
+    c = made.content
+    names = " and ".join(" or ".join(e["class"]) for e in c["effects"])
+    bodies = {name: arrays for name, arrays in made.motion.items() if "positions" in arrays}
+    out = [f'<p class="answer">{_text(SENTENCES[c["answer"]].format(names=names or "it"))}</p>', _effects(c), _errors(c)]
+    if bodies:
+        out += [
+            "<h2>Motion before and after</h2>",
+            draw.player(bodies),
+            draw.error_curves(bodies, c["error"]["noise_floor"], c["error"]["discretisation_floor"]),
+        ]
+        out += [
+            "<h2>Where on the body</h2>",
+            draw.residual_maps(bodies),
+            "<h2>Which stage</h2>",
+            _stages(made),
+            draw.stage_curves(made.stages),
+        ]
+        out.append(
+            '<p class="note">Missing force by the weak residual, which differentiates no measured position; grey: what noise alone makes of it.</p>'
+        )
+    else:
+        out += ["<h2>Data before and after</h2>", draw.data_curves(made.motion, d.problem.unit)]
+    out += _ranking(d)
+    out += ["<h2>Rejected</h2>", _table(("effect", "reason"), [(r["name"], r["reason"]) for r in c["rejected"]])]
+    out += ["<h2>Fitted figures</h2>", _figures(c)]
+    share = made.ceilings["after"]
+    held = "" if math.isnan(share.held_out) else f", and {100 * max(share.held_out, 0.0):.0f} % of it on what was held out"
+    out.append(f"<p>A small network fitted to what remains explains {100 * max(share.fit, 0.0):.0f} % of it where it was fitted{held}: "
+               "the ceiling of any further effect.</p>")  # fmt: skip
+    out += ["<h2>Next experiment</h2>", f"<p>{_text(next_experiment.summary(c['next_experiment']))}</p>"]
+    if c["next_experiment"]:
+        out.append(
+            _table(("other changes", "expected log odds"), [(o["change"], o["expected_log_odds"]) for o in c["next_experiment"]["others"]])
+        )
+    return out
+
+
+def _effects(c: dict[str, Any]) -> str:
+    rows = []
+    for e in c["effects"]:
+        for key, p in e["parameters"].items():
+            if isinstance(p["value"], list):
+                value = ", ".join(f"{v:.4g}" for v in p["value"])
+                rows.append((e["name"], key, value, p["unit"], "", f"{e['p_value']:.3g}", e["where"]))
+            else:
+                low, high = p["interval90"]
+                rows.append((e["name"], key, p["value"], p["unit"], f"{low:.4g} to {high:.4g}", f"{e['p_value']:.3g}", e["where"]))
+    return _table(("effect", "parameter", "value", "unit", "90 % interval", "p (family-wise)", "where"), rows) if rows else ""
+
+
+def _errors(c: dict[str, Any]) -> str:
+    e = c["error"]
+    rows = [
+        (name, e["before"]["by_recording"][name], e["after"]["by_recording"][name], _ratio(e, name)) for name in e["before"]["by_recording"]
+    ]
+    for name, label in (("fit", "all that is fitted"), ("held_out", "all that is held out")):
+        if e["before"][name] is not None:
+            rows.append((label, e["before"][name], e["after"][name], e["before"][name] / max(e["after"][name], 1e-300)))
+    floors = f"Floors: noise {e['noise_floor']:.3g} {e['unit']}, discretisation {e['discretisation_floor']:.3g} {e['unit']}."
+    return f"<h2>Error [{_text(e['unit'])}]</h2>" + _table(("recording", "before", "after", "ratio"), rows) + f"<p>{_text(floors)}</p>"
+
+
+def _ratio(e: dict[str, Any], name: str) -> float:
+    return e["before"]["by_recording"][name] / max(e["after"]["by_recording"][name], 1e-300)
+
+
+def _stages(made: "Details") -> str:
+    rows = []
+    for recording, series in made.stages.items():
+        for s in series:
+            rows.append((recording, s.name, s.unit, s.size(s.before), s.size(s.after), s.size(s.noise), math.sqrt(s.excess(s.before))))
+    return _table(("recording", "stage", "unit", "missing before", "missing after", "noise", "before, in noise"), rows)
+
+
+def _ranking(d: Diagnosis) -> list[str]:
+    out = []
+    for i, r in enumerate(d.rounds):
+        kept = {id(t) for t in r.members} if r.chosen is not None else set()
+        trials = sorted(r.trials, key=lambda t: (id(t) not in kept, t.score))
+        threshold = float(np.quantile(r.null, 1 - ALPHA)) if len(r.null) else 0.0
+        out.append(f"<h2>Ranking{f', step {i + 1}' if len(d.rounds) > 1 else ''}</h2>")
+        out.append(draw.ranking([(t.candidate.key, t.gain, id(t) in kept) for t in trials], threshold))
+        rows = []
+        for t in trials:
+            figures = ", ".join(f"{p.name.partition('.')[2]} = {t.fit.point[p.name]:.3g} {p.unit}" for p in t.candidate.parameters[:6])
+            verdict = t.reason or ("chosen" if t is r.chosen else "not told from it" if id(t) in kept else "")
+            cosine = r.cosines.get(t.candidate.key)
+            rows.append((t.candidate.key, figures, f"{math.exp(t.gain):.2f}", "" if cosine is None else f"{cosine:.2f}", verdict))
+        out.append(_table(("effect", "parameters", "error ratio", "cosine to the best", "verdict"), rows))
+        out.append(
+            f'<p class="note">p = {r.p_value:.3g}, family-wise over all candidates, from {len(r.null)} draws; chance brings {math.exp(threshold):.2f} at 95 %.</p>'
+        )
+    return out
+
+
+def _figures(c: dict[str, Any]) -> str:
+    rows = []
+    for name in c["declared"]:
+        b, a = c["declared"][name], c["after"][name]
+        rows.append(
+            (
+                name,
+                b["unit"],
+                b["value"],
+                "{:.4g} to {:.4g}".format(*b["interval90"]),
+                a["value"],
+                "{:.4g} to {:.4g}".format(*a["interval90"]),
+            )
+        )
+    return _table(("figure", "unit", "before", "90 % interval", "after", "90 % interval"), rows) if rows else "<p>None was free.</p>"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    if not rows:
+        return "<p>None.</p>"
+
+    def cell(value: Any) -> str:
+        if isinstance(value, float | int) and not isinstance(value, bool):
+            return f'<td class="n">{value:.4g}</td>'
+        return f"<td>{_text(value)}</td>"
+
+    lines = ["<tr>" + "".join(f"<th>{_text(h)}</th>" for h in head) + "</tr>"]
+    lines += ["<tr>" + "".join(cell(v) for v in row) + "</tr>" for row in rows]
+    return "<table>" + "\n".join(lines) + "</table>"
+
+
+def _text(value: Any) -> str:
+    return html.escape(str(value))

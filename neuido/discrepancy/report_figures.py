@@ -1,0 +1,201 @@
+"""The figures of a diagnosis' report: inline SVG by matplotlib, and a small player of the motion drawn by the page itself."""
+
+import base64
+import io
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from neuido.discrepancy.residual import Series
+
+INK, BEFORE, AFTER = "#333333", "#c0392b", "#1f77b4"
+MOST_POINTS, MOST_FRAMES = 250, 60
+
+
+def figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, np.ndarray] | None:
+    """A figure without a window and its axes (rows, columns), or None where matplotlib is not installed."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        return None
+    made = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(made)
+    return made, made.subplots(rows, columns, squeeze=False)
+
+
+def svg(made: Any) -> str:
+    """A figure as an inline element."""
+    import matplotlib
+
+    stream = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "neuido"}):
+        made.savefig(stream, format="svg", metadata={"Date": None})
+    return stream.getvalue().partition("<svg")[1] + stream.getvalue().partition("<svg")[2]
+
+
+def stage_curves(stages: Mapping[str, Sequence[Series]]) -> str:
+    """What is missing in each stage over time, before and after, with the noise: a row a recording."""
+    names = list(dict.fromkeys(s.name for rows in stages.values() for s in rows if len(s.times) > 1))
+    if not names:
+        return ""
+    drawn = figure(len(stages), len(names), (2.7 * len(names), 2.3 * len(stages)))
+    if drawn is None:
+        return ""
+    made, axes = drawn
+    for row, (recording, series) in zip(axes, stages.items(), strict=True):
+        own = {s.name: s for s in series}
+        for ax, name in zip(row, names, strict=True):
+            s = own.get(name)
+            if s is None or len(s.times) < 1:
+                ax.axis("off")
+                continue
+            ax.plot(s.times, s.before, ".-", color=BEFORE, lw=1)
+            ax.plot(s.times, s.after, ".-", color=AFTER, lw=1)
+            ax.fill_between(s.times, s.noise, color=INK, alpha=0.2, lw=0)
+            ax.set_title(f"{recording}: {name} [{s.unit}]", fontsize=8)
+            ax.set_ylim(bottom=0.0)
+            _small(ax)
+            ax.set_xlabel("t [s]", fontsize=7)
+    return svg(made)
+
+
+def error_curves(motion: Mapping[str, Mapping[str, np.ndarray]], noise: float, disc: float) -> str:
+    """Root mean square distance of the points over time, before and after, with the floors."""
+    drawn = figure(1, len(motion), (3.6 * len(motion), 2.6))
+    if drawn is None:
+        return ""
+    made, axes = drawn
+    for ax, (name, arrays) in zip(axes[0], motion.items(), strict=True):
+        for when, colour in (("before", BEFORE), ("after", AFTER)):
+            square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
+            seen = np.isfinite(square).any(axis=1)
+            ax.plot(arrays["t"][seen], 1e3 * np.sqrt(np.nanmean(square[seen], axis=1)), color=colour, label=when, lw=1.2)
+        ax.axhline(1e3 * noise, color=INK, ls=":", lw=1, label="noise")
+        ax.axhline(1e3 * np.hypot(noise, disc), color=INK, ls="--", lw=1, label="noise and discretisation")
+        ax.set_title(name, fontsize=9)
+        ax.set_xlabel("t [s]", fontsize=8)
+        ax.set_ylabel("RMS distance [mm]", fontsize=8)
+        ax.set_ylim(bottom=0.0)
+        _small(ax)
+    axes[0][0].legend(fontsize=7, frameon=False)
+    return svg(made)
+
+
+def residual_maps(motion: Mapping[str, Mapping[str, np.ndarray]]) -> str:
+    """Mean residual distance of each point on the body, before and after, seen along z (left) and along x (right)."""
+    drawn = figure(len(motion), 4, (9.0, 2.3 * len(motion)))
+    if drawn is None:
+        return ""
+    made, axes = drawn
+    for row, (name, arrays) in zip(axes, motion.items(), strict=True):
+        place = np.where(np.isfinite(arrays["measured"][0]), arrays["measured"][0], arrays["before"][0])
+        sizes = {}
+        for when in ("before", "after"):
+            square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
+            count = np.isfinite(square).sum(axis=0)
+            sizes[when] = 1e3 * np.sqrt(np.nansum(square, axis=0) / np.maximum(count, 1))
+        top = max(float(np.quantile(sizes["before"], 0.98)), 1e-9)
+        for i, (when, (a, b)) in enumerate((w, v) for w in ("before", "after") for v in ((0, 1), (2, 1))):
+            ax = row[i]
+            shown = ax.scatter(place[:, a], place[:, b], c=sizes[when], s=6, cmap="inferno_r", vmin=0.0, vmax=top, linewidths=0)
+            ax.set_aspect("equal")
+            ax.set_title(f"{name}, {when}, along {'zx'[i % 2]}", fontsize=8)
+            _small(ax)
+        made.colorbar(shown, ax=list(row), shrink=0.8).set_label("mm", fontsize=7)
+    return svg(made)
+
+
+def data_curves(motion: Mapping[str, Mapping[str, np.ndarray]], unit: str) -> str:
+    """Measured data and predictions before and after of a track or a material test, and what each leaves."""
+    drawn = figure(2, len(motion), (3.3 * len(motion), 4.2))
+    if drawn is None:
+        return ""
+    made, axes = drawn
+    for column, (name, arrays) in enumerate(motion.items()):
+        for g in np.unique(arrays["groups"]):
+            own = arrays["groups"] == g
+            t = arrays["times"][own]
+            axes[0, column].plot(t, arrays["measured"][own], ".", color=INK, ms=3)
+            for when, colour in (("before", BEFORE), ("after", AFTER)):
+                axes[0, column].plot(t, arrays[when][own], color=colour, lw=1)
+                axes[1, column].plot(t, arrays["measured"][own] - arrays[when][own], color=colour, lw=1)
+        axes[0, column].set_title(name, fontsize=8)
+        axes[1, column].axhline(0.0, color=INK, lw=0.6)
+        for ax in axes[:, column]:
+            _small(ax)
+    axes[0, 0].set_ylabel(f"data [{unit}]", fontsize=8)
+    axes[1, 0].set_ylabel(f"residual [{unit}]", fontsize=8)
+    return svg(made)
+
+
+def ranking(trials: Sequence[tuple[str, float, bool]], floor: float) -> str:
+    """Gains of the candidates as bars, those of the class in the colour of `after`, and what chance takes."""
+    if not trials:
+        return ""
+    drawn = figure(1, 1, (6.0, 0.26 * len(trials) + 0.9))
+    if drawn is None:
+        return ""
+    made, axes = drawn
+    ax = axes[0, 0]
+    names, gains, kept = zip(*reversed(trials), strict=True)
+    ax.barh(range(len(names)), np.exp(gains), color=[AFTER if k else "#bbbbbb" for k in kept], height=0.7)
+    ax.set_yticks(range(len(names)), names)
+    ax.axvline(np.exp(floor), color=BEFORE, lw=1, ls="--")
+    ax.set_xscale("log")
+    ax.set_xlabel("error before over error after (fitted or held out, the smaller); dashed: 95 % of what chance brings", fontsize=7)
+    _small(ax)
+    return svg(made)
+
+
+def _small(ax: Any) -> None:
+    ax.tick_params(labelsize=7)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+
+
+def player(motion: Mapping[str, Mapping[str, np.ndarray]]) -> str:
+    """A canvas with a slider: measured points, and those predicted before and after, of a few hundred points."""
+    data = {}
+    for name, arrays in motion.items():
+        x = arrays["measured"]
+        points = np.unique(np.linspace(0, x.shape[1] - 1, min(MOST_POINTS, x.shape[1])).round().astype(int))
+        frames = np.unique(np.linspace(0, len(x) - 1, min(MOST_FRAMES, len(x))).round().astype(int))
+        sets = [arrays[k][np.ix_(frames, points)] for k in ("measured", "before", "after")]
+        low, high = np.nanmin(np.stack(sets), axis=(0, 1, 2)), np.nanmax(np.stack(sets), axis=(0, 1, 2))
+        middle, size = 0.5 * (low + high), 0.5 * float(np.max(high - low)) or 1.0
+        packed = []
+        for s in sets:
+            q = np.where(np.isfinite(s), np.clip((s - middle) / size, -1.0, 1.0) * 32000, -32768).astype("<i2")
+            packed.append(base64.b64encode(q.tobytes()).decode())
+        data[name] = {"n": len(points), "k": len(frames), "t": [round(float(v), 5) for v in arrays["t"][frames]], "sets": packed}
+    return PLAYER.replace("/*DATA*/", json.dumps(data).replace("<", "\\u003c")).replace("/*COLOURS*/", json.dumps([INK, BEFORE, AFTER]))
+
+
+PLAYER = """<div class="player"><canvas width="760" height="460"></canvas><div>
+<select></select> <input type="range" min="0" value="0" step="1" style="width:420px"> <output></output>
+<button type="button">play</button>
+<label><input type="checkbox" checked>measured</label><label class="b"><input type="checkbox" checked>before</label>
+<label class="a"><input type="checkbox" checked>after</label> drag to turn</div></div>
+<script>(() => {
+const data = /*DATA*/, colours = /*COLOURS*/, box = document.currentScript.previousElementSibling;
+const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), pick = box.querySelector("select"), slider = box.querySelector("input[type=range]");
+const boxes = [...box.querySelectorAll("input[type=checkbox]")], out = box.querySelector("output"), button = box.querySelector("button");
+let sets = [], now, yaw = 0.5, pitch = 0.25, timer = null;
+for (const name of Object.keys(data)) pick.add(new Option(name));
+const load = () => { now = data[pick.value]; slider.max = now.k - 1; slider.value = 0;
+  sets = now.sets.map(s => new Int16Array(Uint8Array.from(atob(s), c => c.charCodeAt(0)).buffer)); draw(); };
+const draw = () => { const k = +slider.value, w = canvas.width, h = canvas.height, r = 0.44 * h / 32000;
+  pen.clearRect(0, 0, w, h); out.textContent = now.t[k].toFixed(3) + " s";
+  const a = Math.cos(yaw), b = Math.sin(yaw), c = Math.cos(pitch), d = Math.sin(pitch);
+  sets.forEach((s, i) => { if (!boxes[i].checked) return; pen.fillStyle = colours[i];
+    for (let n = 0; n < now.n; n++) { const o = 3 * (k * now.n + n); if (s[o] === -32768) continue;
+      const x = s[o], y = s[o + 1], z = s[o + 2], p = a * x + b * z, q = -b * x + a * z;
+      pen.fillRect(w / 2 + r * p - 1.2, h / 2 - r * (c * y - d * q) - 1.2, i ? 2.4 : 3.4, i ? 2.4 : 3.4); } }); };
+pick.onchange = load; slider.oninput = draw; boxes.forEach(e => e.onchange = draw);
+canvas.onpointermove = e => { if (e.buttons) { yaw += e.movementX / 150; pitch += e.movementY / 150; draw(); } };
+button.onclick = () => { if (timer) { clearInterval(timer); timer = null; button.textContent = "play"; return; }
+  button.textContent = "stop"; timer = setInterval(() => { slider.value = (+slider.value + 1) % now.k; draw(); }, 60); };
+load(); })();</script>"""

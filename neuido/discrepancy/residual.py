@@ -1,0 +1,297 @@
+"""What a residual says by itself: the weak residual of a body's motion, and its stages (flight, rotation, modes, contact, power, rest).
+
+The weak residual tests the balance of momentum with a field w over the body times a bump phi(t) that vanishes with its slope at both
+ends, and moves both time derivatives on to the bump, so that measured positions are never differentiated:
+
+    R[w, phi] = sum_p m_p w_p . INT x_p phi'' dt + sum_p V_p INT phi P_p : grad w_p dt - sum_p m_p w_p . INT phi b dt,
+
+which is zero where nothing is missing. Its noise is known in closed form: sigma^2 sum_p m_p^2 |w_p|^2 INT phi''^2 dt. Of a measured motion
+less a predicted one with the same forces the last two terms cancel (exactly for w = 1, else to first order in their distance), and R is
+the missing force. Weak forms against noise: Messenger and Bortz, Weak SINDy, 2021.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from neuido.types import Plane
+
+WINDOWS = 12
+"""Bumps over a recording, half overlapping."""
+FEWEST = 7
+"""Frames in a window."""
+POWER = 4
+"""Of the bump (1 - s^2)^4."""
+REST = 0.1
+"""Share of the recording, at its end, whose mean residual is the stage `rest`."""
+
+
+class Window(NamedTuple):
+    """A bump over some frames."""
+
+    frames: slice
+    second: np.ndarray
+    """Weights [1/s] of the frames that make INT x phi'' dt of samples x, exact for paths up to t^2."""
+    value: np.ndarray
+    """Weights [s] of the frames that make INT f phi dt."""
+    time: float
+    """Its middle [s]."""
+
+    @property
+    def area(self) -> float:
+        """INT phi dt [s]."""
+        return float(self.value.sum())
+
+
+def window(t: np.ndarray, frames: slice) -> Window:
+    """The bump over the frames of a slice, at times t (T,) [s]."""
+    at = t[frames]
+    half = 0.5 * (at[-1] - at[0])
+    s = np.clip((at - at[0]) / half - 1.0, -1.0, 1.0)
+    step = np.gradient(at)
+    step[[0, -1]] *= 0.5
+    u = 1.0 - s**2
+    value = step * u**POWER
+    second = step * (4 * POWER * (POWER - 1) * s**2 * u ** (POWER - 2) - 2 * POWER * u ** (POWER - 1)) / half**2
+    # sampled at few frames the weights miss a little: rest and steady motion must vanish, and a steady acceleration a give a times the area
+    basis = np.stack([np.ones_like(s), s, s**2], axis=1)
+    wanted = np.array([0.0, 0.0, 2 * value.sum() / half**2])
+    shape = basis * u[:, None] ** 2
+    second = second + shape @ np.linalg.solve(basis.T @ shape, wanted - basis.T @ second)
+    return Window(frames, second, value, float(0.5 * (at[0] + at[-1])))
+
+
+def windows(t: np.ndarray, count: int = WINDOWS) -> list[Window]:
+    """Half-overlapping bumps over a recording; fewer where it is short."""
+    length = max(2 * len(t) // (count + 1), FEWEST)
+    if length > len(t):
+        return [window(t, slice(0, len(t)))] if len(t) >= 5 else []
+    starts = np.unique(np.linspace(0, len(t) - length, max(1, round(2 * (len(t) - length) / length) + 1)).round().astype(int))
+    return [window(t, slice(int(i), int(i) + length)) for i in starts]
+
+
+def weak_residual(
+    x: np.ndarray,
+    bump: Window,
+    fields: np.ndarray,
+    mass: np.ndarray,
+    *,
+    sigma: float = 0.0,
+    force: Sequence[float] = (0.0, 0.0, 0.0),
+    stress: np.ndarray | None = None,
+    gradients: np.ndarray | None = None,
+    volume: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """R[w, phi] of some fields, and its standard deviation from noise of the positions.
+
+    Args:
+        x: Positions, or measured less predicted ones, (T, N, 3) [m]; a point that is not seen (NaN) in the window is left out.
+        bump: The window.
+        fields: w, (K, N, 3).
+        mass: Of the points [kg], (N,).
+        sigma: Standard deviation of a coordinate [m].
+        force: b, per mass [m/s^2].
+        stress: First Piola-Kirchhoff stress of the points [Pa], (T, N, 3, 3), with
+        gradients: of w by the reference positions, (K, N, 3, 3), and
+        volume: of the points [m^3], (N,).
+
+    Returns:
+        (K,) and (K,) in [N s] times the unit of w.
+    """
+    own = x[bump.frames]
+    seen = np.isfinite(own).all(axis=(0, 2))
+    own, w, m = own[:, seen], fields[:, seen], mass[seen]
+    moved = np.einsum("t,tnc->nc", bump.second, own - own[:1])  # constants drop out: less rounding
+    out = np.einsum("n,knc,nc->k", m, w, moved) - bump.area * np.einsum("n,knc,c->k", m, w, np.asarray(force, dtype=np.float64))
+    if stress is not None:
+        if gradients is None or volume is None:
+            raise ValueError("stress needs gradients and volume")
+        total = np.einsum("t,tnab->nab", bump.value, stress[bump.frames][:, seen])
+        out = out + np.einsum("n,nab,knab->k", volume[seen], total, gradients[:, seen])
+    return out, sigma * np.sqrt(np.einsum("n,knc->k", m**2, w**2) * np.sum(bump.second**2))
+
+
+def deformation_gradients(reference: np.ndarray, x: np.ndarray, neighbours: int = 12) -> np.ndarray:
+    """F of every point from its neighbours by weighted least squares, (T, N, 3, 3); exact for affine motions.
+
+    Args:
+        reference: (N, 3) [m].
+        x: (T, N, 3) [m]; NaN makes F of a point and its neighbours NaN.
+        neighbours: How many count; the weight falls to exp(-2) at the last.
+    """
+    distance = np.linalg.norm(reference[:, None] - reference[None], axis=-1)
+    index = np.argsort(distance, axis=1)[:, 1 : neighbours + 1]
+    far = np.take_along_axis(distance, index, axis=1)
+    weight = np.exp(-2.0 * (far / far[:, -1:]) ** 2)
+    arm = reference[index] - reference[:, None]
+    inverse = np.linalg.pinv(np.einsum("nk,nka,nkb->nab", weight, arm, arm))
+    moved = x[:, index] - x[:, :, None]
+    return np.einsum("tnka,nk,nkb,nbc->tnac", moved, weight, arm, inverse)
+
+
+def hats(reference: np.ndarray, nodes: int = 3) -> np.ndarray:
+    """Piecewise linear fields of compact support on a lattice over the body, (nodes^3, N), that add up to one."""
+    low, size = reference.min(axis=0), np.maximum(np.ptp(reference, axis=0), 1e-12)
+    s = (reference - low) / size * (nodes - 1)
+    one = np.maximum(0.0, 1.0 - np.abs(s[:, None, :] - np.arange(nodes)[None, :, None]))
+    return np.einsum("ni,nj,nk->ijkn", *(one[..., a] for a in range(3))).reshape(nodes**3, -1)
+
+
+class Parts(NamedTuple):
+    """A residual field split in its affine part about the mean and a remainder; each over frames."""
+
+    centre: np.ndarray
+    """(T, 3) [m]"""
+    rotation: np.ndarray
+    """Infinitesimal rotation (T, 3) [rad]."""
+    strain: np.ndarray
+    """xx, yy, zz, yz, xz, xy, (T, 6) [-]."""
+    remainder: np.ndarray
+    """Root mean square distance that no affine motion explains, (T,) [m]."""
+
+
+def decompose(x: np.ndarray, predicted: np.ndarray) -> Parts:
+    """Least squares x - predicted = a + A (predicted - its mean), frame by frame; both (T, N, 3) [m], NaN where not seen."""
+    out = np.full((len(x), 13), np.nan)
+    for k, (a, b) in enumerate(zip(x, predicted)):
+        seen = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+        if seen.sum() < 4:
+            continue
+        r, arm = (a - b)[seen], b[seen] - b[seen].mean(axis=0)
+        centre = r.mean(axis=0)
+        A = np.linalg.lstsq(arm, r - centre, rcond=1e-6)[0].T
+        left = r - centre - arm @ A.T
+        W, S = 0.5 * (A - A.T), 0.5 * (A + A.T)
+        turn = [W[2, 1], W[0, 2], W[1, 0]]
+        out[k] = [*centre, *turn, S[0, 0], S[1, 1], S[2, 2], S[1, 2], S[0, 2], S[0, 1], np.sqrt(np.mean(np.sum(left**2, axis=1)))]
+    return Parts(out[:, :3], out[:, 3:6], out[:, 6:12], out[:, 12])
+
+
+def in_contact(x: np.ndarray, planes: Sequence[Plane], margin: float) -> np.ndarray:
+    """Frames in which a point is within a margin [m] of a plane, (T,)."""
+    out = np.zeros(len(x), dtype=bool)
+    for plane in planes:
+        normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
+        height = (x - np.array(plane.point)) @ normal
+        out |= np.nanmin(height, axis=1) < margin
+    return out
+
+
+class Series(NamedTuple):
+    """One stage in the course of time."""
+
+    name: str
+    unit: str
+    times: np.ndarray
+    """Middles of the windows [s], (W,)."""
+    before: np.ndarray
+    """Size of what is missing, (W,)."""
+    after: np.ndarray
+    noise: np.ndarray
+    """What noise alone makes of it, (W,)."""
+    degrees: int
+    """Numbers in each value."""
+
+    def size(self, values: np.ndarray) -> float:
+        """Root mean square over the windows."""
+        return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+    def excess(self, values: np.ndarray) -> float:
+        """Mean square in units of the noise, per number: 1 where there is noise alone."""
+        return float(np.mean((values / np.maximum(self.noise, 1e-300)) ** 2)) if len(values) else 0.0
+
+
+def stages(
+    x: np.ndarray,
+    t: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    *,
+    mass: float,
+    sigma: float,
+    planes: Sequence[Plane],
+    margin: float,
+) -> list[Series]:
+    """What is missing from two predictions, by stage.
+
+    Args:
+        x: Measured points, (T, N, 3) [m], NaN where not seen.
+        t: (T,) [s].
+        before: Predicted, without the effects.
+        after: With them.
+        mass: Of the body [kg], spread evenly over the points.
+        sigma: Noise of a coordinate [m].
+        planes: What the body may touch.
+        margin: How near counts as contact [m].
+
+    Returns:
+        flight (missing acceleration of the centre where no window frame has contact), contact (impulse where one has), rotation
+        (angular acceleration), internal modes (acceleration of the six affine strains), power (of the missing force along the predicted
+        motion), rest (mean distance at the end).
+    """
+    masses = np.full(x.shape[1], mass / x.shape[1])
+    touch = in_contact(x, planes, margin)
+    rows: dict[str, list[tuple[float, float, float, float]]] = {}
+    for bump in windows(t):
+        middle = int(np.abs(t - bump.time).argmin())
+        place = after[middle] - after[middle].mean(axis=0)
+        frames = range(len(t))[bump.frames]
+        a, b = max(middle - 1, frames[0]), min(middle + 1, frames[-1])
+        velocity = (after[b] - after[a]) / (t[b] - t[a])
+        fields = {"centre": np.broadcast_to(np.eye(3)[:, None], (3, len(place), 3)), "rotation": _rotations(place)}
+        fields |= {"internal modes": _strains(place), "power": velocity[None]}
+        for name, w in fields.items():
+            scale = {"power": bump.area}.get(name, bump.area * np.maximum(np.einsum("n,knc->k", masses, w**2), 1e-300))
+            label = name
+            if name == "centre":
+                label = "contact" if touch[bump.frames].any() else "flight"
+                scale = 1.0 if label == "contact" else scale
+            found = []
+            for predicted in (before, after):
+                value, sd = weak_residual(x - predicted, bump, w, masses, sigma=sigma)
+                found.append(np.sqrt(np.mean((value / scale) ** 2)))
+            rows.setdefault(label, []).append((bump.time, *found, float(np.sqrt(np.mean((sd / scale) ** 2)))))
+    units = {"flight": ("m/s^2", 3), "rotation": ("rad/s^2", 3), "internal modes": ("1/s^2", 6), "contact": ("N s", 3), "power": ("W", 1)}
+    out = []
+    for name, (unit, degrees) in units.items():
+        if name in rows:
+            out.append(Series(name, unit, *np.array(rows[name]).T, degrees))
+    return [*out, _rest(x, t, before, after, sigma)]
+
+
+def _rest(x: np.ndarray, t: np.ndarray, before: np.ndarray, after: np.ndarray, sigma: float) -> Series:
+    late = t >= t[-1] - REST * (t[-1] - t[0])
+    late &= np.isfinite(x).any(axis=(1, 2))
+    if not late.any():
+        late[np.flatnonzero(np.isfinite(x).any(axis=(1, 2)))[-1]] = True
+    count = np.isfinite(x[late][..., 0]).sum(axis=0)
+    found = []
+    for predicted in (before, after):
+        r = np.nanmean(np.where(count[:, None] > 0, x[late] - predicted[late], 0.0), axis=0)[count > 0]
+        found.append([float(np.sqrt(np.mean(np.sum(r**2, axis=1))))])
+    noise = sigma * np.sqrt(3.0 * np.mean(1.0 / count[count > 0]))
+    return Series("rest", "m", np.array([float(t[late].mean())]), np.array(found[0]), np.array(found[1]), np.array([noise]), 3)
+
+
+def _rotations(place: np.ndarray) -> np.ndarray:
+    """e_k x r, (3, N, 3)."""
+    return np.stack([np.cross(axis, place) for axis in np.eye(3)])
+
+
+def _strains(place: np.ndarray) -> np.ndarray:
+    """The six symmetric linear fields, (6, N, 3)."""
+    out = []
+    for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)):
+        field = np.zeros_like(place)
+        field[:, i] += place[:, j]
+        if i != j:
+            field[:, j] += place[:, i]
+        out.append(field)
+    return np.stack(out)
+
+
+def telling(series: Sequence[Series]) -> Series | None:
+    """The stage in which the effects cut most of what was above the noise."""
+    able = [s for s in series if len(s.times)]
+    return max(able, key=lambda s: s.excess(s.before) - s.excess(s.after), default=None)

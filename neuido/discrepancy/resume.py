@@ -1,0 +1,141 @@
+"""Predictions kept on disk while a diagnosis runs, so that one that was killed goes on where it stopped, to the same answer."""
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuido.discrepancy.problem import Point, Problem
+
+CHUNK = 32
+"""Points in one stored call: what a kill can cost. It holds with and without a store, so that both compute the same."""
+LIMIT = 2_000_000_000
+"""Bytes that a store may take; what comes after is computed again by a run that is resumed."""
+
+
+class CachedProblem(Problem):
+    """A problem whose predictions are kept in a folder, one file a call.
+
+    The key of a call is its points in their order, its recording and its setting: a batch is computed together, and a resumed run asks in
+    the same order, so that it gets the same bits. All else is the problem's own.
+
+    Args:
+        problem: What predicts.
+        folder: Where the files go; it is made. None: nothing is kept.
+        limit: Bytes of all files.
+        tick: Called with the number of points after every call.
+    """
+
+    def __init__(
+        self, problem: Problem, folder: str | os.PathLike | None, *, limit: int = LIMIT, tick: Callable[[int], None] | None = None
+    ) -> None:
+        super().__init__(**{field.name: getattr(problem, field.name) for field in fields(Problem)})
+        folder = None if folder is None else Path(folder)
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            for path in folder.glob(".*.tmp"):  # of a run that was killed
+                path.unlink(missing_ok=True)
+        used = sum(path.stat().st_size for path in folder.glob("*.npy")) if folder is not None else 0
+        self.problem, self.folder, self.limit, self.tick = problem, folder, limit, tick
+        self.used, self.found, self.computed = used, 0, 0
+
+    def __getattr__(self, name: str) -> Any:  # for what only one kind of problem has, as `motion`
+        if name == "problem":
+            raise AttributeError(name)
+        return getattr(self.problem, name)
+
+    def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
+        parts = [self._part(points[i : i + CHUNK], recording, setting) for i in range(0, len(points), CHUNK)]
+        return np.concatenate(parts) if parts else self.problem.predict([], recording, setting)
+
+    def directions(self, recording: int) -> np.ndarray:
+        return self.problem.directions(recording)
+
+    def error(self, residual: np.ndarray, recording: int) -> float:
+        return self.problem.error(residual, recording)
+
+    def setting_name(self, setting: int) -> str:
+        return self.problem.setting_name(setting)
+
+    def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
+        return self.problem.model_after(values, effects)
+
+    def _part(self, points: Sequence[Point], recording: int, setting: int) -> np.ndarray:
+        path = None if self.folder is None else self.folder / f"{_key(points, recording, setting)}.npy"
+        shape = (len(points), len(self.recordings[recording].y))
+        kept = None if path is None else _load(path, shape)
+        if kept is not None:
+            self.found += 1
+        else:
+            kept = np.asarray(self.problem.predict(points, recording, setting), dtype=np.float64)
+            self.computed += 1
+            if path is not None:
+                self._keep(path, kept)
+        if self.tick is not None:
+            self.tick(len(points))
+        return kept
+
+    def _keep(self, path: Path, values: np.ndarray) -> None:
+        with np.errstate(over="ignore"):
+            short = values.astype(np.float32)
+        stored = short if np.array_equal(short.astype(np.float64), values, equal_nan=True) else values  # the simulators work in float32
+        if self.used + stored.nbytes > self.limit:
+            return
+        hidden = path.with_name(f".{path.name}.tmp")
+        with hidden.open("wb") as stream:
+            np.save(stream, stored)
+        os.replace(hidden, path)
+        self.used += stored.nbytes
+
+
+def _key(points: Sequence[Point], recording: int, setting: int) -> str:
+    rows = [sorted((name, float(value).hex()) for name, value in point.items()) for point in points]
+    return hashlib.sha256(json.dumps([rows, recording, setting]).encode()).hexdigest()[:40]
+
+
+def _load(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
+    if not path.is_file():
+        return None
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError):  # numpy's answers to a file that is cut short
+        return None
+    return values.astype(np.float64) if values.shape == shape else None
+
+
+def plan_of(folder: str | os.PathLike, options: dict[str, Any], *, out: Path) -> str:
+    """A name for what a run computes: its options and the bytes of every file of the measured folder, apart from those in `out`."""
+    digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
+    folder = Path(folder)
+    inside = (p for p in folder.rglob("*") if p.is_file() and not p.resolve().is_relative_to(out.resolve()))
+    for path in sorted(inside):
+        digest.update(str(path.relative_to(folder)).encode())
+        with path.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()[:16]
+
+
+def workplace(out: Path, plan: str, *, resume: bool) -> Path:
+    """The folder of a plan's predictions in `out`; those of other plans go, and its own too where nothing is to be resumed."""
+    root = out / ".work"
+    if root.is_dir():
+        for other in root.iterdir():
+            if other.name != plan or not resume:
+                shutil.rmtree(other) if other.is_dir() else other.unlink()
+    own = root / plan
+    own.mkdir(parents=True, exist_ok=True)
+    return own
+
+
+def clear(out: Path) -> None:
+    """Remove what only a resumed run would need."""
+    with contextlib.suppress(FileNotFoundError):
+        shutil.rmtree(out / ".work")
