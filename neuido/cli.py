@@ -8,6 +8,7 @@ Whatever the user can mend ends in one line on stderr and exit status 2. `NEUIDO
 """
 
 import importlib
+import inspect
 import logging
 import os
 import re
@@ -26,8 +27,11 @@ if TYPE_CHECKING:
     from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 LIGHT = {  # name: (module, function, one line for the list); the module must import torch only inside its functions
-    "simulate": ("neuido.data.simulate", "simulate", "Generate the constitutive trajectories of Stage I."),
+    "simulate": ("neuido.simulate", "simulate", "Generate the trajectories of Stage I, or filmed scenes."),
+    "reconstruct": ("neuido.reconstruct", "reconstruct", "Gaussians and particles of a filmed body's first frame."),
+    "diagnose": ("neuido.discrepancy.command", "diagnose", "Find the effect that a model lacks, from measured motion."),
     "demo": ("neuido.demo", "demo", "Train on small simulated bodies and compare the learned laws with the true ones."),
+    "film": ("neuido.models.film", "film", "Film simulated bodies of many materials, for the video encoder."),
     "doctor": ("neuido.doctor", "doctor", "Print versions and devices, and run a small rollout on each device."),
 }
 HEAVY = {
@@ -36,6 +40,16 @@ HEAVY = {
     "test": "Run one test epoch.",
     "predict": "Run inference.",
 }
+
+MODULES = (  # so that their class names resolve without a path
+    "neuido.models.pretrain",
+    "neuido.models.pretrain_vae",
+    "neuido.models.warmup",
+    "neuido.models.align",
+    "neuido.data.trajectories",
+    "neuido.data.films",
+    "neuido.data.visual_module",
+)
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -79,6 +93,8 @@ def _run_light(name: str, args: list[str]) -> int:
 
     module, function, _ = LIGHT[name]
     component = getattr(importlib.import_module(module), function)
+    if args and not args[0].startswith("-"):  # the first parameter may stand alone
+        args = [f"--{next(iter(inspect.signature(component).parameters))}", *args]
     status = auto_cli(component, args=args, as_positional=False, prog=f"neuido {name}", exit_on_error=False)
     return status if isinstance(status, int) else 0
 
@@ -89,7 +105,7 @@ def run_lightning(args: list[str]) -> "LightningCLI":
     from lightning.pytorch import LightningDataModule, LightningModule
     from lightning.pytorch.cli import LightningCLI
 
-    for module in ("neuido.models.pretrain", "neuido.data.trajectories"):  # so that their class names resolve without a path
+    for module in MODULES:
         importlib.import_module(module)
 
     class NeuidoCLI(LightningCLI):
@@ -142,15 +158,16 @@ def find_config(name: str, option: str = "--config") -> str:
     """The path of a configuration: a file here, or one that comes with neuido by its name."""
     if name.lstrip().startswith("{") or Path(name).is_file():  # jsonargparse accepts the content itself too
         return name
-    own = neuido.configs_root() / (name.removeprefix("configs/").removesuffix(".yaml") + ".yaml")
-    if own.is_file():
-        return str(own)
+    relative = name.removeprefix("configs/").removesuffix(".yaml") + ".yaml"
+    for own in (neuido.configs_root() / relative, neuido.configs_root() / "scenes" / relative):
+        if own.is_file():
+            return str(own)
     raise UserError(f"no configuration file '{name}', neither here nor in {neuido.configs_root()}: change {option}")
 
 
 def _help() -> str:
     table = HEAVY | {name: text for name, (*_, text) in LIGHT.items()}
-    commands = "\n".join(f"  {name:<10}{text}" for name, text in table.items())
+    commands = "\n".join(f"  {name:<13}{text}" for name, text in table.items())
     return (
         f"usage: neuido [--help] [--version] COMMAND [--config FILE] [OPTIONS]\n\n{neuido.__doc__.splitlines()[0]}\n\n"
         f"commands:\n{commands}\n\n`neuido COMMAND --help` lists the options of a command; `--print_config` writes them as YAML."
@@ -171,3 +188,4 @@ def _quiet_lightning() -> None:
     warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).* is deprecated")
     warnings.filterwarnings("ignore", message=r".*tensorboardX.* has been removed")
     warnings.filterwarnings("ignore", message=r".*does not have many workers")  # the data sets are memory maps
+    warnings.filterwarnings("ignore", message=r".*in eval mode at the start of training")  # what is frozen is meant to be

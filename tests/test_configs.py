@@ -7,7 +7,9 @@ import yaml
 
 import neuido
 from neuido import cli
-from neuido.data.simulate import simulate
+from neuido.data.simulate import simulate as trajectories
+from neuido.models.film import film
+from neuido.simulate import simulate
 
 ROOT = neuido.configs_root()
 CONFIGS = sorted(ROOT.rglob("*.yaml"))
@@ -22,8 +24,10 @@ def command_of(path) -> str | None:
     keys = set(content(path))
     if "model" in keys:
         return "fit"
-    if keys <= {*inspect.signature(simulate).parameters}:
+    if keys <= {*inspect.signature(simulate).parameters, *inspect.signature(trajectories).parameters}:
         return "simulate"
+    if keys <= {*inspect.signature(film).parameters}:
+        return "film"
     return None
 
 
@@ -31,11 +35,16 @@ def test_there_are_configurations():
     assert {"stage1.yaml", "quickstart.yaml"} <= {path.name for path in CONFIGS}
 
 
-@pytest.mark.parametrize("path", [p for p in CONFIGS if "scenes" not in p.parts and "sweeps" not in p.parts], ids=lambda p: p.stem)
+def of_a_command(path) -> bool:
+    """A file of one scene, of conditions, or of a sweep, is for no command of its own."""
+    return not {"sweeps", "conditions"} & set(path.parts) and (path.parent.name != "scenes" or "scenes" in content(path))
+
+
+@pytest.mark.parametrize("path", [path for path in CONFIGS if of_a_command(path)], ids=lambda p: p.stem)
 def test_command_line_accepts(path, capsys):
     command = command_of(path)
     assert command is not None, f"no command takes {path.name}"
-    required = ["--out", "nowhere"] if command == "simulate" and "out" not in content(path) else []
+    required = ["--out", "nowhere"] if command in ("simulate", "film") and "out" not in content(path) else []
     with pytest.raises(SystemExit) as stop:
         cli.main([command, "--config", str(path), *required, "--print_config"])
     out, err = capsys.readouterr()

@@ -46,6 +46,15 @@ def publish(hidden: Path, path: Path) -> None:
     _sync(path.parent)
 
 
+def publish_folder(hidden: Path, folder: Path) -> None:
+    """Make a finished temporary folder appear under its name, all at once and for good."""
+    for path in sorted(hidden.rglob("*"), reverse=True):
+        _sync(path)
+    _sync(hidden)
+    os.replace(hidden, folder)
+    _sync(folder.parent)
+
+
 def _sync(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:

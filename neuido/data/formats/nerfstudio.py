@@ -79,6 +79,16 @@ def write(
         views: Names of the views; whole numbers, as the format wants them. Default: 0, 1, ...
         held_out: Views that are named under `test_filenames`.
     """
+    names = write_transforms(folder, cameras, times, views=views, held_out=held_out)
+    for v, name in enumerate(names):
+        for t in range(len(times)):
+            write_image(folder / f"images/{name}_{t:03d}.png", images[v][t], size=(cameras.width, cameras.height))
+
+
+def write_transforms(
+    folder: Path, cameras: Cameras, times: Tensor, *, views: Sequence[str] | None = None, held_out: Sequence[int] = ()
+) -> list[str]:
+    """Write `transforms.json` alone, for images that are written otherwise; arguments as in `write`. Returns the names of the views."""
     names = list(views) if views is not None else [str(v) for v in range(len(cameras.viewmats))]
     if not all(name.isdigit() for name in names):
         raise UserError(f"views must be whole numbers, got {names}")
@@ -90,7 +100,6 @@ def write(
         lens = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
         for t, time in enumerate(times.tolist()):
             relative = f"images/{name}_{t:03d}.png"
-            write_image(folder / relative, images[v][t], size=(cameras.width, cameras.height))
             frames.append({"file_path": relative, **lens, "transform_matrix": poses[v], "time": time, "view": int(name)})
     content: dict[str, Any] = {"camera_model": "OPENCV", "w": cameras.width, "h": cameras.height, "frames": frames}
     if held_out:
@@ -98,6 +107,7 @@ def write(
         content["train_filenames"] = [frame["file_path"] for frame in frames if frame["view"] not in kept]
         content["test_filenames"] = [frame["file_path"] for frame in frames if frame["view"] in kept]
     (folder / "transforms.json").write_text(json.dumps(content, indent=1))
+    return names
 
 
 def write_image(path: Path, image: np.ndarray, *, size: tuple[int, int] | None = None) -> None:

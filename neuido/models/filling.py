@@ -1,0 +1,268 @@
+"""From the surface that images show to a body full of particles: visual hulls, opacity volumes, and their filling.
+
+A volume is a field in 0..1 on a regular grid, whose body is where it exceeds a level. That of masks is the visual hull
+(Laurentini 1994); that of Gaussians is their opacity, with every enclosed place filled (rays, as in PhysGaussian's filling, but 26
+of them, of which two may miss: a small hole in the shell does not leak).
+"""
+
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.types import Cameras, Gaussians, Vector
+
+METHODS = ("voxel", "poisson")
+REACH = 6
+"""A Gaussian reaches at most this many grid cells to each side."""
+
+LEVEL = 0.5
+FAINT = 0.2
+"""Opacity that stops a ray: a shell of Gaussians is thin in places."""
+
+JITTER = 0.5
+"""Of the particles of a voxel filling, in spacings."""
+
+
+class Volume(NamedTuple):
+    """A field on the centres of cubic cells."""
+
+    values: Tensor
+    """In 0..1, (X, Y, Z)."""
+    lower: Tensor
+    """Lower corner of the grid [m], (3,)."""
+    spacing: float
+    """Edge of a cell [m]."""
+
+    def centres(self) -> Tensor:
+        """Centres of the cells [m], (X, Y, Z, 3)."""
+        axes = [torch.arange(n, device=self.lower.device) + 0.5 for n in self.values.shape]
+        return self.lower + self.spacing * torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+
+    def at(self, x: Tensor) -> Tensor:
+        """The field at points x [m] (N, 3), linear between centres and zero outside, (N,)."""
+        size = torch.tensor(self.values.shape, device=x.device) * self.spacing
+        unit = 2 * (x - self.lower) / size - 1
+        grid = unit[:, [2, 1, 0]].view(1, -1, 1, 1, 3).to(self.values)  # grid_sample wants the last axis first
+        return torch.nn.functional.grid_sample(self.values[None, None], grid, align_corners=False).view(-1)
+
+    def measure(self, level: float = LEVEL, finer: int = 3) -> float:
+        """Volume where the field exceeds the level [m^3], counted on a grid `finer` times finer."""
+        step = self.spacing / finer
+        offsets = (torch.arange(finer, device=self.lower.device) + 0.5) * step - 0.5 * self.spacing
+        centres, total = self.centres().reshape(-1, 3), 0
+        for dx in offsets:
+            for dy in offsets:
+                for dz in offsets:
+                    total += int((self.at(centres + torch.stack([dx, dy, dz])) > level).sum())
+        return total * step**3
+
+
+def visual_hull(masks: Tensor, cameras: Cameras, lower: Vector, upper: Vector, *, resolution: int = 96) -> Volume:
+    """The largest body that the masks allow.
+
+    A point counts as the least of what the masks say where it is seen; a camera that does not see it says nothing.
+
+    Args:
+        masks: Share of the object in each pixel, (V, H, W).
+        cameras: Of the V views.
+        lower, upper: Corners of the box in which the body lies [m].
+        resolution: Cells along the longest side of the body.
+
+    Raises:
+        UserError: Masks of another shape than the cameras', or no point that all of them allow.
+    """
+    if tuple(masks.shape) != (len(cameras.viewmats), cameras.height, cameras.width):
+        raise UserError(f"masks have shape {tuple(masks.shape)}; the cameras want {(len(cameras.viewmats), cameras.height, cameras.width)}")
+    low, high = masks.new_tensor(lower), masks.new_tensor(upper)
+    coarse = _carve(masks, cameras, low, high, 48, widen=True)
+    inside = (coarse.values > LEVEL).nonzero()
+    if not len(inside):
+        raise UserError("no point of the scene's domain lies in the masks of all views: check cameras, scale, shift and masks")
+    low = coarse.lower + coarse.spacing * (inside.amin(0) - 1)
+    high = coarse.lower + coarse.spacing * (inside.amax(0) + 2)
+    fine = _carve(masks, cameras, low, high, resolution, widen=False)
+    if not bool((fine.values > LEVEL).any()):
+        raise UserError("the masks of the views do not meet in one body: check cameras, scale, shift and masks")
+    return fine
+
+
+def opacity_volume(gaussians: Gaussians, *, spacing: float, hull: Volume | None = None) -> Volume:
+    """The opacity of Gaussians, 1 - prod(1 - o exp(-d^2 / 2)), one in all enclosed cells, and not outside the hull.
+
+    Args:
+        gaussians: At t = 0.
+        spacing: Edge of a cell [m].
+        hull: From `visual_hull`: what it denies is empty.
+    """
+    from scipy import ndimage
+
+    means = gaussians.means.detach()
+    lower = means.amin(0) - (REACH + 1) * spacing
+    shape = ((means.amax(0) - lower) / spacing + REACH + 1).ceil().int().tolist()
+    if math.prod(shape) > 2**28:
+        raise UserError(f"a volume of {shape} cells is too large: raise its spacing, {spacing:g} m")
+    clear = _transmittance(gaussians, lower, spacing, shape)
+    inside = _enclosed((clear < 1 - FAINT).cpu().numpy())
+    inside = ndimage.uniform_filter(inside.astype(np.float32), 3) > 0.5
+    field = torch.maximum(1 - clear, torch.from_numpy(inside).to(clear))
+    volume = Volume(field, lower, spacing)
+    if hull is not None:
+        allowed = hull.at(volume.centres().reshape(-1, 3)).view(field.shape)
+        volume = volume._replace(values=torch.minimum(field, allowed))
+    return volume
+
+
+def fill(
+    volume: Volume, *, count: int | None = None, spacing: float | None = None, method: str = "voxel", level: float = LEVEL, seed: int = 0
+) -> tuple[Tensor, Tensor]:
+    """Particles inside a volume.
+
+    Args:
+        volume: Where the body is.
+        count: About how many; or
+        spacing: Their distance [m].
+        method: `voxel`: one in each cube of this edge, jittered; `poisson`: at random, none closer to another than a
+            distance that gives the same number (Poisson disks).
+        level: Of the volume.
+        seed: Of the places.
+
+    Returns:
+        Positions (P, 3) [m] and volumes (P,) [m^3], which are equal and add up to that of the body. Both on the CPU, float32.
+
+    Raises:
+        UserError: Neither or both of count and spacing, an unknown method, or a spacing too coarse for a particle.
+    """
+    if (count is None) == (spacing is None):
+        raise UserError("give either the number of particles or their spacing")
+    if method not in METHODS:
+        raise UserError(f"method = {method!r}; one of {', '.join(METHODS)}")
+    if (count is not None and count < 1) or (spacing is not None and not spacing > 0):
+        raise UserError(f"the number of particles and their spacing must be positive, got {count} and {spacing}")
+    size = volume.measure(level)
+    if not size > 0:
+        raise UserError("the opacity volume is empty: the Gaussians show no body")
+    edge = spacing or (size / count) ** (1 / 3)  # type: ignore[operator]
+    generator = np.random.default_rng(seed)
+    x = _lattice(volume, edge, level, generator) if method == "voxel" else _poisson(volume, edge, level, generator)
+    if not len(x):
+        raise UserError(f"no particle lies in the body of {size:.3g} m^3: lower the spacing, {edge:g} m")
+    return x.float(), torch.full((len(x),), size / len(x))
+
+
+def _carve(masks: Tensor, cameras: Cameras, lower: Tensor, upper: Tensor, resolution: int, *, widen: bool) -> Volume:
+    spacing = float((upper - lower).max()) / resolution
+    shape = ((upper - lower) / spacing).round().clamp(min=1).int().tolist()
+    volume = Volume(masks.new_ones(shape), lower, spacing)
+    x = volume.centres().reshape(-1, 3)
+    seen_by = torch.zeros(len(x), dtype=torch.int32, device=x.device)
+    for mask, viewmat, K in zip(masks, cameras.viewmats.to(x), cameras.Ks.to(x)):
+        seen = x @ viewmat[:3, :3].T + viewmat[:3, 3]
+        depth = seen[:, 2].clamp(min=1e-6)
+        pixel = seen[:, :2] / depth[:, None] * torch.stack([K[0, 0], K[1, 1]]) + K[:2, 2]
+        if widen:  # nothing may slip between the centres of coarse cells
+            near = max(0, math.ceil(0.87 * spacing * float(K[0, 0]) / float(depth.median())))
+            mask = torch.nn.functional.max_pool2d(mask[None, None], 2 * near + 1, 1, near)[0, 0]
+        size = pixel.new_tensor([cameras.width, cameras.height])
+        value = torch.nn.functional.grid_sample(mask[None, None], (2 * pixel / size - 1).view(1, 1, -1, 2), align_corners=False).view(-1)
+        visible = (seen[:, 2] > 1e-6) & ((pixel >= 0) & (pixel <= size)).all(1)
+        flat = volume.values.view(-1)
+        flat.copy_(torch.where(visible, torch.minimum(flat, value), flat))
+        seen_by += visible
+    volume.values.view(-1)[seen_by < min(2, len(masks))] = 0
+    return volume
+
+
+def _transmittance(gaussians: Gaussians, lower: Tensor, spacing: float, shape: list[int]) -> Tensor:
+    """prod(1 - o exp(-d^2 / 2)) at the cells' centres, (X, Y, Z).
+
+    Gaussians are at least a third of a cell wide, so that none slips through.
+    """
+    means, covariances = gaussians.means.detach(), gaussians.covariances.detach()
+    covariances = covariances + (spacing / 3) ** 2 * torch.eye(3, device=means.device, dtype=means.dtype)
+    conics = torch.linalg.inv(covariances)
+    reach = (3 * covariances.diagonal(dim1=1, dim2=2).amax(1).sqrt() / spacing).ceil().clamp(1, REACH).int()
+    total = means.new_zeros(math.prod(shape))
+    for r in range(1, REACH + 1):
+        chosen = (reach == r).nonzero().squeeze(1)
+        axis = torch.arange(-r, r + 1, device=means.device)
+        window = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+        for part in chosen.split(max(1, 4_000_000 // len(window))):
+            cell = ((means[part] - lower) / spacing).floor().long()[:, None] + window
+            d = lower + (cell + 0.5) * spacing - means[part, None]
+            alpha = gaussians.opacities.detach()[part, None] * torch.exp(-0.5 * torch.einsum("nwi,nij,nwj->nw", d, conics[part], d))
+            index = (cell[..., 0] * shape[1] + cell[..., 1]) * shape[2] + cell[..., 2]
+            total.index_add_(0, index.flatten(), torch.log1p(-alpha.clamp(max=0.999)).flatten())
+    return total.exp().view(shape)
+
+
+def _enclosed(solid: np.ndarray, share: int = 24) -> np.ndarray:
+    """Cells from which at least `share` of the 26 rays to the sides, edges and corners of a cube meet another that is solid."""
+    hits = np.zeros(solid.shape, dtype=np.int8)
+    for direction in itertools.product((-1, 0, 1), repeat=3):
+        axis = next((a for a, step in enumerate(direction) if step), None)
+        if axis is None:
+            continue
+        step, across = direction[axis], [direction[a] for a in range(3) if a != axis]
+        slices, counts = np.moveaxis(solid, axis, 0), np.moveaxis(hits, axis, 0)
+        carried = np.zeros_like(slices[0])  # whether the ray against the order of slices has met something
+        for i in range(len(slices))[::-step]:
+            carried = _moved(carried, across)
+            counts[i] += carried
+            carried |= slices[i]
+    return hits >= share
+
+
+def _moved(plane: np.ndarray, by: list[int]) -> np.ndarray:
+    """plane[i + by[0], j + by[1]], and False from outside."""
+    padded = np.pad(plane, 1)
+    return padded[1 + by[0] : 1 + by[0] + plane.shape[0], 1 + by[1] : 1 + by[1] + plane.shape[1]]
+
+
+def _lattice(volume: Volume, edge: float, level: float, generator: np.random.Generator) -> Tensor:
+    """One jittered point in each cube of a lattice whose middle lies in the volume."""
+    counts = [math.ceil(n * volume.spacing / edge) for n in volume.values.shape]
+    axes = [torch.arange(n, dtype=torch.float32) + 0.5 for n in counts]
+    cell = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    lower, shift = volume.lower.cpu(), torch.from_numpy(JITTER * generator.uniform(-0.5, 0.5, (len(cell), 3))).float()
+    x = lower + edge * (cell + shift)
+    return x[(volume.at(x.to(volume.lower.device)) > level).cpu()]
+
+
+def _poisson(volume: Volume, edge: float, level: float, generator: np.random.Generator) -> Tensor:
+    """Poisson disks: candidates in random order, each taken unless one that was taken lies closer than the distance.
+
+    All candidates that come first among their neighbours are taken at once, which gives the same as one by one.
+    """
+    from scipy.spatial import cKDTree
+
+    inside = torch.nn.functional.max_pool3d((volume.values > 0)[None, None].float(), 3, 1, 1)[0, 0] > 0
+    cells = inside.nonzero().cpu().numpy()
+    lower = volume.lower.cpu().double().numpy()
+    many = max(1, math.ceil(12 * volume.spacing**3 / edge**3))
+    corner = np.repeat(cells, many, axis=0) + generator.uniform(0, 1, (len(cells) * many, 3))
+    if many == 1:  # candidates are cheap; thin them to about twelve a particle
+        keep = generator.uniform(0, 1, len(corner)) < 12 * volume.spacing**3 / edge**3
+        corner = corner[keep]
+    x = lower + volume.spacing * corner
+    x = x[(volume.at(torch.from_numpy(x).float().to(volume.lower.device)) > level).cpu().numpy()]
+    generator.shuffle(x)
+    distance = 0.825 * edge  # so that about one particle falls on edge^3
+    pairs = cKDTree(x).query_pairs(distance, output_type="ndarray") if len(x) else np.empty((0, 2), int)
+    first, second = pairs.min(1), pairs.max(1)  # the index is the rank
+    open_, taken = np.ones(len(x), bool), np.zeros(len(x), bool)
+    while open_.any():
+        live = open_[first] & open_[second]
+        blocked = np.zeros(len(x), bool)
+        blocked[second[live]] = True
+        now = open_ & ~blocked
+        taken |= now
+        open_ &= ~now
+        hit = now[first]
+        open_[second[hit]] = False
+        first, second = first[live & ~hit], second[live & ~hit]
+    return torch.from_numpy(x[taken])
