@@ -9,6 +9,7 @@ import neuido
 from neuido import cli
 from neuido.data.simulate import simulate as trajectories
 from neuido.models.film import film
+from neuido.discrepancy.command import diagnose
 from neuido.simulate import simulate
 
 ROOT = neuido.configs_root()
@@ -22,6 +23,8 @@ def content(path) -> dict:
 def command_of(path) -> str | None:
     """The command that a configuration is for, by its keys."""
     keys = set(content(path))
+    if "most" in keys and keys <= set(inspect.signature(diagnose).parameters):
+        return "diagnose"
     if "model" in keys:
         return "fit"
     if keys <= {*inspect.signature(simulate).parameters, *inspect.signature(trajectories).parameters}:
@@ -44,7 +47,8 @@ def of_a_command(path) -> bool:
 def test_command_line_accepts(path, capsys):
     command = command_of(path)
     assert command is not None, f"no command takes {path.name}"
-    required = ["--out", "nowhere"] if command in ("simulate", "film") and "out" not in content(path) else []
+    required = ["--out", "nowhere"] if command in ("simulate", "film", "diagnose") and "out" not in content(path) else []
+    required += ["--folder", "nowhere"] if command == "diagnose" else []
     with pytest.raises(SystemExit) as stop:
         cli.main([command, "--config", str(path), *required, "--print_config"])
     out, err = capsys.readouterr()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
-from lightning.pytorch import LightningModule
+from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor, nn
 from torchmetrics import MeanSquaredError, MetricCollection
@@ -175,6 +175,22 @@ class ConstitutiveMetrics(nn.Module):
         return self.stress, self.plastic, self.yielding, self.stress_by_family, self.plastic_by_family
 
 
+def run_length(trainer: Trainer) -> int:
+    """Optimiser steps of a whole run.
+
+    `trainer.estimated_stepping_batches` would do, but it sets up the loaders before Lightning restores their state, and a run
+    resumed in the middle of an epoch would then start that epoch anew.
+    """
+    bounds = [trainer.max_steps] if trainer.max_steps > 0 else []
+    if trainer.max_epochs is not None and trainer.max_epochs > 0:
+        batches, limit = len(trainer.datamodule.train_dataloader()), trainer.limit_train_batches
+        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+        bounds.append(trainer.max_epochs * math.ceil(batches / trainer.accumulate_grad_batches))
+    if not bounds:
+        raise UserError("trainer.max_epochs and trainer.max_steps are both unlimited: the cosine schedule needs an end")
+    return max(1, min(bounds))
+
+
 class PretrainModule(LightningModule):
     """Stage I.
 
@@ -269,24 +285,8 @@ class PretrainModule(LightningModule):
             {"params": [self.latents], "lr": self.hparams.lr * self.hparams.latent_lr_factor, "weight_decay": 0.0},
         ]
         optimizer = torch.optim.AdamW(groups, lr=self.hparams.lr, fused=self.latents.is_cuda)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self._total_steps())
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, run_length(self.trainer))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-    def _total_steps(self) -> int:
-        """Optimiser steps of the whole run.
-
-        `trainer.estimated_stepping_batches` would do, but it sets up the loaders before Lightning restores their state, and a run
-        resumed in the middle of an epoch would then start that epoch anew.
-        """
-        trainer = self.trainer
-        bounds = [trainer.max_steps] if trainer.max_steps > 0 else []
-        if trainer.max_epochs is not None and trainer.max_epochs > 0:
-            batches, limit = len(trainer.datamodule.train_dataloader()), trainer.limit_train_batches
-            batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
-            bounds.append(trainer.max_epochs * math.ceil(batches / trainer.accumulate_grad_batches))
-        if not bounds:
-            raise UserError("trainer.max_epochs and trainer.max_steps are both unlimited: the cosine schedule needs an end")
-        return max(1, min(bounds))
 
     def training_step(self, batch: TrajectoryBatch, batch_idx: int) -> Tensor:
         answers = self._answer(batch)

@@ -1,0 +1,184 @@
+"""Clips of `neuido film` as data: windows of flow for the VAE, whole clips for the projector's warm-up.
+
+The folder holds `plan.json` (what is to be made), a `clip-<number>.npz` for each clip and, when all are there, `index.json`. A clip has
+flow (V, T - 1, S, S, 2) float16 [m/s], cell (V,) [m], frame_interval [s], and n samples of its law: trial,
+corrected (n, 3, 3) and stress (n, 3, 3) [Pa], float32.
+"""
+
+import json
+import zipfile
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from lightning.pytorch import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, TensorDataset
+
+from neuido.errors import UserError
+
+FORMAT = "neuido-films/1"
+
+
+class Clip(NamedTuple):
+    """One filmed motion and its law."""
+
+    flow: Tensor
+    """(V, T - 1, S, S, 2) [m/s]."""
+    cell: Tensor
+    """Side of one of the S x S cells at the body [m], (V,)."""
+    frame_interval: float
+    """[s]"""
+    trial: Tensor
+    """(n, 3, 3)"""
+    corrected: Tensor
+    """(n, 3, 3)"""
+    stress: Tensor
+    """Kirchhoff stress [Pa], (n, 3, 3)."""
+
+
+class FlowBatch(NamedTuple):
+    """Windows of flow."""
+
+    flow: Tensor
+    """(B, t, S, S, 2) [m/s]."""
+
+
+def complete(path: Path) -> bool:
+    """Whether a clip is there in full."""
+    return path.is_file() and zipfile.is_zipfile(path)
+
+
+def read_clip(path: Path) -> Clip:
+    """Read a clip.
+
+    Raises:
+        UserError: A file that is missing, cut short or no clip.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            parts = {name: torch.from_numpy(arrays[name]) for name in Clip._fields if name != "frame_interval"}
+            interval = float(arrays["frame_interval"])
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path} is no clip of `neuido film`: {error}") from error
+    return Clip(**parts, frame_interval=interval)
+
+
+class Windows(Dataset):
+    """Random windows of the clips' flow; a function of seed and number alone."""
+
+    def __init__(self, paths: list[Path], frames: int, per_clip: int, seed: int) -> None:
+        self.paths, self.frames, self.per_clip, self.seed = paths, frames, per_clip, seed
+
+    def __len__(self) -> int:
+        return len(self.paths) * self.per_clip
+
+    def __getitem__(self, index: int) -> Tensor:
+        clip = read_clip(self.paths[index // self.per_clip])
+        random = np.random.default_rng([self.seed, index])
+        v = int(random.integers(len(clip.flow)))
+        start = int(random.integers(max(1, clip.flow.shape[1] - self.frames + 1)))
+        flow = clip.flow[v, start : start + self.frames].float()
+        if random.random() < 0.5:  # a mirrored motion has the same law
+            flow = flow.flip(2) * flow.new_tensor([-1.0, 1.0])
+        return flow
+
+
+class FilmDataModule(LightningDataModule):
+    """Clips of `neuido film`.
+
+    Args:
+        root: Its folder.
+        batch_size: Windows or clips of a batch.
+        frames: Flows of a window, a multiple of 4 (the VAE sees one frame more); 0: whole clips by number, for the warm-up.
+        windows: Windows of each clip in an epoch.
+        held_out: Share of the clips that validation takes, the last ones.
+        num_workers: Worker processes that read.
+        seed: Seed of the order and of the windows.
+    """
+
+    def __init__(
+        self,
+        root: str = "data/films",
+        *,
+        batch_size: int = 16,
+        frames: int = 16,
+        windows: int = 2,
+        held_out: float = 0.1,
+        num_workers: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if batch_size < 1 or windows < 1 or frames < 0 or frames % 4:
+            raise UserError(f"batch_size = {batch_size}, windows = {windows} must be at least 1, frames = {frames} a multiple of 4")
+        if not 0 < held_out < 1:
+            raise UserError(f"held_out must be a fraction between 0 and 1, got {held_out}")
+        self.root, self.batch_size, self.frames, self.windows = Path(root), batch_size, frames, windows
+        self.held_out, self.num_workers, self.seed = held_out, num_workers, seed
+
+    @cached_property
+    def index(self) -> dict[str, Any]:
+        """The content of index.json.
+
+        Raises:
+            UserError: The folder is missing, incomplete or of another format.
+        """
+        path = self.root / "index.json"
+        if not path.is_file():
+            raise UserError(f"data.root = {self.root} holds no finished clips: make them with `neuido film --out {self.root}`")
+        content = json.loads(path.read_text())
+        if content.get("format") != FORMAT:
+            raise UserError(f"{path} has format {content.get('format')!r}, not {FORMAT!r}")
+        return content
+
+    @property
+    def clips(self) -> list[dict[str, Any]]:
+        """name, family and parameters of each clip."""
+        return self.index["clips"]
+
+    @property
+    def training_count(self) -> int:
+        """Clips before those that are held out."""
+        count = len(self.clips)
+        kept = count - max(1, round(self.held_out * count))
+        if kept < 1:
+            raise UserError(f"data.root = {self.root} has {count} clips: too few to hold any out")
+        return kept
+
+    def read(self, number: int) -> Clip:
+        """A clip by its number."""
+        return read_clip(self.root / f"{self.clips[number]['name']}.npz")
+
+    def train_dataloader(self) -> DataLoader:
+        return self._loader(range(self.training_count), shuffle=True)
+
+    def val_dataloader(self) -> DataLoader:
+        return self._loader(range(self.training_count, len(self.clips)), shuffle=False)
+
+    def test_dataloader(self) -> DataLoader:
+        return self.val_dataloader()
+
+    def _loader(self, numbers: range, *, shuffle: bool) -> DataLoader:
+        if self.frames == 0:
+            dataset: Dataset = TensorDataset(torch.tensor(list(numbers)))
+            collate = _numbers
+        else:
+            paths = [self.root / f"{self.clips[i]['name']}.npz" for i in numbers]
+            epoch = self.trainer.current_epoch if self.trainer is not None and shuffle else 0
+            dataset = Windows(paths, self.frames, self.windows, self.seed + 1000 * epoch)
+            collate = _stack
+        generator = torch.Generator().manual_seed(self.seed)
+        size = min(self.batch_size, len(dataset))  # type: ignore[arg-type]
+        return DataLoader(
+            dataset, size, shuffle=shuffle, generator=generator, num_workers=self.num_workers, collate_fn=collate, drop_last=shuffle
+        )
+
+
+def _numbers(rows: list[tuple[Tensor]]) -> Tensor:
+    return torch.stack([row[0] for row in rows])
+
+
+def _stack(rows: list[Tensor]) -> FlowBatch:
+    return FlowBatch(torch.stack(rows))

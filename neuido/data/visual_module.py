@@ -1,0 +1,186 @@
+"""Filmed and reconstructed bodies as data for Stage II, scoring and prediction: a batch is one scene."""
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import LightningDataModule
+from torch.utils.data import DataLoader, Dataset
+
+from neuido.data.visual import VisualScene, load_visual
+from neuido.errors import UserError
+
+
+def in_order(scenes: Sequence[VisualScene], *, rank: int = 0, ranks: int = 1) -> DataLoader:
+    """Scenes as they stand, each by one of the processes."""
+    return DataLoader(_Listed(scenes[rank::ranks]), batch_size=1, collate_fn=_only)
+
+
+class _Listed(Dataset):
+    def __init__(self, scenes: Sequence[VisualScene]) -> None:
+        self.scenes = list(scenes)
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> VisualScene:
+        return self.scenes[index]
+
+
+def _only(samples: list[VisualScene]) -> VisualScene:
+    return samples[0]
+
+
+class Turns:
+    """Scenes one after the other, in an order that is a function of seed and epoch alone, from where a resumed run stopped.
+
+    Lightning calls `sampler.set_epoch` before the first batch of an epoch and stores `state_dict` in its checkpoints.
+
+    Args:
+        scenes: The scenes.
+        seed: Seed of the order.
+        rank: This process among those that share the scenes; where their number does not divide, the first scenes of the order come twice.
+        ranks: Number of processes.
+    """
+
+    def __init__(self, scenes: Sequence[VisualScene], *, seed: int = 0, rank: int = 0, ranks: int = 1) -> None:
+        self.scenes, self.seed, self.rank, self.ranks = list(scenes), seed, rank, ranks
+        self.epoch = 0
+        self._next = 0
+        self._resume: tuple[int, int] | None = None
+
+    @property
+    def sampler(self) -> "Turns":
+        """Where Lightning looks for `set_epoch`."""
+        return self
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return -(-len(self.scenes) // self.ranks)
+
+    def __iter__(self) -> Iterator[VisualScene]:
+        # a generator: Lightning makes the iterator before it sets the epoch, and nothing here runs before the first batch
+        epoch, start = self.epoch, 0
+        if self._resume is not None and self._resume[0] == epoch:
+            start = self._resume[1]
+        self._resume = None
+        self._next = start
+        count = len(self.scenes)
+        order = np.random.default_rng([self.seed, epoch]).permutation(count).tolist()
+        for k in range(start, len(self)):
+            self._next = k + 1
+            yield self.scenes[order[(k * self.ranks + self.rank) % count]]
+
+    def state_dict(self) -> dict[str, int]:
+        return {"epoch": self.epoch, "step": self._next, "scenes": len(self.scenes), "ranks": self.ranks}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        for name, now in (("scenes", len(self.scenes)), ("ranks", self.ranks)):
+            if state.get(name) != now:
+                raise UserError(f"the checkpoint was written with {state.get(name)} {name}, now there are {now}: restore them to resume")
+        self._resume = (state["epoch"], state["step"])
+
+
+class VisualDataModule(LightningDataModule):
+    """Scenes of `neuido simulate` or of one's own, each with what `neuido reconstruct` made of it (`data.visual`).
+
+    Training and validation take `scenes`; test and predict take `scenes` and `unseen`. Under several processes each trains on its own.
+
+    Args:
+        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them).
+        unseen: Scenes that training never sees.
+        root: Folder to which the paths of scenes are relative; none: the current one.
+        reconstructions: Folder that holds a reconstruction for each scene under the name of the scene's folder; none: inside each scene.
+        frame_step: Take each n-th frame.
+        frame_count: Number of frames; none: all.
+        width: Width of the images [px]; none: as recorded.
+        background: `white` or `black`, where a mask is known.
+        seed: Seed of the order of the scenes, which is another one in each epoch.
+    """
+
+    def __init__(
+        self,
+        scenes: list[str | dict[str, Any]],
+        *,
+        unseen: list[str | dict[str, Any]] | None = None,
+        root: str | None = None,
+        reconstructions: str | None = None,
+        frame_step: int = 1,
+        frame_count: int | None = None,
+        width: int | None = None,
+        background: str = "white",
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if not scenes:
+            raise UserError("data.scenes is empty: name at least one folder")
+        self.given, self.given_unseen, self.seed = list(scenes), list(unseen or []), seed
+        self.root, self.reconstructions = root, reconstructions
+        self.options: dict[str, Any] = {"frame_step": frame_step, "frame_count": frame_count, "width": width, "background": background}
+
+    @cached_property
+    def scenes(self) -> list[VisualScene]:
+        """The scenes that training sees."""
+        return [self._open(given, f"data.scenes[{i}]") for i, given in enumerate(self.given)]
+
+    @cached_property
+    def unseen(self) -> list[VisualScene]:
+        """The scenes that it does not see."""
+        return [self._open(given, f"data.unseen[{i}]") for i, given in enumerate(self.given_unseen)]
+
+    @property
+    def unseen_names(self) -> list[str]:
+        return [scene.name for scene in self.unseen]
+
+    def setup(self, stage: str | None = None) -> None:
+        names = [scene.name for scene in [*self.scenes, *(self.unseen if stage in ("test", "predict") else [])]]
+        for name in names:
+            if names.count(name) > 1:
+                raise UserError(f"data.scenes: two scenes have the name {name}; give one of them another in its experiment.yaml")
+        for scene in self.scenes:
+            if bool(scene.batch.held_out.all()):
+                raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} are held out")
+
+    def train_dataloader(self) -> Turns:
+        return Turns(self.scenes, seed=self.seed, **self._share())
+
+    def val_dataloader(self) -> DataLoader:
+        return in_order(self.scenes, **self._share())
+
+    def test_dataloader(self) -> DataLoader:
+        return in_order([*self.scenes, *self.unseen], **self._share())
+
+    def _share(self) -> dict[str, int]:
+        return {} if self.trainer is None else {"rank": self.trainer.global_rank, "ranks": self.trainer.world_size}
+
+    def predict_dataloader(self) -> DataLoader:
+        return self.test_dataloader()
+
+    def __str__(self) -> str:
+        """Lightning's own opens all loaders to describe them, and takes a scene for a collection of them."""
+        return f"VisualDataModule({len(self.given)} scenes, {len(self.given_unseen)} unseen)"
+
+    def transfer_batch_to_device(self, batch: VisualScene, device: torch.device, dataloader_idx: int) -> VisualScene:
+        """Not here: the model brings a scene to the device once, and keeps it there."""
+        return batch
+
+    def _open(self, given: str | dict[str, Any], where: str) -> VisualScene:
+        options: dict[str, Any] = dict(given) if isinstance(given, dict) else {"path": given}
+        if "path" not in options:
+            raise UserError(f"{where} lacks the key 'path'")
+        known = ("path", "reconstruction", "recording", "views")
+        for key in options:
+            if key not in known:
+                raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(known)}")
+        path = Path(self.root or ".") / Path(options.pop("path")).expanduser()
+        if "reconstruction" not in options and self.reconstructions is not None:
+            options["reconstruction"] = Path(self.reconstructions) / path.resolve().name
+        try:
+            return load_visual(path, **options, **self.options)
+        except UserError as error:
+            raise UserError(f"{where}: {error}") from error

@@ -1,0 +1,261 @@
+"""Optical flow, and the three-channel image of it that the video encoder sees (paper, "Branch Network").
+
+The flow is OpenCV's dense inverse search (DIS). Its image keeps the magnitude: speed is the cue for stiffness, and a colour wheel
+that is normalised frame by frame, as Tora's, hides it. That variant is here as an option.
+"""
+
+import hashlib
+import math
+import os
+import zipfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.types import Cameras
+
+PRESETS = {
+    "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
+    "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
+    "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
+}
+ENCODINGS = ("velocity", "wheel")
+SECTORS = (15, 6, 4, 11, 13, 6)
+"""Steps of the Middlebury colour wheel from red to yellow, green, cyan, blue, magenta and back (Baker et al. 2011)."""
+
+
+def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None = None) -> Tensor:
+    """Dense flow from each frame to the next [px per frame], by DIS.
+
+    Args:
+        images: RGB in [0, 1], (..., T, H, W, 3), T >= 2.
+        preset: `ultrafast`, `fast` or `medium`.
+        threads: Videos that are worked on at a time; the number of cores where absent.
+
+    Returns:
+        (..., T - 1, H, W, 2) float32 on the CPU; x to the right, y down.
+
+    Raises:
+        UserError: Fewer than two frames, images under 16 pixels, an unknown preset.
+    """
+    if preset not in PRESETS:
+        raise UserError(f"flow preset = {preset!r}; one of {', '.join(PRESETS)}")
+    if images.ndim < 4 or images.shape[-1] != 3 or images.shape[-4] < 2:
+        raise UserError(f"flow needs videos (..., T, H, W, 3) of at least 2 frames, got {tuple(images.shape)}")
+    if min(images.shape[-3:-1]) < 16:
+        raise UserError(f"flow needs images of at least 16 pixels a side, got {images.shape[-2]} x {images.shape[-3]}")
+    weights = images.new_tensor([0.299, 0.587, 0.114])
+    grey = (255 * (images.detach() @ weights)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
+    videos = grey.reshape(-1, *grey.shape[-3:])
+
+    def video(frames: np.ndarray) -> np.ndarray:
+        search = cv2.DISOpticalFlow_create(PRESETS[preset])
+        return np.stack([search.calc(a, b, None) for a, b in zip(frames, frames[1:])])
+
+    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:  # OpenCV lets go of Python meanwhile
+        flows = np.stack(list(pool.map(video, videos)))
+    return torch.from_numpy(flows).view(*images.shape[:-4], *flows.shape[1:])
+
+
+class Velocities(NamedTuple):
+    """What V videos show of a body's motion."""
+
+    flow: Tensor
+    """Velocity in the image plane (x right, y down), at the depth of the body [m/s], (V, T - 1, S, S, 2); zero beside the body."""
+    cell: Tensor
+    """Side of one of the S x S cells at the depth of the body [m], (V,)."""
+    frame_interval: float
+    """[s]"""
+
+
+def window(masks: Tensor, margin: float = 0.1) -> tuple[int, int, int]:
+    """Top, left and side [px] of the square, within the image, that holds a body in all frames of a video.
+
+    Args:
+        masks: (T, H, W); a body is where they exceed one half.
+        margin: Added all around, as a share of the side.
+    """
+    height, width = masks.shape[-2:]
+    seen = (masks > 0.5).any(0)
+    rows, columns = seen.any(1).nonzero()[:, 0], seen.any(0).nonzero()[:, 0]
+    if not len(rows):
+        return 0, 0, min(height, width)
+    ends = [(int(axis[0]), int(axis[-1]) + 1) for axis in (rows, columns)]
+    side = min(math.ceil(max(high - low for low, high in ends) * (1 + 2 * margin)), height, width)
+    top, left = (min(max((low + high - side) // 2, 0), full - side) for (low, high), full in zip(ends, (height, width)))
+    return top, left, side
+
+
+def measure(
+    images: Tensor,
+    masks: Tensor,
+    times: Tensor | Sequence[float],
+    cameras: Cameras,
+    centre: Tensor,
+    *,
+    size: int = 64,
+    preset: str = "medium",
+    cache: str | os.PathLike | None = None,
+) -> Velocities:
+    """The velocities that videos show, in a square around the body, masked by its silhouette.
+
+    Args:
+        images: RGB in [0, 1], (V, T, H, W, 3).
+        masks: Share of the body in a pixel, (V, T, H, W); ones where it is not known.
+        times: (T,) [s], evenly spaced.
+        cameras: Those of the V views.
+        centre: The middle of the body [m], (3,).
+        size: S.
+        preset: See `optical_flow`.
+        cache: Folder in which results are kept, under a key of everything that decides them; none: nowhere.
+
+    Raises:
+        UserError: See `optical_flow`, `pixel_length` and `frame_interval_of`.
+    """
+    interval, pixel = frame_interval_of(times), pixel_length(cameras, centre)
+    path = None
+    if cache is not None:
+        key = hashlib.sha256(repr((tuple(images.shape), preset, size)).encode())
+        for t in (images, masks):
+            key.update((255 * t.detach()).round().to(torch.uint8).cpu().contiguous().numpy().tobytes())
+        path = Path(cache) / f"flow-{key.hexdigest()[:24]}.npz"
+    found = _kept(path)
+    if found is None:
+        found = _cut(optical_flow(images, preset=preset), masks.cpu(), size)
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            hidden = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+            with hidden.open("wb") as file:
+                np.savez(file, flow=found[0].numpy(), side=found[1].numpy())
+            os.replace(hidden, path)
+    flow, side = found
+    return Velocities(flow * (pixel / interval)[:, None, None, None, None], pixel * side / size, interval)
+
+
+def _cut(flow: Tensor, masks: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Masked flow (V, T - 1, S, S, 2) in pixels of the full image, and the sides of the windows [px], (V,)."""
+    out, sides = [], []
+    for each, mask in zip(flow, masks):
+        top, left, side = window(mask)
+        part = (each * mask[:-1, ..., None])[:, top : top + side, left : left + side].permute(0, 3, 1, 2)
+        out.append(torch.nn.functional.interpolate(part, size=(size, size), mode="bilinear", antialias=True).permute(0, 2, 3, 1))
+        sides.append(float(side))
+    return torch.stack(out), torch.tensor(sides)
+
+
+def _kept(path: Path | None) -> tuple[Tensor, Tensor] | None:
+    if path is None or not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return torch.from_numpy(arrays["flow"]), torch.from_numpy(arrays["side"])
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile):
+        path.unlink()  # cut short; it is made again
+        return None
+
+
+def pixel_length(cameras: Cameras, centre: Tensor) -> Tensor:
+    """What a pixel of each camera measures at the depth of a point [m], (V,).
+
+    Args:
+        cameras: V cameras.
+        centre: The point, such as the middle of the body [m], (3,).
+    """
+    view = cameras.viewmats.double()
+    depth = (view[:, 2, :3] @ centre.to(view)) + view[:, 2, 3]
+    if bool((depth <= 0).any()):
+        raise UserError(f"{int((depth <= 0).sum())} of {len(depth)} cameras have the body behind them; check their matrices")
+    return (depth / cameras.Ks[:, 0, 0].double()).float()
+
+
+def flow_image(flow: Tensor, scale: float) -> Tensor:
+    """Velocity as three channels in [-1, 1]: its two components and its magnitude, over a fixed scale.
+
+    Args:
+        flow: (..., H, W, 2) [m/s].
+        scale: What counts as one [m/s], the same for all videos of a data set.
+
+    Returns:
+        (..., H, W, 3).
+    """
+    scaled = flow / scale
+    return torch.cat([scaled, scaled.norm(dim=-1, keepdim=True)], -1).clamp(-1, 1)
+
+
+def colour_wheel(flow: Tensor) -> Tensor:
+    """The flow as a Middlebury colour image in [-1, 1], each frame over its own largest magnitude (the paper's input, after Tora).
+
+    Args:
+        flow: (..., H, W, 2).
+
+    Returns:
+        RGB (..., H, W, 3); no motion is white.
+    """
+    largest = flow.norm(dim=-1).amax((-2, -1))[..., None, None, None].clamp(min=1e-12)
+    u, v = (flow / largest).unbind(-1)
+    radius = (u * u + v * v).sqrt()[..., None].clamp(max=1)
+    wheel = _wheel().to(flow)
+    at = (torch.atan2(-v, -u) / math.pi + 1) / 2 * (len(wheel) - 1)
+    low = at.floor().long().clamp(max=len(wheel) - 1)
+    part = (at - low)[..., None]
+    colour = (1 - part) * wheel[low] + part * wheel[(low + 1) % len(wheel)]
+    return 2 * (1 - radius * (1 - colour)) - 1
+
+
+def _wheel() -> Tensor:
+    """RGB of the wheel, (55, 3)."""
+    rows = []
+    for sector, steps in enumerate(SECTORS):
+        rise = torch.arange(steps) / steps
+        colour = torch.zeros(steps, 3)
+        full, moving = ((0, 1), (1, 0), (1, 2), (2, 1), (2, 0), (0, 2))[sector]
+        colour[:, full] = 1
+        colour[:, moving] = rise if sector % 2 == 0 else 1 - rise
+        rows.append(colour)
+    return torch.cat(rows)
+
+
+def encode_flow(flow: Tensor, *, encoding: str = "velocity", speed_scale: float = 2.0) -> Tensor:
+    """The flow as videos for a 3D VAE, with an empty first frame so that there is one for each image (Tora).
+
+    Args:
+        flow: V videos (V, T - 1, H, W, 2) [m/s].
+        encoding: `velocity`: see `flow_image`; `wheel`: see `colour_wheel`.
+        speed_scale: The speed that counts as one [m/s].
+
+    Returns:
+        (V, 3, T, H, W) in [-1, 1].
+
+    Raises:
+        UserError: An unknown encoding, or a scale that is not positive.
+    """
+    if encoding not in ENCODINGS:
+        raise UserError(f"flow encoding = {encoding!r}; one of {', '.join(ENCODINGS)}")
+    if not speed_scale > 0:
+        raise UserError(f"speed_scale = {speed_scale:g} must be positive")
+    padded = torch.cat([torch.zeros_like(flow[:, :1]), flow], 1)
+    video = colour_wheel(padded) if encoding == "wheel" else flow_image(padded, speed_scale)
+    return video.permute(0, 4, 1, 2, 3).contiguous()
+
+
+def frame_interval_of(times: Tensor | Sequence[float]) -> float:
+    """The time between the frames [s], which must be even to 1 %.
+
+    Raises:
+        UserError: One frame alone, or uneven times.
+    """
+    times = torch.as_tensor(times, dtype=torch.float64)
+    if len(times) < 2:
+        raise UserError(f"a video needs at least 2 frames, got {len(times)}")
+    steps = times.diff()
+    mean = float(steps.mean())
+    if mean <= 0 or float((steps - mean).abs().max()) > 0.01 * mean:
+        raise UserError(f"frames are between {float(steps.min()):.4g} and {float(steps.max()):.4g} s apart; they must be evenly spaced")
+    return mean

@@ -1,0 +1,195 @@
+"""A small causal 3D-convolutional VAE for flow videos, with the contract of CogVideoX's (which Tora uses).
+
+Three channels in, 16 latent channels out, T' = floor((T - 1) / 4) + 1 frames of H/8 x W/8. Every convolution sees past and present
+frames alone, so the latent of the first frames does not change when more follow.
+"""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+from neuido.errors import UserError
+
+FORMAT = "neuido-flow-vae/1"
+CHANNELS = 16
+"""Latent channels, as CogVideoX's."""
+
+
+class CausalConv3d(nn.Module):
+    """Convolution of (B, C, T, H, W) that pads with the first frame before it, and with zeros at the edges of the image."""
+
+    def __init__(self, inputs: int, outputs: int, *, stride: tuple[int, int, int] = (1, 1, 1)):
+        super().__init__()
+        self.conv = nn.Conv3d(inputs, outputs, 3, stride=stride, padding=(0, 1, 1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv(torch.cat([x[:, :, :1]] * 2 + [x], 2))
+
+
+class Residual(nn.Module):
+    """Two causal convolutions around a skip; normalised frame by frame, so that nothing looks ahead."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.norm1, self.norm2 = nn.GroupNorm(8, channels), nn.GroupNorm(8, channels)
+        self.conv1, self.conv2 = CausalConv3d(channels, channels), CausalConv3d(channels, channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = self.conv1(functional.silu(by_frame(self.norm1, x)))
+        return x + self.conv2(functional.silu(by_frame(self.norm2, h)))
+
+
+def by_frame(layer: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """A layer for images applied to each frame of (B, C, T, H, W)."""
+    flat = x.transpose(1, 2).flatten(0, 1)
+    return layer(flat).unflatten(0, (x.shape[0], x.shape[2])).transpose(1, 2)
+
+
+class FlowVAE(nn.Module):
+    """The VAE.
+
+    Args:
+        width: Channels of the inner layers, a multiple of 8.
+        latent_channels: Channels of the latent (CogVideoX: 16).
+
+    Attributes:
+        scale: Factor that brings latents to unit variance, as CogVideoX's `scaling_factor`; set by `normalise`.
+        card: What the weights file says about their making.
+    """
+
+    def __init__(self, width: int = 32, latent_channels: int = CHANNELS):
+        super().__init__()
+        if width < 8 or width % 8 or latent_channels < 1:
+            raise UserError(f"width = {width} must be a multiple of 8, and latent_channels = {latent_channels} at least 1")
+        self.config = {"width": width, "latent_channels": latent_channels}
+        self.channels = latent_channels
+        self.encoder = nn.Sequential(
+            CausalConv3d(12, width),
+            Residual(width),
+            CausalConv3d(width, 2 * width, stride=(2, 2, 2)),
+            Residual(2 * width),
+            CausalConv3d(2 * width, 2 * width, stride=(2, 2, 2)),
+            Residual(2 * width),
+            CausalConv3d(2 * width, 2 * latent_channels),
+        )
+        self.decoder = nn.ModuleList(
+            [
+                CausalConv3d(latent_channels, 2 * width),
+                Residual(2 * width),
+                CausalConv3d(2 * width, 2 * width),
+                Residual(2 * width),
+                CausalConv3d(2 * width, width),
+                Residual(width),
+                CausalConv3d(width, 12),
+            ]
+        )
+        with torch.no_grad():  # little noise at first, or the decoder learns to do without the latent
+            self.encoder[-1].conv.bias[latent_channels:] = -6.0
+            self.encoder[-1].conv.weight[latent_channels:] *= 0.1
+        self.register_buffer("scale", torch.ones(()))
+        self.card: dict[str, Any] = {}
+
+    def posterior(self, video: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log variance of the latent, before `scale`, (B, 16, T', H/8, W/8) each, of (B, 3, T, H, W) in [-1, 1].
+
+        Raises:
+            UserError: A shape of another kind, or height and width that 8 does not divide.
+        """
+        if video.ndim != 5 or video.shape[1] != 3 or video.shape[-1] % 8 or video.shape[-2] % 8:
+            raise UserError(f"a flow video must be (B, 3, T, H, W) with H and W multiples of 8, got {tuple(video.shape)}; change flow_size")
+        squares = by_frame(lambda frame: functional.pixel_unshuffle(frame, 2), video)  # full size costs the most and tells little more
+        mean, variance = self.encoder(squares).chunk(2, 1)
+        return mean, variance.clamp(-20, 10)
+
+    def encode(self, video: Tensor) -> Tensor:
+        """Mean latents times `scale`, (B, 16, T', H/8, W/8), of videos (B, 3, T, H, W) in [-1, 1]; T' = floor((T - 1) / 4) + 1."""
+        return self.scale * self.posterior(video)[0]
+
+    def decode(self, latent: Tensor) -> Tensor:
+        """Videos (B, 3, 4 T' - 3, H, W) of latents times `scale`."""
+        return self.reconstruct(latent / self.scale)
+
+    def reconstruct(self, latent: Tensor) -> Tensor:
+        """`decode` before `scale`."""
+        first, before, middle, after, narrow, last, out = self.decoder
+        h = before(first(latent))
+        h = after(middle(_longer(h)))
+        h = last(narrow(_longer(h)))
+        return by_frame(lambda frame: functional.pixel_shuffle(frame, 2), out(functional.silu(h)))
+
+    @torch.no_grad()
+    def normalise(self, latents: Tensor) -> None:
+        """Set `scale` from mean latents before it."""
+        self.scale.copy_(1 / latents.std().clamp(min=1e-6))
+
+    def save(self, path: str | os.PathLike, card: Mapping[str, Any] | None = None) -> None:
+        """Write weights and card to a safetensors file, all at once."""
+        tensors = {name: t.detach().contiguous().cpu() for name, t in self.state_dict().items()}
+        card = {"date": date.today().isoformat(), **(card or {})}
+        write_weights(path, FORMAT, self.config, tensors, card)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            UserError: No such file, or not one of this kind.
+        """
+        config, tensors, card = read_weights(path, FORMAT, "vae")
+        vae = cls(**config)
+        load_state(vae, tensors, path)
+        vae.card = card
+        return vae
+
+
+def _longer(x: Tensor) -> Tensor:
+    """Twice the size and all but one frame of twice the length: T' -> 2 T' - 1, the inverse of a causal stride of two."""
+    return functional.interpolate(x, scale_factor=(2, 2, 2))[:, :, 1:]
+
+
+def write_weights(
+    path: str | os.PathLike, kind: str, config: Mapping[str, Any], tensors: dict[str, Tensor], card: Mapping[str, Any]
+) -> None:
+    """A safetensors file with its format, configuration and card, written all at once."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hidden = path.with_name(f".{path.name}.tmp")
+    save_file(tensors, hidden, metadata={"format": kind, "config": json.dumps(dict(config)), "card": json.dumps(dict(card))})
+    os.replace(hidden, path)
+
+
+def read_weights(path: str | os.PathLike, kind: str, option: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
+    """Configuration, tensors and card of a file of `write_weights`.
+
+    Raises:
+        UserError: No such file, or one of another format; it names `option`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{option}: the weights {path} are missing")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+        if metadata.get("format") != kind:
+            raise UserError(f"{option}: {path} has format {metadata.get('format')!r}, not {kind!r}")
+        return json.loads(metadata["config"]), tensors, json.loads(metadata["card"])
+    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+        raise UserError(f"{option}: {path} is no weights file of neuido: {error}") from error
+
+
+def load_state(module: nn.Module, tensors: dict[str, Tensor], path: str | os.PathLike) -> None:
+    """`load_state_dict` whose failure is one line."""
+    try:
+        module.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise UserError(f"{path} does not hold the tensors that its configuration names: {error}") from error

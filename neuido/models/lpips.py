@@ -1,0 +1,131 @@
+"""LPIPS without torchvision: the feature stacks of VGG16 and AlexNet, with the linear heads that torchmetrics ships (Zhang et al. 2018).
+
+The backbone is read from a local file, torchvision's `vgg16-397923af.pth` or `alexnet-owt-7be5be79.pth`, or the same tensors as
+safetensors. Where there is none, there is no value: `open_lpips` says why.
+"""
+
+import os
+import pickle
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from neuido.errors import UserError
+
+# output channels of the convolutions (kernel, stride, padding), "M" for pooling; a feature is taken after each group
+STACKS = {
+    "vgg": ((64, 64), ("M", 128, 128), ("M", 256, 256, 256), ("M", 512, 512, 512), ("M", 512, 512, 512)),
+    "alex": ((64,), ("M", 192), ("M", 384), (256,), (256,)),
+}
+FIRST = {64: (11, 4, 2), 192: (5, 1, 2)}
+FILES = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}
+
+
+class Absent(NamedTuple):
+    """A value that is missing, with its reason."""
+
+    reason: str
+
+
+class LPIPS(nn.Module):
+    """Learned perceptual image patch similarity.
+
+    Args:
+        net: `vgg` (what the peers report) or `alex`.
+
+    Attributes:
+        channels: Of the five features.
+    """
+
+    def __init__(self, net: str = "vgg"):
+        super().__init__()
+        if net not in STACKS:
+            raise UserError(f"lpips_net = {net!r}; one of {', '.join(STACKS)}")
+        self.net, self.channels = net, [next(c for c in reversed(group) if c != "M") for group in STACKS[net]]
+        groups, inputs = [], 3
+        for group in STACKS[net]:
+            layers: list[nn.Module] = []
+            for out in group:
+                if out == "M":
+                    layers.append(nn.MaxPool2d(2, 2) if net == "vgg" else nn.MaxPool2d(3, 2))
+                    continue
+                kernel, stride, padding = FIRST.get(out, (3, 1, 1)) if net == "alex" else (3, 1, 1)
+                layers += [nn.Conv2d(inputs, out, kernel, stride, padding), nn.ReLU()]
+                inputs = out
+            groups.append(nn.Sequential(*layers))
+        self.groups = nn.ModuleList(groups)
+        self.heads = nn.ModuleList([nn.Conv2d(c, 1, 1, bias=False) for c in self.channels])
+        self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1))
+        self.register_buffer("spread", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1))
+        self._load_heads()
+        self.eval().requires_grad_(False)
+
+    def _load_heads(self) -> None:
+        import torchmetrics.functional.image
+
+        path = Path(torchmetrics.functional.image.__file__).parent / "lpips_models" / f"{self.net}.pth"
+        if not path.is_file():
+            raise UserError(f"torchmetrics comes without {path.name}: LPIPS needs a torchmetrics that ships its heads, 1.0 or later")
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+        for i, head in enumerate(self.heads):
+            head.weight.data.copy_(weights[f"lin{i}.model.1.weight"])
+
+    def load_backbone(self, path: str | os.PathLike) -> None:
+        """Take the convolutions of a torchvision file (`features.N.weight`).
+
+        Raises:
+            UserError: No such file, or one without these tensors.
+        """
+        try:
+            if str(path).endswith(".safetensors"):
+                from safetensors.torch import load_file
+
+                weights = load_file(path)
+            else:
+                weights = torch.load(path, map_location="cpu", weights_only=True)
+        except (OSError, RuntimeError, pickle.UnpicklingError) as error:
+            raise UserError(f"lpips_backbone = {path} cannot be read: {error}") from error
+        convolutions = [layer for group in self.groups for layer in group if isinstance(layer, nn.Conv2d)]
+        names = sorted({int(name.split(".")[1]) for name in weights if name.startswith("features.")})
+        if len(names) != len(convolutions):
+            raise UserError(f"lpips_backbone = {path} has {len(names)} layers of features; {self.net} has {len(convolutions)}")
+        for number, layer in zip(names, convolutions):
+            for part in ("weight", "bias"):
+                own, given = getattr(layer, part), weights[f"features.{number}.{part}"]
+                if own.shape != given.shape:
+                    raise UserError(f"lpips_backbone = {path}: features.{number}.{part} is {tuple(given.shape)}, not {tuple(own.shape)}")
+                own.data.copy_(given)
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        """Distance of each pair of images (B, 3, H, W) in [0, 1], (B,)."""
+        total = a.new_zeros(len(a))
+        x, y = (((2 * image - 1) - self.shift) / self.spread for image in (a, b))
+        for group, head in zip(self.groups, self.heads):
+            x, y = group(x), group(y)
+            difference = (functional.normalize(x, dim=1, eps=1e-10) - functional.normalize(y, dim=1, eps=1e-10)).square()
+            total = total + head(difference).mean((1, 2, 3))
+        return total
+
+
+def open_lpips(backbone: str | None = None, net: str = "vgg", device: str | torch.device = "cpu") -> LPIPS | Absent:
+    """LPIPS with the weights of a local file.
+
+    Args:
+        backbone: The file; none: what torch's hub has kept of torchvision, if anything.
+        net: `vgg` or `alex`.
+        device: Where it runs.
+
+    Returns:
+        The module, or why there is none.
+    """
+    path = Path(backbone).expanduser() if backbone else Path(torch.hub.get_dir()) / "checkpoints" / FILES[net]
+    if not path.is_file():
+        if backbone:
+            raise UserError(f"lpips_backbone = {backbone}: there is no such file")
+        return Absent(f"no weights of the {net} backbone: give torchvision's {FILES[net]} by lpips_backbone")
+    module = LPIPS(net)
+    module.load_backbone(path)
+    return module.to(device)

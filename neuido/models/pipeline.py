@@ -1,0 +1,216 @@
+"""From the video of a body to its law, and from the law to particles and images: what Stage II, zero-shot inference and scores share.
+
+images -> flow -> frozen VAE -> projector -> z -> laws -> rollout -> Gaussians -> images
+"""
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuido.data.visual import VisualScene
+from neuido.errors import UserError
+from neuido.models.encoder import DynamicsEncoder
+from neuido.models.flow import frame_interval_of
+from neuido.models.gaussians import Binding, bind, deform, load_ply
+from neuido.models.operator import IntrinsicDynamicsOperator
+from neuido.models.splatting import render
+from neuido.physics.mpm import Simulator
+from neuido.types import Cameras, Gaussians, ParticleState
+
+
+class Prepared(NamedTuple):
+    """A scene with everything that does not change while the projector learns, on one device."""
+
+    source: VisualScene
+    simulator: Simulator
+    gaussians: Gaussians
+    binding: Binding
+    every: int
+    """Substeps from one frame to the next."""
+    images: Tensor
+    """(V, T, H, W, 3) uint8."""
+    masks: Tensor
+    """(V, T, H, W) uint8."""
+    cameras: Cameras
+    background: Tensor
+    training: list[int]
+    """Views that are not held out."""
+    volume: Tensor
+    """Flow latents of the views that the encoder sees, (V', channels, T', h, w)."""
+    conditions: Tensor
+    """(V', 2)"""
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return self.images.shape[1]
+
+    @property
+    def scoring(self) -> list[int]:
+        """The held-out views; all views of a scene that holds none out."""
+        held = self.source.batch.held_out.nonzero()[:, 0].tolist()
+        return held or list(range(len(self.images)))
+
+    def views(self, views: list[int]) -> Cameras:
+        """The cameras of some views."""
+        return self.cameras._replace(viewmats=self.cameras.viewmats[views], Ks=self.cameras.Ks[views])
+
+    def recorded(self, views: list[int], frames: int | None = None) -> Tensor:
+        """Recorded images in [0, 1], (T, V, H, W, 3)."""
+        return self.images[views, :frames].transpose(0, 1).float().div_(255)
+
+    def silhouettes(self, views: list[int], frames: int | None = None) -> Tensor:
+        """Recorded masks in [0, 1], (T, V, H, W)."""
+        return self.masks[views, :frames].transpose(0, 1).float().div_(255)
+
+
+def prepare(
+    scene: VisualScene,
+    encoder: DynamicsEncoder,
+    *,
+    device: str | torch.device = "cpu",
+    encoder_views: int = 0,
+    cache: str | os.PathLike | None = None,
+) -> Prepared:
+    """Bring a scene to a device, bind its Gaussians and embed its flow.
+
+    Args:
+        scene: The scene.
+        encoder: Its frozen VAE makes the flow latents.
+        device: Where it will run.
+        encoder_views: How many of the training views the encoder sees, the first ones; 0: all.
+        cache: Folder in which flows are kept.
+
+    Raises:
+        UserError: Frames that are no whole number of substeps apart, no training view; what `Simulator` and `DynamicsEncoder.watch` refuse.
+    """
+    batch, dt = scene.batch, scene.scene.dt
+    interval = frame_interval_of(batch.times)
+    every = round(interval / dt)
+    if every < 1 or abs(every * dt - interval) > 1e-3 * interval:
+        raise UserError(f"{scene.name}: frames are {interval:g} s apart, no whole number of substeps of {dt:g} s; change dt or frame_step")
+    training = (~batch.held_out).nonzero()[:, 0].tolist()
+    if not training:
+        raise UserError(f"{scene.name} has no training view: all {len(batch.held_out)} are held out")
+    seen = training[: encoder_views or None]
+    with torch.no_grad():
+        velocities = encoder.watch(batch, seen, scene.body.x.mean(0), cache=cache)
+        volume, conditions = encoder.embed(velocities)
+    gaussians = load_ply(scene.gaussians, device=device)
+    simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device)
+    return Prepared(
+        source=scene,
+        simulator=simulator,
+        gaussians=gaussians,
+        binding=bind(gaussians, simulator.state.x),
+        every=every,
+        images=(255 * batch.images).round().to(torch.uint8).to(device),
+        masks=(255 * batch.masks).round().to(torch.uint8).to(device),
+        cameras=batch.cameras._replace(viewmats=batch.cameras.viewmats.to(device), Ks=batch.cameras.Ks.to(device)),
+        background=batch.background.to(device),
+        training=training,
+        volume=volume.to(device),
+        conditions=conditions.to(device),
+    )
+
+
+def roll(prepared: Prepared, operator: IntrinsicDynamicsOperator, z: Tensor, frames: int | None = None) -> ParticleState:
+    """The motion under the law of z (d,): frames of the recording's times, the first `frames` or all.
+
+    Raises:
+        UserError: As `Simulator.rollout`: a law too stiff for the step, a particle lost.
+    """
+    steps = ((frames or prepared.frames) - 1) * prepared.every
+    return prepared.simulator.rollout(steps, *operator.laws(z), every=prepared.every)
+
+
+def roll_surely(prepared: Prepared, operator: IntrinsicDynamicsOperator, z: Tensor, halvings: int = 2) -> tuple[ParticleState, int]:
+    """`roll`, and where it fails the same with half the substep, at most `halvings` times; the frames, and how often it was halved.
+
+    Raises:
+        UserError: As `roll`, with the smallest substep too.
+    """
+    for count in range(halvings + 1):
+        try:
+            if count == 0:
+                return roll(prepared, operator, z), 0
+            source = prepared.source
+            finer = replace(source.scene, dt=source.scene.dt / 2**count)
+            simulator = Simulator(finer, source.body, density=source.density, device=prepared.simulator.device, graphs=False)
+            return roll(prepared._replace(simulator=simulator, every=prepared.every * 2**count), operator, z), count
+        except UserError:
+            if count == halvings:
+                raise
+    raise AssertionError("unreachable")
+
+
+def draw(prepared: Prepared, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:
+    """Images (K, V, H, W, 3) and alphas (K, V, H, W) of a motion of K frames."""
+    moved = deform(prepared.gaussians, motion.F, motion.x, prepared.binding)
+    return render(moved, prepared.views(views), background=prepared.background)
+
+
+class Inference(NamedTuple):
+    """What zero-shot inference gives."""
+
+    z: Tensor
+    """(d,)"""
+    seconds: float
+    """From the flow latents to the laws' tensors [s], the median of several passes."""
+
+
+@torch.no_grad()
+def infer(encoder: DynamicsEncoder, operator: IntrinsicDynamicsOperator, prepared: Prepared, *, repeat: int = 5) -> Inference:
+    """One pass of the encoder, and the time it takes to a law that can run."""
+    was_training = encoder.training
+    encoder.eval()
+    times = []
+    for _ in range(max(1, repeat)):
+        _wait(prepared.volume)
+        start = time.perf_counter()
+        z = encoder(prepared.volume, prepared.conditions)
+        for law in operator.laws(z):
+            law.tensors()
+        _wait(z)
+        times.append(time.perf_counter() - start)
+    encoder.train(was_training)
+    return Inference(z, sorted(times)[len(times) // 2])
+
+
+def _wait(t: Tensor) -> None:
+    if t.is_cuda:
+        torch.cuda.synchronize(t.device)
+
+
+def track(rest: Tensor, points: Tensor, x: Tensor, nearest: int = 8) -> Tensor:
+    """Where material points go that are no particles: each with the weighted mean displacement of the particles about it.
+
+    Args:
+        rest: Particles at t = 0 [m], (P, 3).
+        points: Points at t = 0 [m], (N, 3).
+        x: Particles in K frames [m], (K, P, 3).
+        nearest: Particles that carry a point, weighted by the inverse square of their distance.
+
+    Returns:
+        (K, N, 3).
+    """
+    from scipy.spatial import cKDTree
+
+    distance, index = cKDTree(rest.detach().cpu().numpy()).query(points.detach().cpu().numpy(), k=min(nearest, len(rest)))
+    d = torch.as_tensor(distance, dtype=torch.float64).reshape(len(points), -1)
+    weight = 1 / (d.square() + 1e-12)
+    weight = (weight / weight.sum(1, keepdim=True)).to(x)
+    index = torch.as_tensor(index).reshape(len(points), -1).to(x.device)
+    moved = sum((x - rest)[:, index[:, j]] * weight[:, j, None] for j in range(index.shape[1]))
+    return points.to(x) + moved
+
+
+def folder_of(out: str | os.PathLike, name: str) -> Path:
+    """The folder of a scene's results, under a name that stays inside `out`."""
+    clean = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).lstrip(".") or "scene"
+    return Path(out) / clean

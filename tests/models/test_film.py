@@ -1,0 +1,120 @@
+"""Clips for the encoder: what is in them, that they are the same again, that they resume; and that training on them learns."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import Trainer, seed_everything
+
+from neuido.data.films import FilmDataModule, read_clip
+from neuido.data.generate import laws
+from neuido.errors import UserError
+from neuido.models.encoder import DynamicsEncoder
+from neuido.models.film import film
+from neuido.models.flow_vae import FlowVAE
+from neuido.models.pretrain_vae import FlowVAEModule
+from neuido.models.warmup import WarmupModule, judge
+
+TINY = {"count": 9, "views": 2, "frames": 9, "frame_steps": 8, "dts": [2e-3, 1e-3], "cells": 12, "particles": 150, "width": 48,
+        "flow_size": 32, "samples": 32, "device": "cpu", "progress": False}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("films")
+    film(str(path), **TINY)
+    return path
+
+
+def trainer(tmp_path, **options):
+    options = {"logger": False, "enable_checkpointing": False, "num_sanity_val_steps": 0, **options}
+    return Trainer(accelerator="cpu", default_root_dir=tmp_path, enable_progress_bar=False, enable_model_summary=False, **options)
+
+
+def test_clips(folder):
+    data = FilmDataModule(str(folder), frames=8)
+    assert [clip["family"] for clip in data.clips] == ["elastic", "plasticine", "sand"] * 3
+    clip = data.read(1)
+    assert clip.flow.shape == (2, 8, 32, 32, 2)
+    assert 0.3 < clip.flow.float().norm(dim=-1).max() < 10  # m/s
+    assert 2e-3 < clip.cell[0] < 0.05
+    assert clip.frame_interval in (pytest.approx(8e-3), pytest.approx(16e-3))
+    elastic, plastic = laws("plasticine", [data.clips[1]["parameters"]])
+    assert torch.allclose(plastic(clip.trial.double()).float(), clip.corrected, atol=1e-5)
+    assert torch.allclose(elastic(clip.corrected.double()).float(), clip.stress, rtol=1e-3, atol=1.0)
+    window = next(iter(data.train_dataloader()))
+    assert window.flow.shape == (16, 8, 32, 32, 2)
+
+
+def test_a_body_falls(folder):
+    flow = read_clip(folder / "clip-00000.npz").flow.float()
+    moving = flow[:, 0][flow[:, 0].norm(dim=-1) > 0.2]
+    assert len(moving) > 20 and (moving[:, 1] > 0).float().mean() > 0.9  # y points down in an image
+
+
+def test_it_resumes_and_repeats(folder, tmp_path, monkeypatch):
+    film(str(tmp_path / "a"), **{**TINY, "count": 2})
+    first = (tmp_path / "a" / "clip-00001.npz").stat()
+    os.remove(tmp_path / "a" / "clip-00000.npz")
+    (tmp_path / "a" / "index.json").unlink()
+    film(str(tmp_path / "a"), **{**TINY, "count": 2})
+    assert (tmp_path / "a" / "clip-00001.npz").stat().st_mtime_ns == first.st_mtime_ns
+    for name in ("flow", "stress"):
+        with np.load(folder / "clip-00000.npz") as old, np.load(tmp_path / "a" / "clip-00000.npz") as new:
+            assert np.array_equal(old[name], new[name])
+    assert len(json.loads((tmp_path / "a" / "index.json").read_text())["clips"]) == 2
+    with pytest.raises(UserError, match="count 2 there, 3 here"):
+        film(str(tmp_path / "a"), **{**TINY, "count": 3})
+    with pytest.raises(UserError, match="neuido film"):
+        _ = FilmDataModule(str(tmp_path / "b")).index
+
+
+def test_vae_training_learns(folder, tmp_path):
+    seed_everything(0)
+    data = FilmDataModule(str(folder), batch_size=4, frames=8, windows=2, held_out=0.2)
+    module = FlowVAEModule(8, lr=3e-3, save_to=str(tmp_path / "vae.safetensors"))
+    before = trainer(tmp_path).validate(module, data, verbose=False)[0]
+    trainer(tmp_path, max_steps=40, check_val_every_n_epoch=10).fit(module, data)
+    after = trainer(tmp_path).validate(module, data, verbose=False)[0]
+    assert after["val/error"] < 0.8 * before["val/error"]
+    vae = FlowVAE.load(tmp_path / "vae.safetensors")
+    assert vae.card["steps"] == 40 and vae.scale != 1
+
+
+def test_warm_up_learns_and_touches_the_projector_alone(folder, tmp_path):
+    seed_everything(0)
+    torch.manual_seed(0)
+    FlowVAE(8).save(tmp_path / "vae.safetensors")
+    options = {"vae": str(tmp_path / "vae.safetensors"), "flow_size": 32, "width": 48, "dropout": 0.0, "lr": 3e-3, "noise": 0.0}
+    module = WarmupModule(**options, save_to=str(tmp_path / "encoder.safetensors"))
+    frozen = {name: p.clone() for name, p in module.named_parameters() if "projector" not in name}
+    data = FilmDataModule(str(folder), batch_size=6, frames=0, held_out=0.2)
+    fit = trainer(tmp_path, max_steps=60, check_val_every_n_epoch=100)
+    losses = []
+    step = module.training_step
+    module.training_step = lambda *a: losses.append(step(*a)) or losses[-1]
+    fit.fit(module, data)
+    assert torch.stack(losses[-5:]).mean() < 0.6 * losses[0]
+    assert frozen and all(torch.equal(p, dict(module.named_parameters())[name]) for name, p in frozen.items())
+    assert DynamicsEncoder.load(tmp_path / "encoder.safetensors").card["stage"] == "warm-up"
+
+
+def test_judgement_is_the_same_for_twice_and_half():
+    class Fake:
+        def __init__(self, factor, stress):
+            self.factor, self.stress = factor, stress
+
+        def elastic(self, z, F):
+            return self.factor * self.stress
+
+        def plastic(self, z, F):
+            return F
+
+    F = torch.eye(3) + 0.1 * torch.randn(1, 16, 3, 3)
+    stress = 1e6 * torch.randn(1, 16, 3, 3)
+    twice, half, same = (judge(Fake(factor, stress), torch.zeros(1, 2), F, F, stress) for factor in (2.0, 0.5, 1.0))
+    assert twice.size.item() == pytest.approx(np.log(2), rel=1e-3) == half.size.item()
+    assert twice.stress.item() == pytest.approx(1 / 3, rel=0.02) and half.stress.item() == pytest.approx(1 / 3, rel=0.02)
+    assert same.stress == 0 and same.plastic == 0 and same.size < 1e-5
