@@ -165,9 +165,9 @@ def _samples(motion: ParticleState, clip: Clip, count: int, seed: int) -> dict[s
     elastic, plastic = laws(clip.family, [clip.parameters])
     F, C = motion.F[1:].flatten(0, 1).double(), motion.C[1:].flatten(0, 1).double()
     pick = torch.randint(len(F), (count,), generator=torch.Generator().manual_seed(seed)).to(F.device)
-    trial = (F[pick] + clip.scene.dt * C[pick] @ F[pick]).float().cpu()
+    trial = (F[pick] + clip.scene.dt * C[pick] @ F[pick]).float()
     corrected = _evaluate(plastic, trial)
-    return {"trial": trial, "corrected": corrected, "stress": _evaluate(elastic, corrected)}
+    return {"trial": trial.cpu(), "corrected": corrected.cpu(), "stress": _evaluate(elastic, corrected).cpu()}
 
 
 def _material(plan: Plan, random: np.random.Generator, number: int) -> tuple[str, dict[str, float]]:

@@ -70,4 +70,5 @@ def _array(t: Tensor, dtype: type) -> object:
         if len(_arrays) > 20_000:
             _arrays.clear()
         found = _arrays[key] = wp.from_torch(t.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+        found._ref = found._gradref = None  # Warp would hold the tensor's memory for as long as the descriptor is kept
     return found

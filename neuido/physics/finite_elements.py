@@ -266,10 +266,11 @@ class FiniteElements:
         return frames
 
     def _check(self, frames: ParticleState, steps: int, every: int, inner: list[int]) -> None:
-        """Raise where a motion is not finite, or so fast that a body crosses its own size in a step."""
+        """Raise where a motion is not finite, or so fast that a point crosses an element in a step."""
         for s, (i, j) in enumerate(zip(self.particles.offsets[:-1], self.particles.offsets[1:])):
             dt = self.scenes[s].dt / inner[s]
-            size = float((self.state.x[i:j].amax(dim=0) - self.state.x[i:j].amin(dim=0)).norm())
+            corners = self.meshes[s].nodes[self.meshes[s].elements]
+            size = float((corners[:, 1:] - corners[:, :1]).norm(dim=2).max())
             fine = torch.isfinite(frames.x[:, i:j]).all(dim=2) & (frames.v[:, i:j].norm(dim=2) * dt <= size)
             if not bool(fine.all()):
                 frame = int((~fine.all(dim=1)).nonzero()[0])

@@ -313,3 +313,9 @@ def test_a_step_that_blows_up_is_an_error_not_a_nan():
     sim = Simulator(Scene(cells=16, dt=5e-3), block((0.3, 0.3, 0.3), (0.7, 0.7, 0.7), (6, 6, 6), velocity=(1.0, -3.0, 0.0)), device=DEVICE)
     with pytest.raises(UserError, match="lower `dt`"):
         sim.rollout(400, FixedCorotated(5e6, 0.3), check=False, every=400)
+
+
+def test_launches_do_not_hold_the_memory_of_their_tensors():
+    from neuido.physics.device import _array
+
+    assert _array(torch.zeros(7, 3), wp.vec3f)._ref is None
