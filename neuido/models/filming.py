@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,6 +63,10 @@ class Plan:
             raise UserError(f"families is empty: name at least one of {', '.join(PARAMETERS)}")
         for family, ranges in self.families.items():
             _check_ranges(family, ranges)
+
+
+HALVINGS = 2
+"""Of the step of a clip that is unstable."""
 
 
 class Clip(NamedTuple):
@@ -129,23 +133,34 @@ def draw(plan: Plan, number: int) -> Clip:
 
 def shoot(plan: Plan, group: list[Clip], device: torch.device) -> Iterator[dict[str, Tensor]]:
     """Simulate and render clips of one family: images, masks, and samples of the law of each, on the CPU."""
-    names = group[0].name if len(group) == 1 else f"{group[0].name} .. {group[-1].name}"
-    try:
-        simulator = Simulator([c.scene for c in group], [c.body for c in group], device=device, graphs=False)
-        pair = laws(group[0].family, [c.parameters for c in group])
-        with torch.no_grad():
-            frames = simulator.rollout(plan.frame_steps * (plan.frames - 1), *pair, every=plan.frame_steps)
-    except UserError as error:
-        raise UserError(f"{names}: {error}") from error
-    for s, clip in enumerate(group):
-        own = slice(*simulator.particles.offsets[s : s + 2])
-        motion = ParticleState(*(part[:, own] for part in frames))
+    for clip, motion in zip(group, _roll(plan, group, device), strict=True):
         gaussians = Gaussians(*(None if t is None else t.to(device) for t in clip.gaussians))
         cameras = clip.cameras._replace(viewmats=clip.cameras.viewmats.to(device), Ks=clip.cameras.Ks.to(device))
         with torch.no_grad():
             images, alphas = render(deform(gaussians, motion.F, motion.x), cameras, background=torch.ones(3, device=device))
         seen = {"images": images.transpose(0, 1).cpu(), "masks": alphas.transpose(0, 1).cpu()}
         yield seen | _samples(motion, clip, plan.samples, int(clip.name.removeprefix("clip-")))
+
+
+def _roll(plan: Plan, group: list[Clip], device: torch.device, halvings: int = 0) -> list[ParticleState]:
+    """The frames of each clip. Where one is unstable the others run without it, and it again with steps of a half and a quarter."""
+    share = 2**halvings
+    scenes = [replace(c.scene, dt=c.scene.dt / share) for c in group]
+    try:
+        simulator = Simulator(scenes, [c.body for c in group], device=device, graphs=False)
+        pair = laws(group[0].family, [c.parameters for c in group])
+        every = plan.frame_steps * share
+        with torch.no_grad():
+            frames = simulator.rollout(every * (plan.frames - 1), *pair, every=every)
+    except UserError as error:
+        if len(group) > 1:
+            middle = len(group) // 2
+            return [*_roll(plan, group[:middle], device, halvings), *_roll(plan, group[middle:], device, halvings)]
+        if halvings == HALVINGS:
+            raise UserError(f"{group[0].name}: {error}") from error
+        return _roll(plan, group, device, halvings + 1)
+    parts = zip(simulator.particles.offsets[:-1], simulator.particles.offsets[1:])
+    return [ParticleState(*(part[:, a:b] for part in frames)) for a, b in parts]
 
 
 def _finish(plan: Plan, folder: Path, clip: Clip, shot: dict[str, Tensor]) -> None:
