@@ -8,8 +8,8 @@ import yaml
 import neuido
 from neuido import cli
 from neuido.data.simulate import simulate as trajectories
-from neuido.models.film import film
 from neuido.discrepancy.command import diagnose
+from neuido.models.film import film
 from neuido.simulate import simulate
 
 ROOT = neuido.configs_root()

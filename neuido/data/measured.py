@@ -13,6 +13,8 @@ from neuido.errors import UserError
 from neuido.physics.effects import LIBRARY, Effects
 
 ROLES = ("fit", "held_out")
+WAVES = ["frequency", *(f"{part}{a}" for part in "sc" for a in "xyz")]
+"""Parameters of a harmonic `time_force`, s sin(2 pi f t) + c cos(2 pi f t) [m/s^2], beside its knots."""
 
 
 def read_header(folder: Path, name: str, form: str) -> tuple[Path, dict[str, Any]]:
@@ -91,6 +93,7 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
         UserError: An unknown name or parameter, no number, or a parameter that needs another beside it.
     """
     library = {entry.name: [parameter.name for parameter in entry.parameters] for entry in LIBRARY}
+    library["time_force"] += WAVES
     flat: dict[str, float] = {}
     for name, value in scenes._mapping({} if given is None else given, where).items():
         name, _, part = str(name).partition(".")
@@ -107,7 +110,8 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
         for key, figure in value.items():
             flat[f"{name}.{key}"] = number(figure, f"{where}.{name}.{key}")
     try:
-        Effects.of({key: figure for key, figure in flat.items() if not key.startswith("stiffness_gradient.")})  # that needs a body
+        later = [f"time_force.{key}" for key in WAVES]  # `discrepancy.library` makes knots of them; a gradient needs a body
+        Effects.of({key: figure for key, figure in flat.items() if not key.startswith("stiffness_gradient.") and key not in later})
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
     return flat

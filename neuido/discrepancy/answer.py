@@ -15,8 +15,9 @@ import yaml
 import neuido
 from neuido.data.storage import write as write_text
 from neuido.discrepancy import ceiling, next_experiment, report, residual
-from neuido.discrepancy.attribution import ALPHA, Diagnosis, Round, Trial
+from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.problem import Problem
+from neuido.discrepancy.rounds import ALPHA, Round, Trial
 
 FORMAT = "neuido-diagnosis/1"
 VERSION = neuido.__version__
@@ -110,6 +111,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         "rejected": rejected(d),
         "next_experiment": next_experiment.propose(d),
         "ceiling": {when: {"held_out": c.held_out, "fit": c.fit} for when, c in ceilings.items()},
+        "places": {name: _place(d, name, arrays) for name, arrays in motion.items() if "positions" in arrays},
         "solver": d.problem.setting_name(d.setting),
         "seconds": 0.0,
         "device": device,
@@ -255,6 +257,14 @@ def _stages(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> list[r
                            planes=r.scene.colliders, margin=1.5 * r.scene.dx)  # fmt: skip
 
 
+def _place(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Where on the body the force that is missing before is largest."""
+    n = [r.name for r in d.problem.recordings].index(name)
+    where, excess = residual.place(arrays["measured"], arrays["t"], arrays["before"], sigma=d.rounds[0].floor.noise[n])
+    centre = d.problem.measured[n].body.x.double().mean(dim=0).numpy()
+    return {"from_centre": list(where - centre), "unit": "m", "over_median": excess}
+
+
 def trace(d: Diagnosis) -> dict[str, Any]:
     """Every figure that the decisions rest on, for benchmarks and ablations."""
     names = [
@@ -320,8 +330,9 @@ def summary(found: Found) -> str:
         names = " and ".join("|".join(dict.fromkeys(t.candidate.name for t in r.members)) for r in d.rounds if r.chosen is not None)
         what = f"{d.answer}: {names}" if names else d.answer
         where = f"{d.problem.labels['body']}: " if "body" in d.problem.labels and len(found) > 1 else ""
-        lines.append(f"{where}{what}; {'held-out' if key == 'held_out' else 'fitted'} error {before[key]:.3g} -> {after[key]:.3g} {d.problem.unit} "
-                     f"(floor {math.hypot(d.floors['noise'], d.floors['discretisation']):.2g})")  # fmt: skip
+        scored = "held-out" if key == "held_out" else "fitted"
+        floor = math.hypot(d.floors["noise"], d.floors["discretisation"])
+        lines.append(f"{where}{what}; {scored} error {before[key]:.3g} -> {after[key]:.3g} {d.problem.unit} (floor {floor:.2g})")
     return "\n".join(lines)
 
 

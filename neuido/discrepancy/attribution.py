@@ -1,131 +1,22 @@
-"""From a residual to a name: fit, screen, refit, test against what discretisation and nuisances can do, and say how sure it is.
-
-The order of `reference` protocols for model discrepancy: the base fit with its nuisances; the discretisation error from several
-settings; every candidate's direction in the data and its gain once the declared parameters are refitted; full fits of the best; the
-gain on recordings that were held out against a parametric bootstrap of the largest gain; growth by one effect at a time.
-"""
+"""From a residual to a name: grow the model by one effect at a time, drop what became needless, and say how sure the answer is."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.fit import Covariance, Fit, levenberg_marquardt, run
-from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
+from neuido.discrepancy.fit import Fit, levenberg_marquardt
+from neuido.discrepancy.floors import Floor, Part, split
+from neuido.discrepancy.problem import Point, Problem
+from neuido.discrepancy.rounds import ALPHA, LEAST_GAIN, Inference, Round, Start, Tell, Trial
 
-ALPHA = 0.05
-"""Family-wise level of a named effect."""
+__all__ = ["ALPHA", "MOST", "UNEXPLAINED", "Diagnosis", "Floor", "Inference", "Part", "Round", "Start", "Trial", "diagnose", "split"]
+
 MOST = 3
 """Effects that a growth may add."""
-CLASS_RATIO = 1.4
-"""Candidates whose errors are within this factor of the best one's are not told from it."""
-PARSIMONY = 0.02
-"""What a further parameter must lower the mean logarithm of the errors' squares by."""
-LEAST_GAIN = math.log(1.7)
-"""Smaller gains are no reason to name anything: other solvers differ by as much in ways that no setting of one solver shows."""
-LEAST_GAIN_EXACT = math.log(1.15)
-"""The same where nothing is discretised."""
-GAIN_IN_FLOOR = math.log(4.0)
-"""What it takes where the residual is no larger than the floor: only an effect that the data show far below it."""
-NOISE_ALONE = 1.8
-"""Mean squares up to so many times that of the noise are noise."""
-POLISHED = 3
-"""Candidates whose fits are refined from further starts."""
 UNEXPLAINED = 3.0
 """Times the floor: a residual above it that no effect explains is called unknown."""
-
-Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """The rows of a recording that are fitted, or that are only scored."""
-
-    recording: int
-    rows: np.ndarray
-    fitted: bool
-    name: str
-
-
-@dataclass(frozen=True, eq=False)
-class Floor:
-    """What noise and discretisation do to each recording at one point."""
-
-    noise: dict[int, float]
-    weight: dict[int, np.ndarray]
-    """One over the standard deviation of each datum."""
-    differences: dict[int, np.ndarray]
-    """Of the other settings to the one in use, (n, k)."""
-    spread: dict[int, np.ndarray]
-    """Root mean square of the discretisation error of each datum."""
-    nuisances: dict[int, np.ndarray] = field(default_factory=dict)
-    """What one prior standard deviation of each nuisance does, (n, k); empty: they are held."""
-
-    def whitener(self, parts: Sequence["Part"]) -> Callable[[np.ndarray, int], np.ndarray]:
-        """Residuals of the fitted rows in units of their standard deviation, the nuisances marginalised."""
-        rows = {p.recording: p.rows for p in parts if p.fitted}
-        covariance = {n: Covariance.of(1.0, (self.nuisances[n] * self.weight[n][:, None])[own]) for n, own in rows.items() if n in self.nuisances}
-
-        def whiten(r: np.ndarray, n: int) -> np.ndarray:
-            weighted = (r * self.weight[n])[rows[n]]
-            return covariance[n].whiten(weighted) if n in covariance else weighted
-
-        return whiten
-
-    def settle(self, r: np.ndarray, part: "Part") -> np.ndarray:
-        """A residual (n,) with the nuisances of its recording at their most probable values."""
-        N = self.nuisances.get(part.recording)
-        if N is None or not N.shape[1]:
-            return r
-        A, b = N[part.rows], r[part.rows]
-        w = self.noise[part.recording]
-        values = np.linalg.solve(A.T @ A / w**2 + np.eye(A.shape[1]), A.T @ b / w**2)
-        return r - N @ values
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """The declared model, fitted."""
-
-    fit: Fit
-    floor: Floor
-    errors: np.ndarray
-    """Mean squares of each part."""
-
-
-@dataclass(eq=False)
-class Trial:
-    """One candidate fitted in full."""
-
-    candidate: Candidate
-    fit: Fit
-    errors: np.ndarray
-    """Mean squares of each part."""
-    gain: float
-    reason: str = ""
-    """Why it is rejected; empty: it is not."""
-
-    @property
-    def score(self) -> float:
-        """Mean logarithm of its errors: lower is better."""
-        return float(np.mean(np.log(np.maximum(self.errors, 1e-300))))
-
-
-@dataclass(eq=False)
-class Round:
-    """One step of the growth."""
-
-    base: Point
-    errors: np.ndarray
-    trials: list[Trial]
-    chosen: Trial | None
-    members: list[Trial]
-    p_value: float
-    floor: Floor
-    cosines: dict[str, float] = field(default_factory=dict)
-    null: np.ndarray = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(eq=False)
@@ -149,424 +40,6 @@ class Diagnosis:
     @property
     def effects(self) -> list[Trial]:
         return [r.chosen for r in self.rounds if r.chosen is not None]
-
-
-class Inference:
-    """The steps of a diagnosis on one problem.
-
-    Args:
-        problem: What to diagnose.
-        setting: Setting of the discretisation that predicts; the others tell its error.
-        keep: Candidates that get a full fit, at the least.
-        draws: Of the bootstrap.
-        seed: Of the draws.
-        tell: Called with a line of progress.
-    """
-
-    def __init__(self, problem: Problem, *, setting: int = 0, keep: int = 7, draws: int = 199, seed: int = 0, tell: Tell | None = None) -> None:
-        self.problem, self.setting, self.keep, self.draws, self.seed = problem, setting, keep, draws, seed
-        self.tell = tell or (lambda line: None)
-        self.evaluations = 0
-        self.parts = split(problem)
-        self.fitted = [p.fitted for p in self.parts]
-
-    # Fits.
-
-    def fits(self, requests: Sequence, floor: Floor) -> list[Fit]:
-        rows = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
-
-        def tick(count: int) -> None:
-            self.evaluations += count * len(rows)
-            self.tell(f"{self.evaluations} simulations")
-
-        return run(self.problem, requests, floor.whitener(self.parts), rows, setting=self.setting, tick=tick)
-
-    def mean_squares(self, points: Sequence[Point], floor: Floor) -> list[np.ndarray]:
-        """Of each part, at several points, the nuisances at their most probable values."""
-        found = np.full((len(points), len(self.parts)), np.inf)
-        for n in dict.fromkeys(p.recording for p in self.parts):
-            rows = self.problem.predict(points, n, self.setting) - self.problem.recordings[n].y
-            self.evaluations += len(points)
-            for j, part in enumerate(self.parts):
-                if part.recording == n:
-                    for i, row in enumerate(rows):
-                        if np.isfinite(row).all():
-                            found[i, j] = np.mean(floor.settle(row, part)[part.rows] ** 2)
-        return list(found)
-
-    def noise(self) -> Floor:
-        """The floor without any discretisation error."""
-        noise = {n: self._noise(n) for n in range(len(self.problem.recordings))}
-        ones = {n: np.ones(len(r.y)) for n, r in enumerate(self.problem.recordings)}
-        return Floor(noise, {n: ones[n] / noise[n] for n in noise}, {n: np.empty((len(ones[n]), 0)) for n in noise}, {n: 0.0 * ones[n] for n in noise})
-
-    def _noise(self, n: int) -> float:
-        r = self.problem.recordings[n]
-        return r.noise if r.noise else max(1e-3 * float(np.std(r.y)), 1e-12)
-
-    def floor(self, point: Point) -> Floor:
-        """Noise and discretisation at a point: differences of the settings, and how large they are in the course of time."""
-        plain = self.noise()
-        others = [s for s in range(self.problem.settings) if s != self.setting]
-        if not others:
-            return replace(plain, nuisances=self.nuisances(point, list(plain.noise)))
-        differences, spread, weight = {}, {}, {}
-        for n in plain.noise:
-            here = self.problem.predict([point], n, self.setting)[0]
-            there = [self.problem.predict([point], n, s)[0] for s in others]
-            self.evaluations += 1 + len(others)
-            D = np.stack([t - here for t in there if np.isfinite(t).all()] or [np.zeros_like(here)], axis=1)
-            differences[n] = D
-            spread[n] = _over_time(np.sqrt(np.mean(D**2, axis=1)), self.problem.recordings[n].times)
-            weight[n] = 1.0 / np.sqrt(plain.noise[n] ** 2 + spread[n] ** 2)
-            self.tell(f"discretisation of {self.problem.recordings[n].name}")
-        return Floor(plain.noise, weight, differences, spread, self.nuisances(point, list(plain.noise)))
-
-    def base(self, start: Point, floor: Floor, extra: Sequence[Parameter] = ()) -> Fit:
-        """The declared parameters (and `extra`) fitted from several starts."""
-        free = (*self.problem.declared, *extra)
-        starts = [dict(start)]
-        for p in self.problem.declared:
-            if p.log:
-                value = start.get(p.name, p.value)
-                starts += [dict(start) | {p.name: min(max(value * f, p.lower), p.upper)} for f in (0.5, 2.0)]
-        found = self.fits([levenberg_marquardt(free, s) for s in starts], floor)
-        return min(found, key=lambda f: f.cost)
-
-    def start(self) -> "Start":
-        """The base fit, with what noise and discretisation do to it."""
-        fit = self.base({}, self.noise())
-        floor = self.floor(fit.point)
-        fit = self.base(fit.point, floor)
-        return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
-
-    def is_noise(self, errors: np.ndarray) -> bool:
-        """Whether nothing but noise is left in any part."""
-        return bool(np.all(errors < NOISE_ALONE * np.array([self._noise(p.recording) ** 2 for p in self.parts])))
-
-    # Screening.
-
-    def columns(self, point: Point, candidates: Sequence[Candidate], recordings: Sequence[int]) -> dict[tuple[str, int], dict[int, np.ndarray]]:
-        """Directions of each candidate and start in the data of recordings: (key, start) -> {recording: (n, sizes)}."""
-        asked, places = [], []
-        for c in candidates:
-            for i, start in enumerate(c.starts):
-                sizes = [p.name for p in c.size_parameters]
-                shape = {k: v for k, v in start.items() if k not in sizes}
-                for name in sizes:
-                    asked.append(dict(point) | shape | {name: start[name]})
-                    places.append((c.key, i))
-        out: dict[tuple[str, int], dict[int, np.ndarray]] = {place: {} for place in places}
-        for n in recordings:
-            here = self.problem.predict([point], n, self.setting)[0]
-            rows = self.problem.predict(asked, n, self.setting)
-            self.evaluations += len(asked) + 1
-            self.tell(f"directions of {len(asked)} effects in {self.problem.recordings[n].name}")
-            for place in out:
-                out[place][n] = np.stack([row - here for row, p in zip(rows, places, strict=True) if p == place], axis=1)
-        return out
-
-    def slopes(self, parameters: Sequence[Parameter], point: Point, recordings: Sequence[int], step: float = 0.3) -> dict[int, np.ndarray]:
-        """Derivatives of the data by coordinates of parameters, one typical step each; central where the range allows."""
-        out = {}
-        asked, spans = [], []
-        for p in parameters:
-            q = p.coordinate(point.get(p.name, p.value))
-            ends = [p.physical(q + step), p.physical(q - step)]
-            asked += [dict(point) | {p.name: end} for end in ends]
-            spans.append(max(p.coordinate(ends[0]) - p.coordinate(ends[1]), 1e-9))
-        for n in recordings:
-            rows = self.problem.predict(asked, n, self.setting) if asked else np.empty((0, len(self.problem.recordings[n].y)))
-            self.evaluations += len(asked)
-            parts = [(rows[2 * i] - rows[2 * i + 1]) / span for i, span in enumerate(spans)]
-            out[n] = np.stack([np.where(np.isfinite(part), part, 0.0) for part in parts], axis=1) if parts else np.empty((rows.shape[1], 0))
-        return out
-
-    def screen(self, point: Point, candidates: Sequence[Candidate], floor: Floor, slopes: Mapping[int, np.ndarray]):
-        """Starts of full fits, best first: (predicted share of the misfit that stays, candidate, start, point), and the directions."""
-        fits = [p for p in self.parts if p.fitted]
-        columns = self.columns(point, candidates, [p.recording for p in fits])
-        residual = np.concatenate([self._weighted(floor.settle(self.residual(point, p.recording), p), p, floor) for p in fits])
-        J = np.concatenate([self._weighted(slopes[p.recording], p, floor) for p in fits])
-        q, _ = np.linalg.qr(J) if J.shape[1] else (np.empty((len(residual), 0)), None)
-        left = residual - q @ (q.T @ residual)
-        ranked = []
-        for c in candidates:
-            for i, start in enumerate(c.starts):
-                A = np.concatenate([self._weighted(columns[c.key, i][p.recording], p, floor) for p in fits])
-                if not np.isfinite(A).all():
-                    continue
-                B = A - q @ (q.T @ A)
-                amount = -np.linalg.lstsq(B, left, rcond=1e-6)[0]
-                sizes = c.size_parameters
-                if not c.linear:
-                    amount = np.clip(amount, 0.0, 1.5)
-                for k, p in enumerate(sizes):
-                    low, high = (p.lower / start[p.name], p.upper / start[p.name])
-                    amount[k] = np.clip(amount[k], min(low, high), max(low, high))
-                stays = float(np.sum((left + B @ amount) ** 2) / max(np.sum(left**2), 1e-300))
-                if c.linear:
-                    factor = np.clip(amount, -4.0, 4.0)
-                    factor = np.where(np.abs(factor) < 0.2, np.where(factor < 0, -0.2, 0.2), factor)
-                else:
-                    factor = np.ones(len(sizes))
-                begin = dict(point) | dict(start)
-                for p, f in zip(sizes, factor, strict=True):
-                    begin[p.name] = min(max(start[p.name] * f, p.lower), p.upper)
-                ranked.append((stays, c, i, begin))
-        ranked.sort(key=lambda entry: entry[0])
-        return ranked, columns
-
-    def residual(self, point: Point, n: int) -> np.ndarray:
-        return self.problem.predict([point], n, self.setting)[0] - self.problem.recordings[n].y
-
-    def _weighted(self, columns: np.ndarray, part: Part, floor: Floor) -> np.ndarray:
-        w = floor.weight[part.recording][part.rows]
-        return columns[part.rows] * (w[:, None] if columns.ndim == 2 else w)
-
-    # One round.
-
-    def round(self, base: Fit, floor: Floor, found: Sequence[Trial]) -> Round:
-        """Look for one more effect beside those that were found."""
-        taken = {t.candidate.name for t in found}
-        extra = tuple(p for t in found for p in t.candidate.parameters)
-        candidates = [c for c in self.problem.candidates if c.name not in taken]
-        errors = self.mean_squares([base.point], floor)[0]
-        free = (*self.problem.declared, *extra)
-        everywhere = list(dict.fromkeys(p.recording for p in self.parts))
-        slopes = self.slopes(free, base.point, everywhere)
-        ranked, columns = self.screen(base.point, candidates, floor, slopes)
-        chosen: dict[str, int] = {}
-        starts = []
-        for stays, c, i, begin in ranked:
-            if c.key not in chosen and (len(chosen) < self.keep or stays < 2.0 * ranked[0][0]):
-                chosen[c.key] = i
-                starts.append((c, begin))
-                if not c.linear:
-                    starts.append((c, begin | {p.name: p.value for p in self.problem.declared}))
-            elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
-                starts.append((c, begin))
-        self.tell(f"fitting {', '.join(chosen)}")
-        requests = [levenberg_marquardt((*free, *c.parameters), begin) for c, begin in starts]
-        fits = self.fits(requests, floor)
-        best: dict[str, tuple[Candidate, Fit]] = {}
-        for (c, _), fit in zip(starts, fits, strict=True):
-            if c.key not in best or fit.cost < best[c.key][1].cost:
-                best[c.key] = (c, fit)
-        best |= self.polish(free, best, base, floor)
-        squares = self.mean_squares([fit.point for _, fit in best.values()], floor)
-        trials = []
-        for (c, fit), square in zip(best.values(), squares, strict=True):
-            trial = Trial(c, fit, square, evidence.gain(errors, square, self.fitted))
-            trial.reason = _unphysical(c, fit.point)
-            trials.append(trial)
-        trials.sort(key=lambda t: t.score)
-        model = self._linear(base.point, floor, slopes, columns, chosen, everywhere, candidates)
-        null = model.null(self.draws)
-        good = [t for t in trials if not t.reason]
-        top = min(good, key=lambda t: t.score + PARSIMONY * len(t.candidate.size_parameters)) if good else None
-        p = float((1 + np.sum(null >= top.gain)) / (1 + len(null))) if top else 1.0
-        result = Round(base.point, errors, trials, None, [], p, floor, null=null)
-        if top is None:
-            return result
-        for t in trials:
-            if t.candidate.key in model.keys and top.candidate.key in model.keys:
-                result.cosines[t.candidate.key] = model.cosine(t.candidate.key, top.candidate.key)
-        if p <= ALPHA and top.gain > self.least_gain(errors, floor):
-            result.chosen = top
-            result.members = [t for t in good if self._is_rival(t, top)]
-        for t in trials:
-            if not t.reason and t not in result.members:
-                t.reason = self._why(t, top, result)
-        return result
-
-    def floors(self, floor: Floor) -> np.ndarray:
-        """Noise and discretisation together as mean squares of the parts."""
-        return np.array([np.mean(1.0 / floor.weight[p.recording][p.rows] ** 2) for p in self.parts])
-
-    def least_gain(self, errors: np.ndarray, floor: Floor) -> float:
-        """The gain that an effect must bring, from the size of the residual over the floor."""
-        if self.problem.settings == 1:  # nothing is discretised: only chance is to be beaten
-            return LEAST_GAIN_EXACT
-        over = 0.5 * float(np.mean(np.log(errors / self.floors(floor))))
-        share = min(max(over / math.log(1.5), 0.0), 1.0)  # from the floor itself to half as much again
-        return GAIN_IN_FLOOR + share * (LEAST_GAIN - GAIN_IN_FLOOR)
-
-    def polish(self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], base: Fit, floor: Floor) -> dict[str, tuple[Candidate, Fit]]:
-        """The best fits once more, from where they ended and from the declared values: the base fit may have led all of them astray."""
-        data = sum(len(p.rows) for p in self.parts if p.fitted)
-        top = sorted(best.values(), key=lambda entry: entry[1].cost)[:POLISHED]
-        if not top or top[0][1].cost < 1.2 * data or top[0][1].cost > 0.7 * base.cost:
-            return {}
-        requests, of = [], []
-        for c, fit in top:
-            begin = dict(fit.point)
-            for start in (begin, begin | {p.name: p.value for p in self.problem.declared}):
-                requests.append(levenberg_marquardt((*free, *c.parameters), start))
-                of.append((c, fit))
-        self.tell(f"refining {', '.join(c.key for c, _ in top)}")
-        out: dict[str, tuple[Candidate, Fit]] = {}
-        for (c, before), fit in zip(of, self.fits(requests, floor), strict=True):
-            least = out[c.key][1].cost if c.key in out else before.cost
-            if fit.cost < least:
-                out[c.key] = (c, fit)
-        return out
-
-    def _is_rival(self, t: Trial, top: Trial) -> bool:
-        """Whether the data cannot tell `t` from the best one: about its errors, a gain of its own, and not by many more parameters."""
-        more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
-        if more >= 3 and t.score > top.score - 0.1:
-            return t is top
-        return t is top or (t.score - top.score < 2.0 * math.log(CLASS_RATIO) and t.gain > 0.4 * top.gain)
-
-    def _why(self, t: Trial, top: Trial, result: Round) -> str:
-        if result.chosen is None:
-            at_least = max(float(np.quantile(result.null, 1 - ALPHA)), self.least_gain(result.errors, result.floor))
-            return f"lowers the error {math.exp(t.gain):.2f}-fold; with nuisances and discretisation it takes {math.exp(at_least):.2f}-fold"
-        return f"leaves {math.exp(0.5 * (t.score - top.score)):.1f} times the error of {top.candidate.name}"
-
-    def _linear(self, point, floor, slopes, columns, chosen, everywhere, candidates) -> evidence.LinearModel:
-        held = [p.recording for p in self.parts if not p.fitted]
-        by_key = {c.key: c for c in candidates}
-        best = {c.key: 0 for c in candidates} | chosen
-        one = [replace(by_key[key], starts=(by_key[key].starts[i],)) for key, i in best.items()]
-        new = [n for n in held if n not in [p.recording for p in self.parts if p.fitted]]
-        there = self.columns(point, one, new) if new else {}
-        nuisances = floor.nuisances or {n: np.empty((len(self.problem.recordings[n].y), 0)) for n in everywhere}
-        made = []
-        for part in self.parts:
-            n, rows = part.recording, part.rows
-            own = {}
-            for key, i in best.items():
-                c = columns[key, i][n] if n in columns[key, i] else there[key, 0][n]
-                if np.isfinite(c).all():
-                    own[key] = c[rows]
-            scale = floor.spread[n][rows]
-            made.append(evidence.Columns(floor.weight[n][rows], floor.noise[n], slopes[n][rows], nuisances[n][rows], floor.differences[n][rows],
-                                         0.5 * scale[:, None] * self.problem.directions(n)[rows], own))  # fmt: skip
-        common = set.intersection(*(set(c.candidates) for c in made))
-        made = [replace(c, candidates={k: v for k, v in c.candidates.items() if k in common}) for c in made]
-        return evidence.LinearModel([c for c, p in zip(made, self.parts, strict=True) if p.fitted],
-                                    [c for c, p in zip(made, self.parts, strict=True) if not p.fitted], seed=self.seed)  # fmt: skip
-
-    def nuisances(self, point: Point, recordings: Sequence[int]) -> dict[int, np.ndarray]:
-        """Directions of the nuisances of each recording, of one prior standard deviation."""
-        out = {}
-        for n in recordings:
-            name = self.problem.recordings[n].name
-            own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{name}")]
-            moved = [dict(point) | {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + p.prior)} for p in own]
-            rows = self.problem.predict([point, *moved], n, self.setting)
-            self.evaluations += len(rows)
-            out[n] = np.stack([np.where(np.isfinite(row).all(), row - rows[0], 0.0) for row in rows[1:]], axis=1) if own else np.empty((rows.shape[1], 0))
-        return out
-
-    # The end.
-
-    def drop(self, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:
-        """Leave out effects that the later ones made needless."""
-        for trial in list(found[:-1]):
-            rest = [t for t in found if t is not trial]
-            extra = tuple(p for t in rest for p in t.candidate.parameters)
-            start = {k: v for k, v in base.point.items() if k.split(".")[0] != trial.candidate.name}
-            (fit,) = self.fits([levenberg_marquardt((*self.problem.declared, *extra), start)], floor)
-            without, with_it = self.mean_squares([fit.point, base.point], floor)
-            if evidence.gain(without, with_it, self.fitted) < LEAST_GAIN / 2:
-                base, found = fit, rest
-        return base, found
-
-    def intervals(self, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
-        """90 % intervals: noise, and the part of the discretisation error that the residual leaves room for, through the fit."""
-        parts = [p for p in self.parts if p.fitted]
-        parameters = [self.problem.parameter(name) for name in fit.names]
-        slopes = self.slopes(parameters, fit.point, [p.recording for p in parts], step=0.1)
-        nuisances = floor.nuisances
-        J = np.concatenate([self._weighted(slopes[p.recording], p, floor) for p in parts])
-        gain = np.linalg.pinv(J)
-        covariance = np.zeros((len(parameters), len(parameters)))
-        at = 0
-        for p, square in zip(parts, errors[np.array(self.fitted)], strict=True):
-            n, w = p.recording, floor.weight[p.recording][p.rows]
-            own = gain[:, at : at + len(w)]
-            at += len(w)
-            covariance += floor.noise[n] ** 2 * (own * w**2) @ own.T
-            room = max(float(square) - floor.noise[n] ** 2, 0.0) / max(float(np.mean(floor.spread[n][p.rows] ** 2)), 1e-300)
-            shifts = [own @ (self._weighted(floor.differences[n], p, floor) * math.sqrt(min(room, 1.0) / max(floor.differences[n].shape[1], 1)))]
-            if n in nuisances:
-                shifts.append(own @ self._weighted(nuisances[n], p, floor) * math.sqrt(min(room + 0.05, 1.0)))
-            for shift in shifts:
-                covariance += shift @ shift.T
-        out = {}
-        for parameter, deviation in zip(parameters, np.sqrt(np.diag(covariance)), strict=True):
-            q = parameter.coordinate(fit.point[parameter.name])
-            out[parameter.name] = (parameter.physical(q - 1.645 * deviation), parameter.physical(q + 1.645 * deviation))
-        return out
-
-    def conclude(self, before: Point, base: Fit, found: list[Trial], rounds: list[Round], floor: Floor) -> Diagnosis:
-        """The answer and its figures."""
-        first = rounds[0]
-        kept = {t.candidate.key for t in found}
-        steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
-        over = np.sqrt(first.errors / self.floors(first.floor))
-        if found:
-            classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
-            answer = "class" if max(classes) > 1 else "effect"
-        elif float(np.exp(np.mean(np.log(over)))) > UNEXPLAINED:
-            answer = "unknown"
-        else:
-            answer = "none" if self.enough() else "insufficient"
-        squares = self.mean_squares([before, base.point], floor)
-        errors = {when: self._by_recording(row) for when, row in zip(("before", "after"), squares, strict=True)}
-        intervals = self.intervals(base, floor, squares[1])
-        start = Fit(before, tuple(p.name for p in self.problem.declared), 0.0, np.empty((0, 0)), np.empty(0), 0, True)
-        declared = self.intervals(start, first.floor, squares[0]) if self.problem.declared else {}
-        scale = self.problem.error(np.ones(1), 0)
-        floors = {
-            "noise": scale * math.sqrt(np.mean([v**2 for v in floor.noise.values()])),
-            "discretisation": scale * math.sqrt(np.mean([np.mean(v**2) for v in floor.spread.values()])),
-        }
-        return Diagnosis(self.problem, answer, steps, before, base.point, self.parts, errors, floors, intervals, declared, self.setting, self.evaluations)
-
-    def enough(self) -> bool:
-        """Whether there are many more data than parameters in every part."""
-        return all(int(p.rows.sum()) > 3 * len(self.problem.declared) + 10 for p in self.parts)
-
-    def _by_recording(self, squares: np.ndarray) -> dict[str, float]:
-        scale = self.problem.error(np.ones(1), 0)
-        return {p.name: scale * math.sqrt(float(v)) for p, v in zip(self.parts, squares, strict=True)}
-
-
-def split(problem: Problem) -> list[Part]:
-    """What is fitted and what is held out: whole recordings where there are some, else the last 40 % of the time."""
-    roles = problem.roles
-    whole = {n: np.ones(len(r.y), bool) for n, r in enumerate(problem.recordings)}
-    names = {n: r.name for n, r in enumerate(problem.recordings)}
-    if roles["held_out"]:
-        return [Part(n, whole[n], True, names[n]) for n in roles["fit"]] + [Part(n, whole[n], False, names[n]) for n in roles["held_out"]]
-    parts = []
-    for fitted in (True, False):
-        for n in roles["fit"]:
-            t = problem.recordings[n].times
-            early = t <= t.min() + 0.6 * np.ptp(t)
-            parts.append(Part(n, early if fitted else ~early, fitted, names[n] if fitted else f"{names[n]} (last 40 %)"))
-    return parts
-
-
-def _over_time(size: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Root mean square of a size over all data of one time."""
-    _, index = np.unique(times, return_inverse=True)
-    total = np.bincount(index, size**2) / np.bincount(index)
-    return np.sqrt(total)[index]
-
-
-def _unphysical(c: Candidate, point: Point) -> str:
-    for p in c.size_parameters:
-        value = point[p.name]
-        for bound in (p.lower, p.upper):
-            zero = abs(bound) < 1e-12
-            if (zero and abs(value) < 1e-3 * p.scale and len(c.size_parameters) == 1 and not p.log) or (not zero and abs(value - bound) < 1e-6 * abs(bound)):
-                return f"{p.name} ends at {value:.3g} {p.unit}, the edge of its physical range" if not zero else "its size fits as zero"
-    return ""
 
 
 def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0, most: int = MOST, tell: Tell | None = None) -> Diagnosis:
@@ -610,10 +83,102 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
             break  # nothing is left but noise
         floor = inference.floor(base.point)
         rounds.append(inference.round(base, floor, found))
-    base, found = inference.drop(base, floor, found)
+    base, found = drop(inference, base, floor, found)
     inference.evaluations = sum(i.evaluations for i in tried)
-    return inference.conclude(start.fit.point, base, found, rounds, floor)
+    return conclude(inference, start.fit.point, base, found, rounds, floor)
 
 
 def _score(errors: np.ndarray) -> float:
     return float(np.mean(np.log(np.maximum(errors, 1e-300))))
+
+
+def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:
+    """Leave out effects that the later ones made needless."""
+    for trial in list(found[:-1]):
+        rest = [t for t in found if t is not trial]
+        extra = tuple(p for t in rest for p in t.candidate.parameters)
+        start = {k: v for k, v in base.point.items() if k.split(".")[0] != trial.candidate.name}
+        (fit,) = inference.fits([levenberg_marquardt((*inference.problem.declared, *extra), start)], floor)
+        without, with_it = inference.mean_squares([fit.point, base.point], floor)
+        if evidence.gain(without, with_it, inference.fitted) < LEAST_GAIN / 2:
+            base, found = fit, rest
+    return base, found
+
+
+def intervals(inference: Inference, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
+    """90 % intervals: noise, and the part of the discretisation error that the residual leaves room for, through the fit."""
+    parts = [p for p in inference.parts if p.fitted]
+    parameters = [inference.problem.parameter(name) for name in fit.names]
+    slopes = inference.slopes(parameters, fit.point, [p.recording for p in parts], step=0.1)
+    nuisances = floor.nuisances
+    J = np.concatenate([inference.weighted(slopes[p.recording], p, floor) for p in parts])
+    gain = np.linalg.pinv(J)
+    covariance = np.zeros((len(parameters), len(parameters)))
+    at = 0
+    for p, square in zip(parts, errors[np.array(inference.fitted)], strict=True):
+        n, w = p.recording, floor.weight[p.recording][p.rows]
+        own = gain[:, at : at + len(w)]
+        at += len(w)
+        covariance += floor.noise[n] ** 2 * (own * w**2) @ own.T
+        room = max(float(square) - floor.noise[n] ** 2, 0.0) / max(float(np.mean(floor.spread[n][p.rows] ** 2)), 1e-300)
+        shifts = [
+            own @ (inference.weighted(floor.differences[n], p, floor) * math.sqrt(min(room, 1.0) / max(floor.differences[n].shape[1], 1)))
+        ]
+        if n in nuisances:
+            shifts.append(own @ inference.weighted(nuisances[n], p, floor) * math.sqrt(min(room + 0.05, 1.0)))
+        for shift in shifts:
+            covariance += shift @ shift.T
+    out = {}
+    for parameter, deviation in zip(parameters, np.sqrt(np.diag(covariance)), strict=True):
+        q = parameter.coordinate(fit.point[parameter.name])
+        out[parameter.name] = (parameter.physical(q - 1.645 * deviation), parameter.physical(q + 1.645 * deviation))
+    return out
+
+
+def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial], rounds: list[Round], floor: Floor) -> Diagnosis:
+    """The answer and its figures."""
+    first = rounds[0]
+    kept = {t.candidate.key for t in found}
+    steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
+    over = np.sqrt(first.errors / inference.floors(first.floor))
+    if found:
+        classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
+        answer = "class" if max(classes) > 1 else "effect"
+    elif float(np.exp(np.mean(np.log(over)))) > UNEXPLAINED:
+        answer = "unknown"
+    else:
+        answer = "none" if enough(inference) else "insufficient"
+    squares = inference.mean_squares([before, base.point], floor)
+    errors = {when: _by_recording(inference, row) for when, row in zip(("before", "after"), squares, strict=True)}
+    after = intervals(inference, base, floor, squares[1])
+    start = Fit(before, tuple(p.name for p in inference.problem.declared), 0.0, np.empty((0, 0)), np.empty(0), 0, True)
+    declared = intervals(inference, start, first.floor, squares[0]) if inference.problem.declared else {}
+    scale = inference.problem.error(np.ones(1), 0)
+    floors = {
+        "noise": scale * math.sqrt(np.mean([v**2 for v in floor.noise.values()])),
+        "discretisation": scale * math.sqrt(np.mean([np.mean(v**2) for v in floor.spread.values()])),
+    }
+    return Diagnosis(
+        inference.problem,
+        answer,
+        steps,
+        before,
+        base.point,
+        inference.parts,
+        errors,
+        floors,
+        after,
+        declared,
+        inference.setting,
+        inference.evaluations,
+    )
+
+
+def enough(inference: Inference) -> bool:
+    """Whether there are many more data than parameters in every part."""
+    return all(int(p.rows.sum()) > 3 * len(inference.problem.declared) + 10 for p in inference.parts)
+
+
+def _by_recording(inference: Inference, squares: np.ndarray) -> dict[str, float]:
+    scale = inference.problem.error(np.ones(1), 0)
+    return {p.name: scale * math.sqrt(float(v)) for p, v in zip(inference.parts, squares, strict=True)}

@@ -127,7 +127,7 @@ class BodyProblem(Problem):
         for p in self.declared:
             _place(model, p.name, values.get(p.name, p.value))
         own = {key: float(value) for key, value in values.items() if key.split(".")[0] in effects}
-        if "time_force" in effects:
+        if any(key.startswith("time_force.") and key[-1].isdigit() for key in own):
             own.setdefault("time_force.interval", self.duration / (KNOTS - 1))
         model["free"] = list(self.experiment.free)
         if own:
@@ -270,14 +270,18 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
         raise UserError("no recording has the role fit: set it on at least one in experiment.yaml")
     declared = []
     for name in experiment.free:
-        value = next(part[name] for part in (experiment.model["elasticity"], experiment.model["plasticity"], experiment.model) if name in part)
+        value = next(
+            part[name] for part in (experiment.model["elasticity"], experiment.model["plasticity"], experiment.model) if name in part
+        )
         log = name in LOG_STEPS
         declared.append(Parameter(name, UNITS[name], float(value), LOG_STEPS.get(name, STEPS.get(name, 1.0)), *RANGES[name], log=log))
     nuisances = []
     for r in measured:
         speed, spin = _typical(r)
         for name, unit, relative in NUISANCES:
-            unit_size = {"release_time": r.frame_interval, "velocity": speed, "spin": spin}.get(name.split("_")[0] if name != "release_time" else name, 1.0)
+            unit_size = {"release_time": r.frame_interval, "velocity": speed, "spin": spin}.get(
+                name.split("_")[0] if name != "release_time" else name, 1.0
+            )
             scale = relative * unit_size
             nuisances.append(Parameter(f"{name}:{r.name}", unit, 0.0, scale, -8 * scale, 8 * scale, prior=1.0))
     return BodyProblem(
@@ -347,7 +351,9 @@ def _first_seen(r: Measured) -> Tensor:
     seen = r.seen
     first = seen.int().argmax(dim=0)
     place = x[first, torch.arange(x.shape[1])]
-    centre = torch.stack([x[k][seen[k] & seen[0]].mean(dim=0) if bool((seen[k] & seen[0]).any()) else x.new_full((3,), torch.nan) for k in range(len(x))])
+    centre = torch.stack(
+        [x[k][seen[k] & seen[0]].mean(dim=0) if bool((seen[k] & seen[0]).any()) else x.new_full((3,), torch.nan) for k in range(len(x))]
+    )
     shift = centre[first] - centre[0]
     place = place - torch.where(shift.isnan(), 0.0, shift)
     return torch.where(place.isnan(), r.body.x.double().mean(dim=0), place)

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuido.discrepancy.attribution import Diagnosis, Part
+from neuido.discrepancy.attribution import Diagnosis
+from neuido.discrepancy.floors import Part
 
 WIDTH = 32
 ROWS = 12_000

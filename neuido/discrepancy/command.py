@@ -65,11 +65,13 @@ def diagnose(
 
     chosen = choose_device(device)
     problems = [restricted(problem, effects) for problem in problems_of(kind, place, model, chosen)]
-    options = {"model": Path(model).expanduser().read_text() if model else None, "effects": effects, "draws": draws, "seed": seed, "most": most,
-               "device": chosen, "version": answer.VERSION}  # fmt: skip
+    given = Path(model).expanduser().read_text() if model else None
+    options = {"model": given, "effects": effects, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": answer.VERSION}
     plan = store.plan_of(place, options, out=target)
     target.mkdir(parents=True, exist_ok=True)
     work = store.workplace(target, plan, resume=resume)
+    if not any(work.iterdir()):  # a run that goes on keeps its log
+        (target / "log.csv").unlink(missing_ok=True)
     log = Log(target / "log.csv", shown=progress, begun=begun)
     found: list[tuple[Diagnosis, float]] = []
     for i, problem in enumerate(problems):

@@ -84,7 +84,9 @@ def levenberg_marquardt(
     r = with_priors(r, q)
     count = 1
     if r is None or not len(names):
-        return Fit(point(q), names, np.inf if r is None else float(r @ r), np.empty((0 if r is None else len(r), 0)), r, count, r is not None)
+        return Fit(
+            point(q), names, np.inf if r is None else float(r @ r), np.empty((0 if r is None else len(r), 0)), r, count, r is not None
+        )
     cost = float(r @ r)
     J, converged = None, False
     for _ in range(iterations):

@@ -68,7 +68,15 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     planes = [p for r in experiment.recordings for p in r.scene.colliders]
     out: list[Candidate] = []
 
-    def add(name: str, where: str, starts: Sequence[Mapping[str, float]], *parameters: tuple, form: str = "", sizes: str = "", linear: bool = True):
+    def add(
+        name: str,
+        where: str,
+        starts: Sequence[Mapping[str, float]],
+        *parameters: tuple,
+        form: str = "",
+        sizes: str = "",
+        linear: bool = True,
+    ):
         made = tuple(
             Parameter(f"{name}.{key}", unit, 0.0 if not sizes or key in sizes.split() else starts[0][key], scale, low, high, log=log)
             for key, unit, scale, low, high, log in parameters
@@ -106,7 +114,12 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     add("maxwell", "internal modes", [{"ratio": 0.5, "time": s.wave * f} for f in (0.3, 1.5, 6.0)],
         ("ratio", "1", 0.3, 0.0, 20.0, False), ("time", "s", 0.5, s.step, 20 * s.duration, True), sizes="ratio")  # fmt: skip
     add("hysteresis", "internal modes", [{"eta": 0.2}], ("eta", "1", 0.1, 0.0, 1.5, False))
-    add("stiffness_change", "internal modes", [{"rate": 0.5 / s.duration}], ("rate", "1/s", 0.3 / s.duration, -8 / s.duration, 8 / s.duration, False))
+    add(
+        "stiffness_change",
+        "internal modes",
+        [{"rate": 0.5 / s.duration}],
+        ("rate", "1/s", 0.3 / s.duration, -8 / s.duration, 8 / s.duration, False),
+    )
     add("tension_compression", "internal modes", [{"r": 0.3}], ("r", "1", 0.2, -0.8, 5.0, False))
     add("stiffness_gradient", "internal modes", [dict.fromkeys("xyz", 0.6)], *vector("xyz", "1", 0.4, 5.0), form="gradient")
     add("stiffness_gradient", "internal modes", _places(experiment, s.length), ("log_ratio", "1", 0.5, -4.0, 4.0, False),
@@ -124,8 +137,22 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         add("friction", "contact", [{"mu": 0.15}, {"mu": 0.5}], ("mu", "1", 0.1, -least, 3.0, False), linear=False)
         # the rates are per substep of a node in contact: one that takes half of the speed in one substep is large
         rates = [0.02 / s.step, 0.2 / s.step]
-        add("stick", "contact", [{"rate": r} for r in rates], ("rate", "1/s", 1.0, 1e-4 / s.step, 20 / s.step, True), sizes="rate", linear=False)
-        add("restitution", "contact", [{"rate": r} for r in rates], ("rate", "1/s", 1.0, 1e-4 / s.step, 20 / s.step, True), sizes="rate", linear=False)
+        add(
+            "stick",
+            "contact",
+            [{"rate": r} for r in rates],
+            ("rate", "1/s", 1.0, 1e-4 / s.step, 20 / s.step, True),
+            sizes="rate",
+            linear=False,
+        )
+        add(
+            "restitution",
+            "contact",
+            [{"rate": r} for r in rates],
+            ("rate", "1/s", 1.0, 1e-4 / s.step, 20 / s.step, True),
+            sizes="rate",
+            linear=False,
+        )
     if plastic == "identity":
         # at large yield stresses nothing flows and the slope is zero: the fit starts where something does
         starts = [{"inverse": 1.0 / (f * s.young)} for f in (0.2, 0.08, 0.03, 0.012)]
@@ -159,7 +186,9 @@ def _places(experiment: Experiment, length: float) -> list[dict[str, float]]:
         if np.linalg.norm(x - place, axis=1).min() < 1.5 * spacing:
             c = place - mean
             # a border of one spacing: a sharp one moves particles in and out one by one, and has no slope
-            out.append({"log_ratio": 1.0, "cx": float(c[0]), "cy": float(c[1]), "cz": float(c[2]), "radius": 0.3 * length, "width": float(spacing)})
+            out.append(
+                {"log_ratio": 1.0, "cx": float(c[0]), "cy": float(c[1]), "cz": float(c[2]), "radius": 0.3 * length, "width": float(spacing)}
+            )
     return out
 
 
@@ -212,7 +241,8 @@ def _with_waves(made: Effects, waves: Mapping[str, torch.Tensor], duration: floa
     t = torch.linspace(0.0, duration, count, dtype=torch.float64)
     phase = 2 * math.pi * frequency[:, None] * t
     parts = [
-        waves.get(f"time_force.s{a}", zero)[:, None] * phase.sin() + waves.get(f"time_force.c{a}", zero)[:, None] * phase.cos() for a in "xyz"
+        waves.get(f"time_force.s{a}", zero)[:, None] * phase.sin() + waves.get(f"time_force.c{a}", zero)[:, None] * phase.cos()
+        for a in "xyz"
     ]
     knots = torch.stack(parts, -1)
     if made.time_force is not None and made.time_force_interval is not None:  # in one launch with points that have knots of their own

@@ -176,7 +176,7 @@ def _moved(r: Measured, velocity: torch.Tensor) -> Measured:
 
 
 def _turned(r: Measured, axis: int) -> Measured | None:
-    """The body turned by a right angle about its centre; the velocity field keeps its mean and turns its spin. None: it leaves the domain."""
+    """The body turned by a right angle about its centre; the velocity keeps its mean and turns its spin. None: it leaves the domain."""
     R = torch.eye(3, dtype=torch.float64)
     i, j = [a for a in range(3) if a != axis]
     R[i, i], R[i, j], R[j, i], R[j, j] = 0.0, -1.0, 1.0, 0.0
@@ -264,8 +264,8 @@ def _materials(problem: Problem) -> Iterator[tuple[str, Problem, Any]]:
     stress = max(float(np.abs(t.stress).max()) for t in tests)
     noise = max([r.noise or 0.0 for r in problem.recordings]) + 0.01 * stress
     up = np.linspace(0.0, 1.0, 16)[1:]
-    for mode, factor, back, pace in itertools.product(("uniaxial", "equibiaxial", "pure_shear", "biaxial", "simple_shear"), (1.0, 1.3), (False, True),
-                                                      (1.0, 0.1) if timed else (1.0,)):  # fmt: skip
+    modes, paces = ("uniaxial", "equibiaxial", "pure_shear", "biaxial", "simple_shear"), (1.0, 0.1) if timed else (1.0,)
+    for mode, factor, back, pace in itertools.product(modes, (1.0, 1.3), (False, True), paces):
         course = np.concatenate([up, up[-2::-1]]) if back else up
         e = factor * largest * course
         path = e[:, None] if mode == "simple_shear" else np.exp(np.stack([e, 0.5 * e], 1) if mode == "biaxial" else e[:, None])

@@ -9,7 +9,8 @@ import numpy as np
 
 from neuido.discrepancy import next_experiment
 from neuido.discrepancy import report_figures as draw
-from neuido.discrepancy.attribution import ALPHA, Diagnosis
+from neuido.discrepancy.attribution import Diagnosis
+from neuido.discrepancy.rounds import ALPHA
 
 if TYPE_CHECKING:
     from neuido.discrepancy.answer import Details
@@ -17,9 +18,12 @@ if TYPE_CHECKING:
 STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:1120px;margin:2em auto;padding:0 1em}
 h1{font-size:1.5em}h2{font-size:1.15em;margin-top:1.8em;border-bottom:1px solid #ddd}
 table{border-collapse:collapse;margin:.6em 0}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #eee;font-size:.93em}
-td.n{text-align:right;font-variant-numeric:tabular-nums}.answer{font-size:1.2em;padding:.6em 1em;background:#f3f6f9;border-left:4px solid #1f77b4}
+td.n{text-align:right;font-variant-numeric:tabular-nums}
+.answer{font-size:1.2em;padding:.6em 1em;background:#f3f6f9;border-left:4px solid #1f77b4}
 svg{max-width:100%;height:auto}canvas{border:1px solid #ddd;background:#fff;touch-action:none;max-width:100%}
 .player label{margin-right:.8em}.b{color:#c0392b}.a{color:#1f77b4}.note{color:#666;font-size:.9em}"""
+WEAK = "The missing force by the weak residual, which differentiates no measured position; grey: what noise alone makes of it."
+NOTHING = "<p>The residual is noise alone: no effect was fitted.</p>"
 SENTENCES = {
     "effect": "The declared model lacks {names}.",
     "class": "The declared model lacks an effect; these recordings cannot tell {names} apart.",
@@ -44,11 +48,12 @@ def page(details: "Sequence[Details]", diagnoses: Sequence[Diagnosis], *, kind: 
             parts.append(f"<h1>{_text(made.content.get('body', d.problem.name))}</h1>")
         parts += _one(made, d)
     seconds = sum(made.content["seconds"] for made in details)
-    parts.append(f'<p class="note">neuido {_text(details[0].content["version"])}, {seconds:.0f} s on {_text(details[0].content["device"])}, '
-                 f"{sum(d.evaluations for d in diagnoses)} simulations.</p>")  # fmt: skip
-    return f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{_text(name)}</title><style>{STYLE}</style></head><body>\n' + "\n".join(
-        part for part in parts if part
-    ) + "\n</body></html>\n"  # fmt: skip
+    device, version = details[0].content["device"], details[0].content["version"]
+    simulations = sum(d.evaluations for d in diagnoses)
+    parts.append(f'<p class="note">neuido {_text(version)}, {seconds:.0f} s on {_text(device)}, {simulations} simulations.</p>')
+    head = f'<meta charset="utf-8"><title>{_text(name)}</title><style>{STYLE}</style>'
+    body = "\n".join(part for part in parts if part)
+    return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
 
 
 def _one(made: "Details", d: Diagnosis) -> list[str]:
@@ -69,18 +74,23 @@ def _one(made: "Details", d: Diagnosis) -> list[str]:
             _stages(made),
             draw.stage_curves(made.stages),
         ]
-        out.append(
-            '<p class="note">Missing force by the weak residual, which differentiates no measured position; grey: what noise alone makes of it.</p>'
-        )
+        out.append(f'<p class="note">{WEAK}</p>')
+        for name, p in c["places"].items():
+            at = ", ".join(f"{v:.3g}" for v in p["from_centre"])
+            out.append(
+                f"<p>{_text(name)}: the missing force is largest at ({at}) m from the centre, {p['over_median']:.1f} times the median.</p>"
+            )
     else:
         out += ["<h2>Data before and after</h2>", draw.data_curves(made.motion, d.problem.unit)]
     out += _ranking(d)
     out += ["<h2>Rejected</h2>", _table(("effect", "reason"), [(r["name"], r["reason"]) for r in c["rejected"]])]
     out += ["<h2>Fitted figures</h2>", _figures(c)]
     share = made.ceilings["after"]
-    held = "" if math.isnan(share.held_out) else f", and {100 * max(share.held_out, 0.0):.0f} % of it on what was held out"
-    out.append(f"<p>A small network fitted to what remains explains {100 * max(share.fit, 0.0):.0f} % of it where it was fitted{held}: "
-               "the ceiling of any further effect.</p>")  # fmt: skip
+    fit, held = (100 * min(max(value, 0.0), 1.0) for value in (share.fit, share.held_out))
+    there = "" if math.isnan(share.held_out) else f", and {held:.0f} % of it on what was held out"
+    out.append(
+        f"<p>A small network explains {fit:.0f} % of what remains beside noise where it was fitted{there}: the ceiling of any effect.</p>"
+    )
     out += ["<h2>Next experiment</h2>", f"<p>{_text(next_experiment.summary(c['next_experiment']))}</p>"]
     if c["next_experiment"]:
         out.append(
@@ -136,14 +146,15 @@ def _ranking(d: Diagnosis) -> list[str]:
         out.append(draw.ranking([(t.candidate.key, t.gain, id(t) in kept) for t in trials], threshold))
         rows = []
         for t in trials:
-            figures = ", ".join(f"{p.name.partition('.')[2]} = {t.fit.point[p.name]:.3g} {p.unit}" for p in t.candidate.parameters[:6])
+            figures = ", ".join(
+                f"{p.name.partition('.')[2]} = {t.fit.point.get(p.name, p.value):.3g} {p.unit}" for p in t.candidate.parameters[:6]
+            )
             verdict = t.reason or ("chosen" if t is r.chosen else "not told from it" if id(t) in kept else "")
             cosine = r.cosines.get(t.candidate.key)
             rows.append((t.candidate.key, figures, f"{math.exp(t.gain):.2f}", "" if cosine is None else f"{cosine:.2f}", verdict))
         out.append(_table(("effect", "parameters", "error ratio", "cosine to the best", "verdict"), rows))
-        out.append(
-            f'<p class="note">p = {r.p_value:.3g}, family-wise over all candidates, from {len(r.null)} draws; chance brings {math.exp(threshold):.2f} at 95 %.</p>'
-        )
+        chance = f"chance brings {math.exp(threshold):.2f} at 95 %, from {len(r.null)} draws"
+        out.append(f'<p class="note">p = {r.p_value:.3g}, family-wise over all candidates; {chance}.</p>' if trials else NOTHING)
     return out
 
 

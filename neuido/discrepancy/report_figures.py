@@ -181,7 +181,8 @@ PLAYER = """<div class="player"><canvas width="760" height="460"></canvas><div>
 <label class="a"><input type="checkbox" checked>after</label> drag to turn</div></div>
 <script>(() => {
 const data = /*DATA*/, colours = /*COLOURS*/, box = document.currentScript.previousElementSibling;
-const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d"), pick = box.querySelector("select"), slider = box.querySelector("input[type=range]");
+const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d");
+const pick = box.querySelector("select"), slider = box.querySelector("input[type=range]");
 const boxes = [...box.querySelectorAll("input[type=checkbox]")], out = box.querySelector("output"), button = box.querySelector("button");
 let sets = [], now, yaw = 0.5, pitch = 0.25, timer = null;
 for (const name of Object.keys(data)) pick.add(new Option(name));

@@ -138,6 +138,26 @@ def hats(reference: np.ndarray, nodes: int = 3) -> np.ndarray:
     return np.einsum("ni,nj,nk->ijkn", *(one[..., a] for a in range(3))).reshape(nodes**3, -1)
 
 
+def place(x: np.ndarray, t: np.ndarray, predicted: np.ndarray, *, sigma: float) -> tuple[np.ndarray, float]:
+    """Where on the body the missing force is largest: the centre of that hat [m] at t = 0, and by how much it exceeds the median hat.
+
+    Args:
+        x: Measured points (T, N, 3) [m], NaN where not seen.
+        t: (T,) [s].
+        predicted: (T, N, 3) [m].
+        sigma: Noise of a coordinate [m].
+    """
+    shape = hats(predicted[0])
+    shape = shape[shape.sum(axis=1) > 1.0]  # those with hardly a point are noise
+    fields = np.einsum("kn,ac->kanc", shape, np.eye(3)).reshape(-1, *predicted.shape[1:])
+    total = np.zeros(len(shape))
+    for bump in windows(t):
+        value, sd = weak_residual(x - predicted, bump, fields, np.ones(x.shape[1]), sigma=sigma)
+        total += np.sum((value / np.maximum(sd, 1e-300)).reshape(-1, 3) ** 2, axis=1) / shape.sum(axis=1)  # a force per mass
+    best = int(total.argmax())
+    return shape[best] @ predicted[0] / shape[best].sum(), float(total[best] / max(float(np.median(total)), 1e-300))
+
+
 class Parts(NamedTuple):
     """A residual field split in its affine part about the mean and a remainder; each over frames."""
 

@@ -29,8 +29,10 @@ def body(velocity: tuple[float, float, float], spin: float, height: float, side:
     return Body((x + torch.tensor([0.5, height, 0.5])).float(), v.float(), torch.full((len(x),), 0.027 / len(x)))
 
 
-def experiment(folder: Path, effects: dict[str, float], *, noise: float = 4e-4, frames: int = 16, seed: int = 1, side: int = 5) -> Experiment:
-    """Write an experiment: a block that is thrown on a floor twice, the second time held out, with effects that the model does not declare."""
+def experiment(
+    folder: Path, effects: dict[str, float], *, noise: float = 4e-4, frames: int = 16, seed: int = 1, side: int = 5
+) -> Experiment:
+    """Write an experiment: a block thrown on a floor twice, the second time held out, with effects that are not declared."""
     scene = Scene(cells=14, dt=1e-3, colliders=(Plane((0.0, 0.1, 0.0), (0.0, 1.0, 0.0), "separate", 0.2),))
     rng = np.random.default_rng(seed)
     recordings = []
@@ -40,15 +42,24 @@ def experiment(folder: Path, effects: dict[str, float], *, noise: float = 4e-4, 
     ):
         simulator = Simulator(scene, b, density=1000.0)
         with torch.no_grad():
-            out = simulator.rollout(10 * (frames - 1), *material(MODEL["elasticity"], MODEL["plasticity"]), every=10, effects=Effects.of(effects))
+            out = simulator.rollout(
+                10 * (frames - 1), *material(MODEL["elasticity"], MODEL["plasticity"]), every=10, effects=Effects.of(effects)
+            )
         pick = torch.from_numpy(rng.permutation(len(b.x))[:60].copy())
         x = out.x[:, pick] + noise * torch.from_numpy(rng.standard_normal((frames, 60, 3))).float()
         x[frames // 2, :3] = torch.nan
         recordings.append(
             Recording(
-                name=name, role=role, scene=scene, frame_interval=0.01, noise=noise, x=x, body=b,
-                t=torch.arange(frames, dtype=torch.float64) * 0.01, track=pick,
-            )  # fmt: skip
+                name=name,
+                role=role,
+                scene=scene,
+                frame_interval=0.01,
+                noise=noise,
+                x=x,
+                body=b,
+                t=torch.arange(frames, dtype=torch.float64) * 0.01,
+                track=pick,
+            )
         )
     believed = {**MODEL, "elasticity": {**MODEL["elasticity"], "young": 7e4}}
     made = Experiment("block", folder, scene, believed, ("young",), tuple(recordings))
@@ -99,11 +110,13 @@ def material_test(folder: Path, *, stiffening: float = 0.05) -> None:
         x = s**2 + second**2 + third**2 - 3
         P = 4e5 * (1 + stiffening * x) * (s**2 - third**2) / s * (1 + 0.002 * rng.standard_normal(len(s)))
         np.savetxt(folder / f"{mode}.csv", np.stack([s, P], 1), delimiter=",", header="stretch,stress", comments="")
-        tests.append({"name": mode, "file": f"{mode}.csv", "mode": mode, "columns": {"stretch": "stretch", "nominal_stress": "stress"}, "role": role})
+        tests.append(
+            {"name": mode, "file": f"{mode}.csv", "mode": mode, "columns": {"stretch": "stretch", "nominal_stress": "stress"}, "role": role}
+        )
     content = {
         "format": "neuido-material-test/1", "name": "rubber",
-        "model": {"density": 1000.0, "elasticity": {"law": "neo_hookean", "young": 1.0e6, "poisson": 0.499}, "plasticity": {"law": "identity"},
-                  "free": ["young"], "incompressible": True},
+        "model": {"density": 1000.0, "elasticity": {"law": "neo_hookean", "young": 1.0e6, "poisson": 0.499},
+                  "plasticity": {"law": "identity"}, "free": ["young"], "incompressible": True},
         "tests": tests,
     }  # fmt: skip
     (folder / "test.yaml").write_text(yaml.safe_dump(content, sort_keys=False))

@@ -18,6 +18,7 @@ from neuido.cli import main
 from tests.discrepancy import made
 
 ROOT = Path(neuido.__file__).parents[1]
+DRAGS = ["--effects", "drag_linear,drag_quadratic,gravity", "--progress", "false"]
 
 
 def run(capsys, *args) -> tuple[int, str, str]:
@@ -118,7 +119,11 @@ WRONG = {  # kind, what is done to it, words of the line
     "step": ("experiment", change(E, "discretisation", "dt", 0.0), "dt"),
     "no-folder": ("experiment", remove("throw"), "throw"),
     "no-arrays": ("experiment", remove("throw/particles.npz"), "particles.npz"),
-    "cut-short": ("experiment", lambda f: (f / "throw/particles.npz").write_bytes((f / "throw/particles.npz").read_bytes()[:300]), "particles.npz"),
+    "cut-short": (
+        "experiment",
+        lambda f: (f / "throw/particles.npz").write_bytes((f / "throw/particles.npz").read_bytes()[:300]),
+        "particles.npz",
+    ),
     "shape": ("experiment", arrays(x=lambda x: x[:, :, :2]), "shape"),
     "infinite": ("experiment", arrays(x=spoiled(3, 2, np.inf)), "infinity"),
     "times": ("experiment", arrays(t=lambda t: t[::-1].copy()), "t must rise"),
@@ -198,7 +203,7 @@ def without_time(path: Path) -> dict:
 def track_answer(folders, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("track")
     with pytest.raises(SystemExit) as stop:
-        main(["diagnose", str(folders["track"]), "--out", str(out), "--progress", "false"])
+        main(["diagnose", str(folders["track"]), "--out", str(out), *DRAGS])
     assert stop.value.code == 0
     return out
 
@@ -209,14 +214,21 @@ def test_track_finds_its_drag(track_answer):
     (effect,) = content["effects"]
     assert "drag_quadratic" in effect["class"]
     assert content["error"]["after"]["held_out"] < 0.2 * content["error"]["before"]["held_out"]
-    assert {p.name for p in track_answer.iterdir()} == {"diagnosis.json", "report.html", "model_after.yaml", "trace.json", "log.csv", "predicted"}
+    assert {p.name for p in track_answer.iterdir()} == {
+        "diagnosis.json",
+        "report.html",
+        "model_after.yaml",
+        "trace.json",
+        "log.csv",
+        "predicted",
+    }
     assert (track_answer / "log.csv").read_text().startswith("seconds,body,stage,simulations\n")
 
 
 def test_killed_run_goes_on_to_the_same_answer(folders, track_answer, tmp_path):
     """Killed outright after some predictions are stored; the same command then finds them and ends with the same figures."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "neuido", "diagnose", str(folders["track"]), "--out", str(out), "--progress", "false"]
+    command = [sys.executable, "-m", "neuido", "diagnose", str(folders["track"]), "--out", str(out), *DRAGS]
     process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while len(list(out.glob(".work/*/0/*.npy"))) < 6:
@@ -303,3 +315,27 @@ def test_experiment_closes_the_loop(folders, tmp_path, capsys):
     assert status == 0
     assert out.startswith("none; ")
     assert json.loads((tmp_path / "second" / "diagnosis.json").read_text())["effects"] == []
+
+
+def test_declared_effects_are_simulated_and_are_the_candidates_start(folders):
+    """What the model declares is in every prediction, as if the point had it; and a candidate of that name starts from it."""
+    from neuido.data.experiments import read_experiment
+    from neuido.discrepancy.body import body_problem
+
+    plain = read_experiment(folders["experiment"])
+    for effects in (
+        {"drag_linear.k": 3.0},
+        {"time_force.sx": 4.0, "time_force.frequency": 9.0},
+        {"stiffness_gradient.x": 1.0},
+        {"time_force.y0": 3.0, "time_force.y4": -3.0},
+    ):
+        model = {**plain.model, "free": ["young"], "effects": effects}
+        believed = body_problem(read_experiment(folders["experiment"], model=model))
+        (with_it,) = believed.predict([{"young": 6e4}], 0)
+        (asked,) = body_problem(plain).predict([{"young": 6e4, **effects}], 0)
+        (without,) = body_problem(plain).predict([{"young": 6e4}], 0)
+        np.testing.assert_allclose(with_it, asked, atol=1e-6)
+        assert np.abs(with_it - without).max() > 1e-3
+        for name, value in effects.items():
+            assert value in [p.value for c in believed.candidates for p in c.parameters if p.name == name]
+            assert believed.model_after({"young": 6e4}, [])["effects"][name] == value

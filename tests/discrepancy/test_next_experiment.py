@@ -8,10 +8,12 @@ import torch
 
 from neuido.data.experiments import read_experiment
 from neuido.data.tracks import read_tracks
-from neuido.discrepancy import attribution, next_experiment
-from neuido.discrepancy.attribution import Diagnosis, Floor, Round, Trial
+from neuido.discrepancy import floors, next_experiment
+from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.fit import Fit
+from neuido.discrepancy.floors import Floor
+from neuido.discrepancy.rounds import Round, Trial
 from neuido.discrepancy.track import TrackProblem
 from tests.discrepancy import made
 
@@ -26,7 +28,7 @@ def diagnosis(problem, points: dict[str, dict[str, float]]) -> Diagnosis:
     floor = Floor({}, {}, {}, {})
     step = Round({}, np.ones(2), trials, trials[0], trials, 0.005, floor)
     point = trials[0].fit.point
-    return Diagnosis(problem, "class", [step], {}, point, attribution.split(problem), {}, {}, {}, {}, 0, 0)
+    return Diagnosis(problem, "class", [step], {}, point, floors.split(problem), {}, {}, {}, {}, 0, 0)
 
 
 def test_distance_is_half_the_whitened_square_after_a_refit():

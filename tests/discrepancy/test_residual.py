@@ -104,7 +104,7 @@ def test_decompose_finds_shift_turn_strain_and_the_rest():
 @pytest.mark.parametrize("kind", ["flight", "internal modes", "rotation", "none"])
 def test_stages_tell_where(kind):
     """A missing body force shows in flight alone; a missing strain or turn in modes or rotation; noise in none."""
-    before = falling(np.array([0.0, -9.8, 0.0])) + [0.0, 5.0, 0.0]
+    before = falling(np.array([0.0, -9.8, 0.0])) + np.array([0.0, 5.0, 0.0])
     truth = before.copy()
     if kind == "flight":
         truth = truth + 0.5 * np.array([2.0, 0.0, 0.0]) * T[:, None, None] ** 2
@@ -130,10 +130,21 @@ def test_stages_tell_where(kind):
 
 
 def test_contact_is_told_from_flight():
-    x = falling(np.array([0.0, -9.8, 0.0])) + [0.0, 0.15, 0.0]
+    x = falling(np.array([0.0, -9.8, 0.0])) + np.array([0.0, 0.15, 0.0])
     touch = residual.in_contact(x, (FLOOR,), 0.02)
     low = x[..., 1].min(axis=1)
     np.testing.assert_array_equal(touch, low < 0.02)
     assert 0 < touch.sum() < len(touch)
     names = {s.name for s in residual.stages(x, T, x, x, mass=1.0, sigma=1e-4, planes=(FLOOR,), margin=0.02)}
     assert {"contact", "flight"} <= names
+
+
+def test_place_finds_the_corner_that_is_pushed():
+    before = falling(np.array([0.0, -9.8, 0.0]))
+    corner = X[:, 0] + X[:, 1] - X[:, 2]
+    pushed = np.exp(-((corner.max() - corner) ** 2) / 2e-3)[:, None] * np.array([1.0, 0.0, 0.0])
+    x = before + 0.5 * pushed * T[:, None, None] ** 2 + 1e-4 * RNG.standard_normal(before.shape)
+    where, excess = residual.place(x, T, before, sigma=1e-4)
+    assert excess > 3
+    signs = np.sign(where - X.mean(axis=0))
+    np.testing.assert_array_equal(signs, [1, 1, -1])

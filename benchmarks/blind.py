@@ -1,0 +1,241 @@
+"""Blind cases: experiments with an undeclared effect, or none, diagnosed without their keys and then scored against them.
+
+    python benchmarks/blind.py --out runs/blind [--cases 60] [--curves 0] [--workers 2] [--device cpu]
+                               [--ablation single-recording no-discretisation] [--only make|diagnose|score] [--folders FOLDER ...]
+
+A third of the cases are nulls, half of them with wrong nuisances; the others spread evenly over the library's effects, with some of two
+effects and some outside the library, made by three solvers in turn. Whatever is there already is kept, so the command goes on where it was
+stopped. The keys are opened by the scoring alone, after the answers' digests are in results.csv. Ablations `plain-bic`, `no-unknown` and
+`take-smallest-error` follow from the figures of the full run and are always scored; `single-recording` and `no-discretisation` run again.
+`--folders` scores given folders instead (each with a truth.yaml, or a key in ../keys). A GPU takes the cases one after the other.
+"""
+
+import argparse
+import csv
+import dataclasses
+import hashlib
+import json
+import multiprocessing
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parent))
+import blind_scores
+
+from neuido.data.scenes import read_yaml
+from neuido.data.storage import write
+from neuido.data.undeclared import Case, make_undeclared
+from neuido.data.undeclared.effects import KINDS, OUTSIDE
+from neuido.errors import UserError
+
+RERUN = ("single-recording", "no-discretisation")
+SOLVERS = ("same", "finer", "elements")
+PAIRS = (
+    "drag_linear+yield", "uniform_acceleration+viscosity_shear", "friction+stiffness_gradient", "gravity+strain_stiffening",
+    "magnus+softening", "drag_quadratic+hardening", "restitution+fibre", "friction+viscosity_shear", "position_force+yield",
+    "drag_linear+friction",
+)  # fmt: skip
+
+
+def plan(cases: int, curves: int, seed: int, *, particles: int = 0, seconds: float = 0.0) -> list[tuple[str, int, Case]]:
+    """Names, seeds and options of the cases, in an order that says nothing."""
+    rng = np.random.default_rng(seed)
+    nulls, two, outside = round(cases / 3), round(cases * 5 / 60), round(cases * 7 / 60)
+    kinds: list[tuple[str, bool]] = [("none", i < nulls // 2) for i in range(nulls)]
+
+    def deal(names: tuple[str, ...], count: int) -> list[str]:
+        """So many names, each as often as the others to one."""
+        order = [str(name) for _ in range(count // len(names) + 1) for name in rng.permutation(names)]
+        return order[:count]
+
+    kinds += [(k, False) for k in deal(PAIRS, two)] + [(k, False) for k in deal(tuple(OUTSIDE), outside)]
+    kinds += [(k, False) for k in deal(tuple(KINDS), cases - len(kinds))]
+    made = []
+    for i, (kind, off) in enumerate(kinds):
+        solver: str | None = SOLVERS[i % 3]
+        if kind == "cohesion" or any((KINDS | OUTSIDE)[k].grid for k in kind.split("+") if k != "none"):
+            solver = SOLVERS[i % 2]
+        made.append(Case(kind=kind, nuisances=off, solver=solver, particles=particles, seconds=seconds))
+    made += [Case(measured=("material_test", "track")[i % 2]) for i in range(curves)]
+    return [(f"case-{n:03d}", 1000 * seed + int(i), made[i]) for n, i in enumerate(rng.permutation(len(made)))]
+
+
+def make_one(name: str, seed: int, case: Case, folder: str, device: str) -> str:
+    """One case; a seed that gives none is followed by others."""
+    for attempt in range(4):
+        out = Path(folder) / name
+        try:
+            make_undeclared(seed + 100_000 * attempt, str(out), case=case, device=device, progress=False)
+            return ""
+        except UserError as error:
+            reason = str(error)
+    return reason
+
+
+def diagnose_one(folder: str, out: str, ablation: str, device: str) -> str:
+    """Diagnose a folder into `out`, which appears when it is whole; returns what failed."""
+    from neuido.discrepancy import answer, attribution, command
+
+    target = Path(out)
+    try:
+        if ablation == "no-discretisation":
+            kind, place = command.kind_of(folder)
+            target.mkdir(parents=True, exist_ok=True)
+            found = []
+            for problem in command.problems_of(kind, place, None, device):
+                begun = time.monotonic()
+                if problem.settings > 1:
+                    problem = dataclasses.replace(problem, settings=1, solvers=(0,))
+                found.append((attribution.diagnose(problem), time.monotonic() - begun))
+            answer.write(target, found, kind=kind, device=device)
+        else:
+            given = folder
+            if ablation == "single-recording":
+                given = str(_with_one_recording(Path(folder), target.parent / ".inputs" / target.name))
+            command.diagnose(given, out=out, device=device, progress=False)
+    except Exception as error:  # a case that fails is scored as failed, and the others go on
+        target.mkdir(parents=True, exist_ok=True)
+        (target / "failed.txt").write_text(f"{type(error).__name__}: {error}\n")
+        return f"{type(error).__name__}: {error}"
+    (target / "failed.txt").unlink(missing_ok=True)
+    return ""
+
+
+def _with_one_recording(folder: Path, target: Path) -> Path:
+    """A copy of a measured folder without what is held out."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(folder, target, ignore=shutil.ignore_patterns("truth.yaml", "README.md"))
+    for file in ("experiment.yaml", "test.yaml", "track.yaml"):
+        if (target / file).is_file():
+            content = yaml.safe_load((target / file).read_text())
+            part = "tests" if file == "test.yaml" else "recordings"
+            content[part] = [r for r in content[part] if r["role"] == "fit"]
+            (target / file).write_text(yaml.safe_dump(content, sort_keys=False))
+    return target
+
+
+def in_parallel(work, tasks: list[tuple], workers: int) -> Iterator[tuple[tuple, Any]]:
+    """(task, result) as they finish, in processes of their own."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        waiting = {pool.submit(work, *task): task for task in tasks}
+        for done in as_completed(waiting):
+            yield waiting[done], done.result()
+
+
+def record(path: Path, row: dict[str, Any]) -> None:
+    """Add a row to a CSV file."""
+    fresh = not path.exists()
+    with path.open("a", newline="") as stream:
+        writer = csv.DictWriter(stream, list(row))
+        if fresh:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def key_of(folder: Path) -> dict[str, Any]:
+    """The key of a case, once its digest agrees with the one in the case's README; or the folder's truth.yaml."""
+    path = folder.parent / "keys" / f"{folder.name}.yaml"
+    if not path.is_file():
+        return read_yaml(folder / "truth.yaml")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if digest not in (folder / "README.md").read_text():
+        raise SystemExit(f"{path} is not the key that {folder}/README.md sealed")
+    return read_yaml(path)
+
+
+def answers(folder: Path) -> list[dict[str, Any]] | None:
+    """The diagnoses of a folder (one for each body), or none where there are none yet."""
+    if (folder / "failed.txt").is_file():
+        none = {"held_out": float("nan")}
+        error = {"noise_floor": float("nan"), "discretisation_floor": 0.0, "before": none, "after": none}
+        return [{"answer": "failed", "effects": [], "error": error}]
+    if not (folder / "diagnosis.json").is_file():
+        return None
+    content = json.loads((folder / "diagnosis.json").read_text())
+    return content.get("bodies", [content])
+
+
+def score_all(folders: list[Path], out: Path, ablations: list[str]) -> str:
+    """Score what is there; writes scores.csv, returns the table."""
+    columns, everything = {}, []
+    for how in ("none", *ablations, *blind_scores.FROM_TRACE):
+        rows = []
+        for folder in folders:
+            place = out / "answers" / ("none" if how in blind_scores.FROM_TRACE else how) / folder.name
+            found = answers(place)
+            if found is None:
+                continue
+            key = key_of(folder)
+            if how in blind_scores.FROM_TRACE and found[0]["answer"] != "failed":
+                trace = json.loads((place / "trace.json").read_text())
+                found = [blind_scores.ablated(how, d, t) for d, t in zip(found, trace.get("bodies", [trace]), strict=True)]
+            rows += [{"case": folder.name, "ablation": how} | blind_scores.score(key, d) for d in found]
+        if rows:
+            columns["full" if how == "none" else how] = blind_scores.summary(rows)
+            everything += rows
+    if not everything:
+        return "nothing is diagnosed yet"
+    hidden = out / ".scores.csv.tmp"
+    hidden.unlink(missing_ok=True)
+    for row in everything:
+        record(hidden, row)
+    os.replace(hidden, out / "scores.csv")
+    return blind_scores.table(columns)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/blind"))
+    parser.add_argument("--cases", type=int, default=60)
+    parser.add_argument("--curves", type=int, default=0, help="further cases that are material tests and tracks, in turn")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--ablation", nargs="*", choices=RERUN, default=[])
+    parser.add_argument("--only", choices=("make", "diagnose", "score"))
+    parser.add_argument("--folders", nargs="+", type=Path, help="score these instead of made ones")
+    parser.add_argument("--particles", type=int, default=0, help="of a body; 0: 1500 to 3000")
+    parser.add_argument("--seconds", type=float, default=0.0, help="of a body's recordings; 0: 0.4 to 0.6")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    workers = 1 if options.device != "cpu" else options.workers
+    if options.folders:
+        folders = [folder.resolve() for folder in options.folders]
+    else:
+        cases = plan(options.cases, options.curves, options.seed, particles=options.particles, seconds=options.seconds)
+        folders = [options.out / "cases" / name for name, *_ in cases]
+        if options.only in (None, "make"):
+            missing = [(*one, str(options.out / "cases"), options.device) for one in cases if not (options.out / "cases" / one[0]).is_dir()]
+            for n, (task, failed) in enumerate(in_parallel(make_one, missing, workers), 1):
+                print(f"made {n} of {len(missing)}: {task[0]}{': FAILED, ' + failed if failed else ''}", flush=True)
+        folders = [folder for folder in folders if folder.is_dir()]
+    if options.only in (None, "diagnose"):
+        places = [(f, options.out / "answers" / how / f.name, how) for how in ("none", *options.ablation) for f in folders]
+        asked = [(str(folder), str(place), how, options.device) for folder, place, how in places]
+        waiting = [task for task in asked if not (Path(task[1]) / "diagnosis.json").is_file()]
+        for n, (task, failed) in enumerate(in_parallel(diagnose_one, waiting, workers), 1):
+            place = Path(task[1])
+            found = answers(place) or []
+            digest = "" if failed else hashlib.sha256((place / "diagnosis.json").read_bytes()).hexdigest()
+            row = {"case": place.name, "ablation": task[2], "answer": " ".join(d["answer"] for d in found),
+                   "named": " ".join(e["name"] for d in found for e in d["effects"]), "sha256": digest, "failed": failed}  # fmt: skip
+            record(options.out / "results.csv", row)
+            print(f"{n} of {len(waiting)}: {row['case']} ({task[2]}): {row['answer']} {row['named']} {failed}", flush=True)
+    if options.only in (None, "score"):
+        text = score_all(folders, options.out, options.ablation)
+        write(options.out / "table.md", text + "\n")
+        print(text)
+
+
+if __name__ == "__main__":
+    main()

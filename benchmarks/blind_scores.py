@@ -1,0 +1,226 @@
+"""Scores of diagnoses against the sealed keys of `neuido simulate --undeclared`, and the answers that a lesser machinery would give.
+
+A key is a mapping as `neuido.data.undeclared` writes it (a truth.yaml of the same form will do), a diagnosis the content of
+diagnosis.json, a trace that of trace.json.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+NAMED = ("effect", "class")
+FROM_TRACE = ("plain-bic", "no-unknown", "take-smallest-error")
+"""Ablations that follow from the figures of a full diagnosis."""
+
+
+def score(key: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
+    """One case.
+
+    Attribution: `exact` where the named effects are the true ones by name, `in_class` where each true one is in the class of another of the
+    named ones; both only where as many are named as there are. `found` counts the true effects that are in a class.
+    """
+    true = key.get("undeclared") or []
+    outside = any(one.get("outside_library") for one in true)
+    effects = diagnosis.get("effects") or []
+    answer = diagnosis["answer"]
+    named = [e["name"] for e in effects] if answer in NAMED else []
+    classes = [{e["name"], *e.get("class", ())} for e in effects] if answer in NAMED else []
+    wanted = [set(one["diagnosis_names"]) for one in true if not one.get("outside_library")]
+    pairs = _pairs(wanted, classes)
+    exact = [i for i, j in pairs if named[j] in wanted[i]]
+    whole = len(named) == len(wanted)
+    errors, covered = [], []
+    known = [one for one in true if not one.get("outside_library")]
+    for i, j in pairs:
+        one, effect = known[i], effects[j]
+        if effect["name"] not in one["diagnosis_names"]:
+            continue
+        asked = _sizes(one, effect["parameters"])
+        if asked:
+            off = [effect["parameters"][name]["value"] - value for name, value in asked.items()]
+            errors.append(math.hypot(*off) / math.hypot(*asked.values()))
+            intervals = [(value, effect["parameters"][name]["interval90"]) for name, value in asked.items()]
+            covered += [_inside(value, interval) for value, interval in intervals if interval is not None]
+    for name, figure in (diagnosis.get("after") or {}).items():
+        if covered and name in (key.get("material") or {}) and whole and len(exact) == len(wanted) and not outside:
+            covered.append(_inside(key["material"][name], figure["interval90"]))
+    error = diagnosis["error"]
+    before, after = (error[when].get("held_out") or error[when].get("fit") for when in ("before", "after"))
+    floor = math.hypot(error["noise_floor"], error["discretisation_floor"])
+    reference = max((r.get("reference_rms_m", 0.0) for r in key.get("recordings", [])[:1]), default=0.0)
+    apart = min((r["separation_rms_m"] for r in key.get("recordings", [])[:1] if "separation_rms_m" in r), default=math.nan)
+    return {
+        "group": group_of(key),
+        "measured": key.get("measured", "body"),
+        "kind": "+".join(one["kind"] for one in true) or "none",
+        "solver": key.get("solver", ""),
+        "snr": apart / math.hypot(key.get("noise") or math.nan, reference),
+        "answer": answer,
+        "named": "+".join(named),
+        "classes": " ".join("|".join(sorted(c)) for c in classes),
+        "class_size": max((len(c) for c in classes), default=0),
+        "exact": bool(wanted) and whole and len(exact) == len(wanted),
+        "in_class": bool(wanted) and whole and len(pairs) == len(wanted),
+        "found": len(pairs),
+        "effects": len(wanted),
+        "near": outside and any(c & set(one.get("near", ())) for c in classes for one in true),
+        "parameter_error": float(np.median(errors)) if errors else math.nan,
+        "covered": sum(covered),
+        "intervals": len(covered),
+        "before": before,
+        "after": after,
+        "floor": floor,
+        "noise": error["noise_floor"],
+        "seconds": diagnosis.get("seconds", math.nan),
+    }
+
+
+def group_of(key: Mapping[str, Any]) -> str:
+    """null, nuisance (a null with wrong nuisances), one, two or outside."""
+    true = key.get("undeclared") or []
+    if not true:
+        return "nuisance" if key.get("nuisances") else "null"
+    if any(one.get("outside_library") for one in true):
+        return "outside"
+    return "one" if len(true) == 1 else "two"
+
+
+def _pairs(wanted: Sequence[set[str]], classes: Sequence[set[str]]) -> list[tuple[int, int]]:
+    """The largest matching of true effects with classes that hold them."""
+    best: list[tuple[int, int]] = []
+    slots = [*range(len(classes)), *[-1] * len(wanted)]
+    for order in set(itertools.permutations(slots, len(wanted))):
+        found = [(i, j) for i, j in enumerate(order) if j >= 0 and wanted[i] & classes[j]]
+        best = max(best, found, key=len)
+    return best
+
+
+def _sizes(one: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, float]:
+    """The true sizes that a diagnosis gives a figure for, by its names; vectors by component."""
+    flat: dict[str, float] = {}
+    for name, value in one["parameters"].items():
+        if name in one.get("sizes", (name,)) and name not in ("centre", "radius"):
+            flat |= dict(zip("xyz", value)) if isinstance(value, list) else {name: value}
+    asked = {name: float(value) for name, value in flat.items() if name in given}
+    return asked if len(asked) == len(flat) and any(asked.values()) else {}
+
+
+def _inside(value: float, interval: Sequence[float]) -> bool:
+    return interval[0] <= value <= interval[1]
+
+
+def upper_bound(count: int, of: int, level: float = 0.95) -> float:
+    """One-sided upper bound of a share by Clopper and Pearson, at `level`."""
+    return 1.0 if count >= of else float(beta.ppf(level, count + 1, of - count))
+
+
+def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """The figures of a table's column, in words."""
+
+    def of(*groups: str) -> list[Mapping[str, Any]]:
+        return [r for r in rows if r["group"] in groups]
+
+    def share(test: Callable[[Mapping[str, Any]], Any], among: Sequence[Mapping[str, Any]]) -> str:
+        count = sum(bool(test(r)) for r in among)
+        return f"{count} of {len(among)} ({100 * count / len(among):.0f} %)" if among else "none made"
+
+    def median(values: Sequence[float], form: str = "{:.3g}") -> str:
+        good = [v for v in values if math.isfinite(v)]
+        return form.format(float(np.median(good))) if good else "none"
+
+    nulls, known, outside = of("null", "nuisance"), of("one", "two"), of("outside")
+    alarms = sum(r["answer"] in NAMED for r in nulls)
+    named = [r for r in known if r["answer"] in NAMED]
+    clear = [r for r in known if r["snr"] >= 10]
+    dim = [r for r in known if r["snr"] < 10]
+    covered, intervals = sum(r["covered"] for r in known), sum(r["intervals"] for r in known)
+    right = [r for r in known if r["in_class"]]
+    return {
+        "false alarms on nulls": share(lambda r: r["answer"] in NAMED, nulls),
+        "their 95 % upper bound": f"{100 * upper_bound(alarms, len(nulls)):.0f} %" if nulls else "none made",
+        "of these with wrong nuisances": share(lambda r: r["answer"] in NAMED, of("nuisance")),
+        "nulls answered none": share(lambda r: r["answer"] == "none", nulls),
+        "in class": share(lambda r: r["in_class"], known),
+        "exact": share(lambda r: r["exact"], known),
+        "in class, effect >= 10 times the floor": share(lambda r: r["in_class"], clear),
+        "in class, smaller effects": share(lambda r: r["in_class"], dim),
+        "missed (no effect named)": share(lambda r: r["answer"] not in NAMED, known),
+        "class size, median and largest": f"{median([r['class_size'] for r in named])}, {max((r['class_size'] for r in named), default=0)}",
+        "two effects, both in class": share(lambda r: r["found"] == 2, of("two")),
+        "two effects, at least one in class": share(lambda r: r["found"] >= 1, of("two")),
+        "outside the library: unknown": share(lambda r: r["answer"] == "unknown", outside),
+        "outside: a near effect named": share(lambda r: r["answer"] in NAMED and r["near"], outside),
+        "outside: another effect named": share(lambda r: r["answer"] in NAMED and not r["near"], outside),
+        "median parameter error": median([100 * r["parameter_error"] for r in known], "{:.3g} %"),
+        "coverage of 90 % intervals": f"{covered} of {intervals} ({100 * covered / intervals:.0f} %)" if intervals else "none",
+        "held-out error, before / after, median": median([r["before"] / r["after"] for r in right]),
+        "held-out after <= 1.5 sqrt(noise^2 + disc^2)": share(lambda r: r["after"] <= 1.5 * r["floor"], right),
+        "seconds, median": median([r["seconds"] for r in rows]),
+        "failed": share(lambda r: r["answer"] == "failed", rows),
+    }
+
+
+def table(columns: Mapping[str, Mapping[str, str]]) -> str:
+    """Markdown, a column for each ablation."""
+    lines = ["| " + " | ".join(["", *columns]) + " |", "| " + " | ".join(["---"] * (len(columns) + 1)) + " |"]
+    for name in next(iter(columns.values())):
+        lines.append("| " + " | ".join([name, *(column[name] for column in columns.values())]) + " |")
+    return "\n".join(lines)
+
+
+def ablated(how: str, diagnosis: Mapping[str, Any], trace: Mapping[str, Any]) -> dict[str, Any]:
+    """The answer that a part of the machinery alone would give, from the fits that the whole made.
+
+    plain-bic: the Bayesian information criterion with independent noise on the fitted recordings, for as many effects as lower it.
+    take-smallest-error: the candidate of the first round with the smallest fitted error, always. no-unknown: where the answer is
+    `unknown` the best candidate. Where no candidate was fitted (the declared model is at the noise already) the answer stays.
+    """
+    out = dict(diagnosis)
+    rounds = [r for r in trace["rounds"] if r["trials"]]
+    if not rounds:
+        return out
+    fitted = [i for i, part in enumerate(trace["parts"]) if part["fitted"]]
+    rows = sum(trace["parts"][i]["rows"] for i in fitted)
+
+    def mean(squares: Sequence[float | None]) -> float:
+        total = sum((math.inf if squares[i] is None else squares[i]) * trace["parts"][i]["rows"] for i in fitted)
+        return total / rows
+
+    chosen: list[Mapping[str, Any]] = []
+    if how == "take-smallest-error":
+        chosen = [min(rounds[0]["trials"], key=lambda t: mean(t["mean_squares"]))]
+    elif how == "no-unknown":
+        if diagnosis["answer"] != "unknown":
+            return out
+        able = [t for t in rounds[0]["trials"] if all(v is not None for v in t["mean_squares"])]
+        chosen = [min(able, key=lambda t: t["score"])] if able else []
+    elif how == "plain-bic":
+        for r in rounds:
+            here = mean(r["mean_squares"])
+            gains = [rows * (math.log(here) - np.log(mean(t["mean_squares"]))) - t["parameters"] * math.log(rows) for t in r["trials"]]
+            best = int(np.argmax(gains))
+            if gains[best] <= 0:
+                break
+            chosen.append(r["trials"][best])
+            if r["chosen"] != chosen[-1]["key"]:
+                break  # the next round was made beside another effect
+    else:
+        raise ValueError(f"{how} does not follow from a trace")
+    out["answer"] = "effect" if chosen else "none"
+    out["effects"] = [
+        {"name": t["name"], "class": [t["name"]],
+         "parameters": {name.partition(".")[2]: {"value": value, "interval90": None} for name, value in t["point"].items()
+                        if name.partition(".")[0] == t["name"]}}
+        for t in chosen
+    ]  # fmt: skip
+    if chosen:
+        unit = diagnosis["error"]["before"]["held_out"]
+        held = [i for i, part in enumerate(trace["parts"]) if not part["fitted"]]
+        if held and unit:
+            ratio = sum(chosen[-1]["mean_squares"][i] or math.inf for i in held) / sum(trace["rounds"][0]["mean_squares"][i] for i in held)
+            out["error"] = {**diagnosis["error"], "after": {**diagnosis["error"]["after"], "held_out": unit * math.sqrt(ratio)}}
+    return out

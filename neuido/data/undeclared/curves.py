@@ -1,0 +1,221 @@
+"""Material tests and tracks with an undeclared effect: curves, beside the moving bodies of `case`."""
+
+import csv
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from neuido.data.material_tests import read_material_tests
+from neuido.data.tracks import read_tracks
+from neuido.data.undeclared import Case
+from neuido.data.undeclared.effects import ELASTIC, PLASTIC, Drawn, entry_of
+from neuido.data.undeclared.sizing import Again, rms, short, sized
+from neuido.errors import UserError
+from neuido.physics.effects import Effects
+from neuido.physics.laws import material
+from neuido.physics.material_point import Specimen, stress_along
+from neuido.physics.point_mass import Forces, fly
+
+Sizes = Mapping[str, tuple[Mapping[str, float], str, float, float]]
+TEST_KINDS = ("viscosity_shear", "maxwell", "hysteresis", "strain_stiffening", "second_invariant", "tension_compression", "yield",
+              "hardening", "kinematic_hardening", "rate_yield", "softening", "stiffness_change")  # fmt: skip
+TRACK_KINDS = ("gravity", "uniform_acceleration", "drag_linear", "drag_quadratic", "magnus", "position_force")
+PERIOD = 2.0
+"""Of the loading of a specimen [s]."""
+
+
+def curve_case(
+    rng: np.random.Generator, case: Case, name: str, device: str, advance: Callable[[int], Any]
+) -> tuple[Callable[[Path], None], dict[str, Any]]:
+    """What writes the folder, and the key. The CPU does it, whatever the device."""
+    for option in ("solver", "nuisances", "particles", "seconds"):
+        if getattr(case, option):
+            raise UserError(f"case.{option} = {getattr(case, option)} is for bodies; leave it out with case.measured = {case.measured}")
+    kinds = TEST_KINDS if case.measured == "material_test" else TRACK_KINDS
+    if case.kind is not None and case.kind != "none" and case.kind not in kinds:
+        raise UserError(f"case.kind = {case.kind!r} with case.measured = {case.measured}; one of none, {', '.join(kinds)}")
+    kind = case.kind or ("none" if rng.random() < 1 / 3 else str(rng.choice(kinds)))
+    ratio = case.separation or float(np.exp(rng.uniform(np.log(20.0), np.log(80.0))))
+    return (_test if case.measured == "material_test" else _track)(rng, kind, ratio, name, advance)
+
+
+def _effect(
+    rng: np.random.Generator, kind: str, sizes: Sizes, target: float, noise: float, apart: Callable[[Mapping[str, float]], float]
+) -> Drawn | None:
+    if kind == "none":
+        return None
+    values, names, least, most = sizes[kind]
+    drawn = Drawn(kind, {f"{kind}.{k}": float(v) for k, v in values.items()}, tuple(f"{kind}.{k}" for k in names.split()), least, most)
+    found = sized(drawn, target, lambda one: apart(one.values), 16.0 * noise)
+    return found.rounded()
+
+
+def _rows(true: list[np.ndarray], plain: list[np.ndarray], noise: float, roles: list[str], names: list[str], unit: str) -> list[dict]:
+    rows = []
+    for x, y, role, name in zip(true, plain, roles, names):
+        apart = rms(x - y)
+        rows.append({"name": name, "role": role, f"separation_rms_{unit}": short(apart), "separation_over_noise": short(apart / noise)})
+    return rows
+
+
+def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance: Callable[[int], Any]):
+    plastic = PLASTIC if kind in ("hardening", "kinematic_hardening", "rate_yield") else ELASTIC
+    if kind == "none" and rng.random() < 0.3:
+        plastic = PLASTIC
+    young = float(f"{math.exp(rng.uniform(math.log(1e5), math.log(1e6))):.3g}")
+    elasticity = {"law": "sigma" if plastic == PLASTIC else "neo_hookean", "young": young, "poisson": round(rng.uniform(0.3, 0.45), 2)}
+    plasticity: dict[str, Any] = {"law": plastic}
+    reach = rng.uniform(0.35, 0.5)
+    if plastic == PLASTIC:
+        reach = rng.uniform(0.06, 0.1)
+        plasticity["yield_stress"] = float(f"{young * rng.uniform(0.015, 0.025):.3g}")
+    paths, n = [], 160
+    plans = (("slow", "uniaxial", "fit", 1.0, 1.0), ("flat", "equibiaxial", "fit", 0.6, 0.7), ("fast", "uniaxial", "held_out", 1.15, 0.4))
+    for _, _, _, amount, period in plans:
+        t = np.linspace(0.0, 2.25 * period * PERIOD, n)
+        swing = np.sin(2 * np.pi * t / (period * PERIOD)) * (0.55 + 0.45 * t / t[-1])
+        paths.append((t, np.exp(reach * amount * swing)))
+
+    def stresses(values: Mapping[str, float]) -> list[np.ndarray]:
+        specimen = Specimen(*material(elasticity, plasticity), Effects.of(dict(values)), 1)
+        found = []
+        for (_, mode, *_), (t, path) in zip(plans, paths):
+            given = torch.from_numpy(path)[:, None]
+            found.append(stress_along(specimen, mode, given, time=torch.from_numpy(t))[0, :, 0].numpy())
+        advance(1)
+        if not all(np.isfinite(one).all() for one in found):
+            raise Again("the specimen finds no equilibrium")
+        return found
+
+    plain = stresses({})
+    noise = 3e-3 * max(float(np.abs(one).max()) for one in plain)
+    flow = plasticity.get("yield_stress", young)
+    sizes: Sizes = {
+        "viscosity_shear": ({"eta": 0.01 * young * PERIOD}, "eta", 0.01, 30),
+        "maxwell": ({"ratio": 0.3, "time": PERIOD * 10 ** rng.uniform(-1.3, 0.0)}, "ratio", 0.05, 8),
+        "hysteresis": ({"eta": 0.15}, "eta", 0.1, 4),
+        "strain_stiffening": ({"k": 0.3}, "k", 0.05, 8),
+        "second_invariant": ({"c": 0.3}, "c", 0.05, 8),
+        "tension_compression": ({"r": 0.3}, "r", 0.05, 6),
+        "yield": ({"inverse": 6.0 / young}, "inverse", 0.2, 6),
+        "hardening": ({"h": 0.05 * young}, "h", 0.02, 10),
+        "kinematic_hardening": ({"h": 0.05 * young}, "h", 0.02, 10),
+        "rate_yield": ({"eta": 0.1 * flow * PERIOD}, "eta", 0.02, 30),
+        "softening": ({"s": 0.5}, "s", 0.05, 6),
+        "stiffness_change": ({"rate": -0.1 if rng.random() < 0.5 else 0.1}, "rate", 0.05, 3),
+    }
+    drawn = _effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms(stresses(values)[0] - plain[0]))
+    true = stresses(drawn.values) if drawn else plain
+    believed = float(f"{young * (rng.uniform(0.65, 0.85) if rng.random() < 0.5 else rng.uniform(1.2, 1.5)):.3g}")
+    free = ["young", "yield_stress"] if plastic == PLASTIC and rng.random() < 0.5 else ["young"]
+    start = {"young": believed} | ({"yield_stress": float(f"{1.3 * flow:.3g}")} if len(free) > 1 else {})
+    roles, names = [plan[2] for plan in plans], [plan[0] for plan in plans]
+    truth = {
+        "undeclared": [entry_of(drawn, free=tuple(free))] if drawn else [],
+        "measured": "material_test",
+        "material": {"elasticity": elasticity["law"], "plasticity": plastic,
+                     **{k: v for part in (elasticity, plasticity) for k, v in part.items() if k != "law"}},
+        "started_from": start,
+        "simulated_with": "the law along the path",
+        "noise": short(noise),
+        "tests": _rows(true, plain, noise, roles, names, "pa") if drawn else [],
+    }  # fmt: skip
+    tests = []
+    for (title, mode, role, *_), (t, path), stress in zip(plans, paths, true):
+        tests.append((title, mode, role, np.stack([t, path, stress + noise * rng.normal(size=n)], axis=1)))
+    model = {
+        "density": 1000.0,
+        "elasticity": {k: start.get(k, v) for k, v in elasticity.items()},
+        "plasticity": {k: start.get(k, v) for k, v in plasticity.items()},
+        "free": free,
+    }
+
+    def write_folder(folder: Path) -> None:
+        entries = []
+        for title, mode, role, rows in tests:
+            _write_csv(folder / f"{title}.csv", ("time_s", "stretch", "stress_pa"), rows)
+            columns = {"time": "time_s", "stretch": "stretch", "nominal_stress": "stress_pa"}
+            entries.append({"name": title, "file": f"{title}.csv", "mode": mode, "columns": columns, "role": role})
+        content = {"format": "neuido-material-test/1", "name": name, "model": model, "tests": entries}
+        (folder / "test.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+        read_material_tests(folder)
+
+    return write_folder, truth
+
+
+def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance: Callable[[int], Any]):
+    fps, seconds, noise = float(rng.choice([60.0, 100.0])), rng.uniform(0.8, 1.2), float(rng.choice([2e-3, 3e-3, 5e-3]))
+    t = np.arange(round(seconds * fps)) / fps
+    count = 4
+    heading = rng.uniform(0, 2 * np.pi) + np.arange(count) * np.pi / 2 + rng.uniform(-0.3, 0.3, count)
+    speed, up = rng.uniform(1.0, 4.0, count), rng.uniform(1.0, 5.0, count)
+    velocity = np.stack([speed * np.cos(heading), up, speed * np.sin(heading)], axis=1)
+    start = np.tile([0.0, 1.5, 0.0], (count, 1)) + rng.uniform(-0.3, 0.3, (count, 3))
+    gravity = (0.0, -9.81, 0.0)
+
+    def paths(values: Mapping[str, float]) -> np.ndarray:
+        own = {key.partition(".")[2]: value for key, value in values.items()}
+        acting: dict[str, Any] = {"gravity": np.array(gravity)}
+        if kind == "gravity" and own:
+            acting["gravity"] = np.array(gravity) * (1 + own["g"] / 9.81)
+        elif kind in ("uniform_acceleration", "magnus") and own:
+            acting[kind] = np.array([own[a] for a in "xyz"])
+        elif kind == "position_force" and own:
+            acting |= {"position_force": own["k"], "position_centre": np.array([own[a] for a in "xyz"])}
+        elif own:
+            acting[kind] = own["k"]
+        advance(1)
+        return fly(t, start, velocity, np.zeros(count), Forces(**acting), step=2e-3)
+
+    plain = paths({})
+    level = np.array([1.0, 0.2, 1.0]) * rng.normal(size=3)
+    level /= np.linalg.norm(level)
+    turn = rng.normal(size=3)
+    turn /= np.linalg.norm(turn)
+    place = np.array([0.0, 1.5, 0.0]) + rng.uniform(-1.0, 1.0, 3)
+    sizes: Sizes = {
+        "gravity": ({"g": -0.6 if rng.random() < 0.5 else 0.6}, "g", 0.05, 6),
+        "uniform_acceleration": (dict(zip("xyz", level)), "x y z", 0.05, 3),
+        "drag_linear": ({"k": 0.2}, "k", 0.02, 10),
+        "drag_quadratic": ({"k": 0.05}, "k", 0.02, 10),
+        "magnus": (dict(zip("xyz", 0.3 * turn)), "x y z", 0.05, 8),
+        "position_force": ({"k": 1.0, **dict(zip("xyz", place))}, "k", 0.05, 8),
+    }
+    drawn = _effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms((paths(values) - plain)[:2]))
+    true = paths(drawn.values) if drawn else plain
+    roles, names = ["fit", "fit", "held_out", "held_out"], [f"throw-{i + 1}" for i in range(count)]
+    truth = {
+        "undeclared": [entry_of(drawn)] if drawn else [],
+        "measured": "track",
+        "simulated_with": "a point mass, Runge-Kutta steps of 2 ms",
+        "noise": noise,
+        "recordings": _rows(list(true), list(plain), noise, roles, names, "m") if drawn else [],
+    }
+    seen = true + noise * rng.normal(size=true.shape)
+
+    def write_folder(folder: Path) -> None:
+        entries = []
+        for title, role, x in zip(names, roles, seen):
+            _write_csv(folder / f"{title}.csv", ("t_s", "x_m", "y_m", "z_m"), np.concatenate([t[:, None], x], axis=1))
+            columns = {"t": "t_s", "x": "x_m", "y": "y_m", "z": "z_m"}
+            entries.append({"name": title, "body": "ball", "file": f"{title}.csv", "columns": columns, "noise": noise, "role": role})
+        content = {
+            "format": "neuido-track/1", "name": name, "model": {"gravity": list(gravity), "effects": {}, "free": []},
+            "nuisances": {"release_time": 0.002, "length_scale": 0.002, "time_base": 0.001}, "bodies": {"ball": {}}, "recordings": entries,
+        }  # fmt: skip
+        (folder / "track.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+        read_tracks(folder)
+
+    return write_folder, truth
+
+
+def _write_csv(path: Path, titles: tuple[str, ...], rows: np.ndarray) -> None:
+    with path.open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(titles)
+        writer.writerows([[f"{value:.7g}" for value in row] for row in rows])

@@ -1,0 +1,225 @@
+"""The true motion of a case: any of the solvers, the library's effects, and those outside it by operator splitting."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.physics.effects import Effects, linear_gradient
+from neuido.physics.finite_elements import FiniteElements
+from neuido.physics.laws import material
+from neuido.physics.mpm import Simulator
+from neuido.types import Body, ParticleState, Scene
+
+SPLIT = 2e-3
+"""Longest time between two kicks of a force that no rollout knows [s]."""
+CORE = 0.08
+"""Within it a magnet's pull grows no more [m]."""
+SLOW = 0.05
+"""Speed below which dry drag falls to zero [m/s]."""
+
+Field = Callable[[Tensor, Tensor], Tensor]
+"""Positions and velocities (P, 3) -> acceleration (P, 3)."""
+
+
+class Solver(NamedTuple):
+    """Which code moves a body, on which grid."""
+
+    name: str = "same"
+    """same, finer or elements."""
+    cells: int = 32
+    dt: float = 5e-4
+    tetrahedra: int = 5
+    density: float = 1.0
+    """Elements a particle."""
+
+    def words(self) -> str:
+        """For the key."""
+        if self.name == "elements":
+            return f"explicit finite elements, {self.tetrahedra} linear tetrahedra a cell, {self.density:.2f} elements a particle"
+        return f"a material point method, {self.cells} cells a side, {self.dt:g} s a substep"
+
+
+class Motion(NamedTuple):
+    """Frames of several recordings of one body."""
+
+    x: np.ndarray
+    """[m], (S, K, P, 3)."""
+    v: np.ndarray
+    """[m/s], (S, K, P, 3)."""
+    interval: float
+    """From frame to frame [s]."""
+
+    def at(self, times: np.ndarray, recording: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities (T, P, 3) of a recording at some times by cubic Hermite interpolation; uniform motion before 0."""
+        x, v, h = self.x[recording], self.v[recording], self.interval
+        k = np.clip(np.floor(times / h + 1e-9).astype(int), 0, len(x) - 2)
+        u = (times / h - k)[:, None, None]
+        x0, x1, v0, v1 = x[k], x[k + 1], v[k] * h, v[k + 1] * h
+        place = x0 + u * v0 + u**2 * (3 * (x1 - x0) - 2 * v0 - v1) + u**3 * (2 * (x0 - x1) + v0 + v1)
+        place = np.where(u < 0, x0 + u * v0, place)
+        return place, ((1 - u) * v0 + u * v1) / h
+
+
+def move(
+    solver: Solver,
+    scene: Scene,
+    bodies: Sequence[Body],
+    law: Mapping[str, Any],
+    values: Mapping[str, float],
+    *,
+    seconds: float,
+    interval: float,
+    device: str = "cpu",
+) -> Motion:
+    """Move bodies of one material for some time.
+
+    Args:
+        solver: Grid and step, or finite elements.
+        scene: The declared one.
+        bodies: The body at the start of each recording.
+        law: density, elasticity, plasticity: the truth.
+        values: Effects by flat names, of the library or outside it.
+        seconds: How long.
+        interval: Between frames [s], a multiple of the step.
+        device: Where.
+
+    Raises:
+        UserError: A step above the stability limit, a particle lost.
+    """
+    scene = replace(scene, cells=solver.cells, dt=solver.dt)
+    args = [scene] * len(bodies), list(bodies)
+    if solver.name == "elements":
+        elements = round(solver.density * len(bodies[0].x))
+        simulator = FiniteElements(*args, density=law["density"], device=device, elements=elements, tetrahedra=solver.tetrahedra)
+    else:
+        simulator = Simulator(*args, density=law["density"], device=device)
+    every = round(interval / scene.dt)
+    frames = math.ceil(seconds / interval - 1e-6)
+    elasticity, plasticity = material(law["elasticity"], law["plasticity"])
+    x, mass = simulator.state.x, None
+    known = {name: value for name, value in values.items() if not name.startswith(OWN)}
+    own = {name.partition(".")[0]: {} for name in values if name.startswith(OWN)}
+    for name, value in values.items():
+        if name.startswith(OWN):
+            own[name.partition(".")[0]][name.partition(".")[2]] = value
+    effects = _effects(known, x, simulator.particles.scene)
+    if "density_gradient" in own:
+        mass = _graded(simulator, own.pop("density_gradient"))
+    lift = None
+    if "moving_floor" in own:
+        lift = own.pop("moving_floor")
+        effects = effects._replace(**_shaken(lift, frames * every, scene.dt))
+    with torch.no_grad():
+        if own:
+            out = _split(simulator, elasticity, plasticity, effects, own, frames, every)
+        else:
+            out = simulator.rollout(frames * every, elasticity, plasticity, every=every, effects=effects, mass=mass)
+    count = len(bodies)
+    place, velocity = (t.double().cpu().numpy().reshape(frames + 1, count, -1, 3).swapaxes(0, 1) for t in (out.x, out.v))
+    if lift is not None:  # back from the frame of the floor
+        t = np.arange(frames + 1) * interval
+        w = 2 * math.pi * lift["frequency"]
+        up = np.array([0.0, 1.0, 0.0])
+        place = place + (lift["amplitude"] * (1 - np.cos(w * t)))[None, :, None, None] * up
+        velocity = velocity + (lift["amplitude"] * w * np.sin(w * t))[None, :, None, None] * up
+    return Motion(place, velocity, interval)
+
+
+OWN = ("dry_drag.", "moving_floor.", "delayed_spring.", "swelling.", "magnet.", "density_gradient.", "spin_decay.")
+
+
+def _effects(values: Mapping[str, float], x: Tensor, scene: Tensor) -> Effects:
+    values = dict(values)
+    if "viscosity_shear.eta" in values:  # Kelvin and Voigt's 2 eta D, of which the library's is the deviator
+        values["viscosity_bulk.zeta"] = values.get("viscosity_bulk.zeta", 0.0) + 2 / 3 * values["viscosity_shear.eta"]
+    return Effects.of(values, x=x, scene=scene)
+
+
+def _graded(simulator: Simulator | FiniteElements, slope: Mapping[str, float]) -> Tensor:
+    """Masses with a gradient over each body, the same in all."""
+    x, mass = simulator.state.x.double(), simulator.mass.double()
+    s = torch.tensor([slope[a] for a in "xyz"], dtype=torch.float64, device=x.device)
+    factor = torch.cat([linear_gradient(x[i:j], s) for i, j in zip(simulator.particles.offsets[:-1], simulator.particles.offsets[1:])])
+    parts = zip(simulator.particles.offsets[:-1], simulator.particles.offsets[1:])
+    return torch.cat([mass[i:j] * factor[i:j] / (mass[i:j] * factor[i:j]).sum() * mass[i:j].sum() for i, j in parts]).to(simulator.mass)
+
+
+def _shaken(lift: Mapping[str, float], steps: int, dt: float) -> dict[str, Any]:
+    """The inertia in the frame of a floor at amplitude (1 - cos w t); it starts at rest, so velocities are the same in both frames."""
+    w = 2 * math.pi * lift["frequency"]
+    t = torch.arange(steps + 1, dtype=torch.float64) * dt
+    force = torch.zeros(steps + 1, 3, dtype=torch.float64)
+    force[:, 1] = -lift["amplitude"] * w**2 * torch.cos(w * t)
+    return {"time_force": force, "time_force_interval": dt}
+
+
+def _split(
+    simulator: Simulator, elasticity, plasticity, effects: Effects, own: dict[str, dict[str, float]], frames: int, every: int
+) -> ParticleState:
+    """Rollouts between kicks (Strang's splitting); the library's effects beside them must not remember anything."""
+    dt = float(simulator.dt[0])
+    pieces = max(1, math.ceil(every * dt / SPLIT - 1e-9))
+    while every % pieces:
+        pieces += 1
+    steps, h = every // pieces, every * dt / pieces
+    state = simulator.state
+    scene = simulator.particles.scene.long()
+    count = len(simulator.scenes)
+    mass = simulator.mass
+    total = torch.zeros(count, dtype=mass.dtype, device=mass.device).index_add_(0, scene, mass)
+
+    def mean(t: Tensor) -> Tensor:
+        return torch.zeros(count, 3, dtype=t.dtype, device=t.device).index_add_(0, scene, mass[:, None] * t) / total[:, None]
+
+    past = [mean(state.x)]
+    kept = [state]
+    for n in range(frames * pieces):
+        state = _kick(state, _fields(own, mean, scene, state, past, h), 0.5 * h)
+        out = simulator.rollout(steps, elasticity, plasticity, state=state, effects=effects, every=steps, check=n == 0)
+        state = ParticleState(*(t[-1] for t in out))
+        if "swelling" in own:
+            state = state._replace(F=state.F * math.exp(-own["swelling"]["rate"] * h / 3))
+        past.append(mean(state.x))
+        state = _kick(state, _fields(own, mean, scene, state, past, h), 0.5 * h)
+        if (n + 1) % pieces == 0:
+            kept.append(state)
+    return ParticleState(*(torch.stack(parts) for parts in zip(*kept)))
+
+
+def _fields(own: Mapping[str, Mapping[str, float]], mean, scene: Tensor, state: ParticleState, past: list[Tensor], h: float) -> list[Field]:
+    def vector(given: Mapping[str, float]) -> Tensor:
+        return torch.tensor([given[a] for a in "xyz"], dtype=state.x.dtype, device=state.x.device)
+
+    fields: list[Field] = []
+    if (one := own.get("dry_drag")) is not None:
+        c = one["c"]
+        fields.append(lambda x, v: -c * v / (v.square().sum(1, keepdim=True) + SLOW**2).sqrt())
+    if (one := own.get("magnet")) is not None:
+        m, place = one["m"], vector(one)
+        fields.append(lambda x, v: -m * (x - place) / torch.linalg.vector_norm(x - place, dim=1, keepdim=True).clamp(min=CORE) ** 5)
+    if (one := own.get("delayed_spring")) is not None:
+        then = past[max(len(past) - 1 - round(one["delay"] / h), 0)]
+        pull = (-one["k"] * (then - vector(one)))[scene]
+        fields.append(lambda x, v: pull)
+    if (one := own.get("spin_decay")) is not None:
+        k, centre = one["k"], mean(state.v)[scene]
+        fields.append(lambda x, v: -k * (v - centre))
+    return fields
+
+
+def _kick(state: ParticleState, fields: Sequence[Field], h: float) -> ParticleState:
+    """Velocities, and their gradients by central differences across a millimetre."""
+    x, v, C, F = state
+    reach = 1e-3
+    for field in fields:
+        columns = [
+            (field(x + reach * e, v + reach * C[:, :, j]) - field(x - reach * e, v - reach * C[:, :, j])) / (2 * reach)
+            for j, e in enumerate(torch.eye(3, dtype=x.dtype, device=x.device))
+        ]
+        v, C = v + h * field(x, v), C + h * torch.stack(columns, dim=2)
+    return ParticleState(x, v, C, F)

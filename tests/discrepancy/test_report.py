@@ -1,0 +1,142 @@
+"""The page of a diagnosis: whole, self-contained, escaped, and useful without matplotlib."""
+
+import base64
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from shutil import which
+
+import numpy as np
+import pytest
+
+from neuido.discrepancy import answer, report, report_figures
+from neuido.discrepancy.attribution import diagnose
+from neuido.discrepancy.residual import Series
+from tests.discrepancy.test_answer import Curve
+
+RNG = np.random.default_rng(0)
+
+
+def motion(frames: int = 9, points: int = 400) -> dict:
+    x = RNG.uniform(0, 1, (frames, points, 3))
+    seen = x.copy()
+    seen[4, 10] = np.nan
+    return {
+        "take <1>": {"positions": np.array(1), "t": np.linspace(0, 0.08, frames), "measured": seen, "before": x + 0.1, "after": x + 0.01}
+    }
+
+
+class Checker(HTMLParser):
+    """Collects what a page would load from elsewhere, and whether its elements close."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.outside, self.open = [], []
+
+    def handle_starttag(self, tag, attributes):
+        for key, value in attributes:
+            if key in ("src", "href", "data") and value and not value.startswith(("#", "data:")):
+                self.outside.append((tag, value))
+        if tag not in ("meta", "input", "br", "use", "path"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.handle_starttag(tag, attributes)
+        if tag not in ("meta", "input", "br", "use", "path"):
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        if tag in ("path", "use"):
+            return
+        assert self.open
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def found():
+    return diagnose(Curve({"young": 1.5, "drag_linear.k": 0.8}), draws=39)
+
+
+def test_page_is_whole_and_needs_nothing_else(found):
+    details = answer.describe(found, device="cpu")
+    page = report.page([details], [found], kind="experiment")
+    checker = Checker()
+    checker.feed(page)
+    assert checker.outside == []
+    assert checker.open == []
+    for word in ("drag_linear", "gravity", "90 % interval", "family-wise", "Next experiment", "<svg", "Floors"):
+        assert word in page
+
+
+def test_names_are_escaped(found):
+    details = answer.describe(found, device="cpu")
+    details.content["effects"][0]["where"] = "<script>alert(1)</script>"
+    assert "<script>alert" not in report.page([details], [found], kind="experiment")
+
+
+def test_page_without_matplotlib_has_its_tables(tmp_path):
+    code = f"""
+import sys
+sys.modules["matplotlib"] = None
+from neuido.discrepancy import answer, report
+from neuido.discrepancy.attribution import diagnose
+from tests.discrepancy.test_answer import Curve
+d = diagnose(Curve({{"young": 1.5, "drag_linear.k": 0.8}}), draws=19)
+page = report.page([answer.describe(d, device="cpu")], [d], kind="experiment")
+assert "<svg" not in page and "<table" in page and "drag_linear" in page
+open({str(tmp_path / "page.html")!r}, "w").write(page)
+"""
+    answer_ = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert answer_.returncode == 0, answer_.stderr
+    assert (tmp_path / "page.html").stat().st_size > 1000
+
+
+def test_player_holds_the_motion():
+    page = report_figures.player(motion())
+    assert page.count("</script>") == 1  # a name with markup closes nothing
+    data = json.loads(re.search(r"const data = (\{.*?\}), colours", page).group(1))
+    own = data["take <1>"]
+    assert (own["n"], own["k"]) == (250, 9)
+    values = [np.frombuffer(base64.b64decode(s), "<i2").reshape(9, 250, 3).astype(float) for s in own["sets"]]
+    x = motion()["take <1>"]
+    assert (values[0] == -32768).any()
+    shift = values[1] - values[2]  # both are the same motion, 0.09 apart
+    low, high = 0.0, float(np.nanmax(x["before"]))
+    assert np.median(shift) * (high - low) / 2 / 32000 == pytest.approx(0.09, rel=0.05)
+
+
+def test_player_runs(tmp_path):
+    node = which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    script = re.search(r"<script>(.*)</script>", report_figures.player(motion()), re.S).group(1)
+    stub = """
+let drawn = 0; const pen = {clearRect() {}, fillRect() { drawn++; }};
+const element = {getContext: () => pen, width: 10, height: 10, add(o) { this.value = o; }, value: 0, max: 0};
+const box = {querySelector: () => element, querySelectorAll: () => [{checked: true}, {checked: true}, {checked: true}]};
+globalThis.document = {currentScript: {previousElementSibling: box}}; globalThis.Option = function (n) { return n; };
+const pick = {add(o) { this.value = o; }, value: ""}; const slider = {value: 0};
+box.querySelector = q => q === "select" ? pick : q === "canvas" ? element : q.includes("range") ? slider : {};
+"""
+    # `new Option(name)` yields an object of the constructor's return only for objects: names are kept as they are
+    stub = stub.replace("function (n) { return n; }", "class extends String {}").replace("this.value = o;", "this.value = String(o);")
+    (tmp_path / "p.js").write_text(stub + script + "\nif (drawn < 700) throw new Error('drew ' + drawn);")
+    answer_ = subprocess.run([node, str(tmp_path / "p.js")], capture_output=True, text=True)
+    assert answer_.returncode == 0, answer_.stderr
+
+
+def test_figures_are_drawn():
+    m = motion()
+    series = [Series(n, "m", np.arange(3.0), np.ones(3), np.ones(3), 0.1 * np.ones(3), 3) for n in ("flight", "power")]
+    for page in (
+        report_figures.error_curves(m, 1e-3, 1e-3),
+        report_figures.residual_maps(m),
+        report_figures.stage_curves({"take <1>": series}),
+        report_figures.ranking([("a", 1.0, True), ("b", 0.1, False)], 0.3),
+    ):
+        assert page.startswith("<svg")
+        assert "</svg>" in page
+    assert report_figures.stage_curves({}) == ""
+    assert report_figures.ranking([], 0.0) == ""
