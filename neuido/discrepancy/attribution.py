@@ -54,7 +54,11 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         tell: Called with a line of progress.
     """
     tried = [Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell) for n in problem.solvers]
-    starts = [inference.start() for inference in tried]
+    starts: list[Start] = []
+    for inference in tried:
+        starts.append(inference.start(starts[0].fit.point if starts else None))
+        if inference.is_noise(starts[-1].errors):
+            break
     at_noise = [i for i, start in enumerate(starts) if tried[i].is_noise(start.errors)]
     rounds: list[Round] = []
     if at_noise:

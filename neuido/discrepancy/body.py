@@ -173,7 +173,11 @@ class BodyProblem(Problem):
         full = [{p.name: p.value for p in self.declared} | self.experiment.model.get("effects", {}) | dict(point) for point in points]
         elasticity, plasticity = self.laws(full)
         always = () if self.device == "cpu" or len(points) == 1 else [p.name for c in self.candidates for p in c.parameters]
-        effects = effects_of(full, simulator.state.x, simulator.particles.scene, self.duration, always=always)
+        turned = self._turn(recording).to(simulator.state.x)
+        material = (simulator.state.x - simulator.state.x[: len(r.body.x)].mean(dim=0)) @ turned  # as the first recording holds the body
+        effects = effects_of(full, material, simulator.particles.scene, self.duration, always=always)
+        if effects.fibre_direction is not None:
+            effects = effects._replace(fibre_direction=torch.as_tensor(effects.fibre_direction).to(material) @ turned.T)
         every, steps, exact = _frames(r, scene.dt)
         with torch.no_grad():
             out = simulator.rollout(
@@ -236,6 +240,22 @@ class BodyProblem(Problem):
             skew[:, k, j], skew[:, j, k] = w[:, i], -w[:, i]
         v = v + change[0][scene] + torch.einsum("pab,pb->pa", skew[scene], x - centre)
         return ParticleState(x, v, C + skew[scene], F)
+
+    def _turn(self, recording: int) -> Tensor:
+        """The rotation (3, 3) from the body of the first recording to that of another one: fibres and gradients turn with it.
+
+        The identity where the two are not the same particles in another pose (to 1 % of the body's size).
+        """
+        x, y = (self.measured[n].body.x.double() for n in (0, recording))
+        eye = torch.eye(3, dtype=torch.float64)
+        if recording == 0 or x.shape != y.shape:
+            return eye
+        x, y = x - x.mean(dim=0), y - y.mean(dim=0)
+        U, _, Vt = torch.linalg.svd(y.T @ x)
+        R = U @ torch.diag(torch.stack([eye[0, 0], eye[0, 0], torch.linalg.det(U @ Vt)])) @ Vt
+        size = float(x.norm(dim=1).max())
+        straight, turned = float((x - y).abs().max()), float((x @ R.T - y).abs().max())
+        return R if turned < 0.01 * size and turned < 0.5 * straight else eye
 
     def _map(self, recording: int) -> tuple[Tensor, Tensor]:
         """Particles (N, k) and weights (N, k) of each tracked point."""

@@ -157,22 +157,28 @@ class Inference:
             self.tell(f"discretisation of {self.problem.recordings[n].name}")
         return Floor(plain.noise, weight, differences, spread, self.nuisances(point, list(plain.noise)))
 
-    def base(self, start: Point, floor: Floor, extra: Sequence[Parameter] = ()) -> Fit:
-        """The declared parameters (and `extra`) fitted from several starts."""
-        free = (*self.problem.declared, *extra)
-        starts = [dict(start)]
+    def base(self, starts: Sequence[Point], floor: Floor) -> Fit:
+        """The declared parameters fitted from several starts; the best one after a few iterations goes on."""
+        free = self.problem.declared
+        if len(starts) > 1:
+            short = self.fits([levenberg_marquardt(free, s, iterations=3) for s in starts], floor)
+            starts = [min(short, key=lambda f: f.cost).point]
+        return self.fits([levenberg_marquardt(free, starts[0])], floor)[0]
+
+    def starts(self, point: Point) -> list[Point]:
+        """A point, and half and twice each parameter whose logarithm is fitted."""
+        out = [dict(point)]
         for p in self.problem.declared:
             if p.log:
-                value = start.get(p.name, p.value)
-                starts += [dict(start) | {p.name: min(max(value * f, p.lower), p.upper)} for f in (0.5, 2.0)]
-        found = self.fits([levenberg_marquardt(free, s) for s in starts], floor)
-        return min(found, key=lambda f: f.cost)
+                value = point.get(p.name, p.value)
+                out += [dict(point) | {p.name: min(max(value * f, p.lower), p.upper)} for f in (0.5, 2.0)]
+        return out
 
-    def start(self) -> "Start":
-        """The base fit, with what noise and discretisation do to it."""
-        fit = self.base({}, self.noise())
+    def start(self, near: Point | None = None) -> "Start":
+        """The base fit, with what noise and discretisation do to it; from the declared values, and from `near` where that is given."""
+        fit = self.base([*self.starts({}), *([near] if near else [])], self.noise())
         floor = self.floor(fit.point)
-        fit = self.base(fit.point, floor)
+        fit = self.base([fit.point], floor)
         return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
 
     def is_noise(self, errors: np.ndarray) -> bool:

@@ -104,7 +104,7 @@ LIBRARY = (
     ),
     Entry(
         "viscosity_shear",
-        "sigma += 2 eta dev D",
+        "sigma += 2 eta D",
         (Parameter("eta", "viscosity_shear", "Pa s", 0.0, 1e3),),
         "internal modes",
         ("maxwell", "hysteresis", "viscosity_bulk", "restitution", "drag_linear"),

@@ -73,7 +73,7 @@ class Effects(NamedTuple):
     position_centre: Triple = None
     """That place [m], (3,) or (S, 3)."""
     viscosity_shear: Number = None
-    """eta of Kelvin-Voigt's Cauchy stress 2 eta dev D [Pa s]."""
+    """eta of Kelvin-Voigt's Cauchy stress 2 eta D [Pa s]: in full, not its deviator alone."""
     viscosity_bulk: Number = None
     """zeta of Kelvin-Voigt's Cauchy stress zeta tr(D) I [Pa s]."""
     gravity: Number = None
@@ -226,10 +226,14 @@ class Effects(NamedTuple):
         return torch.cat([self.rows(name, scene_count, like) for name in names], dim=1)
 
     def viscosity(self, scene_count: int, like: Tensor) -> Tensor | None:
-        """Columns shear and bulk viscosity, (S, 2), or None where neither is given (the rollout then skips them)."""
+        """Columns of 2 eta dev D + zeta tr(D) I, (S, 2), or None where neither is given (the rollout then skips them).
+
+        The trace of `viscosity_shear`'s own 2 eta D is in the second.
+        """
         if self.viscosity_shear is None and self.viscosity_bulk is None:
             return None
-        return torch.cat([self.rows(name, scene_count, like) for name in ("viscosity_shear", "viscosity_bulk")], dim=1)
+        eta, zeta = (self.rows(name, scene_count, like) for name in ("viscosity_shear", "viscosity_bulk"))
+        return torch.cat([eta, zeta + 2.0 / 3.0 * eta], dim=1)
 
     def growth(self, dt: Tensor, steps: int) -> Tensor | None:
         """exp(r t) of `stiffness_change` at the start of each substep, (T, S), or None."""

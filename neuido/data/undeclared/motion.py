@@ -134,9 +134,6 @@ OWN = ("dry_drag.", "moving_floor.", "delayed_spring.", "swelling.", "magnet.", 
 
 
 def _effects(values: Mapping[str, float], x: Tensor, scene: Tensor) -> Effects:
-    values = dict(values)
-    if "viscosity_shear.eta" in values:  # Kelvin and Voigt's 2 eta D, of which the library's is the deviator
-        values["viscosity_bulk.zeta"] = values.get("viscosity_bulk.zeta", 0.0) + 2 / 3 * values["viscosity_shear.eta"]
     return Effects.of(values, x=x, scene=scene)
 
 
