@@ -1,113 +1,160 @@
-"""The `demo` command: pre-train the operator on small simulated bodies, then let its laws move a body of another shape."""
+"""The `demo` command: laws learned from simulated bodies, a law read from video, one closed loop, and a page that shows them."""
 
+import base64
+import html
+import os
+import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
+
+from neuido.errors import UserError
 
 if TYPE_CHECKING:
-    import numpy as np
+    from neuido.demo_laws import LawsResult
+    from neuido.demo_loop import LoopResult
+    from neuido.demo_video import VideoResult
 
-    from neuido.models.operator import IntrinsicDynamicsOperator
-
-STEPS, EVERY, DT = 600, 200, 5e-4
-CELLS, INSET = 20, 2.0
-
-
-class Comparison(NamedTuple):
-    """A ball under the true and under the learned law of one material."""
-
-    name: str
-    true: "np.ndarray"
-    """Positions [m] at the frames, (K, P, 3)."""
-    learned: "np.ndarray"
-    """The same, under the learned law."""
-
-    @property
-    def rmse(self) -> float:
-        """Root mean square distance of matched particles over all frames [m]."""
-        return float(((self.learned - self.true) ** 2).sum(-1).mean() ** 0.5)
-
-    @property
-    def path(self) -> float:
-        """Root mean square displacement from the start under the true law, over the same frames [m]."""
-        return float(((self.true - self.true[:1]) ** 2).sum(-1).mean() ** 0.5)
+PARTS = ("laws", "video", "loop")
+STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:1120px;margin:2em auto;padding:0 1em}
+h1{font-size:1.5em}h2{font-size:1.2em;margin-top:2em;border-bottom:1px solid #ddd}img{max-width:100%}
+table{border-collapse:collapse;margin:.6em 0}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #eee}
+td.n{text-align:right;font-variant-numeric:tabular-nums}.note{color:#666;font-size:.9em}"""
 
 
-def demo(*, out: str = "runs/demo", settings: str = "quickstart") -> None:
-    """Pre-train the operator on small simulated bodies, and compare the motion under its laws with that under the true ones.
+def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "laws,video,loop") -> None:
+    """Learn laws from simulated bodies, read a law from video, and find an effect that a model lacks; minutes on a CPU.
 
-    Runs `neuido fit --config quickstart` on trajectories of a thrown cube, then drops a ball that the operator has not seen,
-    prints a table and draws a picture. Takes about a minute on one CPU core; a second run reuses the trajectories.
+    Three parts: `laws` trains the operator on small trajectories and compares the motion under its laws with the true one (Stage I);
+    `video` films small bodies, trains Stage II on two of them and reads the law of a third in one pass; `loop` diagnoses a small
+    experiment whose model lacks an effect. Writes tables, pictures and one page, <out>/report.html.
 
     Args:
-        out: Folder for the trajectories, the run and the picture.
-        settings: Configuration to train with.
+        out: Folder for runs, pictures and the page.
+        settings: Configuration of Stage I.
+        parts: Which parts to run, with commas.
+
+    Raises:
+        UserError: A part that there is not.
     """
+    chosen = [part.strip() for part in parts.split(",") if part.strip()]
+    for part in chosen:
+        if part not in PARTS:
+            raise UserError(f"parts = {parts}: {part!r} is not known; choose from {', '.join(PARTS)}")
+    if not chosen:
+        raise UserError(f"parts = {parts!r} names none: choose from {', '.join(PARTS)}")
+
     import torch
 
-    from neuido.cli import find_config, run_lightning
-
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)  # for matrices this small a second thread costs more than it brings
-    folder, config = Path(out), find_config(settings, "--settings")
-    print(f"[1/2] neuido fit --config {settings} --data.root {folder / 'trajectories'}", flush=True)
-    root = ["--data.root", str(folder / "trajectories"), "--trainer.default_root_dir", str(folder)]
-    trained = run_lightning(["fit", "--config", config, *root])
-    print("[2/2] a falling ball under the true and under the learned laws", flush=True)
-    data = trained.datamodule
-    chosen: dict[str, tuple[str, dict[str, float]]] = {}
-    for name, family, values in zip(data.names, data.families, data.parameters, strict=True):
-        chosen.setdefault(family, (name, values))  # the first of each family: NCLaw's published material
-    compared = [_compare(trained.model.operator, name, family, values) for family, (name, values) in chosen.items()]
-    figures = {key: float(value) for key, value in trained.trainer.callback_metrics.items()}
-    _print_table(compared, list(chosen), figures)
-    picture = folder / "demo.png"
-    _draw(compared, picture)
-    print(f"picture: {picture}\nrun: {trained.trainer.log_dir}")
+    folder, sections = Path(out), []
+    try:
+        for part in (part for part in PARTS if part in chosen):
+            begun = time.monotonic()
+            body = {"laws": _laws, "video": _video, "loop": _loop}[part](folder, settings)
+            spent = time.monotonic() - begun
+            print(f"{part}: {spent:.0f} s\n", flush=True)
+            sections.append(f'{body}<p class="note">{spent:.0f} s.</p>')
+    finally:
+        torch.set_num_threads(threads)
+    page = folder / "report.html"
+    _write(page, "\n".join(sections))
+    print(f"report: {page}")
 
 
-def _compare(operator: "IntrinsicDynamicsOperator", name: str, family: str, parameters: dict[str, float]) -> Comparison:
-    import torch
+def _laws(folder: Path, settings: str) -> str:
+    from neuido.demo_laws import demo_laws
 
-    from neuido.data.generate import laws
-    from neuido.data.shapes import ball
-    from neuido.physics.mpm import Simulator
-    from neuido.types import Scene, Walls
-
-    body = ball(centre=(0.5, 0.3, 0.5), radius=0.15, spacing=0.027, velocity=(0.5, -1.0, 0.0))
-    simulator = Simulator(Scene(cells=CELLS, dt=DT, walls=Walls(inset=INSET)), body)
-    with torch.no_grad():
-        true = simulator.rollout(STEPS, *laws(family, [parameters]), every=EVERY).x
-        learned = simulator.rollout(STEPS, *operator.cpu().laws(operator.latent(name)), every=EVERY).x
-    return Comparison(name, true.numpy(), learned.numpy())
+    return laws_section(demo_laws(str(folder), settings=settings))
 
 
-def _print_table(compared: list[Comparison], families: list[str], figures: dict[str, float]) -> None:
-    print(f"\n{'material':<14}{'stress error':>14}{'plastic error':>15}{'particle RMSE':>16}{'of the path':>14}")
-    for family, each in zip(families, compared, strict=True):
-        stress, plastic = (figures.get(f"val/{kind}_error/{family}", float("nan")) for kind in ("stress", "plastic"))
-        print(f"{each.name:<14}{stress:>14.2e}{plastic:>15.2e}{each.rmse:>14.2e} m{each.rmse / each.path:>14.2e}")
-    print("Errors: relative, medians over held-out particles and steps of the family (a material that does not flow has none).")
-    print(f"RMSE: matched particles of a falling ball of 0.3 m, against the true law, over {STEPS * DT:g} s.\n")
+def _video(folder: Path, settings: str) -> str:
+    from neuido.demo_video import demo_video
+
+    return video_section(demo_video(str(folder / "video")))
 
 
-def _draw(compared: list[Comparison], path: Path) -> None:
-    from matplotlib.figure import Figure
+def _loop(folder: Path, settings: str) -> str:
+    from neuido.demo_loop import demo_loop
 
-    times = [DT * EVERY * k for k in range(len(compared[0].true))]
-    figure = Figure(figsize=(2.8 * len(times), 1.8 * len(compared)), layout="constrained")
-    figure.suptitle("A falling ball, a shape that training has not seen: all particles, from the front", fontsize=9)
-    panels = figure.subplots(len(compared), len(times), squeeze=False, sharex=True, sharey=True)
-    for row, each in zip(panels, compared, strict=True):
-        row[0].set_ylabel(f"{each.name}\ny [m]", fontsize=9)
-        for panel, true, learned in zip(row, each.true, each.learned, strict=True):
-            panel.axhline(INSET / CELLS, color="0.4", linewidth=0.8)  # the floor
-            panel.scatter(true[:, 0], true[:, 1], s=14, facecolors="none", edgecolors="0.6", linewidths=0.5, label="true law")
-            panel.scatter(learned[:, 0], learned[:, 1], s=3, color="tab:red", linewidths=0, label="learned law")
-            panel.set(xlim=(0.1, 0.9), ylim=(0.05, 0.5), aspect="equal")
-            panel.tick_params(labelsize=6)
-    for panel, time in zip(panels[0], times, strict=True):
-        panel.set_title(f"t = {time:g} s", fontsize=9)
-    for panel in panels[-1]:
-        panel.set_xlabel("x [m]", fontsize=8)
-    panels[0][0].legend(fontsize=6, loc="upper right")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    return loop_section(demo_loop(str(folder / "loop")), folder)
+
+
+def laws_section(result: "LawsResult") -> str:
+    """Stage I on the page."""
+    head = ("material", "stress error", "plastic error", "particle RMSE [m]", "RMSE over path")
+    text = (
+        "Trained on a thrown cube, tried on a falling ball: relative errors of the stress and of the plastic correction, held out "
+        "(a material that does not flow has no plastic error), and the distance of matched particles from the motion under the true law."
+    )
+    return f"<h2>Stage I: laws from simulated bodies</h2><p>{text}</p>{_table(head, result.rows)}{_picture(result.picture)}"
+
+
+def video_section(result: "VideoResult") -> str:
+    """Stage II and zero-shot on the page: figures, and predicted against recorded frames."""
+    keys = [key for key in ("cd", "floor", "rmse", "psnr", "ssim") if any(key in scene.scores for scene in result.scenes)]
+    units = {"cd": "CD [1e-4]", "floor": "its floor [1e-4]", "rmse": "particle RMSE [m]", "psnr": "PSNR [dB]", "ssim": "SSIM"}
+    rows = [
+        (scene.name, "unseen" if scene.unseen else "trained on", f"{1e3 * scene.seconds:.1f} ms", *(scene.scores.get(k, "") for k in keys))
+        for scene in result.scenes
+    ]
+    head = ("scene", "", "inference", *(units[key] for key in keys))
+    text = (
+        f"The image loss of Stage II went from {result.losses[0]:.3g} to {result.losses[-1]:.3g} over {len(result.losses)} logged steps. "
+        "Inference: one pass from flow latents to the law. Scores are those of views that were held out."
+        if result.losses
+        else "Scores are those of views that were held out."
+    )
+    shown = "".join(f"<h3>{_text(s.name)}: recorded above, predicted below</h3>{_picture(s.picture)}" for s in result.scenes)
+    return f"<h2>Stage II: a law from video, in one pass</h2><p>{text}</p>{_table(head, rows)}{shown}"
+
+
+def loop_section(result: "LoopResult", folder: Path) -> str:
+    """The closed loop on the page, with a link to its own report."""
+    from neuido.demo_loop import figures
+
+    rows: list[tuple[Any, ...]] = [
+        ("what is missing (truth)", figures(result.truth)),
+        ("answer", result.words),
+        ("its figures", figures(result.parameters)),
+        ("held-out error before [mm]", 1e3 * result.before),
+        ("held-out error after [mm]", 1e3 * result.after),
+        ("floor of noise and discretisation [mm]", 1e3 * result.floor),
+    ]
+    if result.again:
+        rows.append(("answer once the effect is in the model", result.again))
+    link = html.escape(Path(os.path.relpath(result.report, folder)).as_posix())
+    text = (
+        "A block is thrown twice; its declared model lacks an effect. The residual of the best fit is traced to it: arrows, at each point, "
+        f'ten times what the model leaves unexplained. <a href="{link}">The whole diagnosis</a>.'
+    )
+    head = "<h2>The closed loop: what does the model lack?</h2>"
+    return f"{head}<p>{text}</p>{_table(('', ''), rows)}{_picture(result.picture)}"
+
+
+def _write(path: Path, body: str) -> None:
+    from neuido.data.storage import write
+
+    head = f'<meta charset="utf-8"><title>neuido demo</title><style>{STYLE}</style>'
+    write(path, f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n<h1>neuido demo</h1>\n{body}\n</body></html>\n')
+
+
+def _picture(path: Path) -> str:
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<p><img alt="{_text(path.stem)}" src="data:image/png;base64,{data}"></p>'
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    def cell(value: Any) -> str:
+        if isinstance(value, float):
+            return f'<td class="n">{value:.3g}</td>' if value == value else "<td></td>"  # a NaN: there is none
+        return f"<td>{_text(value)}</td>"
+
+    lines = ["<tr>" + "".join(f"<th>{_text(h)}</th>" for h in head) + "</tr>"] if any(head) else []
+    lines += ["<tr>" + "".join(cell(v) for v in row) + "</tr>" for row in rows]
+    return "<table>" + "\n".join(lines) + "</table>"
+
+
+def _text(value: Any) -> str:
+    return html.escape(str(value))

@@ -61,12 +61,20 @@ class LoopResult(NamedTuple):
     seconds: float
     parameters: dict[str, float]
     """Of the effects, by flat names."""
+    truth: dict[str, float]
+    """What acts and is not declared, by flat names."""
     again: str
     """The answer of a second pass on the model that came out; empty where there was none."""
     picture: Path
     """Residual, ranking and errors."""
     report: Path
     """The diagnosis' own page."""
+
+    @property
+    def words(self) -> str:
+        """The answer with its effects."""
+        names = " and ".join("|".join(names) for names in self.effects)
+        return f"{self.answer}: {names}" if names else self.answer
 
 
 def demo_loop(
@@ -107,14 +115,26 @@ def demo_loop(
         floor=(error["noise_floor"] ** 2 + error["discretisation_floor"] ** 2) ** 0.5,
         seconds=content["seconds"],
         parameters={
-            f"{e['name']}.{key}": p["value"] for e in content["effects"] for key, p in e["parameters"].items() if not isinstance(p["value"], list)
+            f"{e['name']}.{key}": p["value"]
+            for e in content["effects"]
+            for key, p in e["parameters"].items()
+            if not isinstance(p["value"], list)
         },
+        truth=dict(UNDECLARED),
         again=again,
         picture=folder / "loop.png",
         report=folder / "diagnosis" / "report.html",
     )
     draw(folder / "diagnosis", result.picture)
+    print(f"answer: {result.words} (truth: {figures(result.truth)}; found: {figures(result.parameters) or 'nothing'})")
+    print(f"held-out error: {1e3 * result.before:.3g} mm before, {1e3 * result.after:.3g} mm after; floor {1e3 * result.floor:.2g} mm")
+    print(f"picture: {result.picture}\ndiagnosis: {result.report}")
     return result
+
+
+def figures(values: Mapping[str, float]) -> str:
+    """Names and values as one line."""
+    return ", ".join(f"{name} = {value:.3g}" for name, value in values.items())
 
 
 def record(
@@ -189,9 +209,7 @@ def record(
         )
     given = {"young": BELIEVED_YOUNG} if believed is None else believed
     declared = {part: {key: given.get(key, value) for key, value in model[part].items()} for part in ("elasticity", "plasticity")}
-    made = Experiment(
-        folder.name, folder, scene, {"density": model["density"], **declared}, tuple(given) or ("young",), tuple(recordings)
-    )
+    made = Experiment(folder.name, folder, scene, {"density": model["density"], **declared}, tuple(given) or ("young",), tuple(recordings))
     write_experiment(made, folder)
     return made
 
@@ -263,7 +281,7 @@ def draw(diagnosis: Path, path: Path) -> None:
         ranks.barh([t["key"] for t in trials], [np.exp(t["gain"]) for t in trials],
                    color=[AFTER if t["name"] in kept else "0.75" for t in trials])  # fmt: skip
         ranks.axvline(1.0, color="0.3", linewidth=0.8)
-        ranks.set_xlabel("error of the declared model over that with the effect", fontsize=8)
+        ranks.set_xlabel("error before over error after", fontsize=8)
     else:
         ranks.axis("off")
     ranks.tick_params(labelsize=7)

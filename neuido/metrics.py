@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
+from neuido.physics.nearest import nearest_by_pairs
+
 
 class MedianRelativeError(Metric):
     """Median of per-sample relative errors, from a histogram of their logarithm.
@@ -44,38 +46,46 @@ class MedianRelativeError(Metric):
         return torch.where(index == 0, torch.zeros_like(median), median)
 
 
-def nearest_squared(a: Tensor, b: Tensor, chunk: int = 4096) -> Tensor:
-    """Squared distance of each point of a (P, 3) to its nearest of b (Q, 3), (P,) [unit of a, squared].
+def nearest_squared(a: Tensor, b: Tensor) -> Tensor:
+    """Squared distance of each point to its nearest in the other set [unit of a, squared].
 
-    On the CPU by a k-d tree, on a GPU by blocks of all pairs.
+    On the CPU by a k-d tree a frame, on a GPU by all pairs of all frames in one launch (`physics.nearest`).
 
     Args:
-        a: Points (P, 3).
-        b: Points (Q, 3).
-        chunk: Points of `a` at a time.
-    """
-    if not a.is_cuda:
-        from scipy.spatial import cKDTree
+        a: Points (P, 3), or of frames (..., P, 3).
+        b: Points (Q, 3), or of as many frames (..., Q, 3).
 
-        distance, _ = cKDTree(b.detach().numpy()).query(a.detach().numpy())
-        return torch.from_numpy(distance).square().to(a.dtype)
-    # Exact differences: the shortcut |a|^2 + |b|^2 - 2 a.b loses distances below 3e-4 in float32.
-    return torch.cat([torch.cdist(part, b, compute_mode="donot_use_mm_for_euclid_dist").amin(1).square() for part in a.split(chunk)])
+    Returns:
+        (P,), or (..., P).
+
+    Raises:
+        ValueError: Another number of frames, or no point in `b`.
+    """
+    if a.shape[:-2] != b.shape[:-2] or a.shape[-1] != 3 or b.shape[-1] != 3 or not b.shape[-2]:
+        raise ValueError(f"points of shapes {tuple(a.shape)} and {tuple(b.shape)}; needed (..., P, 3) and (..., Q, 3), Q >= 1")
+    frames, others = a.detach().reshape(-1, *a.shape[-2:]), b.detach().reshape(-1, *b.shape[-2:]).to(a)
+    if a.is_cuda:
+        return nearest_by_pairs(frames, others).reshape(a.shape[:-1])
+    from scipy.spatial import cKDTree
+
+    found = [torch.from_numpy(cKDTree(y.numpy()).query(x.numpy())[0]) for x, y in zip(frames, others)]
+    return torch.stack(found).square().to(a.dtype).reshape(a.shape[:-1])
 
 
 def chamfer_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Mean squared nearest distance from a (P, 3) to b (Q, 3) plus that from b to a [unit of a, squared]."""
-    return nearest_squared(a, b).mean() + nearest_squared(b, a).mean()
+    """Mean squared nearest distance from a (..., P, 3) to b (..., Q, 3) plus that from b to a, (...) [unit of a, squared]."""
+    return nearest_squared(a, b).mean(-1) + nearest_squared(b, a).mean(-1)
 
 
 def resampling_floor(points: Tensor, seed: int = 0) -> Tensor:
-    """The Chamfer distance between two random halves of a point set (P, 3): what a perfect law drawn anew would score.
+    """The Chamfer distance between two random halves of a point set (..., P, 3): what a perfect law drawn anew would score, (...).
 
     Halves are sparser than the set; nearest distances in three dimensions go with P^(-1/3), so the value is multiplied by 2^(-2/3).
+    All frames are halved alike.
     """
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed)).to(points.device)
-    half = len(points) // 2
-    return chamfer_distance(points[order[:half]], points[order[half : 2 * half]]) * 2 ** (-2 / 3)
+    count = points.shape[-2]
+    order, half = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).to(points.device), count // 2
+    return chamfer_distance(points[..., order[:half], :], points[..., order[half : 2 * half], :]) * 2 ** (-2 / 3)
 
 
 def matched_rmse(a: Tensor, b: Tensor) -> Tensor:
@@ -100,9 +110,9 @@ class ChamferDistance(Metric):
 
     def update(self, prediction: Tensor, target: Tensor) -> None:
         """Add frames: points (P, 3) and (Q, 3), or K frames of them (K, P, 3) and (K, Q, 3)."""
-        for a, b in zip(prediction.reshape(-1, *prediction.shape[-2:]), target.reshape(-1, *target.shape[-2:]), strict=True):
-            self.total += chamfer_distance(a, b).double()
-            self.frames += 1
+        distances = chamfer_distance(prediction, target)
+        self.total += distances.double().sum()
+        self.frames += distances.numel()
 
     def compute(self) -> Tensor:
         """Mean over frames times `scale`."""

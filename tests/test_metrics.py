@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from neuido.metrics import ChamferDistance, MatchedRMSE, MedianRelativeError, chamfer_distance, nearest_squared, resampling_floor
+from neuido.physics.nearest import nearest_by_pairs
 
 
 def points(count, seed):
@@ -29,10 +30,36 @@ def test_chamfer_metric_is_the_mean_over_frames_in_the_unit_of_the_paper():
     assert metric.compute().item() == pytest.approx(expected.item(), rel=1e-5)
 
 
+def frames(count, many, seed):
+    return torch.stack([points(many, seed + k) for k in range(count)])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_all_pairs_equal_the_tree(dtype):
+    """The GPU's kernel, here on the CPU; a distance of 1e-6 between points near 1 must survive, which |a|^2 + |b|^2 - 2 a.b loses."""
+    a, b = frames(3, 400, 20).to(dtype), frames(3, 330, 30).to(dtype)
+    b[:, :5] = a[:, :5] + 1e-6
+    found, expected = nearest_by_pairs(a, b), nearest_squared(a, b)
+    assert found.dtype == dtype and found.shape == (3, 400)
+    torch.testing.assert_close(found, expected, rtol=1e-5 if dtype == torch.float32 else 1e-12, atol=0)
+    assert found[:, :5].max() < 4e-12
+
+
+def test_frames_at_once_equal_frames_alone():
+    a, b = frames(4, 200, 40).view(2, 2, 200, 3), frames(4, 150, 50).view(2, 2, 150, 3)
+    for batched, alone in (
+        (chamfer_distance(a, b), [[chamfer_distance(x, y) for x, y in zip(*rows)] for rows in zip(a, b)]),
+        (resampling_floor(a), [[resampling_floor(x) for x in row] for row in a]),
+    ):
+        torch.testing.assert_close(batched, torch.tensor(alone))
+    with pytest.raises(ValueError, match="needed"):
+        chamfer_distance(a, b[:1])
+
+
 @pytest.mark.gpu
 def test_nearest_on_a_gpu_equals_the_tree():
-    a, b = points(5000, 6), points(3000, 7)
-    torch.testing.assert_close(nearest_squared(a.cuda(), b.cuda(), chunk=1024).cpu(), nearest_squared(a, b), rtol=1e-4, atol=1e-9)
+    a, b = frames(4, 5000, 6), frames(4, 3000, 60)
+    torch.testing.assert_close(nearest_squared(a.cuda(), b.cuda()).cpu(), nearest_squared(a, b), rtol=1e-5, atol=1e-12)
 
 
 def test_resampling_floor_is_the_distance_of_two_samplings():

@@ -8,6 +8,9 @@ import numpy as np
 from neuido.discrepancy.fit import Covariance
 from neuido.discrepancy.problem import Problem
 
+BOUND = 2.5
+"""Prior standard deviations that a nuisance may move by."""
+
 
 @dataclass(frozen=True, eq=False)
 class Part:
@@ -53,7 +56,15 @@ class Floor:
             return r
         A, b = N[part.rows], r[part.rows]
         w = self.noise[part.recording]
-        values = np.linalg.solve(A.T @ A / w**2 + np.eye(A.shape[1]), A.T @ b / w**2)
+        normal, right = A.T @ A / w**2 + np.eye(A.shape[1]), A.T @ b / w**2
+        values, free = np.zeros(len(right)), np.ones(len(right), bool)
+        while free.any():  # thousands of correlated data would outweigh any prior: beyond its bounds a nuisance is held there
+            values[free] = np.linalg.solve(normal[np.ix_(free, free)], right[free] - normal[np.ix_(free, ~free)] @ values[~free])
+            beyond = free & (np.abs(values) > BOUND)
+            if not beyond.any():
+                break
+            values[beyond] = np.clip(values[beyond], -BOUND, BOUND)
+            free &= ~beyond
         return r - N @ values
 
 

@@ -120,6 +120,7 @@ class AlignModule(LightningModule):
         self.operator, self.encoder = open_branch(operator, init_from, vae, **flow, **sizes)  # type: ignore[arg-type]
         self._prepared: dict[str, Prepared] = {}
         self._start: dict[str, Tensor] = {}
+        self._floors: dict[str, Tensor] = {}
         self._rows: list[dict[str, Any]] = []
         self._predicted: list[tuple[Prepared, Tensor]] = []
         self._total = 1
@@ -221,9 +222,16 @@ class AlignModule(LightningModule):
             summary["halvings"] = halvings
         except UserError as error:
             return summary | {"failed": str(error)}, [], []
-        particles = scores.score_motion(prepared, motion)
+        particles = scores.score_motion(prepared, motion, self._floor(prepared))
         pictures = scores.score_images(prepared, motion, prepared.scoring, self._lpips()) if images else []
         return summary | scores.mean_of(particles, FIGURES) | scores.mean_of(pictures, FIGURES), particles, pictures
+
+    def _floor(self, prepared: Prepared) -> Tensor | None:
+        """Measured once a scene: it depends on the truth alone."""
+        name = prepared.source.name
+        if prepared.source.truth is not None and name not in self._floors:
+            self._floors[name] = scores.floor_by_frame(prepared)
+        return self._floors.get(name)
 
     def _lpips(self):
         if not hasattr(self, "_lpips_module"):
@@ -281,7 +289,7 @@ class AlignModule(LightningModule):
                         motion, _ = roll_surely(prepared, self.operator, z)
                 except UserError:
                     continue
-                values.append(scores.mean_of(scores.score_motion(prepared, motion), ("cd",))["cd"])
+                values.append(float(scores.chamfer_by_frame(prepared, motion).mean()))
             out[f"cd_{name}_failed"] = len(candidates) - len(values)
             if values:
                 out[f"cd_{name}"] = sorted(values)[len(values) // 2]

@@ -52,12 +52,12 @@ def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None 
     if min(images.shape[-3:-1]) < 16:
         raise UserError(f"flow needs images of at least 16 pixels a side, got {images.shape[-2]} x {images.shape[-3]}")
     weights = images.new_tensor([0.299, 0.587, 0.114])
-    grey = (255 * (images.detach() @ weights)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
-    videos = grey.reshape(-1, *grey.shape[-3:])
+    videos = images.detach().flatten(0, -5) if images.ndim > 4 else images.detach()[None]
 
-    def video(frames: np.ndarray) -> np.ndarray:
+    def video(frames: Tensor) -> np.ndarray:
+        grey = [(255 * (frame @ weights)).round().clamp(0, 255).to(torch.uint8).cpu().numpy() for frame in frames]
         search = cv2.DISOpticalFlow_create(PRESETS[preset])
-        return np.stack([search.calc(a, b, None) for a, b in zip(frames, frames[1:])])
+        return np.stack([search.calc(a, b, None) for a, b in zip(grey, grey[1:])])
 
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:  # OpenCV lets go of Python meanwhile
         flows = np.stack(list(pool.map(video, videos)))
@@ -124,7 +124,7 @@ def measure(
     if cache is not None:
         key = hashlib.sha256(repr((tuple(images.shape), preset, size)).encode())
         for t in (images, masks):
-            key.update((255 * t.detach()).round().to(torch.uint8).cpu().contiguous().numpy().tobytes())
+            key.update(as_bytes(t).cpu().numpy())
         path = Path(cache) / f"flow-{key.hexdigest()[:24]}.npz"
     found = _kept(path)
     if found is None:
@@ -139,12 +139,22 @@ def measure(
     return Velocities(flow * (pixel / interval)[:, None, None, None, None], pixel * side / size, interval)
 
 
+def as_bytes(images: Tensor) -> Tensor:
+    """Images or masks in [0, 1] as bytes, (V, T, ...) uint8; frame by frame, since whole videos as floats fill gigabytes."""
+    out = torch.empty(images.shape, dtype=torch.uint8, device=images.device)
+    for view, own in zip(images.detach(), out):
+        for frame, part in zip(view, own):
+            part.copy_((255 * frame).round_())
+    return out
+
+
 def _cut(flow: Tensor, masks: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Masked flow (V, T - 1, S, S, 2) in pixels of the full image, and the sides of the windows [px], (V,)."""
     out, sides = [], []
     for each, mask in zip(flow, masks):
         top, left, side = window(mask)
-        part = (each * mask[:-1, ..., None])[:, top : top + side, left : left + side].permute(0, 3, 1, 2)
+        cut = (slice(None), slice(top, top + side), slice(left, left + side))
+        part = (each[cut] * mask[:-1][cut][..., None]).permute(0, 3, 1, 2)
         out.append(torch.nn.functional.interpolate(part, size=(size, size), mode="bilinear", antialias=True).permute(0, 2, 3, 1))
         sides.append(float(side))
     return torch.stack(out), torch.tensor(sides)

@@ -15,7 +15,7 @@ from torch import Tensor
 from neuido.data.visual import VisualScene
 from neuido.errors import UserError
 from neuido.models.encoder import DynamicsEncoder
-from neuido.models.flow import frame_interval_of
+from neuido.models.flow import as_bytes, frame_interval_of
 from neuido.models.gaussians import Binding, bind, deform, load_ply
 from neuido.models.operator import IntrinsicDynamicsOperator
 from neuido.models.splatting import render
@@ -109,8 +109,8 @@ def prepare(
         gaussians=gaussians,
         binding=bind(gaussians, simulator.state.x),
         every=every,
-        images=(255 * batch.images).round().to(torch.uint8).to(device),
-        masks=(255 * batch.masks).round().to(torch.uint8).to(device),
+        images=as_bytes(batch.images).to(device),
+        masks=as_bytes(batch.masks).to(device),
         cameras=batch.cameras._replace(viewmats=batch.cameras.viewmats.to(device), Ks=batch.cameras.Ks.to(device)),
         background=batch.background.to(device),
         training=training,

@@ -1,0 +1,177 @@
+"""Decisions on the smallest bodies that show them: one answer for each stage, and what "take the smallest fitted error" would say instead.
+
+Each case is diagnosed twice, the second time with the decision replaced: no test, no floors, in each step the effect whose fit leaves
+least. What is asserted of the first must not hold of the second.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from neuido.data.experiments import Experiment
+from neuido.data.material_tests import read_material_tests
+from neuido.data.tracks import read_tracks
+from neuido.data.undeclared.motion import Solver, move
+from neuido.demo_loop import ELASTIC, Launch, record
+from neuido.discrepancy import attribution, residual
+from neuido.discrepancy.answer import motions
+from neuido.discrepancy.attribution import Diagnosis
+from neuido.discrepancy.body import body_problem
+from neuido.discrepancy.command import restricted
+from neuido.discrepancy.material import MaterialProblem
+from neuido.discrepancy.problem import Problem
+from neuido.discrepancy.resume import CachedProblem
+from neuido.discrepancy.rounds import Inference, Round
+from neuido.discrepancy.track import track_problems
+from neuido.types import Plane, Scene
+from tests.discrepancy import made
+
+
+class SmallestError(Inference):
+    """The inference with its decision replaced."""
+
+    def is_noise(self, errors: np.ndarray) -> bool:
+        return False
+
+    def round(self, base, floor, found) -> Round:
+        result = super().round(base, floor, found)
+        result.chosen = min(result.trials, key=lambda t: t.fit.cost, default=None)
+        result.members = [result.chosen] if result.chosen else []
+        return result
+
+
+def says(d: Diagnosis) -> tuple[str, ...]:
+    """The answer, and the effects that were added."""
+    return d.answer, *(t.candidate.name for t in d.effects)
+
+
+def both(problem: Problem, effects: str, folder: Path, monkeypatch, most: int) -> tuple[Diagnosis, Diagnosis]:
+    """The diagnosis with the named candidates, and the same with the decision replaced."""
+    folder.mkdir()
+    cached = CachedProblem(restricted(problem, effects), folder)
+    sound = attribution.diagnose(cached, draws=39, most=most)
+    monkeypatch.setattr(attribution, "Inference", SmallestError)
+    return sound, attribution.diagnose(cached, draws=39, most=most)
+
+
+def over(friction: float) -> Scene:
+    """A scene with a floor."""
+    return Scene(cells=14, dt=1e-3, colliders=(Plane((0.0, 0.2, 0.0), (0.0, 1.0, 0.0), "separate", friction),))
+
+
+FREE, WEIGHTLESS = Scene(cells=14, dt=1e-3), Scene(cells=14, dt=1e-3, gravity=(0.0, 0.0, 0.0))
+FLIES = Launch("a", "fit", (1.2, 1.0, 0.3), spin=2.0), Launch("b", "held_out", (-2.0, 0.2, -0.4), spin=-2.0)
+SPINS = Launch("a", "fit", (0.0, 0.0, 0.0), spin=11.0), Launch("b", "held_out", (0.0, 0.0, 0.0), spin=-8.0)
+RINGS = Launch("a", "fit", (0.3, 0.5, 0.0), 1.0, 6.0), Launch("b", "held_out", (-0.3, 0.5, 0.0), -2.0, -8.0)
+SLIDES = (
+    Launch("a", "fit", (1.0, -0.3, 0.0), centre=(0.35, 0.36, 0.5)),
+    Launch("b", "held_out", (-1.4, -0.3, 0.3), centre=(0.65, 0.36, 0.45)),
+)
+FALLS = Launch("a", "fit", (0.2, -2.5, 0.0), centre=(0.5, 0.4, 0.5)), Launch("b", "held_out", (-0.2, -3.0, 0.2), centre=(0.5, 0.42, 0.5))
+
+
+class Case(NamedTuple):
+    """A block of 125 particles on 14 cells."""
+
+    truth: dict[str, float]
+    launches: tuple[Launch, Launch]
+    scene: Scene
+    candidates: str
+    most: int = 2
+    frames: int = 13
+    stage: str = ""
+    """Where the residual must stand out most."""
+
+
+CASES = {
+    "flight": Case({"gravity.g": 5.0}, FLIES, FREE, "gravity,uniform_acceleration", 1, 17, "flight"),
+    "rotation": Case({"drag_linear.k": 6.0}, SPINS, WEIGHTLESS, "drag_linear,viscosity_shear,stiffness_change", stage="rotation"),
+    "internal modes": Case(
+        {"viscosity_shear.eta": 200.0}, RINGS, FREE, "viscosity_shear,drag_linear,stiffness_change", 2, 13, "internal modes"
+    ),
+    "contact": Case({"friction.mu": 0.4}, SLIDES, over(0.0), "friction,drag_linear"),
+    "rest": Case({"yield.inverse": 1 / 3000}, FALLS, over(0.2), "yield,viscosity_shear"),
+}
+
+
+@pytest.mark.parametrize("stage", CASES)
+def test_each_stage_is_answered(stage, tmp_path, monkeypatch):
+    case = CASES[stage]
+    experiment = record(tmp_path / "block", case.truth, launches=case.launches, scene=case.scene, frames=case.frames)
+    sound, smallest = both(body_problem(experiment), case.candidates, tmp_path / "runs", monkeypatch, case.most)
+    ((key, value),) = case.truth.items()
+    name = key.partition(".")[0]
+    assert name in {t.candidate.name for t in sound.rounds[0].members}
+    assert says(sound)[1:] == (name,)
+    assert sound.after[key] == pytest.approx(value, rel=0.15)
+    assert sound.after["young"] == pytest.approx(6e4, rel=0.1)
+    before, after = sound.errors["before"]["b"], sound.errors["after"]["b"]
+    assert after < 1.3 * sound.floors["noise"] < before / 1.5
+    assert says(smallest)[1:] != (name,)
+    if case.stage:
+        assert telling(sound) == case.stage
+
+
+def telling(d: Diagnosis) -> str:
+    """The stage of the fitted recording in which the residual stands out most."""
+    arrays = motions(d)["a"]
+    found = residual.stages(arrays["measured"], arrays["t"], arrays["before"], arrays["after"], mass=27.0, sigma=d.rounds[0].floor.noise[0])
+    return residual.telling(found).name
+
+
+def test_nothing_is_missing(tmp_path, monkeypatch):
+    experiment = record(tmp_path / "block", {}, launches=FLIES, frames=13)
+    sound, smallest = both(body_problem(experiment), "drag_linear,gravity,viscosity_shear", tmp_path / "runs", monkeypatch, 1)
+    assert says(sound) == ("none",)
+    assert sound.errors["after"]["b"] < 1.3 * sound.floors["noise"]
+    assert says(smallest) != ("none",)
+
+
+def test_what_no_effect_explains_is_unknown(tmp_path, monkeypatch):
+    """A body that swells: no effect of the library, and many times the floor."""
+    experiment = swollen(record(tmp_path / "block", {}, launches=FLIES, frames=13), 3.0)
+    sound, smallest = both(body_problem(experiment), "drag_linear,gravity", tmp_path / "runs", monkeypatch, 1)
+    assert says(sound) == ("unknown",)
+    assert says(smallest) != ("unknown",)
+
+
+def swollen(experiment: Experiment, rate: float) -> Experiment:
+    """The same launches of a body whose natural volume grows as exp(rate t)."""
+    bodies = [r.body for r in experiment.recordings]
+    interval, frames = experiment.recordings[0].frame_interval, len(experiment.recordings[0].t)
+    solver = Solver("same", experiment.scene.cells, experiment.scene.dt)
+    motion = move(solver, experiment.scene, bodies, ELASTIC, {"swelling.rate": rate}, seconds=(frames - 1) * interval, interval=interval)
+    rng = np.random.default_rng(4)
+    made = []
+    for r, x in zip(experiment.recordings, motion.x, strict=True):
+        seen = x[:, r.track.numpy()]
+        made.append(replace(r, x=torch.from_numpy(seen + r.noise * rng.standard_normal(seen.shape)).float()))
+    return replace(experiment, recordings=tuple(made))
+
+
+def material_test(folder: Path) -> Problem:
+    made.material_test(folder)
+    return MaterialProblem(read_material_tests(folder))
+
+
+def track(folder: Path) -> Problem:
+    made.track(folder)
+    return track_problems(read_tracks(folder))[0]
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "candidates"),
+    [
+        (material_test, "strain_stiffening", "strain_stiffening,second_invariant"),
+        (track, "drag_quadratic", "drag_linear,drag_quadratic,gravity"),
+    ],
+)
+def test_tests_and_tracks(make: Callable[[Path], Problem], name, candidates, tmp_path, monkeypatch):
+    sound, smallest = both(make(tmp_path / "measured"), candidates, tmp_path / "runs", monkeypatch, 2)
+    assert says(sound) == ("effect", name)
+    assert says(smallest) != ("effect", name)
