@@ -30,7 +30,7 @@ LIGHT = {  # name: (module, function, one line for the list); the module must im
     "simulate": ("neuido.simulate", "simulate", "Generate the trajectories of Stage I, or filmed scenes."),
     "reconstruct": ("neuido.reconstruct", "reconstruct", "Gaussians and particles of a filmed body's first frame."),
     "diagnose": ("neuido.discrepancy.command", "diagnose", "Find the effect that a model lacks, from measured motion."),
-    "demo": ("neuido.demo", "demo", "Train on small simulated bodies and compare the learned laws with the true ones."),
+    "demo": ("neuido.demo", "demo", "Learn laws from bodies and from video, and find an effect that a model lacks."),
     "film": ("neuido.models.film", "film", "Film simulated bodies of many materials, for the video encoder."),
     "doctor": ("neuido.doctor", "doctor", "Print versions and devices, and run a small rollout on each device."),
 }
@@ -103,7 +103,7 @@ def run_lightning(args: list[str]) -> "LightningCLI":
     """Run a command of the trainer; the model, the data module and the trainer are attributes of what it returns."""
     _quiet_lightning()
     from lightning.pytorch import LightningDataModule, LightningModule
-    from lightning.pytorch.cli import LightningCLI
+    from lightning.pytorch.cli import LightningCLI, SaveConfigCallback
 
     for module in MODULES:
         importlib.import_module(module)
@@ -122,6 +122,11 @@ def run_lightning(args: list[str]) -> "LightningCLI":
             if options.get("weights_only") is None:
                 options["weights_only"] = True
 
+    class BesideTheLog(SaveConfigCallback):
+        def setup(self, trainer, pl_module, stage):  # without a log it would write into the current folder, and refuse to a second time
+            if trainer.loggers:
+                super().setup(trainer, pl_module, stage)
+
     parser = {"exit_on_error": False}  # raise argparse.ArgumentError instead of 100 lines of usage
     return NeuidoCLI(
         LightningModule,
@@ -130,6 +135,7 @@ def run_lightning(args: list[str]) -> "LightningCLI":
         subclass_mode_data=True,
         auto_configure_optimizers=False,
         seed_everything_default=0,
+        save_config_callback=BesideTheLog,
         parser_kwargs={"prog": "neuido", "version": neuido.__version__, **parser, **{name: dict(parser) for name in HEAVY}},
         args=args,
     )
