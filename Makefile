@@ -16,7 +16,7 @@ installed := $(VENV)/.installed
 .DEFAULT_GOAL := help
 
 help:
-	@echo 'make demo      install, then train on small simulated bodies: CPU, a few minutes'
+	@echo 'make demo      install, then learn laws from bodies and video and close one loop: CPU, minutes'
 	@echo 'make test      run the tests'
 	@echo 'make test-slow, test-gpu, lint, format, types, venv, clean'
 

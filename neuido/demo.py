@@ -126,8 +126,8 @@ def loop_section(result: "LoopResult", folder: Path) -> str:
         rows.append(("answer once the effect is in the model", result.again))
     link = html.escape(Path(os.path.relpath(result.report, folder)).as_posix())
     text = (
-        "A block is thrown twice; its declared model lacks an effect. The residual of the best fit is traced to it: arrows, at each point, "
-        f'ten times what the model leaves unexplained. <a href="{link}">The whole diagnosis</a>.'
+        "A block is thrown twice; its declared model lacks an effect. The residual of the best fit (arrows, at each point) is "
+        f'traced to it. <a href="{link}">The whole diagnosis</a>.'
     )
     head = "<h2>The closed loop: what does the model lack?</h2>"
     return f"{head}<p>{text}</p>{_table(('', ''), rows)}{_picture(result.picture)}"

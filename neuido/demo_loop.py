@@ -251,18 +251,20 @@ def draw(diagnosis: Path, path: Path) -> None:
     figure.suptitle(f"{content['answer']}{': ' if found else ''}{found}", fontsize=11)
     left, right = figure.subfigures(1, 2, width_ratios=(2.6, 1.0))
     panels = left.subplots(len(names), 3, squeeze=False)
+    longest = max(float(np.nanmax(np.abs(m["measured"][-1] - m["before"][-1]))) for m in motions.values())
+    times = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n * longest < 0.15), default=1)
     for row, name in zip(panels, names, strict=True):
         m = motions[name]
         rest = {when: m["measured"] - m[when] for when in ("before", "after")}
         for panel, when in zip(row, rest, strict=False):
             place, arrow = m["measured"][-1], rest[when][-1]
             panel.scatter(place[:, 0], place[:, 1], s=6, color="0.75", linewidths=0)
-            panel.quiver(place[:, 0], place[:, 1], 10 * arrow[:, 0], 10 * arrow[:, 1],
+            panel.quiver(place[:, 0], place[:, 1], times * arrow[:, 0], times * arrow[:, 1],
                          angles="xy", scale_units="xy", scale=1, width=4e-3, color={"before": BEFORE, "after": AFTER}[when])  # fmt: skip
             own = 1e3 * error[when]["by_recording"][name]
-            panel.set_title(f"{name}, {when}: {own:.2f} mm\nresidual in the last frame, 10 times", fontsize=8)
+            panel.set_title(f"{name}, {when}: {own:.2f} mm\nresidual in the last frame, times {times}", fontsize=8)
             panel.set(aspect="equal", xlabel="x [m]")
-            panel.margins(0.25)
+            panel.margins(0.35)
         row[0].set_ylabel("y [m]", fontsize=8)
         for when, colour in (("before", BEFORE), ("after", AFTER)):
             square = (rest[when] ** 2).sum(-1)

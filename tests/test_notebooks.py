@@ -1,0 +1,63 @@
+"""The notebooks run from top to bottom, at a small size, as scripts."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+
+import neuido
+
+ROOT = Path(neuido.__file__).parents[1]
+
+
+def execute(name: str, out: Path, **environment: str) -> str:
+    """Run a notebook as a script; what it printed."""
+    own = {"MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1", "NEUIDO_NOTEBOOK_SMALL": "1", "NEUIDO_NOTEBOOK_OUT": str(out), **environment}
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    command = [sys.executable, str(ROOT / "notebooks" / f"{name}.py")]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path, **own}, cwd=out.parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def closed_loop(tmp_path_factory):
+    """The folder of a run without measured data, and what it printed."""
+    out = tmp_path_factory.mktemp("notebook") / "out"
+    return out, execute("closed_loop", out, NEUIDO_DATA="")
+
+
+def test_closed_loop(closed_loop):
+    out, printed = closed_loop
+    answer, again = (line for line in printed.splitlines() if "held-out error" in line)
+    assert answer.startswith(("effect: drag_linear", "class: drag_linear"))
+    assert again.startswith("none; ")
+    assert "set NEUIDO_DATA" in printed
+    assert matplotlib.image.imread(out / "block.png").std() > 0.05
+    assert not (out / "rubber.png").exists()
+
+
+def test_closed_loop_cells_are_well_formed():
+    """Every cell begins with the marker of the percent format, and each one compiles alone."""
+    text = (ROOT / "notebooks" / "closed_loop.py").read_text()
+    cells = text.split("\n# %%")[1:]
+    assert sum(cell.startswith(" [markdown]") for cell in cells) >= 5
+    for cell in cells:
+        kind, _, body = cell.partition("\n")
+        if kind == " [markdown]":
+            assert all(not line or line.startswith("#") for line in body.splitlines())
+        else:
+            compile(body, "cell", "exec")
+
+
+def test_closed_loop_on_rubber(data_root, tmp_path):
+    """The real case: stiffening, and a much better extrapolation."""
+    execute("closed_loop", tmp_path / "out", NEUIDO_DATA=str(data_root))
+    content = json.loads((tmp_path / "out" / "rubber" / "diagnosis.json").read_text())
+    assert "strain_stiffening" in content["effects"][0]["class"]
+    assert content["error"]["after"]["held_out"] < 0.2 * content["error"]["before"]["held_out"]
+    assert matplotlib.image.imread(tmp_path / "out" / "rubber.png").std() > 0.05
