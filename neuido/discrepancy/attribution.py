@@ -53,12 +53,14 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         most: Effects that may be added.
         tell: Called with a line of progress.
     """
-    tried = [Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell) for n in problem.solvers]
+    tried: list[Inference] = []
     starts: list[Start] = []
-    for inference in tried:
+    for n in problem.solvers:
+        inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell)
+        if starts and (tried[-1].is_noise(starts[-1].errors) or not inference.runs(starts[0].fit.point)):
+            continue
+        tried.append(inference)
         starts.append(inference.start(starts[0].fit.point if starts else None))
-        if inference.is_noise(starts[-1].errors):
-            break
     at_noise = [i for i, start in enumerate(starts) if tried[i].is_noise(start.errors)]
     rounds: list[Round] = []
     if at_noise:

@@ -181,6 +181,10 @@ class Inference:
         fit = self.base([fit.point], floor)
         return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
 
+    def runs(self, point: Point) -> bool:
+        """Whether every recording can be predicted there: finite elements tangle where sand flows."""
+        return all(bool(np.isfinite(self.problem.predict([point], p.recording, self.setting)).all()) for p in self.parts)
+
     def is_noise(self, errors: np.ndarray) -> bool:
         """Whether nothing but noise is left in any part."""
         return bool(np.all(errors < NOISE_ALONE * np.array([self.noise_of(p.recording) ** 2 for p in self.parts])))
