@@ -5,14 +5,13 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
 from neuido.data.films import FlowBatch
 from neuido.errors import UserError
 from neuido.models.flow import encode_flow
 from neuido.models.flow_vae import FlowVAE
-from neuido.models.pretrain import run_length
+from neuido.models.training import publish, run_length
 
 
 class FlowVAEModule(LightningModule):
@@ -100,13 +99,5 @@ class FlowVAEModule(LightningModule):
         self.vae.scale.fill_(max(squares / count - (total / count) ** 2, 1e-12) ** -0.5)
 
     def on_train_end(self) -> None:
-        self._publish()
-
-    @rank_zero_only
-    def _publish(self) -> None:
-        figures = {k: float(v) for k, v in self.trainer.callback_metrics.items() if k.startswith("val/")}
-        for name, value in figures.items():
-            self.print(f"{name:40s} {value:.4g}")
-        if self.hparams.save_to is not None:
-            flow = {"flow_encoding": self.hparams.flow_encoding, "speed_scale": self.hparams.speed_scale}
-            self.vae.save(self.hparams.save_to, {"steps": self.global_step, "flow": flow, "figures": figures})
+        flow = {"flow_encoding": self.hparams.flow_encoding, "speed_scale": self.hparams.speed_scale}
+        publish(self, self.vae.save, {"steps": self.global_step, "flow": flow})
