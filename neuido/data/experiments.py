@@ -16,13 +16,12 @@ from torch import Tensor
 from neuido.data import scenes
 from neuido.data.formats import nerfstudio
 from neuido.data.formats.layout import MultiView, inside, number
-from neuido.data.measured import read_effects
+from neuido.data.measured import read_effects, read_free, read_role
 from neuido.errors import UserError
 from neuido.physics.effects import LIBRARY
 from neuido.types import Body, Box, Plane, Scene, Walls
 
 FORMAT = "neuido-experiment/1"
-ROLES = ("fit", "held_out")
 OVERRIDES = ("gravity", "attached_masses", "colliders")
 NEEDED, OPTIONAL = ("x", "t", "x0", "v0", "volume"), ("F0", "track", "anchor")
 
@@ -191,24 +190,17 @@ def _model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
             _text(given[part].get("law"), f"model.{part}.law")
     model = scenes.model_from_dict(given)
     known = ["density", *(key for part in ("elasticity", "plasticity") for key in model[part] if key != "law")]
-    if not isinstance(free, list):
-        raise UserError(f"model.free must be a list of parameters, got {free!r}")
-    for key in free:
-        if key not in known:
-            raise UserError(f"model.free has {key!r}, which the model lacks; one of {', '.join(known)}")
-    if len(set(free)) < len(free):
-        raise UserError(f"model.free names a parameter twice: {free}")
+    free = read_free(free, tuple(known))
     if effects:
         model["effects"] = effects
-    return model, tuple(free)
+    return model, free
 
 
 def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path) -> Recording:
     scenes._keys(entry, where, ("name", "role", "frame_interval", "noise", *OVERRIDES), ("noise", *OVERRIDES))
     name = _text(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
-    if entry["role"] not in ROLES:
-        raise UserError(f"{where}.role = {entry['role']!r} is not known; one of {', '.join(ROLES)}")
+    role = read_role(entry["role"], where)
     interval = number(entry["frame_interval"], f"{where}.frame_interval", above=0.0)
     noise = number(entry["noise"], f"{where}.noise", least=0.0) if entry.get("noise") is not None else None
     merged = dict(content["scene"]) | {key: entry[key] for key in OVERRIDES if key in entry}
@@ -230,7 +222,7 @@ def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path)
     gaussians = own / "gaussians.ply"
     return Recording(
         name=name,
-        role=entry["role"],
+        role=role,
         scene=scene,
         frame_interval=interval,
         noise=noise,

@@ -1,4 +1,4 @@
-"""What the readers of measured tables share: columns of a CSV file, effects that a model declares, roles. The files are not trusted."""
+"""What the readers of measured data share: columns of a CSV file, effects that a model declares, roles. The files are not trusted."""
 
 import csv
 from collections.abc import Mapping

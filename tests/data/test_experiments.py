@@ -133,7 +133,7 @@ def test_scene_to_dict():
         ("density: 1000.0", "density: heavy", "model.density must be a finite number"),
         ("free: [young, yield_stress]", "free: [young, friction_angle]", "model.free has 'friction_angle'"),
         ("free: [young, yield_stress]", "free: young", "model.free must be a list"),
-        ("free: [young, yield_stress]", "free: [young, young]", "names a parameter twice"),
+        ("free: [young, yield_stress]", "free: [young, young]", "names a figure twice"),
         ("role: fit", "role: train", r"recordings\[0\] \(drop\).role = 'train'"),
         ("noise: 0.0005", "noise: -1", r"recordings\[0\] \(drop\).noise must be at least 0"),
         ("noise: 0.0005", "nois: 1", r"unknown key 'nois' in recordings\[0\]"),
