@@ -17,8 +17,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
+from neuido.data.families import laws
 from neuido.data.films import Clip, FilmDataModule
-from neuido.data.generate import laws
 from neuido.errors import UserError
 from neuido.models.branch import open_branch, small_strain_modulus
 from neuido.models.flow import Velocities

@@ -8,8 +8,8 @@ import pytest
 import torch
 from lightning.pytorch import Trainer, seed_everything
 
+from neuido.data.families import laws
 from neuido.data.films import FilmDataModule, read_clip
-from neuido.data.generate import laws
 from neuido.errors import UserError
 from neuido.models.encoder import DynamicsEncoder
 from neuido.models.film import film
