@@ -15,6 +15,7 @@ from neuido.physics.laws import material
 from neuido.physics.mpm import Simulator
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
 from tests.data import samples
+from tests.data.refused import assert_refused
 
 S = samples.Sample()
 
@@ -155,12 +156,7 @@ def test_scene_to_dict():
     ],
 )
 def test_malformed_yaml(folder, old, new, message):
-    file = folder / "experiment.yaml"
-    assert file.read_text().count(old) >= 1
-    file.write_text(file.read_text().replace(old, new, 1))
-    with pytest.raises(UserError, match=message) as caught:
-        read_experiment(folder)
-    assert "\n" not in str(caught.value) and "experiment.yaml" in str(caught.value)
+    assert_refused(read_experiment, folder / "experiment.yaml", old, new, message)
 
 
 def wrong(key: str, change):
