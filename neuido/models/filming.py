@@ -82,18 +82,23 @@ class Clip(NamedTuple):
     cameras: Cameras
 
 
-def make(plan: Plan, out: str | os.PathLike, *, device: str = "auto", batch: int = 0, progress: bool = True) -> None:
-    """Make what is missing of the clips, and the index when none is missing any more."""
+def make(
+    plan: Plan, out: str | os.PathLike, *, device: str = "auto", batch: int = 0, shard: int = 0, shards: int = 1, progress: bool = True
+) -> None:
+    """Make what is missing of a shard's clips; whoever finds none missing any more writes the index."""
     folder, chosen = Path(out), choose_device(device)
+    if not 0 <= shard < shards:
+        raise UserError(f"shard = {shard} must be from 0 to shards - 1 = {shards - 1}")
     if batch < 0:
         raise UserError(f"batch must be 0 (automatic) or positive, got {batch}")
     text = json.dumps({"format": FORMAT, "plan": asdict(plan)}, indent=1) + "\n"
     claim(folder, text, "clips of another set-up", compared="plan")
     names = [f"clip-{i:05d}" for i in range(plan.count)]
-    missing = [i for i, name in enumerate(names) if not complete(folder / f"{name}.npz")]
+    own = range(shard, plan.count, shards)
+    missing = [i for i in own if not complete(folder / f"{names[i]}.npz")]
     size = batch or (16 if chosen.type == "cuda" else 1)
     kinds = list(plan.families)
-    with tqdm(total=plan.count, initial=plan.count - len(missing), unit="clip", disable=not progress) as bar:
+    with tqdm(total=len(own), initial=len(own) - len(missing), unit="clip", disable=not progress) as bar:
         for k in range(len(kinds)):
             wanted = [i for i in missing if i % len(kinds) == k]
             for start in range(0, len(wanted), size):
@@ -102,7 +107,7 @@ def make(plan: Plan, out: str | os.PathLike, *, device: str = "auto", batch: int
                     shots = shoot(plan, group, chosen)
                     list(pool.map(lambda pair: _finish(plan, folder, *pair), zip(group, shots)))
                 bar.update(len(group))
-    if missing or not (folder / "index.json").exists():
+    if (missing or not (folder / "index.json").exists()) and all(complete(folder / f"{name}.npz") for name in names):
         entries = []
         for i, name in enumerate(names):
             family, parameters = _material(plan, np.random.default_rng([plan.seed, i]), i)
@@ -193,8 +198,11 @@ def _material(plan: Plan, random: np.random.Generator, number: int) -> tuple[str
 
 
 def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, float]:
-    """Points (P, 3) of a ball, box, cylinder or a union of three ellipsoids about the origin, turned at random, and their volume [m^3]."""
-    kind = random.choice(["ball", "box", "cylinder", "blob"])
+    """Points (P, 3) of a ball, box, cylinder or a union of ellipsoids about the origin, turned at random, and their volume [m^3].
+
+    Half of all bodies are unions: three thick ellipsoids, or a trunk with four thin limbs, since those bend long before the trunk yields.
+    """
+    kind = random.choice(["ball", "box", "cylinder", "blob", "limbs", "limbs"])
     half = random.uniform(0.09, 0.24, 3)
     points = random.uniform(-1, 1, (max(20_000, 25 * particles), 3))
     if kind == "ball":
@@ -203,6 +211,9 @@ def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, flo
         inside = np.ones(len(points), dtype=bool)
     elif kind == "cylinder":
         inside = points[:, 0] ** 2 + points[:, 2] ** 2 < 1
+    elif kind == "limbs":
+        half = random.uniform(0.17, 0.3, 3)
+        inside = (((points / random.uniform(0.3, 0.6, 3)) ** 2).sum(1) < 1) | _limbs(random, points)
     else:
         centres, radii = random.uniform(-0.45, 0.45, (3, 3)), random.uniform(0.35, 0.55, (3, 1, 3))
         inside = ((((points - centres[:, None]) / radii) ** 2).sum(2) < 1).any(0)
@@ -214,6 +225,15 @@ def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, flo
     cell = np.unique(place @ np.array([10**10, 10**5, 1]), return_index=True)[1]
     turn, _ = np.linalg.qr(random.standard_normal((3, 3)))
     return filled[cell] @ turn, volume
+
+
+def _limbs(random: np.random.Generator, points: np.ndarray) -> np.ndarray:
+    """Which points lie in one of four capsules that stick out of the origin."""
+    tips = random.standard_normal((4, 3))
+    tips *= random.uniform(0.5, 0.95, (4, 1)) / np.linalg.norm(tips, axis=1, keepdims=True)
+    along = np.clip(points @ tips.T / (tips**2).sum(1), 0, 1)
+    distance = np.linalg.norm(points[:, None] - along[..., None] * tips, axis=2)
+    return (distance < random.uniform(0.12, 0.3, 4)).any(1)
 
 
 def _texture(random: np.random.Generator, body: Body, volume: float) -> Gaussians:

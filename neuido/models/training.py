@@ -32,17 +32,23 @@ def figures_of(module: LightningModule) -> dict[str, float]:
 
 
 @rank_zero_only
-def publish(module: LightningModule, save: Callable[[str, dict[str, Any]], None], card: Mapping[str, Any]) -> None:
-    """Print the figures of the last validation and, where `save_to` names a file, write what was trained.
+def publish(
+    module: LightningModule,
+    save: Callable[[str, dict[str, Any]], None],
+    card: Mapping[str, Any],
+    figures: Mapping[str, float] | None = None,
+) -> None:
+    """Print the figures of a validation and, where `save_to` names a file, write what was trained.
 
     Args:
         module: At the end of its fit; it has the hyperparameter `save_to`.
         save: Takes the file and its card.
         card: What the card says beside the figures.
+        figures: By names that begin with `val/`; those of the last validation where absent.
     """
-    figures = figures_of(module)
+    figures = figures_of(module) if figures is None else figures
     for name, value in figures.items():
         if name.count("/") == 1:  # not of single scenes
             module.print(f"{name:40s} {value:.4g}")
     if module.hparams.save_to is not None:
-        save(module.hparams.save_to, {**card, "figures": figures})
+        save(module.hparams.save_to, {**card, "figures": dict(figures)})
