@@ -80,8 +80,8 @@ def test_rollout_gradient_equals_finite_differences():
     gradients = torch.autograd.grad(p.loss(p.sim.rollout, 6, 2)[0], p.leaves())
     for name, t, gradient in zip(NAMES, p.leaves(), gradients, strict=True):
         direction = torch.randn(t.shape, generator=torch.Generator().manual_seed(9), dtype=t.dtype).to(t.device)
-        # relative steps; the loss is piecewise smooth and this one stays on its piece
-        h = 1e-5 * float(t.detach().norm() / direction.norm())
+        # relative steps; the loss is piecewise smooth in x and F, and a short step stays on its piece; elsewhere a long one rounds off less
+        h = (1e-5 if name in "xF" else 1e-4) * float(t.detach().norm() / direction.norm())
         with torch.no_grad():
             values = []
             for shift in (-2, -1, 1, 2):
