@@ -23,6 +23,9 @@ LOCKED = 0.05
 GAP = 1e-6
 """Lower bound of sigma_i + sigma_j in a denominator; only an inverted F can come near it."""
 
+FLAT = 0.1
+"""det F below which a stretch is taken from the principal frame."""
+
 
 class LawKernels(NamedTuple):
     """The kernels for one scalar type. `kinds` (S,) int32, `params` (S, n); a particle of scene s reads row min(s, S - 1)."""
@@ -51,6 +54,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     vec = wp.types.vector(3, real)
     floor = wp.constant(real(FLOOR))
     gap = wp.constant(real(GAP))
+    flat = wp.constant(real(FLAT))
     zero = wp.constant(real(0.0))
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
@@ -58,7 +62,29 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     own = warp_linalg.functions(real, builtin_svd=builtin_svd)
     log1p, exp_slope, strain, volume_change, cofactor = own.log1p, own.exp_slope, own.strain, own.volume_change, own.cofactor
     frame, compose, bounded, hencky = own.frame, own.compose, own.bounded, own.hencky
-    inverse_stretch, log_difference = own.inverse_stretch, own.log_difference
+    inverse_stretch, log_difference, stretch = own.inverse_stretch, own.log_difference, own.stretch
+
+    @wp.func
+    def corotated_in_frame(Fp: mat, mu: real, lam: real):
+        U, d, _V = frame(Fp)
+        dJ = d[0] + d[1] + d[2] + d[0] * d[1] + d[0] * d[2] + d[1] * d[2] + d[0] * d[1] * d[2]
+        bulk = lam * (one + dJ) * dJ
+        k = two * mu
+        return compose(U, vec(k * (one + d[0]) * d[0] + bulk, k * (one + d[1]) * d[1] + bulk, k * (one + d[2]) * d[2] + bulk))
+
+    @wp.func
+    def corotated_by_stretch(Fp: mat, mu: real, lam: real):
+        """tau = 2 mu (V^2 - V) + lambda J (J - 1) I, without a frame: a fifth of the time."""
+        dJ = volume_change(Fp)
+        out = mat()
+        if one + dJ > flat:
+            E = strain(Fp)
+            out = (two * mu) * (E - stretch(E, dJ)) + (lam * (one + dJ) * dJ) * wp.identity(n=3, dtype=real)
+        else:
+            out = corotated_in_frame(Fp, mu, lam)
+        return out
+
+    corotated = corotated_in_frame if builtin_svd else corotated_by_stretch
 
     @wp.kernel(enable_backward=enable_backward, module="unique")
     def stress(
@@ -77,18 +103,14 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
         if kind == NEO_HOOKEAN:
             dJ = bounded(volume_change(Fp))
             tau[p] = mu * strain(Fp) + (lam * log1p(dJ)) * wp.identity(n=3, dtype=real)
+        elif kind == FIXED_COROTATED:
+            tau[p] = corotated(Fp, mu, lam)
         else:
             U, d, _V = frame(Fp)
-            if kind == FIXED_COROTATED:
-                dJ = d[0] + d[1] + d[2] + d[0] * d[1] + d[0] * d[2] + d[1] * d[2] + d[0] * d[1] * d[2]
-                bulk = lam * (one + dJ) * dJ
-                k = two * mu
-                tau[p] = compose(U, vec(k * (one + d[0]) * d[0] + bulk, k * (one + d[1]) * d[1] + bulk, k * (one + d[2]) * d[2] + bulk))
-            else:
-                e = hencky(d)
-                bulk = lam * (e[0] + e[1] + e[2])
-                k = two * mu
-                tau[p] = compose(U, vec(k * e[0] + bulk, k * e[1] + bulk, k * e[2] + bulk))
+            e = hencky(d)
+            bulk = lam * (e[0] + e[1] + e[2])
+            k = two * mu
+            tau[p] = compose(U, vec(k * e[0] + bulk, k * e[1] + bulk, k * e[2] + bulk))
 
     @wp.kernel(enable_backward=False, module="unique")
     def stress_adjoint(
