@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Parameter, Point, Problem
 
 STEP = 0.02
@@ -131,7 +132,7 @@ def _bound(p: Parameter, value: float) -> float:
 
 
 def run(
-    problem: Problem,
+    problem: Problem | Memo,
     requests: Sequence[Request],
     whiten: Callable[[np.ndarray, int], np.ndarray],
     recordings: Sequence[int],
@@ -171,7 +172,7 @@ def run(
 
 
 def residuals(
-    problem: Problem, points: Sequence[Point], whiten: Callable[[np.ndarray, int], np.ndarray], recordings: Sequence[int], setting: int = 0
+    problem: Problem | Memo, points: Sequence[Point], whiten: Callable[[np.ndarray, int], np.ndarray], recordings: Sequence[int], setting: int = 0
 ) -> list[np.ndarray | None]:
     """Whitened residuals of each point over the recordings, joined; None where one of them cannot run."""
     parts: list[list[np.ndarray]] = [[] for _ in points]

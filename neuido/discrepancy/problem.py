@@ -111,6 +111,10 @@ class Problem:
         """The data that each point predicts, (len(points), n); a row of NaN where the model cannot run there."""
         raise NotImplementedError
 
+    def effort(self, recording: int, setting: int = 0) -> float:
+        """What one prediction costs, in a unit of the model's own (particle-substeps of a body); data where that says enough."""
+        return float(len(self.recordings[recording].y))
+
     def directions(self, recording: int) -> np.ndarray:
         """Smooth patterns in which an unknown part of the discretisation error may lie, (n, k), of mean square one together."""
         return np.empty((len(self.recordings[recording].y), 0))

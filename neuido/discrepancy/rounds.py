@@ -14,6 +14,7 @@ import numpy as np
 from neuido.discrepancy import evidence
 from neuido.discrepancy.fit import Fit, levenberg_marquardt, run
 from neuido.discrepancy.floors import Floor, Part, over_time, split
+from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
 
 ALPHA = 0.05
@@ -89,14 +90,23 @@ class Inference:
         draws: Of the bootstrap.
         seed: Of the draws.
         tell: Called with a line of progress.
+        memo: Predictions that are shared with the inferences of other settings.
     """
 
     def __init__(
-        self, problem: Problem, *, setting: int = 0, keep: int = 7, draws: int = 199, seed: int = 0, tell: Tell | None = None
+        self,
+        problem: Problem,
+        *,
+        setting: int = 0,
+        keep: int = 7,
+        draws: int = 199,
+        seed: int = 0,
+        tell: Tell | None = None,
+        memo: Memo | None = None,
     ) -> None:
         self.problem, self.setting, self.keep, self.draws, self.seed = problem, setting, keep, draws, seed
         self.tell = tell or (lambda line: None)
-        self.evaluations = 0
+        self.memo = memo or Memo(problem)
         self.parts = split(problem)
         self.fitted = [p.fitted for p in self.parts]
 
@@ -106,17 +116,17 @@ class Inference:
         rows = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
 
         def tick(count: int) -> None:
-            self.evaluations += count * len(rows)
-            self.tell(f"{self.evaluations} simulations")
+            self.tell(f"{self.memo.simulations} simulations")
 
-        return run(self.problem, requests, floor.whitener(self.parts), rows, setting=self.setting, tick=tick)
+        with self.memo.during("fits"):
+            return run(self.memo, requests, floor.whitener(self.parts), rows, setting=self.setting, tick=tick)
 
     def mean_squares(self, points: Sequence[Point], floor: Floor) -> list[np.ndarray]:
         """Of each part, at several points, the nuisances at their most probable values."""
         found = np.full((len(points), len(self.parts)), np.inf)
         for n in dict.fromkeys(p.recording for p in self.parts):
-            rows = self.problem.predict(points, n, self.setting) - self.problem.recordings[n].y
-            self.evaluations += len(points)
+            with self.memo.during("errors of fits"):
+                rows = self.memo.predict(points, n, self.setting) - self.problem.recordings[n].y
             for j, part in enumerate(self.parts):
                 if part.recording == n:
                     for i, row in enumerate(rows):
@@ -147,9 +157,9 @@ class Inference:
             return replace(plain, nuisances=self.nuisances(point, list(plain.noise)))
         differences, spread, weight = {}, {}, {}
         for n in plain.noise:
-            here = self.problem.predict([point], n, self.setting)[0]
-            there = [self.problem.predict([point], n, s)[0] for s in others]
-            self.evaluations += 1 + len(others)
+            with self.memo.during("discretisation"):
+                here = self.memo.predict([point], n, self.setting)[0]
+                there = [self.memo.predict([point], n, s)[0] for s in others]
             D = np.stack([t - here for t in there if np.isfinite(t).all()] or [np.zeros_like(here)], axis=1)
             differences[n] = D
             spread[n] = over_time(np.sqrt(np.mean(D**2, axis=1)), self.problem.recordings[n].times)
@@ -183,7 +193,7 @@ class Inference:
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows."""
-        return all(bool(np.isfinite(self.problem.predict([point], p.recording, self.setting)).all()) for p in self.parts)
+        return all(bool(np.isfinite(self.memo.predict([point], p.recording, self.setting)).all()) for p in self.parts)
 
     def is_noise(self, errors: np.ndarray) -> bool:
         """Whether nothing but noise is left in any part."""
@@ -205,9 +215,8 @@ class Inference:
                     places.append((c.key, i))
         out: dict[tuple[str, int], dict[int, np.ndarray]] = {place: {} for place in places}
         for n in recordings:
-            here = self.problem.predict([point], n, self.setting)[0]
-            rows = self.problem.predict(asked, n, self.setting)
-            self.evaluations += len(asked) + 1
+            with self.memo.during("screening"):
+                here, *rows = self.memo.predict([point, *asked], n, self.setting)
             self.tell(f"directions of {len(asked)} effects in {self.problem.recordings[n].name}")
             for place in out:
                 out[place][n] = np.stack([row - here for row, p in zip(rows, places, strict=True) if p == place], axis=1)
@@ -223,8 +232,8 @@ class Inference:
             asked += [dict(point) | {p.name: end} for end in ends]
             spans.append(max(p.coordinate(ends[0]) - p.coordinate(ends[1]), 1e-9))
         for n in recordings:
-            rows = self.problem.predict(asked, n, self.setting) if asked else np.empty((0, len(self.problem.recordings[n].y)))
-            self.evaluations += len(asked)
+            with self.memo.during("slopes"):
+                rows = self.memo.predict(asked, n, self.setting)
             parts = [(rows[2 * i] - rows[2 * i + 1]) / span for i, span in enumerate(spans)]
             out[n] = np.stack([np.where(np.isfinite(part), part, 0.0) for part in parts], axis=1) if parts else np.empty((rows.shape[1], 0))
         return out
@@ -265,7 +274,7 @@ class Inference:
         return ranked, columns
 
     def residual(self, point: Point, n: int) -> np.ndarray:
-        return self.problem.predict([point], n, self.setting)[0] - self.problem.recordings[n].y
+        return self.memo.predict([point], n, self.setting)[0] - self.problem.recordings[n].y
 
     def weighted(self, columns: np.ndarray, part: Part, floor: Floor) -> np.ndarray:
         w = floor.weight[part.recording][part.rows]
@@ -406,8 +415,8 @@ class Inference:
             name = self.problem.recordings[n].name
             own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{name}")]
             moved = [dict(point) | {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + p.prior)} for p in own]
-            rows = self.problem.predict([point, *moved], n, self.setting)
-            self.evaluations += len(rows)
+            with self.memo.during("nuisances"):
+                rows = self.memo.predict([point, *moved], n, self.setting)
             out[n] = (
                 np.stack([np.where(np.isfinite(row).all(), row - rows[0], 0.0) for row in rows[1:]], axis=1)
                 if own

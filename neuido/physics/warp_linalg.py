@@ -45,6 +45,12 @@ class Functions(NamedTuple):
     """max(x, FLOOR - 1), NaN kept"""
     stretch: Any
     """(F F^T - I, det F - 1) -> V - I of the left stretch V, exactly symmetric; for det F > 0"""
+    slight: Any
+    """Largest norm of F F^T - I for `log_stretch`."""
+    log_stretch: Any
+    """F F^T - I -> ln V, exactly symmetric, by a series for slight strains"""
+    exp_excess: Any
+    """symmetric X -> exp(X) - I by a series, |X| at most `slight`"""
 
 
 @functools.cache
@@ -61,6 +67,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
     converged = wp.constant(real(1e-14 if real is wp.float32 else 1e-33))
     # Square of the relative size of a Newton step whose successor is below the rounding.
     halved = wp.constant(real(1e-8 if real is wp.float32 else 1e-17))
+    slight = wp.constant(real(0.1 if real is wp.float32 else 2e-3))
     zero = wp.constant(real(0.0))
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
@@ -289,6 +296,21 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         return (((two + p) * (two + p) - q) / D) * E - (one / D) * (E * E) + ((real(4.0) + p) * r / D) * wp.identity(n=3, dtype=real)
 
     @wp.func
+    def log_stretch(E: mat):
+        Z = E * wp.inverse(E + two * wp.identity(n=3, dtype=real))  # ln V = artanh Z
+        W = Z * Z
+        L = Z + Z * (W * (wp.identity(n=3, dtype=real) / real(3.0) + W / real(5.0)))
+        return half * (L + wp.transpose(L))
+
+    @wp.func
+    def exp_excess(X: mat):
+        eye = wp.identity(n=3, dtype=real)
+        out = eye + X / real(5.0)
+        out = eye + X * out / real(4.0)
+        out = eye + X * out / real(3.0)
+        return X * (eye + X * out / two)
+
+    @wp.func
     def inverse_stretch(excess: vec):
         """The derivative of `hencky`."""
         result = vec(zero, zero, zero)
@@ -326,4 +348,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         log_difference,
         bounded,
         stretch,
+        slight,
+        log_stretch,
+        exp_excess,
     )
