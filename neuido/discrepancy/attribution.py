@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.fit import Fit, levenberg_marquardt
+from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
@@ -112,7 +112,7 @@ def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> t
         rest = [t for t in found if t is not trial]
         extra = tuple(p for t in rest for p in t.candidate.parameters)
         start = {k: v for k, v in base.point.items() if k.split(".")[0] != trial.candidate.name}
-        (fit,) = inference.fits([levenberg_marquardt((*inference.problem.declared, *extra), start)], floor)
+        (fit,) = inference.fits([inference.request((*inference.problem.declared, *extra), start)], floor)
         without, with_it = inference.mean_squares([fit.point, base.point], floor)
         if evidence.gain(without, with_it, inference.fitted) < LEAST_GAIN / 2:
             base, found = fit, rest

@@ -99,6 +99,10 @@ class BodyProblem(Problem):
             self._predict(points, groups[at : at + size], recording, setting, out)
         return out
 
+    @property
+    def together(self) -> bool:
+        return self.device != "cpu"
+
     def effort(self, recording: int, setting: int = 0) -> float:
         """Particle-substeps; inner steps of the finite elements count as one."""
         r = self.measured[recording]

@@ -58,6 +58,10 @@ class CachedProblem(Problem):
     def effort(self, recording: int, setting: int = 0) -> float:
         return self.problem.effort(recording, setting)
 
+    @property
+    def together(self) -> bool:
+        return self.problem.together
+
     def directions(self, recording: int) -> np.ndarray:
         return self.problem.directions(recording)
 

@@ -8,11 +8,12 @@ recordings that were held out against a parametric bootstrap of the largest gain
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.fit import Fit, levenberg_marquardt, run
+from neuido.discrepancy.fit import Fit, Race, Request, levenberg_marquardt, run
 from neuido.discrepancy.floors import Floor, Part, over_time, split
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
@@ -31,6 +32,8 @@ GAIN_IN_FLOOR = math.log(4.0)
 """What it takes where the residual is no larger than the floor: only an effect that the data show far below it."""
 NOISE_ALONE = 1.8
 """Mean squares up to so many times that of the noise are noise."""
+MANY = 5
+"""Parameters above which a candidate is fitted after the others, which tell what it must reach."""
 POLISHED = 3
 """Candidates whose fits are refined from further starts."""
 
@@ -167,13 +170,17 @@ class Inference:
             self.tell(f"discretisation of {self.problem.recordings[n].name}")
         return Floor(plain.noise, weight, differences, spread, self.nuisances(point, list(plain.noise)))
 
+    def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
+        """A fit; options of `levenberg_marquardt`."""
+        return levenberg_marquardt(parameters, start, together=self.problem.together, **options)
+
     def base(self, starts: Sequence[Point], floor: Floor) -> Fit:
         """The declared parameters fitted from several starts; the best one after a few iterations goes on."""
         free = self.problem.declared
         if len(starts) > 1:
-            short = self.fits([levenberg_marquardt(free, s, iterations=3) for s in starts], floor)
+            short = self.fits([self.request(free, s, iterations=3) for s in starts], floor)
             starts = [min(short, key=lambda f: f.cost).point]
-        return self.fits([levenberg_marquardt(free, starts[0])], floor)[0]
+        return self.fits([self.request(free, starts[0])], floor)[0]
 
     def starts(self, point: Point) -> list[Point]:
         """A point, and half and twice each parameter whose logarithm is fitted."""
@@ -185,8 +192,8 @@ class Inference:
         return out
 
     def start(self, near: Point | None = None) -> "Start":
-        """The base fit, with what noise and discretisation do to it; from the declared values, and from `near` where that is given."""
-        fit = self.base([*self.starts({}), *([near] if near else [])], self.noise())
+        """The base fit, with what noise and discretisation do to it; from about the declared values, or from them and from `near`."""
+        fit = self.base([{}, near] if near else self.starts({}), self.noise())
         floor = self.floor(fit.point)
         fit = self.base([fit.point], floor)
         return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
@@ -303,12 +310,7 @@ class Inference:
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
                 starts.append((c, begin))
         self.tell(f"fitting {', '.join(chosen)}")
-        requests = [levenberg_marquardt((*free, *c.parameters), begin) for c, begin in starts]
-        fits = self.fits(requests, floor)
-        best: dict[str, tuple[Candidate, Fit]] = {}
-        for (c, _), fit in zip(starts, fits, strict=True):
-            if c.key not in best or fit.cost < best[c.key][1].cost:
-                best[c.key] = (c, fit)
+        best = self.contest(free, starts, floor)
         best |= self.polish(free, best, base, floor)
         squares = self.mean_squares([fit.point for _, fit in best.values()], floor)
         trials = []
@@ -348,6 +350,20 @@ class Inference:
         share = min(max(over / math.log(1.5), 0.0), 1.0)  # from the floor itself to half as much again
         return GAIN_IN_FLOOR + share * (LEAST_GAIN - GAIN_IN_FLOOR)
 
+    def contest(
+        self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """The best fit of each candidate; those of many parameters come last, and fits that cannot catch up with the best one stop."""
+        best: dict[str, tuple[Candidate, Fit]] = {}
+        race = Race()
+        for many in (False, True):
+            own = [(c, begin) for c, begin in starts if (len(c.parameters) > MANY) == many]
+            fits = self.fits([self.request((*free, *c.parameters), begin, race=race) for c, begin in own], floor)
+            for (c, _), fit in zip(own, fits, strict=True):
+                if c.key not in best or fit.cost < best[c.key][1].cost:
+                    best[c.key] = (c, fit)
+        return best
+
     def polish(
         self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], base: Fit, floor: Floor
     ) -> dict[str, tuple[Candidate, Fit]]:
@@ -356,11 +372,11 @@ class Inference:
         top = sorted(best.values(), key=lambda entry: entry[1].cost)[:POLISHED]
         if not top or top[0][1].cost < 1.2 * data or top[0][1].cost > 0.7 * base.cost:
             return {}
-        requests, of = [], []
+        requests, of, race = [], [], Race(top[0][1].cost)
         for c, fit in top:
             begin = dict(fit.point)
             for start in (begin, begin | {p.name: p.value for p in self.problem.declared}):
-                requests.append(levenberg_marquardt((*free, *c.parameters), start))
+                requests.append(self.request((*free, *c.parameters), start, race=race))
                 of.append((c, fit))
         self.tell(f"refining {', '.join(c.key for c, _ in top)}")
         out: dict[str, tuple[Candidate, Fit]] = {}
