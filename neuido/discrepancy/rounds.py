@@ -7,7 +7,7 @@ recordings that were held out against a parametric bootstrap of the largest gain
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from neuido.discrepancy.fit import Fit, Race, Request, levenberg_marquardt, run
 from neuido.discrepancy.floors import Floor, Part, over_time, split
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
+from neuido.discrepancy.trials import Round, Start, Trial, unphysical
 
 ALPHA = 0.05
 """Family-wise level of a named effect."""
@@ -32,55 +33,14 @@ GAIN_IN_FLOOR = math.log(4.0)
 """What it takes where the residual is no larger than the floor: only an effect that the data show far below it."""
 NOISE_ALONE = 1.8
 """Mean squares up to so many times that of the noise are noise."""
+ROUGH = 0.02
+"""Relative gain that ends the fit before the floors are known."""
 MANY = 5
 """Parameters above which a candidate is fitted after the others, which tell what it must reach."""
 POLISHED = 3
 """Candidates whose fits are refined from further starts."""
 
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """The declared model, fitted."""
-
-    fit: Fit
-    floor: Floor
-    errors: np.ndarray
-    """Mean squares of each part."""
-
-
-@dataclass(eq=False)
-class Trial:
-    """One candidate fitted in full."""
-
-    candidate: Candidate
-    fit: Fit
-    errors: np.ndarray
-    """Mean squares of each part."""
-    gain: float
-    reason: str = ""
-    """Why it is rejected; empty: it is not."""
-
-    @property
-    def score(self) -> float:
-        """Mean logarithm of its errors: lower is better."""
-        return float(np.mean(np.log(np.maximum(self.errors, 1e-300))))
-
-
-@dataclass(eq=False)
-class Round:
-    """One step of the growth."""
-
-    base: Point
-    errors: np.ndarray
-    trials: list[Trial]
-    chosen: Trial | None
-    members: list[Trial]
-    p_value: float
-    floor: Floor
-    cosines: dict[str, float] = field(default_factory=dict)
-    null: np.ndarray = field(default_factory=lambda: np.empty(0))
 
 
 class Inference:
@@ -174,13 +134,13 @@ class Inference:
         """A fit; options of `levenberg_marquardt`."""
         return levenberg_marquardt(parameters, start, together=self.problem.together, **options)
 
-    def base(self, starts: Sequence[Point], floor: Floor) -> Fit:
-        """The declared parameters fitted from several starts; the best one after a few iterations goes on."""
+    def base(self, starts: Sequence[Point], floor: Floor, **options: Any) -> Fit:
+        """The declared parameters fitted from several starts; the best one after a few iterations goes on, with options of the fit."""
         free = self.problem.declared
         if len(starts) > 1:
             short = self.fits([self.request(free, s, iterations=3) for s in starts], floor)
             starts = [min(short, key=lambda f: f.cost).point]
-        return self.fits([self.request(free, starts[0])], floor)[0]
+        return self.fits([self.request(free, starts[0], **options)], floor)[0]
 
     def starts(self, point: Point) -> list[Point]:
         """A point, and half and twice each parameter whose logarithm is fitted."""
@@ -193,7 +153,8 @@ class Inference:
 
     def start(self, near: Point | None = None) -> "Start":
         """The base fit, with what noise and discretisation do to it; from about the declared values, or from them and from `near`."""
-        fit = self.base([{}, near] if near else self.starts({}), self.noise())
+        # the first fit only says where the floor is to be found
+        fit = self.base([{}, near] if near else self.starts({}), self.noise(), iterations=6, tolerance=ROUGH)
         floor = self.floor(fit.point)
         fit = self.base([fit.point], floor)
         return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
@@ -316,7 +277,7 @@ class Inference:
         trials = []
         for (c, fit), square in zip(best.values(), squares, strict=True):
             trial = Trial(c, fit, square, evidence.gain(errors, square, self.fitted))
-            trial.reason = _unphysical(c, fit.point)
+            trial.reason = unphysical(c, fit.point)
             trials.append(trial)
         trials.sort(key=lambda t: t.score)
         model = self._linear(base.point, floor, slopes, columns, chosen, everywhere, candidates)
@@ -439,15 +400,3 @@ class Inference:
                 else np.empty((rows.shape[1], 0))
             )
         return out
-
-
-def _unphysical(c: Candidate, point: Point) -> str:
-    for p in c.size_parameters:
-        value = point[p.name]
-        for bound in (p.lower, p.upper):
-            zero = abs(bound) < 1e-12
-            if (zero and abs(value) < 1e-3 * p.scale and len(c.size_parameters) == 1 and not p.log) or (
-                not zero and abs(value - bound) < 1e-6 * abs(bound)
-            ):
-                return f"{p.name} ends at {value:.3g} {p.unit}, the edge of its physical range" if not zero else "its size fits as zero"
-    return ""
