@@ -17,7 +17,7 @@ KEPT_PROMISE = 0.7
 NOTHING = 2e-4
 """Relative gain, as the linear model promises it, that is not worth a run."""
 BEHIND = 4.0
-"""A fit that would end above so many times the lowest cost of a race, at the pace of its last two iterations, is given up."""
+"""A fit that would end above so many times the lowest cost of a race, at the pace of its last step, is given up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,8 @@ class Race:
         self.best = min(self.best, costs[-1])
         if len(costs) < 3:
             return False
-        pace = (costs[-1] / max(costs[-3], 1e-300)) ** 0.5
+        failed = costs[-1] == costs[-2]  # one step that fails says only that it was too bold
+        pace = (costs[-1] / max(costs[-3], 1e-300)) ** 0.5 if failed else costs[-1] / costs[-2]
         return costs[-1] * pace**left > BEHIND * self.best
 
 
