@@ -36,7 +36,7 @@ NOISE_ALONE = 1.8
 ROUGH = 0.02
 """Relative gain that ends the fit before the floors are known."""
 MANY = 5
-"""Parameters above which a candidate is fitted after the others, which tell what it must reach."""
+"""Parameters above which a candidate is fitted after the others."""
 POLISHED = 3
 """Candidates whose fits are refined from further starts."""
 
@@ -314,11 +314,14 @@ class Inference:
     def contest(
         self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point]], floor: Floor
     ) -> dict[str, tuple[Candidate, Fit]]:
-        """The best fit of each candidate; those of many parameters come last, and fits that cannot catch up with the best one stop."""
+        """The best fit of each candidate; fits that cannot catch up with the best one stop.
+
+        Where every point costs, candidates of many parameters come last, when it is known what they must reach.
+        """
         best: dict[str, tuple[Candidate, Fit]] = {}
         race = Race()
-        for many in (False, True):
-            own = [(c, begin) for c, begin in starts if (len(c.parameters) > MANY) == many]
+        few, many = ([(c, begin) for c, begin in starts if (len(c.parameters) > MANY) == most] for most in (False, True))
+        for own in [starts] if self.problem.together else [few, many]:
             fits = self.fits([self.request((*free, *c.parameters), begin, race=race) for c, begin in own], floor)
             for (c, _), fit in zip(own, fits, strict=True):
                 if c.key not in best or fit.cost < best[c.key][1].cost:
