@@ -3,7 +3,7 @@
 import csv
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ from neuido.errors import UserError
 
 if TYPE_CHECKING:
     from neuido.discrepancy.attribution import Diagnosis
+    from neuido.discrepancy.memo import Work
     from neuido.discrepancy.problem import Problem
 
 KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}
@@ -83,6 +84,8 @@ def diagnose(
     log.name = ""
     answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
     store.clear(target)
+    for diagnosis, _ in found:
+        log.work(diagnosis.work)
     log.close(answer.summary(found))
 
 
@@ -213,6 +216,14 @@ class Log:
             self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, stage, self.count])
             self.file.flush()
             self._show()
+
+    def work(self, steps: "Mapping[str, Work]") -> None:
+        """What each step of a diagnosis ran, the dearest first."""
+        for step, w in sorted(steps.items(), key=lambda item: -item[1].effort):
+            line = f"{step}: {w.simulations} simulations, {w.reused} reused, {w.effort:.3g} particle-substeps or data, {w.seconds:.1f} s"
+            self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, line, self.count])
+            if self.shown and self.terminal:
+                print(f"\r\x1b[K{line}", file=sys.stderr)
 
     def _show(self) -> None:
         self.last = time.monotonic()
