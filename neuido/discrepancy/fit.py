@@ -16,7 +16,7 @@ KEPT_PROMISE = 0.7
 """Share of the gain that the linear model promises at which a step is taken without trying other dampings."""
 NOTHING = 2e-4
 """Relative gain, as the linear model promises it, that is not worth a run."""
-BEHIND = 4.0
+BEHIND = 2.5
 """A fit that would end above so many times the lowest cost of a race, at the pace of its last step, is given up."""
 
 BEST_PACE = 0.6
