@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -36,6 +37,8 @@ class Details:
     """Of each recording of a body."""
     ceilings: dict[str, ceiling.Ceiling] = field(default_factory=dict)
     """`before` and `after`."""
+    silhouettes: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Of each recording of a filmed body: masks, those drawn before and after, and their scores."""
 
 
 def write(
@@ -70,7 +73,7 @@ def write(
     for made in details:
         for name, arrays in made.motion.items():
             _save(out / "predicted" / f"{name}.npz", arrays)
-    models = {_body(d): d.problem.model_after(d.after, [t.candidate.name for t in d.effects]) for d, _ in found}
+    models = {_body(d): _beside(out, d.problem.model_after(d.after, [t.candidate.name for t in d.effects])) for d, _ in found}
     model = {"bodies": models} if len(found) > 1 else next(iter(models.values()))
     write_text(out / "model_after.yaml", yaml.safe_dump(_plain(model), sort_keys=False, default_flow_style=None))
     traces = [trace(d) for d, _ in found]
@@ -119,7 +122,12 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
     }
     if "body" in d.problem.labels:
         content["body"] = d.problem.labels["body"]
-    return Details(_plain(content), motion, series, ceilings)
+    drawn = d.problem.silhouettes(d) if hasattr(d.problem, "silhouettes") else {}
+    if drawn:
+        content["silhouettes"] = {name: own["scores"] for name, own in drawn.items()}
+        for name, own in drawn.items():
+            motion[name] |= {key: np.round(255 * own[key]).astype(np.uint8) for key in ("masks", "drawn_before", "drawn_after")}
+    return Details(_plain(content), motion, series, ceilings, drawn)
 
 
 def errors(d: Diagnosis, when: str) -> dict[str, Any]:
@@ -233,7 +241,7 @@ def motions(d: Diagnosis) -> dict[str, dict[str, np.ndarray]]:
     problem: Problem = d.problem
     for n, recording in enumerate(problem.recordings):
         own = {when: ceiling.as_seen(d, point, n) for when, point in (("before", d.before), ("after", d.after))}
-        if not hasattr(problem, "motion"):
+        if not getattr(problem, "tracked", hasattr(problem, "motion")):
             out[recording.name] = {"times": recording.times, "groups": recording.groups, "measured": recording.y, **own}
             continue
         r = problem.measured[n]
@@ -343,6 +351,18 @@ def write_json(path: Path, content: Any) -> None:
 
 def _body(d: Diagnosis) -> str:
     return d.problem.labels.get("body", d.problem.name)
+
+
+def _beside(out: Path, model: dict[str, Any]) -> dict[str, Any]:
+    """The model with its neural law, where it has one, copied beside it."""
+    if "law" not in model:
+        return model
+    source, target = Path(model["law"]["file"]), out / "law.safetensors"
+    if not (target.is_file() and target.samefile(source)):
+        hidden = target.with_name(".law.tmp.safetensors")
+        shutil.copyfile(source, hidden)
+        os.replace(hidden, target)
+    return model | {"law": model["law"] | {"file": target.name}}
 
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

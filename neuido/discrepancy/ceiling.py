@@ -62,7 +62,7 @@ def _samples(
     """Features (n, k), residuals (n, c) and weights (n,) of a part."""
     problem, n = d.problem, part.recording
     r = problem.recordings[n]
-    if not hasattr(problem, "motion"):
+    if not getattr(problem, "tracked", hasattr(problem, "motion")):
         velocity = _slope(predicted, r.times, r.groups)
         channels = r.groups[:, None] == np.unique(r.groups)[None]
         features = np.concatenate([r.times[:, None], predicted[:, None], velocity[:, None], channels], axis=1)
