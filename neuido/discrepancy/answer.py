@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ import neuido
 from neuido.data.storage import write as write_text
 from neuido.discrepancy import ceiling, next_experiment, report, residual
 from neuido.discrepancy.attribution import Diagnosis
+from neuido.discrepancy.declared import beside
 from neuido.discrepancy.problem import Problem
 from neuido.discrepancy.rounds import ALPHA, Round, Trial
 
@@ -73,7 +73,7 @@ def write(
     for made in details:
         for name, arrays in made.motion.items():
             _save(out / "predicted" / f"{name}.npz", arrays)
-    models = {_body(d): _beside(out, d.problem.model_after(d.after, [t.candidate.name for t in d.effects])) for d, _ in found}
+    models = {_body(d): beside(out, d.problem.model_after(d.after, [t.candidate.name for t in d.effects])) for d, _ in found}
     model = {"bodies": models} if len(found) > 1 else next(iter(models.values()))
     write_text(out / "model_after.yaml", yaml.safe_dump(_plain(model), sort_keys=False, default_flow_style=None))
     traces = [trace(d) for d, _ in found]
@@ -351,18 +351,6 @@ def write_json(path: Path, content: Any) -> None:
 
 def _body(d: Diagnosis) -> str:
     return d.problem.labels.get("body", d.problem.name)
-
-
-def _beside(out: Path, model: dict[str, Any]) -> dict[str, Any]:
-    """The model with its neural law, where it has one, copied beside it."""
-    if "law" not in model:
-        return model
-    source, target = Path(model["law"]["file"]), out / "law.safetensors"
-    if not (target.is_file() and target.samefile(source)):
-        hidden = target.with_name(".law.tmp.safetensors")
-        shutil.copyfile(source, hidden)
-        os.replace(hidden, target)
-    return model | {"law": model["law"] | {"file": target.name}}
 
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

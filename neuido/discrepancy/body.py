@@ -134,6 +134,12 @@ class BodyProblem(Problem):
         x, _ = self._roll([point], recording, setting)
         return x[0]
 
+    def simulated(self, recording: int) -> Measured:
+        """The recording as the declared model has it, with its effects and without noise."""
+        r = self.measured[recording]
+        x = torch.from_numpy(self.motion({}, recording)).float()
+        return replace(r, x=x, noise=None, video=None, gaussians=None)
+
     def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
         model = {key: dict(value) if isinstance(value, Mapping) else value for key, value in self.experiment.model.items()}
         for p in self.declared:

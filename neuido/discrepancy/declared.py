@@ -4,6 +4,7 @@
 """
 
 import functools
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from neuido.data.experiments import Experiment, read_model_part
 from neuido.data.scenes import read_yaml
+from neuido.data.storage import publish
 from neuido.discrepancy.library import KNOTS, effects_of
 from neuido.errors import UserError
 from neuido.models.results import load_law
@@ -134,6 +136,18 @@ def ready(model: str | Path | Mapping[str, Any], simulator: Simulator | FiniteEl
     centred = torch.cat([x[i:j] - x[i:j].mean(dim=0) for i, j in zip(offsets[:-1], offsets[1:])])
     rows = [effects] * (len(offsets) - 1)
     return Ready(*laws_of(checked, [{}]), effects_of(rows, centred, simulator.particles.scene, duration))
+
+
+def beside(folder: Path, model: Mapping[str, Any]) -> dict[str, Any]:
+    """The model for a file in `folder`, with its neural law, where it has one, copied there."""
+    if "law" not in model:
+        return dict(model)
+    source, target = Path(model["law"]["file"]), folder / "law.safetensors"
+    if not (target.is_file() and target.samefile(source)):
+        hidden = target.with_name(".law.tmp.safetensors")
+        shutil.copyfile(source, hidden)
+        publish(hidden, target)
+    return {**model, "law": {**model["law"], "file": target.name}}
 
 
 def _load(path: str) -> tuple[Any, Any]:

@@ -29,8 +29,11 @@ PARTICLES = 2000
 """Of a body that is made from silhouettes."""
 HULL_VIEWS = 12
 OPACITY = 0.9
-INSIDE, SPREAD = 0.25, 0.2
-"""Eight Gaussians stand for a particle: their places and standard deviation, in edges of its share of the body."""
+INSIDE, SPREAD = 0.2, 0.15
+"""Eight Gaussians stand for a particle: their places and standard deviation, in edges of its share of the body. What is drawn is about as
+large as the body where an edge is several pixels; what is left of it is the same in all frames, and the first one tells it."""
+BLUR = 0.1
+"""Added to their covariance in the image [px^2]."""
 FINE = 1.5
 """Edges of fewer pixels get one Gaussian."""
 
@@ -65,7 +68,7 @@ class Look(NamedTuple):
         means = (x.unsqueeze(2) + torch.einsum("tpij,pmj->tpmi", F, self.offset)).flatten(1, 2)
         covariances = (self.spread.square()[:, None, None] * (F @ F.mT)).repeat_interleave(self.offset.shape[1], dim=1)
         opacity = x.new_full((means.shape[1],), OPACITY)
-        return rasterize(means, covariances, opacity, x.new_zeros(means.shape[1], 3), *cameras)[1]
+        return rasterize(means, covariances, opacity, x.new_zeros(means.shape[1], 3), *cameras, eps2d=BLUR)[1]
 
 
 class Splats:
@@ -81,7 +84,7 @@ class Splats:
         F = motion.F if self.back is None else motion.F @ self.back
         moved = deform(self.gaussians._replace(harmonics=self.gaussians.harmonics[:, :1]), F, motion.x, self.binding)
         tint = motion.x.new_zeros(moved.means.shape[-2], 3)
-        return rasterize(moved.means, moved.covariances, moved.opacities, tint, *cameras)[1]
+        return rasterize(moved.means, moved.covariances, moved.opacities, tint, *cameras, eps2d=BLUR)[1]
 
 
 def look_of(body: Body, film: Film, device: str) -> Look:

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from neuido.discrepancy.silhouettes import LEVEL
+from neuido.discrepancy.silhouettes import distances
 
 BEFORE, AFTER = (192, 57, 43), (31, 119, 180)
 """Red and blue of the report, RGB."""
@@ -21,7 +21,7 @@ def section(drawn: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The parts of the page about silhouettes.
 
     Args:
-        drawn: Of each recording `masks`, `drawn_before`, `drawn_after` (T, V, H, W) in 0..1, `level`, `times` (T,) [s], and `scores`.
+        drawn: Of each recording `masks`, `drawn_before`, `drawn_after` (T, V, H, W) in 0..1, `inset` [px], `times` (T,) [s], and `scores`.
     """
     out = ["<h2>Silhouettes before and after</h2>", _table(drawn)]
     for name, own in drawn.items():
@@ -51,9 +51,9 @@ def _overlay(own: Mapping[str, Any], t: int, v: int) -> np.ndarray:
     mask = own["masks"][t, v]
     size = (ENLARGED * mask.shape[1], ENLARGED * mask.shape[0])
     image = np.repeat((255 - 90 * cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR))[..., None], 3, axis=2).round().astype(np.uint8)
-    for when, colour, level in (("drawn_before", BEFORE, own["level"]), ("drawn_after", AFTER, own["level"])):
-        fine = cv2.resize(own[when][t, v].astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-        found, _ = cv2.findContours((fine >= max(level, 0.1 * LEVEL)).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    for when, colour in (("drawn_before", BEFORE), ("drawn_after", AFTER)):
+        body = (distances(own[when][None, t, v])[0] + own["inset"] <= 0).astype(np.uint8)
+        found, _ = cv2.findContours(cv2.resize(body, size, interpolation=cv2.INTER_NEAREST), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         image = cv2.drawContours(image, found, -1, colour, 1)
     image[:, -1] = 230
     return image

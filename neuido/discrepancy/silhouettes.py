@@ -205,19 +205,36 @@ class Score(NamedTuple):
     """Of the masks as images [dB]."""
 
 
-def score(drawn: np.ndarray, measured: np.ndarray, level: float = LEVEL) -> Score:
-    """Compare drawn with measured masks, (R, H, W) in 0..1; `level` is where a drawn body ends."""
-    ious, distances = [], []
-    for a, b in zip(drawn >= level, measured >= LEVEL, strict=True):
+def distances(masks: np.ndarray) -> np.ndarray:
+    """Signed distance from the outline of soft masks (R, H, W), positive outside [px], on a grid `FINER` times finer."""
+    out = []
+    for mask in masks:
+        size = (FINER * mask.shape[1], FINER * mask.shape[0])
+        inside = (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) >= LEVEL).astype(np.uint8)
+        far = [cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5 * part for part in (1 - inside, inside)]
+        out.append((far[0] - far[1]) / FINER)
+    return np.stack(out)
+
+
+def inset(drawn: np.ndarray, measured: np.ndarray) -> float:
+    """How far inside the drawn outlines (R, H, W) a body ends whose area is that of the measured ones [px]."""
+    far = np.sort(distances(drawn).ravel())
+    wanted = int((distances(measured) <= 0).sum())
+    return -float(far[min(max(wanted - 1, 0), far.size - 1)])
+
+
+def score(drawn: np.ndarray, measured: np.ndarray, inside: float = 0.0) -> Score:
+    """Compare drawn with measured masks, (R, H, W) in 0..1; the drawn body ends `inside` its outline [px]."""
+    ious, apart = [], []
+    for far, true in zip(distances(drawn) + inside, distances(measured), strict=True):
+        a, b = far <= 0, true <= 0
         ious.append(np.sum(a & b) / max(np.sum(a | b), 1))
         if a.any() and b.any():
-            distances.append(0.5 * (_distance(a, b) + _distance(b, a)))
+            apart.append(0.5 * (np.abs(true[_edge(a)]).mean() + np.abs(far[_edge(b)]).mean()))
     psnr = -10 * np.log10(max(float(np.mean((drawn - measured) ** 2)), 1e-10))
-    return Score(float(np.mean(ious)), float(np.mean(distances)) if distances else float("nan"), float(psnr))
+    return Score(float(np.mean(ious)), float(np.mean(apart)) if apart else float("nan"), float(psnr))
 
 
-def _distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean distance of the border pixels of a from those of b [px]."""
-    edges = [m & ~cv2.erode(m.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0).astype(bool) for m in (a, b)]
-    far = cv2.distanceTransform((~edges[1]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return float(far[edges[0]].mean())
+def _edge(mask: np.ndarray) -> np.ndarray:
+    """The border pixels of a mask."""
+    return mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0).astype(bool)

@@ -56,8 +56,8 @@ class Footage(NamedTuple):
     first_views: list[int]
     millimetres: float
     """Of a recorded pixel at the body."""
-    level: float = 0.5
-    """Of the drawn mask, at which the first frame's body has its measured area."""
+    inset: float = 0.0
+    """How far inside the drawn outline the measured one lies in the first frame [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class VideoProblem(BodyProblem):
             chosen = chosen & (np.arange(len(frames)) > 0)
             if chosen.any():
                 flat = (a[chosen].reshape(-1, *a.shape[2:]) for a in (drawn, f.film.masks))
-                score = silhouettes.score(*flat, f.level)
+                score = silhouettes.score(*flat, f.inset)
                 scores[name] = score._replace(outline=score.outline * f.film.factor)
         return drawn, scores
 
@@ -103,7 +103,7 @@ class VideoProblem(BodyProblem):
         out = {}
         for n, r in enumerate(self.recordings):
             f = self.footage[n]
-            own: dict[str, Any] = {"masks": f.film.masks, "level": f.level, "times": f.film.times.numpy(), "scores": {}}
+            own: dict[str, Any] = {"masks": f.film.masks, "inset": f.inset, "times": f.film.times.numpy(), "scores": {}}
             for when, point in (("before", d.before), ("after", d.after)):
                 own[f"drawn_{when}"], scores = self._scored(point, n, d.setting)
                 own["scores"][when] = {
@@ -119,6 +119,12 @@ class VideoProblem(BodyProblem):
         if self.roles["held_out"]:
             return np.full(len(t), self.recordings[recording].role == "fit")
         return t <= t[1] + 0.6 * (t[-1] - t[1])
+
+    def simulated(self, recording: int) -> Measured:
+        """All particles as the declared model moves them: nobody tracked a point."""
+        r = self.measured[recording]
+        x = self._move([{}], recording, 0)[0].x.cpu().float()
+        return replace(r, x=x, track=torch.arange(x.shape[1]), noise=None, video=None, gaussians=None)
 
     def as_tracked(self) -> BodyProblem:
         """The same bodies as if some of their particles were tracked, with the noise that a pixel is at their distance."""
@@ -237,7 +243,7 @@ def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0
         cameras, noise = _register(r, footage[n], moved[n])
         nuisances += cameras
         recordings.append(_recording(r, footage[n], noise))
-        footage[n] = footage[n]._replace(level=_level(footage[n], moved[n]))
+        footage[n] = footage[n]._replace(inset=_inset(footage[n], moved[n]))
     kinds = tuple(f"camera_{key}{v}" for key, _, _ in CAMERA for v in range(max(len(f.film.views) for f in footage)))
     return VideoProblem(
         name=experiment.name, measure="outline", unit="px", declared=base.declared, nuisances=tuple(nuisances),
@@ -324,12 +330,10 @@ def _settle(drawn: Tensor, at: Outlines, target: Tensor, factor: float, steps: i
     return [float(v) for v in given], residual(values)
 
 
-def _level(f: Footage, moved: ParticleState) -> float:
-    """The level of a drawn mask at which the first frame has its measured area."""
+def _inset(f: Footage, moved: ParticleState) -> float:
+    """How far inside what is drawn of the first frame its measured outline lies [px]."""
     drawn = f.look.draw(ParticleState(*(t[:1] for t in moved)), f.cameras)[0].cpu().numpy()
-    wanted = float((f.film.masks[0] >= silhouettes.LEVEL).sum())
-    levels = np.linspace(0.05, 0.98, 94)
-    return float(levels[np.argmin([abs(float((drawn >= level).sum()) - wanted) for level in levels])])
+    return silhouettes.inset(drawn[f.first_views], f.film.masks[0, f.first_views])
 
 
 def _recording(r: Measured, f: Footage, noise: float) -> Recording:

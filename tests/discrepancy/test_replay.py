@@ -1,0 +1,130 @@
+"""model_after.yaml goes back: into `neuido simulate`, into `neuido diagnose`, and into a rollout of one's own."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from neuido.cli import main
+from neuido.data.experiments import read_experiment, write_experiment
+from neuido.discrepancy.body import body_problem
+from neuido.discrepancy.declared import ready
+from neuido.errors import UserError
+from neuido.physics.mpm import Simulator
+from tests.discrepancy import made
+
+EFFECTS = {"drag_linear.k": 3.0}
+
+
+def run(capsys, *args) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in args])
+    out, err = capsys.readouterr()
+    return stop.value.code, out, err
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("replay") / "block"
+    made.experiment(path, EFFECTS, frames=10, side=4, noise=1e-4)
+    return path
+
+
+@pytest.fixture(scope="module")
+def after(folder):
+    """What a diagnosis that finds the drag leaves behind, as `body.model_after` writes it."""
+    problem = body_problem(read_experiment(folder))
+    path = folder.parent / "model_after.yaml"
+    path.write_text(yaml.safe_dump(problem.model_after({"young": 6e4, **EFFECTS}, ["drag_linear"])))
+    return path
+
+
+def test_simulate_repeats_the_recordings_under_the_model(folder, after, tmp_path, capsys):
+    status, _, err = run(capsys, "simulate", "--experiment", folder, "--model", after, "--out", tmp_path / "again", "--device", "cpu")
+    assert status == 0, err
+    measured, again = read_experiment(folder), read_experiment(tmp_path / "again")
+    assert again.model["effects"] == EFFECTS
+    assert [r.name for r in again.recordings] == [r.name for r in measured.recordings]
+    for a, b in zip(again.recordings, measured.recordings, strict=True):
+        assert a.noise is None
+        assert (a.x - b.x)[b.seen].square().mean().sqrt() < 1.2e-4  # the noise of the measured one
+    plain = body_problem(measured).motion({}, 0)
+    assert np.abs(again.recordings[0].x.numpy() - plain).max() > 0.01
+
+
+def test_diagnose_of_the_repeated_recordings_answers_none(folder, after, tmp_path, capsys):
+    run(capsys, "simulate", "--experiment", folder, "--model", after, "--out", tmp_path / "again", "--device", "cpu")
+    options = ["--effects", "drag_linear,viscosity_shear", "--draws", "19", "--device", "cpu"]
+    status, out, err = run(capsys, "diagnose", tmp_path / "again", "--out", tmp_path / "out", *options)
+    assert status == 0, err
+    assert out.startswith("none; ")
+    content = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert content["after"]["young"]["value"] == pytest.approx(6e4, rel=0.02)
+
+
+def test_ready_is_what_the_problem_simulates(folder, after):
+    r = read_experiment(folder)["throw"]
+    simulator = Simulator(r.scene, r.body, density=1000.0)
+    law = ready(after, simulator)
+    with torch.no_grad():
+        out = simulator.rollout(90, law.elasticity, law.plasticity, effects=law.effects, every=10)
+    problem = body_problem(read_experiment(folder, model=yaml.safe_load(after.read_text())))
+    np.testing.assert_allclose(out.x[:, r.track].numpy(), problem.motion({}, 0), atol=1e-5)
+
+
+def test_ready_takes_fields_over_the_body_and_forces_in_time(folder):
+    r = read_experiment(folder)["throw"]
+    simulator = Simulator([r.scene] * 2, [r.body] * 2, density=1000.0)
+    base = {"density": 1000.0, "elasticity": {"law": "fixed_corotated", "young": 6e4, "poisson": 0.3}, "free": ["young"]}
+    for effects in ({"stiffness_gradient.x": 0.5}, {"time_force.y0": 2.0, "time_force.y4": -2.0, "time_force.interval": 0.02}):
+        law = ready({**base, "effects": effects}, simulator)
+        problem = body_problem(read_experiment(folder, model={**base, "plasticity": {"law": "identity"}, "effects": effects}))
+        with torch.no_grad():
+            out = simulator.rollout(90, law.elasticity, law.plasticity, effects=law.effects, every=10)
+        count = len(r.body.x)
+        for s in range(2):
+            np.testing.assert_allclose(out.x[:, s * count : (s + 1) * count][:, r.track].numpy(), problem.motion({}, 0), atol=1e-5)
+    with pytest.raises(UserError, match="interval"):
+        ready({**base, "effects": {"time_force.y0": 2.0}}, simulator)
+
+
+@pytest.mark.parametrize(
+    ("more", "word"),
+    [
+        (["--model", "nowhere.yaml", "--experiment", "FOLDER"], "nowhere.yaml"),
+        (["--model", "nowhere.yaml"], "experiment"),
+        (["--experiment", "FOLDER", "--undeclared", "3"], "undeclared"),
+        (["--experiment", "nowhere"], "nowhere"),
+        (["--experiment", "FOLDER", "--device", "abacus"], "abacus"),
+    ],
+)
+def test_wrong_option_is_one_line(more, word, folder, tmp_path, capsys):
+    given = [str(folder) if part == "FOLDER" else part for part in more]
+    status, _, err = run(capsys, "simulate", "--out", tmp_path / "out", *given)
+    assert (status, len(err.splitlines())) == (2, 1), err
+    assert word in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_there_is_not_overwritten(folder, capsys):
+    status, _, err = run(capsys, "simulate", "--experiment", folder, "--out", folder)
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert "already" in err
+
+
+def test_a_recording_of_many_substeps_keeps_its_frames_alone(folder):
+    """Nothing but the frames of a long recording is kept: memory does not grow with the substeps."""
+    experiment = read_experiment(folder)
+    fine = [dataclasses.replace(r, scene=dataclasses.replace(r.scene, dt=2e-4)) for r in experiment.recordings]
+    problem = body_problem(dataclasses.replace(experiment, recordings=tuple(fine)))
+    problem.predict([{}], 0)
+    simulator = problem.simulator(0, 0, 1)
+    tapes = [kept.tape for kept in simulator.cache.kept.values()] if hasattr(simulator.cache, "kept") else []
+    assert all(len(tape.states[0]) == 10 for tape in tapes)
+    assert problem.motion({}, 0).shape == (10, 60, 3)
+
+
+__all__ = ["write_experiment"]
