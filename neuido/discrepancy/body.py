@@ -47,6 +47,8 @@ NUISANCES = (  # name, unit, prior standard deviation; of the frame interval, of
 )
 INSTRUMENTS = ("release_time", "time_base", "length_scale")
 NEIGHBOURS = 12
+SEGMENT = 2000
+"""Substeps that are launched as one piece where launches are captured or a tape is kept."""
 WINDOWS = 6
 """In time, of the patterns of an unknown discretisation error."""
 
@@ -200,7 +202,13 @@ class BodyProblem(Problem):
         every, steps, exact = _frames(r, scene.dt)
         with torch.no_grad():
             out = simulator.rollout(
-                steps, elasticity, plasticity, state=self._start(simulator, full, recording), every=every, effects=effects
+                steps,
+                elasticity,
+                plasticity,
+                state=self._start(simulator, full, recording),
+                every=every,
+                segment=_segment(steps, every),
+                effects=effects,
             )
         count = len(r.body.x)
         own = [ParticleState(*(t[:, s * count : (s + 1) * count] for t in out)) for s in range(wanted)]
@@ -357,6 +365,12 @@ def _frames(r: Measured, dt: float) -> tuple[int, int, bool]:
         return every, every * (len(t) - 1), True
     every = max(1, round(float(np.diff(t).min()) / dt / 6))
     return every, every * int(np.ceil(t[-1] / (every * dt) + 1e-9)), False
+
+
+def _segment(steps: int, every: int) -> int:
+    """Substeps of a piece of a rollout: a divisor of `steps` and a multiple of `every`, of `SEGMENT` at the most where there is one."""
+    frames = steps // every
+    return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
 
 
 def _gather(x: Tensor, index: Tensor, weight: Tensor) -> Tensor:

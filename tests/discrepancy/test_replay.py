@@ -1,6 +1,5 @@
 """model_after.yaml goes back: into `neuido simulate`, into `neuido diagnose`, and into a rollout of one's own."""
 
-import dataclasses
 import json
 
 import numpy as np
@@ -9,10 +8,11 @@ import torch
 import yaml
 
 from neuido.cli import main
-from neuido.data.experiments import read_experiment, write_experiment
-from neuido.discrepancy.body import body_problem
+from neuido.data.experiments import read_experiment
+from neuido.discrepancy.body import SEGMENT, _segment, body_problem
 from neuido.discrepancy.declared import ready
 from neuido.errors import UserError
+from neuido.physics.laws import FixedCorotated
 from neuido.physics.mpm import Simulator
 from tests.discrepancy import made
 
@@ -115,16 +115,34 @@ def test_a_folder_that_is_there_is_not_overwritten(folder, capsys):
     assert "already" in err
 
 
-def test_a_recording_of_many_substeps_keeps_its_frames_alone(folder):
-    """Nothing but the frames of a long recording is kept: memory does not grow with the substeps."""
-    experiment = read_experiment(folder)
-    fine = [dataclasses.replace(r, scene=dataclasses.replace(r.scene, dt=2e-4)) for r in experiment.recordings]
-    problem = body_problem(dataclasses.replace(experiment, recordings=tuple(fine)))
+def test_long_recordings_run_in_pieces(folder, monkeypatch):
+    """Pieces fit their recording, and what is kept of one of many substeps are its frames: memory does not grow with the substeps."""
+    for steps, every in ((32_000, 400), (26_910, 1), (26_911, 1), (90, 10), (5000, 5000)):
+        piece = _segment(steps, every)
+        assert steps % piece == 0
+        assert piece % every == 0
+        assert piece == every or piece <= SEGMENT
+    assert _segment(32_000, 400) == 2000
+    monkeypatch.setattr("neuido.discrepancy.body.SEGMENT", 30)
+    problem = body_problem(read_experiment(folder))
+    asked, rollout = [], Simulator.rollout
+
+    def watched(self, steps, *args, **options):
+        asked.append((steps, options["segment"]))
+        return rollout(self, steps, *args, **options)
+
+    monkeypatch.setattr(Simulator, "rollout", watched)
     problem.predict([{}], 0)
-    simulator = problem.simulator(0, 0, 1)
-    tapes = [kept.tape for kept in simulator.cache.kept.values()] if hasattr(simulator.cache, "kept") else []
-    assert all(len(tape.states[0]) == 10 for tape in tapes)
-    assert problem.motion({}, 0).shape == (10, 60, 3)
+    assert asked == [(90, 30)]
+    (kept,) = problem.simulator(0, 0, 1).cache._kept.values()
+    assert len(kept.tape.x) == 10
 
 
-__all__ = ["write_experiment"]
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_pieces_on_a_gpu_are_the_whole(folder):
+    r = read_experiment(folder)["throw"]
+    simulator = Simulator(r.scene, r.body, density=1000.0, device="cuda")
+    with torch.no_grad():
+        whole, pieces = (simulator.rollout(90, FixedCorotated(6e4, 0.3), every=10, segment=segment) for segment in (None, 30))
+    torch.testing.assert_close(whole.x, pieces.x, atol=1e-5, rtol=0.0)
