@@ -194,19 +194,29 @@ def read_model_part(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, 
         UserError: An unknown key, an impossible material, an unknown effect.
     """
     given = scenes._mapping(given, "model")
-    law = given.pop("law", None)
+    if "law" not in given:
+        return _model(given)
+    law = scenes._mapping(given.pop("law"), "model.law")
+    scenes._keys(law, "model.law", ("file", "stiffness"), ("stiffness",))
+    file = folder / Path(_text(law["file"], "model.law.file")).expanduser()
+    stiffness = number(law.get("stiffness", 1.0), "model.law.stiffness", above=0.0)
+    free = given.get("free", [])
+    scaled = isinstance(free, list) and "stiffness" in free
+    if scaled:
+        given["free"] = [name for name in free if name != "stiffness"]
+    model, own = _model(given)
+    return {**model, "law": {"file": str(file), "stiffness": stiffness}}, ("stiffness", *own) if scaled else own
+
+
+def _model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
+    given = scenes._mapping(given, "model")
     free = given.pop("free", [])
     effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY))
     for part in ("elasticity", "plasticity"):
         if isinstance(given.get(part), Mapping):
             _text(given[part].get("law"), f"model.{part}.law")
     model = scenes.model_from_dict(given)
-    if law is not None:
-        law = scenes._mapping(law, "model.law")
-        scenes._keys(law, "model.law", ("file", "stiffness"), ("stiffness",))
-        file = Path(_text(law["file"], "model.law.file")).expanduser()
-        model["law"] = {"file": str(folder / file), "stiffness": number(law.get("stiffness", 1.0), "model.law.stiffness", above=0.0)}
-    known = ["density", *(key for part in ("elasticity", "plasticity", "law") for key in model.get(part, {}) if key not in ("law", "file"))]
+    known = ["density", *(key for part in ("elasticity", "plasticity") for key in model[part] if key != "law")]
     if not isinstance(free, list):
         raise UserError(f"model.free must be a list of parameters, got {free!r}")
     for key in free:

@@ -37,6 +37,8 @@ UNSEEN = 6.0
 """And those of a launch that was estimated from the images."""
 FAINT = 0.15
 """Least noise of an outline [px of the compared silhouettes]."""
+LEAST_OVERLAP = 0.4
+"""Of the drawn body and the silhouette of the first frame (area of both over that of either)."""
 TRACKED = 60
 """Particles that stand for the body where a proposal for a further experiment wants points."""
 
@@ -290,7 +292,7 @@ def _register(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Param
         UserError: The body is not where the images show it.
     """
     drawn = f.look.draw(ParticleState(*(t[:1] for t in moved)), f.cameras)[0]
-    factor, out, left = f.film.factor, [], []
+    factor, out, left, overlap = f.film.factor, [], [], 1.0
     for v in range(len(f.film.views)):
         given = [0.0] * len(CAMERA)
         if v in f.first_views:
@@ -300,13 +302,14 @@ def _register(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Param
             target = silhouettes.features(measured, at)
             given, rest = _settle(drawn[v][None], at, target, factor)
             left.append(rest)
+            overlap = min(overlap, silhouettes.score(drawn[v][None].cpu().numpy(), f.film.masks[:1, v]).iou)
         for (key, unit, deviation), value in zip(CAMERA, given, strict=True):
             name, far = f"camera_{key}{v}:{r.name}", 8 * deviation
             out.append(Parameter(name, unit, value, deviation, value - far, value + far, prior=1.0))
     rest = np.concatenate(left)
-    if not np.isfinite(rest).all() or np.sqrt(np.mean(rest**2)) > 0.8 * silhouettes.REACH:
+    if overlap < LEAST_OVERLAP or not np.isfinite(rest).all():
         raise UserError(
-            f"recording {r.name}: the first frame's body is {factor * np.sqrt(np.mean(rest**2)):.3g} px from its silhouette: check "
+            f"recording {r.name}: body and silhouette of the first frame have an overlap of {overlap:.2f}, below {LEAST_OVERLAP}: check "
             "transform_matrix, intrinsics and x0"
         )
     return out, factor * float(np.hypot(FAINT, np.sqrt(np.mean(rest**2))))
