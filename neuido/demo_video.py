@@ -32,7 +32,7 @@ class VideoResult(NamedTuple):
     """The encoder after Stage II."""
 
 
-def demo_video(out: str = "runs/demo/video", *, epochs: int = 8, init_from: str | None = "pretrained") -> VideoResult:
+def demo_video(out: str = "runs/demo/video", *, epochs: int = 8, init_from: str | None = "pretrained-small") -> VideoResult:
     """Film three small bodies, train Stage II on two of them, and read the law of the third from its video in one pass.
 
     Takes minutes on a CPU core; scenes and reconstructions that are there are used again.

@@ -1,6 +1,6 @@
 """Filmed and reconstructed bodies as data for Stage II, scoring and prediction: a batch is one scene."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
+from neuido.data.sampling import Resumable
 from neuido.data.visual import VisualScene, load_visual
 from neuido.errors import UserError
 
@@ -34,10 +35,8 @@ def _only(samples: list[VisualScene]) -> VisualScene:
     return samples[0]
 
 
-class Turns:
-    """Scenes one after the other, in an order that is a function of seed and epoch alone, from where a resumed run stopped.
-
-    Lightning calls `sampler.set_epoch` before the first batch of an epoch and stores `state_dict` in its checkpoints.
+class Turns(Resumable[VisualScene]):
+    """Scenes one after the other, in an order that is a function of seed and epoch alone.
 
     Args:
         scenes: The scenes.
@@ -47,43 +46,16 @@ class Turns:
     """
 
     def __init__(self, scenes: Sequence[VisualScene], *, seed: int = 0, rank: int = 0, ranks: int = 1) -> None:
+        super().__init__({"scenes": len(scenes), "ranks": ranks})
         self.scenes, self.seed, self.rank, self.ranks = list(scenes), seed, rank, ranks
-        self.epoch = 0
-        self._next = 0
-        self._resume: tuple[int, int] | None = None
-
-    @property
-    def sampler(self) -> "Turns":
-        """Where Lightning looks for `set_epoch`."""
-        return self
-
-    def set_epoch(self, epoch: int) -> None:
-        self.epoch = epoch
 
     def __len__(self) -> int:
         return -(-len(self.scenes) // self.ranks)
 
-    def __iter__(self) -> Iterator[VisualScene]:
-        # a generator: Lightning makes the iterator before it sets the epoch, and nothing here runs before the first batch
-        epoch, start = self.epoch, 0
-        if self._resume is not None and self._resume[0] == epoch:
-            start = self._resume[1]
-        self._resume = None
-        self._next = start
+    def batches(self, epoch: int, start: int) -> Iterable[VisualScene]:
         count = len(self.scenes)
         order = np.random.default_rng([self.seed, epoch]).permutation(count).tolist()
-        for k in range(start, len(self)):
-            self._next = k + 1
-            yield self.scenes[order[(k * self.ranks + self.rank) % count]]
-
-    def state_dict(self) -> dict[str, int]:
-        return {"epoch": self.epoch, "step": self._next, "scenes": len(self.scenes), "ranks": self.ranks}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        for name, now in (("scenes", len(self.scenes)), ("ranks", self.ranks)):
-            if state.get(name) != now:
-                raise UserError(f"the checkpoint was written with {state.get(name)} {name}, now there are {now}: restore them to resume")
-        self._resume = (state["epoch"], state["step"])
+        return (self.scenes[order[(k * self.ranks + self.rank) % count]] for k in range(start, len(self)))
 
 
 class VisualDataModule(LightningDataModule):

@@ -55,6 +55,13 @@ class CachedProblem(Problem):
         parts = [self._part(points[i : i + CHUNK], recording, setting) for i in range(0, len(points), CHUNK)]
         return np.concatenate(parts) if parts else self.problem.predict([], recording, setting)
 
+    def effort(self, recording: int, setting: int = 0) -> float:
+        return self.problem.effort(recording, setting)
+
+    @property
+    def together(self) -> bool:
+        return self.problem.together
+
     def directions(self, recording: int) -> np.ndarray:
         return self.problem.directions(recording)
 

@@ -89,7 +89,7 @@ class VideoProblem(BodyProblem):
     def _scored(self, point: Point, recording: int, setting: int = 0) -> tuple[np.ndarray, dict[str, Score]]:
         """Drawn silhouettes (T, V, H, W), and how well those of the fitted and of the other frames agree with the film's."""
         f = self.footage[recording]
-        drawn = self._drawn(self._move([point], recording, setting)[0], recording, point)
+        drawn = self._drawn(_alone(self._move([point], recording, setting), 0), recording, point)
         frames = self.fitted_frames(recording)
         scores = {}
         for name, chosen in (("fit", frames), ("held_out", ~frames)):
@@ -125,7 +125,7 @@ class VideoProblem(BodyProblem):
     def simulated(self, recording: int) -> Measured:
         """All particles as the declared model moves them: nobody tracked a point."""
         r = self.measured[recording]
-        x = self._move([{}], recording, 0)[0].x.cpu().float()
+        x = self._move([{}], recording, 0).x[:, 0].cpu().float()
         return replace(r, x=x, track=torch.arange(x.shape[1]), noise=None, video=None, gaussians=None)
 
     def as_tracked(self) -> BodyProblem:
@@ -155,7 +155,8 @@ class VideoProblem(BodyProblem):
                 out[groups[0]] = np.nan
             return
         f = self.footage[recording]
-        for g, motion in zip(groups, moved, strict=True):
+        for s, g in enumerate(groups):
+            motion = _alone(moved, s)
             drawn: dict[tuple[float, float], Tensor] = {}
             for i in g:
                 clock = self._clock(points[i], recording)
@@ -206,6 +207,11 @@ class VideoProblem(BodyProblem):
         return torch.stack(out, 1).cpu().numpy()
 
 
+def _alone(frames: ParticleState, s: int) -> ParticleState:
+    """The frames of one point, (T, P, ...), of those of several."""
+    return ParticleState(*(t[:, s].contiguous() for t in frames))
+
+
 def _warped(masks: Tensor, view: View) -> Tensor:
     """Masks (T, H, W) as a camera shows them that is off."""
     height, width = masks.shape[-2:]
@@ -234,7 +240,7 @@ def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0
     plain = replace(experiment, recordings=tuple(measured))
     base = body_problem(plain, device=device, batch=batch)
     # the declared motion of some particles stands for that of the body: typical speeds and places are taken from it
-    moved = [base._move([{}], n, 0)[0] for n in range(len(measured))]
+    moved = [_alone(base._move([{}], n, 0), 0) for n in range(len(measured))]
     tracked = [_some(r, m) for r, m in zip(measured, moved, strict=True)]
     base = body_problem(replace(experiment, recordings=tuple(tracked)), device=device, batch=batch)
     footage = [_footage(r, experiment, film, m, device) for r, film, m in zip(tracked, films, moved, strict=True)]

@@ -22,7 +22,10 @@ from neuido.models.video_vae import CogVideoXVAE, open_vae
 from neuido.types import MultiViewBatch
 
 FORMAT = "neuido-encoder/1"
-PRETRAINED = Path(__file__).parent / "weights" / "stage2.safetensors"
+PRETRAINED = {
+    "pretrained": Path(__file__).parent / "weights" / "stage2_small.safetensors",
+    "pretrained-small": Path(__file__).parent / "weights" / "stage2_small.safetensors",
+}
 CLOCK, CELL = 5e-3, 1e-2
 """The frame interval [s] and the side of a cell [m] at which the projector's two conditions are zero."""
 
@@ -217,12 +220,12 @@ class DynamicsEncoder(nn.Module):
 
     @classmethod
     def load(cls, path: str | os.PathLike = "pretrained") -> Self:
-        """Read what `save` wrote; `pretrained` is the file that comes with neuido.
+        """Read what `save` wrote. `pretrained` comes with neuido; so does `pretrained-small`, for few, coarse frames on a CPU.
 
         Raises:
             UserError: No such file, or not one of this kind.
         """
-        file = PRETRAINED if str(path) == "pretrained" else Path(path)
+        file = PRETRAINED.get(str(path)) or Path(path)
         config, tensors, card = read_weights(file, FORMAT, "encoder")
         vae = config["source"] or FlowVAE(**config["vae"])
         sizes = {key: config["projector"][key] for key in ("latent_dim", "width", "heads", "conditions")}

@@ -10,8 +10,8 @@ import yaml
 
 from neuido.cli import main
 from neuido.data.experiments import read_experiment
+from neuido.discrepancy.believed import classical, laws_of, ready, scaled, with_law
 from neuido.discrepancy.body import body_problem
-from neuido.discrepancy.declared import classical, laws_of, ready, scaled, with_law
 from neuido.models.operator import IntrinsicDynamicsOperator
 from neuido.models.results import load_law, save_law
 from neuido.physics.mpm import Simulator

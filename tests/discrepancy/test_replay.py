@@ -9,8 +9,8 @@ import yaml
 
 from neuido.cli import main
 from neuido.data.experiments import read_experiment
+from neuido.discrepancy.believed import ready
 from neuido.discrepancy.body import SEGMENT, _segment, body_problem
-from neuido.discrepancy.declared import ready
 from neuido.errors import UserError
 from neuido.physics.laws import FixedCorotated
 from neuido.physics.mpm import Simulator
@@ -134,7 +134,8 @@ def test_long_recordings_run_in_pieces(folder, monkeypatch):
     monkeypatch.setattr(Simulator, "rollout", watched)
     problem.predict([{}], 0)
     assert asked == [(90, 30)]
-    (kept,) = problem.simulator(0, 0, 1).cache._kept.values()
+    (simulator,) = problem._simulators.values()
+    (kept,) = simulator.cache._kept.values()
     assert len(kept.tape.x) == 10
 
 
