@@ -13,10 +13,14 @@ import yaml
 
 from neuido.cli import main
 from neuido.data.experiments import read_experiment
+from neuido.data.synthetic import dress
 from neuido.discrepancy import silhouettes
 from neuido.discrepancy.attribution import diagnose
+from neuido.discrepancy.filmed import Splats, looks, read_film
 from neuido.discrepancy.silhouettes import View
 from neuido.discrepancy.video import VideoProblem, video_problem
+from neuido.models.gaussians import harmonics_of, save_ply
+from neuido.types import Gaussians, ParticleState
 from tests.discrepancy import made
 
 EFFECTS = {"drag_linear.k": 4.0}
@@ -159,6 +163,20 @@ def test_a_body_is_made_of_silhouettes_where_none_is_given(folders):
     assert problem.error(problem.predict([EFFECTS], 0)[0] - problem.recordings[0].y, 0) < 4.0
 
 
+def test_gaussians_of_the_folder_are_what_is_drawn(folders, tmp_path):
+    folder = tmp_path / "folder"
+    shutil.copytree(folders["drag"], folder)
+    for r in read_experiment(folder).recordings:
+        dense = dress(r.body, 27, seed="splats")
+        means, covariances = dense.at(r.body.x[None], torch.eye(3).expand(1, len(r.body.x), 3, 3))
+        opacity = torch.full((means.shape[1],), 0.9)
+        save_ply(folder / r.name / "gaussians.ply", Gaussians(means[0], covariances[0], opacity, harmonics_of(dense.colour)))
+    problem = problem_of(folder)
+    assert all(isinstance(f.look, Splats) for f in problem.footage)
+    (truth,) = problem.predict([{"young": 6e4, **EFFECTS}], 0)
+    assert problem.error(truth - problem.recordings[0].y, 0) < 2 * problem.recordings[0].noise
+
+
 def test_command_writes_the_silhouettes(folders, tmp_path, capsys):
     """The whole command, with its report; the model that comes out, put back, lacks nothing."""
     folder = tmp_path / "folder"
@@ -183,6 +201,21 @@ def test_command_writes_the_silhouettes(folders, tmp_path, capsys):
     )
     assert status == 0, err
     assert out.startswith("none; ")
+
+
+def test_measured_film_shows_the_body_that_goes_with_it(data_root):
+    """The silicone bar: eight frames are fitted, five held out, and the body of t = 0 covers the first silhouette."""
+    experiment = read_experiment(data_root / "measured" / "silicone-video")
+    (r,) = experiment.recordings
+    film = read_film(experiment, r)
+    assert film.masks.shape[:2] == (13, 1)
+    t = film.times.numpy()
+    assert np.sum(t[1:] <= t[1] + 0.6 * (t[-1] - t[1])) + 1 == 8
+    motion = ParticleState(r.body.x[None], r.body.v[None], torch.zeros(1, len(r.body.x), 3, 3), r.body.F[None])
+    drawn = looks(r, experiment, r.body, film, "cpu").draw(motion, film.cameras)[0].numpy()
+    inside = silhouettes.inset(drawn, film.masks[0])
+    assert abs(inside) < 1.0
+    assert silhouettes.score(drawn, film.masks[0], inside).iou > 0.85
 
 
 def edit(change):
