@@ -17,13 +17,12 @@ from torch.nn import functional
 
 from neuido.errors import UserError
 from neuido.models.flow import ENCODINGS, Velocities, encode_flow, measure
-from neuido.models.flow_vae import CHANNELS, FlowVAE, load_state, read_weights, write_weights
+from neuido.models.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, load_state, read_weights, write_weights
 from neuido.models.video_vae import CogVideoXVAE, open_vae
 from neuido.types import MultiViewBatch
 
-FORMAT = "neuido-encoder/1"
 PRETRAINED = {
-    "pretrained": Path(__file__).parent / "weights" / "stage2_small.safetensors",
+    "pretrained": Path(__file__).parent / "weights" / "stage2.safetensors",
     "pretrained-small": Path(__file__).parent / "weights" / "stage2_small.safetensors",
 }
 CLOCK, CELL = 5e-3, 1e-2
@@ -216,7 +215,7 @@ class DynamicsEncoder(nn.Module):
         config = {"flow": self.flow, "projector": self.projector.config, "source": self.source, "vae": getattr(self.vae, "config", None)}
         if self.source is not None:
             config["vae"] = None
-        write_weights(path, FORMAT, config, tensors, {"date": date.today().isoformat(), **(card or {})})
+        write_weights(path, ENCODER_FORMAT, config, tensors, {"date": date.today().isoformat(), **(card or {})})
 
     @classmethod
     def load(cls, path: str | os.PathLike = "pretrained") -> Self:
@@ -226,7 +225,7 @@ class DynamicsEncoder(nn.Module):
             UserError: No such file, or not one of this kind.
         """
         file = PRETRAINED.get(str(path)) or Path(path)
-        config, tensors, card = read_weights(file, FORMAT, "encoder")
+        config, tensors, card = read_weights(file, (ENCODER_FORMAT,), "encoder")
         vae = config["source"] or FlowVAE(**config["vae"])
         sizes = {key: config["projector"][key] for key in ("latent_dim", "width", "heads", "conditions")}
         encoder = cls(vae, **config["flow"], **sizes)

@@ -20,6 +20,8 @@ from torch.nn import functional
 from neuido.errors import UserError
 
 FORMAT = "neuido-flow-vae/1"
+ENCODER_FORMAT = "neuido-encoder/1"
+"""Of `models.encoder`, whose files hold a VAE beside the projector."""
 CHANNELS = 16
 """Latent channels, as CogVideoX's."""
 
@@ -153,12 +155,17 @@ class FlowVAE(nn.Module):
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Self:
-        """Read what `save` wrote.
+        """Read what `save` wrote, or the VAE inside an encoder's file.
 
         Raises:
-            UserError: No such file, or not one of this kind.
+            UserError: No such file, or not one of these kinds.
         """
-        config, tensors, card = read_weights(path, FORMAT, "vae")
+        config, tensors, card = read_weights(path, (FORMAT, ENCODER_FORMAT), "vae")
+        if "projector" in config:
+            if config["vae"] is None:
+                raise UserError(f"vae: {path} holds no VAE: its encoder uses {config['source']}")
+            config, card = config["vae"], {}
+            tensors = {name.removeprefix("vae."): t for name, t in tensors.items() if name.startswith("vae.")}
         vae = cls(**config)
         load_state(vae, tensors, path)
         vae.card = card
@@ -181,11 +188,11 @@ def write_weights(
     os.replace(hidden, path)
 
 
-def read_weights(path: str | os.PathLike, kind: str, option: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
+def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
     """Configuration, tensors and card of a file of `write_weights`.
 
     Raises:
-        UserError: No such file, or one of another format; it names `option`.
+        UserError: No such file, or one of a format that is not in `kinds`; it names `option`.
     """
     path = Path(path)
     if not path.is_file():
@@ -194,8 +201,8 @@ def read_weights(path: str | os.PathLike, kind: str, option: str) -> tuple[dict[
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}
-        if metadata.get("format") != kind:
-            raise UserError(f"{option}: {path} has format {metadata.get('format')!r}, not {kind!r}")
+        if metadata.get("format") not in kinds:
+            raise UserError(f"{option}: {path} has format {metadata.get('format')!r}, not {' or '.join(map(repr, kinds))}")
         return json.loads(metadata["config"]), tensors, json.loads(metadata["card"])
     except (SafetensorError, KeyError, json.JSONDecodeError) as error:
         raise UserError(f"{option}: {path} is no weights file of neuido: {error}") from error
