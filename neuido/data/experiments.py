@@ -105,7 +105,7 @@ def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None 
         scenes._keys(content, "the file", ("format", "name", "scene", "model", "discretisation", "recordings"))
         name = read_text(content["name"], "name")
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
-        believed, free = read_model(content["model"] if model is None else model)
+        believed, free = read_belief(content["model"] if model is None else model, folder=folder)
         recordings = read_entries(
             content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, content, folder)
         )
@@ -161,6 +161,31 @@ def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
     if scene.walls != Walls():
         out["walls"] = scene.walls and {"contact": scene.walls.contact, "friction": scene.walls.friction, "inset": scene.walls.inset}
     return out, {"grid": scene.cells, "dt": scene.dt}
+
+
+def read_belief(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """`read_model` for a body, whose model may have a key `law`: a neural law in place of elasticity and plasticity.
+
+    Args:
+        given: As `read_model` takes it, and `law`: a `file` and a factor on its stress, `stiffness`, which may be free.
+        folder: What the law's file is relative to.
+
+    Raises:
+        UserError: An unknown key, an impossible material, an unknown effect.
+    """
+    given = scenes._mapping(given, "model")
+    if "law" not in given:
+        return read_model(given)
+    law = scenes._mapping(given.pop("law"), "model.law")
+    scenes._keys(law, "model.law", ("file", "stiffness"), ("stiffness",))
+    file = folder / Path(read_text(law["file"], "model.law.file")).expanduser()
+    stiffness = number(law.get("stiffness", 1.0), "model.law.stiffness", above=0.0)
+    free = given.get("free", [])
+    scaled = isinstance(free, list) and "stiffness" in free
+    if scaled:
+        given["free"] = [name for name in free if name != "stiffness"]
+    model, own = read_model(given)
+    return {**model, "law": {"file": str(file), "stiffness": stiffness}}, ("stiffness", *own) if scaled else own
 
 
 def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:

@@ -158,7 +158,7 @@ def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial],
     if found:
         classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
         answer = "class" if max(classes) > 1 else "effect"
-    elif float(np.exp(np.mean(np.log(over)))) > UNEXPLAINED:
+    elif float(np.exp(np.mean(np.log(np.maximum(over, 1e-150))))) > UNEXPLAINED:
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"

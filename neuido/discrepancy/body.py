@@ -17,6 +17,7 @@ from torch import Tensor
 
 from neuido.data.experiments import Experiment
 from neuido.data.experiments import Recording as Measured
+from neuido.discrepancy.believed import CLASSICAL, classical, laws_of
 from neuido.discrepancy.declared import declared
 from neuido.discrepancy.library import body_candidates, effects_of, present
 from neuido.discrepancy.problem import Parameter, Point, Problem, Recording
@@ -25,7 +26,6 @@ from neuido.physics import effect_kernels, law_kernels
 from neuido.physics.device import real_of
 from neuido.physics.effect_library import KNOTS
 from neuido.physics.finite_elements import FiniteElements
-from neuido.physics.laws import material
 from neuido.physics.meshing import follow
 from neuido.physics.mpm import Simulator
 from neuido.physics.threads import _one_thread_each, pool
@@ -45,7 +45,10 @@ NUISANCES = (  # name, unit, prior standard deviation; of the frame interval, of
     ("spin_y", "rad/s", 0.01),
     ("spin_z", "rad/s", 0.01),
 )
+INSTRUMENTS = ("release_time", "time_base", "length_scale")
 NEIGHBOURS = 12
+SEGMENT = 2000
+"""Substeps that are launched as one piece where launches are captured or a tape is kept."""
 KEPT = 24
 """Simulators that are kept: of each recording, setting, and number of parameter sets or thread."""
 WINDOWS = 6
@@ -76,6 +79,10 @@ class BodyProblem(Problem):
     device: str = "cpu"
     batch: int = 0
     """Parameter sets in a launch on a GPU; 0: 96. On the CPU each runs alone, as many at a time as there are cores."""
+    instruments: tuple[str, ...] = INSTRUMENTS
+    """Nuisances that change what is seen of a motion, and not the motion."""
+    tracked: bool = True
+    """Whether the data are positions of points."""
     _simulators: dict[Any, Simulator] = field(default_factory=dict, repr=False)
     _maps: dict[int, Any] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
@@ -83,7 +90,7 @@ class BodyProblem(Problem):
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         # instruments alone need no further run: points that move alike share one
         name = self.measured[recording].name
-        instruments = tuple(f"{kind}:{name}" for kind in ("release_time", "time_base", "length_scale"))
+        instruments = tuple(f"{kind}:{name}" for kind in self.instruments)
         unique: dict[tuple, list[int]] = {}
         for i, point in enumerate(points):
             key = tuple(sorted((k, v) for k, v in point.items() if k not in instruments and (":" not in k or k.endswith(f":{name}"))))
@@ -135,6 +142,12 @@ class BodyProblem(Problem):
         x, _ = self._roll([point], recording, setting)
         return x[0]
 
+    def simulated(self, recording: int) -> Measured:
+        """The recording as the declared model has it, with its effects and without noise."""
+        r = self.measured[recording]
+        x = torch.from_numpy(self.motion({}, recording)).float()
+        return replace(r, x=x, noise=None, video=None, gaussians=None)
+
     def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
         model = {key: dict(value) if isinstance(value, Mapping) else value for key, value in self.experiment.model.items()}
         for p in self.declared:
@@ -175,7 +188,8 @@ class BodyProblem(Problem):
         centre = x[0].mean(axis=0)
         return centre + (1.0 + value["length_scale"]) * (x + (value["release_time"] + value["time_base"] * t) * v - centre)
 
-    def _roll(self, points: Sequence[Point], recording: int, setting: int) -> tuple[np.ndarray, np.ndarray]:
+    def _move(self, points: Sequence[Point], recording: int, setting: int) -> ParticleState:
+        """The frames of the recording under each point, (T, S, P, ...)."""
         r = self.measured[recording]
         wanted = len(points)
         if self.device != "cpu":  # few sizes: each has buffers of its own
@@ -194,27 +208,27 @@ class BodyProblem(Problem):
         every, steps, exact = _frames(r, scene.dt)
         with torch.no_grad():
             out = simulator.rollout(
-                steps, elasticity, plasticity, state=self._start(simulator, full, recording), every=every, effects=effects
+                steps,
+                elasticity,
+                plasticity,
+                state=self._start(simulator, full, recording),
+                every=every,
+                segment=_segment(steps, every),
+                effects=effects,
             )
+        frames = ParticleState(*(t.unflatten(1, (len(points), len(r.body.x)))[:, :wanted] for t in out))
+        return frames if exact else _at_times(frames, every * scene.dt, r.t.to(out.x))
+
+    def _roll(self, points: Sequence[Point], recording: int, setting: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities of the tracked points, (S, T, N, 3) each."""
+        frames = self._move(points, recording, setting)
         index, weight = self._map(recording)
-        frames = (t.unflatten(1, (len(points), len(r.body.x)))[:, :wanted] for t in (out.x, out.v))
-        x, v = (_gather(t, index, weight) for t in frames)
-        if not exact:
-            x, v = _at_times(x, v, every * scene.dt, r.t.to(x))
+        x, v = (_gather(t, index, weight) for t in (frames.x, frames.v))
         return tuple(t.transpose(0, 1).double().cpu().numpy() for t in (x, v))
 
     def laws(self, points: Sequence[Mapping[str, float]]):
         """The declared laws of several points, a row each."""
-
-        def filled(part: str) -> dict[str, Any]:
-            given = dict(self.experiment.model[part])
-            for p in self.declared:
-                if p.name in given:
-                    given[p.name] = torch.tensor([point[p.name] for point in points], dtype=torch.float64)
-            return given
-
-        elasticity, plasticity = filled("elasticity"), filled("plasticity")
-        return material(elasticity, plasticity)
+        return laws_of(self.experiment.model, points)
 
     def simulator(self, recording: int, setting: int, count: int) -> Simulator:
         """`count` copies of a recording's scene, kept for the next call of this thread: they hold buffers."""
@@ -300,9 +314,7 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
         raise UserError("no recording has the role fit: set it on at least one in experiment.yaml")
     free = []
     for name in experiment.free:
-        value = next(
-            part[name] for part in (experiment.model["elasticity"], experiment.model["plasticity"], experiment.model) if name in part
-        )
+        value = next(part[name] for part in _parts(experiment.model) if name in part)
         free.append(declared(name, value, within=POISSON if name == "poisson" else None))
     nuisances = []
     for r in measured:
@@ -313,18 +325,21 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
             )
             scale = relative * unit_size
             nuisances.append(Parameter(f"{name}:{r.name}", unit, 0.0, scale, -8 * scale, 8 * scale, prior=1.0))
+    neural = CLASSICAL if "law" in experiment.model else {}
+    candidates = tuple(c for c in body_candidates(classical(experiment)) if c.name not in neural)
     return BodyProblem(
         name=experiment.name,
         measure="rmse",
         unit="m",
         declared=tuple(free),
         nuisances=tuple(nuisances),
-        candidates=present(body_candidates(experiment), experiment.model.get("effects", {})),
+        candidates=present(candidates, experiment.model.get("effects", {})),
         recordings=tuple(_recording(r) for r in measured),
         settings=len(SETTINGS),
         solvers=(0, 4),
         experiment=experiment,
         measured=tuple(measured),
+        labels={"excluded": neural},
         device=device,
         batch=batch,
     )
@@ -366,18 +381,26 @@ def _frames(r: Measured, dt: float) -> tuple[int, int, bool]:
     return every, every * int(np.ceil(t[-1] / (every * dt) + 1e-9)), False
 
 
+def _segment(steps: int, every: int) -> int:
+    """Substeps of a piece of a rollout: a divisor of `steps` and a multiple of `every`, of `SEGMENT` at the most where there is one."""
+    frames = steps // every
+    return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
+
+
 def _gather(x: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
     """Weighted sums over particles, (K, S, P, 3) -> (K, S, N, 3); no weights: the particles themselves."""
     return x[:, :, index] if weight is None else torch.einsum("nk,tsnkc->tsnc", weight.to(x), x[:, :, index])
 
 
-def _at_times(x: Tensor, v: Tensor, step: float, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Cubic Hermite interpolation of frames that are `step` apart."""
+def _at_times(frames: ParticleState, step: float, t: Tensor) -> ParticleState:
+    """Frames (K, S, P, ...) that are `step` apart at other times: cubic Hermite interpolation of x, linear of the rest."""
+    x, v, C, F = frames
     k = (t / step).floor().long().clamp(max=len(x) - 2)
     u = (t / step - k)[:, None, None, None]
     x0, x1, v0, v1 = x[k], x[k + 1], v[k] * step, v[k + 1] * step
     place = (1 + 2 * u) * (1 - u) ** 2 * x0 + u * (1 - u) ** 2 * v0 + u**2 * (3 - 2 * u) * x1 + u**2 * (u - 1) * v1
-    return place, ((1 - u) * v0 + u * v1) / step
+    w = u[..., None]
+    return ParticleState(place, ((1 - u) * v0 + u * v1) / step, (1 - w) * C[k] + w * C[k + 1], (1 - w) * F[k] + w * F[k + 1])
 
 
 def _first_seen(r: Measured) -> Tensor:
@@ -394,7 +417,12 @@ def _first_seen(r: Measured) -> Tensor:
     return torch.where(place.isnan(), r.body.x.double().mean(dim=0), place)
 
 
+def _parts(model: Mapping[str, Any]) -> list[Any]:
+    """The parts of a model that hold figures."""
+    return [model["elasticity"], model["plasticity"], model.get("law", {}), model]
+
+
 def _place(model: dict[str, Any], name: str, value: float) -> None:
-    for part in (model["elasticity"], model["plasticity"], model):
+    for part in _parts(model):
         if name in part:
             part[name] = float(value)
