@@ -186,7 +186,7 @@ class LowRankAdaptation(Method):
         plain = copy.deepcopy(self.tuned)
         if not isinstance(plain, IntrinsicDynamicsOperator):
             plain = plain.unload()
-            del plain.peft_config
+            vars(plain).pop("peft_config", None)  # or PEFT would take it for a second adapter
         self.rank = 0
         self.tuned = plain
         if (folder / PEFT_FILES[0]).exists() or content.get("found", {}).get("rank"):
