@@ -282,6 +282,7 @@ class AdaptModule(FilmedModule):
 
     def on_train_end(self) -> None:
         self._finish()
+        self._say_absent()
 
     def _finish(self) -> None:
         """Score the current scene once its steps are done, and write what was found."""
