@@ -42,13 +42,9 @@ HEAVY = {
 }
 
 MODULES = (  # so that their class names resolve without a path
-    "neuido.models.pretrain",
-    "neuido.models.pretrain_vae",
-    "neuido.models.warmup",
-    "neuido.models.align",
-    "neuido.data.trajectories",
-    "neuido.data.films",
-    "neuido.data.visual_module",
+    *(f"neuido.models.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt", "adapter")),
+    *(f"neuido.data.{name}" for name in ("trajectories", "films", "visual_module")),
+    "neuido.discrepancy.diagnosed",
 )
 
 
@@ -194,4 +190,5 @@ def _quiet_lightning() -> None:
     warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).* is deprecated")
     warnings.filterwarnings("ignore", message=r".*tensorboardX.* has been removed")
     warnings.filterwarnings("ignore", message=r".*does not have many workers")  # the data sets are memory maps
+    warnings.filterwarnings("ignore", message=r".*but have no `validation_step`")  # adaptation scores before and after each scene
     warnings.filterwarnings("ignore", message=r".*in eval mode at the start of training")  # what is frozen is meant to be

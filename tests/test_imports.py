@@ -29,6 +29,10 @@ NETS = tuple(
         "gaussians",
         "filling",
         "baselines",
+        "methods",
+        "adapter",
+        "scene_fit",
+        "progress",
     )
 )
 ROOMS = {  # room: the parts of neuido that it may import, itself included

@@ -1,5 +1,6 @@
 """Filmed and reconstructed bodies as data for Stage II, scoring and prediction: a batch is one scene."""
 
+import os
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -11,8 +12,13 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
 from neuido.data.sampling import Resumable
+from neuido.data.scenes import VARIABLE, data_root
 from neuido.data.visual import VisualScene, load_visual
+from neuido.data.visual_known import load_known
 from neuido.errors import UserError
+
+KEYS = {"reconstruction": ("reconstruction", "recording", "views"), "particles": ("recording", "views", "dt", "crop")}
+"""What a scene's mapping takes beside `path`, by where its body comes from (`body`)."""
 
 
 def in_order(scenes: Sequence[VisualScene], *, rank: int = 0, ranks: int = 1) -> DataLoader:
@@ -53,9 +59,27 @@ class Turns(Resumable[VisualScene]):
         return -(-len(self.scenes) // self.ranks)
 
     def batches(self, epoch: int, start: int) -> Iterable[VisualScene]:
+        return (self.scenes[i] for i in self._order(epoch)[start:])
+
+    def _order(self, epoch: int) -> list[int]:
+        """Which scenes this process gets in an epoch."""
         count = len(self.scenes)
         order = np.random.default_rng([self.seed, epoch]).permutation(count).tolist()
-        return (self.scenes[order[(k * self.ranks + self.rank) % count]] for k in range(start, len(self)))
+        return [order[(k * self.ranks + self.rank) % count] for k in range(len(self))]
+
+
+class OneByOne(Turns):
+    """Each scene for so many steps: an epoch is one scene, in the order given."""
+
+    def __init__(self, scenes: Sequence[VisualScene], *, steps: int) -> None:
+        super().__init__(scenes)
+        self.steps = steps
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def _order(self, epoch: int) -> list[int]:
+        return [epoch] * self.steps if epoch < len(self.scenes) else []
 
 
 class VisualDataModule(LightningDataModule):
@@ -64,9 +88,10 @@ class VisualDataModule(LightningDataModule):
     Training and validation take `scenes`; test and predict take `scenes` and `unseen`. Under several processes each trains on its own.
 
     Args:
-        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them).
+        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them); with
+            `body: particles` instead of `recording`, `views`, `dt`, `crop` (as `load_known` takes them).
         unseen: Scenes that training never sees.
-        root: Folder to which the paths of scenes are relative; none: the current one.
+        root: Folder to which the paths of scenes are relative; none: the current one, and what is not there is sought in NEUIDO_DATA.
         reconstructions: Folder that holds a reconstruction for each scene under the name of the scene's folder; none: inside each scene.
         frame_step: Take each n-th frame.
         frame_count: Number of frames; none: all.
@@ -94,6 +119,8 @@ class VisualDataModule(LightningDataModule):
         self.given, self.given_unseen, self.seed = list(scenes), list(unseen or []), seed
         self.root, self.reconstructions = root, reconstructions
         self.options: dict[str, Any] = {"frame_step": frame_step, "frame_count": frame_count, "width": width, "background": background}
+        self.steps_in_a_row: int | None = None
+        """Set by a model that fits one scene after the other: how many steps each takes, and an epoch is then one scene."""
 
     @cached_property
     def scenes(self) -> list[VisualScene]:
@@ -119,6 +146,8 @@ class VisualDataModule(LightningDataModule):
                 raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} are held out")
 
     def train_dataloader(self) -> Turns:
+        if self.steps_in_a_row is not None:
+            return OneByOne(self.scenes, steps=self.steps_in_a_row)
         return Turns(self.scenes, seed=self.seed, **self._share())
 
     def val_dataloader(self) -> DataLoader:
@@ -141,18 +170,27 @@ class VisualDataModule(LightningDataModule):
         """Not here: the model brings a scene to the device once, and keeps it there."""
         return batch
 
+    def _find(self, path: Path) -> Path:
+        own = Path(self.root or ".") / path
+        if self.root is None and not own.exists() and os.environ.get(VARIABLE):
+            return data_root() / path
+        return own
+
     def _open(self, given: str | dict[str, Any], where: str) -> VisualScene:
         options: dict[str, Any] = dict(given) if isinstance(given, dict) else {"path": given}
         if "path" not in options:
             raise UserError(f"{where} lacks the key 'path'")
-        known = ("path", "reconstruction", "recording", "views")
+        body = options.pop("body", "reconstruction")
+        if body not in KEYS:
+            raise UserError(f"{where}.body = {body!r}; one of {', '.join(KEYS)}")
+        known = ("path", "body", *KEYS[body])
         for key in options:
             if key not in known:
                 raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(known)}")
-        path = Path(self.root or ".") / Path(options.pop("path")).expanduser()
-        if "reconstruction" not in options and self.reconstructions is not None:
+        path = self._find(Path(options.pop("path")).expanduser())
+        if body == "reconstruction" and "reconstruction" not in options and self.reconstructions is not None:
             options["reconstruction"] = Path(self.reconstructions) / path.resolve().name
         try:
-            return load_visual(path, **options, **self.options)
+            return (load_known if body == "particles" else load_visual)(path, **options, **self.options)
         except UserError as error:
             raise UserError(f"{where}: {error}") from error
