@@ -18,7 +18,7 @@ from neuido.models import results, scores
 from neuido.models.branch import implausibility, open_branch, small_strain_modulus
 from neuido.models.conditions import read_conditions, run_condition
 from neuido.models.lpips import Absent, open_lpips
-from neuido.models.pipeline import Prepared, draw, folder_of, infer, prepare, roll_surely
+from neuido.models.pipeline import Prepared, draw, folder_of, infer, prepare, roll, roll_surely
 from neuido.models.pretrain import run_length
 
 
@@ -218,7 +218,7 @@ class AlignModule(LightningModule):
         summary["modulus"] = float(small_strain_modulus(self.operator, found.z[None])[0])
         try:
             with torch.no_grad():
-                motion, halvings = roll_surely(prepared, self.operator, found.z)
+                motion, halvings = roll_surely(prepared, lambda scene: roll(scene, self.operator, found.z))
             summary["halvings"] = halvings
         except UserError as error:
             return summary | {"failed": str(error)}, [], []
@@ -286,7 +286,7 @@ class AlignModule(LightningModule):
             for z in candidates.to(self.device):
                 try:
                     with torch.no_grad():
-                        motion, _ = roll_surely(prepared, self.operator, z)
+                        motion, _ = roll_surely(prepared, lambda scene, z=z: roll(scene, self.operator, z))
                 except UserError:
                     continue
                 values.append(float(scores.chamfer_by_frame(prepared, motion).mean()))
@@ -324,7 +324,7 @@ class AlignModule(LightningModule):
         results.save_law(folder / "law.safetensors", self.operator, found.z, card)
         with torch.no_grad():
             try:
-                motion, halvings = roll_surely(prepared, self.operator, found.z)
+                motion, halvings = roll_surely(prepared, lambda scene: roll(scene, self.operator, found.z))
             except UserError as error:
                 print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
                 return {"scene": scene.name, "folder": str(folder), "seconds": found.seconds, "failed": str(error)}

@@ -5,6 +5,7 @@ images -> flow -> frozen VAE -> projector -> z -> laws -> rollout -> Gaussians -
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -40,9 +41,9 @@ class Prepared(NamedTuple):
     background: Tensor
     training: list[int]
     """Views that are not held out."""
-    volume: Tensor
-    """Flow latents of the views that the encoder sees, (V', channels, T', h, w)."""
-    conditions: Tensor
+    volume: Tensor | None
+    """Flow latents of the views that the encoder sees, (V', channels, T', h, w); none without an encoder."""
+    conditions: Tensor | None
     """(V', 2)"""
 
     @property
@@ -71,7 +72,7 @@ class Prepared(NamedTuple):
 
 def prepare(
     scene: VisualScene,
-    encoder: DynamicsEncoder,
+    encoder: DynamicsEncoder | None,
     *,
     device: str | torch.device = "cpu",
     encoder_views: int = 0,
@@ -81,7 +82,7 @@ def prepare(
 
     Args:
         scene: The scene.
-        encoder: Its frozen VAE makes the flow latents.
+        encoder: Its frozen VAE makes the flow latents; none: they are not needed.
         device: Where it will run.
         encoder_views: How many of the training views the encoder sees, the first ones; 0: all.
         cache: Folder in which flows are kept.
@@ -97,10 +98,11 @@ def prepare(
     training = (~batch.held_out).nonzero()[:, 0].tolist()
     if not training:
         raise UserError(f"{scene.name} has no training view: all {len(batch.held_out)} are held out")
-    seen = training[: encoder_views or None]
-    with torch.no_grad():
-        velocities = encoder.watch(batch, seen, scene.body.x.mean(0), cache=cache)
-        volume, conditions = encoder.embed(velocities)
+    volume = conditions = None
+    if encoder is not None:
+        with torch.no_grad():
+            velocities = encoder.watch(batch, training[: encoder_views or None], scene.body.x.mean(0), cache=cache)
+            volume, conditions = (t.to(device) for t in encoder.embed(velocities))
     gaussians = load_ply(scene.gaussians, device=device)
     simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device)
     return Prepared(
@@ -114,8 +116,8 @@ def prepare(
         cameras=batch.cameras._replace(viewmats=batch.cameras.viewmats.to(device), Ks=batch.cameras.Ks.to(device)),
         background=batch.background.to(device),
         training=training,
-        volume=volume.to(device),
-        conditions=conditions.to(device),
+        volume=volume,
+        conditions=conditions,
     )
 
 
@@ -129,24 +131,27 @@ def roll(prepared: Prepared, operator: IntrinsicDynamicsOperator, z: Tensor, fra
     return prepared.simulator.rollout(steps, *operator.laws(z), every=prepared.every)
 
 
-def roll_surely(prepared: Prepared, operator: IntrinsicDynamicsOperator, z: Tensor, halvings: int = 2) -> tuple[ParticleState, int]:
-    """`roll`, and where it fails the same with half the substep, at most `halvings` times; the frames, and how often it was halved.
+def roll_surely(prepared: Prepared, run: Callable[[Prepared], ParticleState], halvings: int = 2) -> tuple[ParticleState, int]:
+    """The frames of `run`, and how often the substep was halved, at most `halvings` times, because it had failed.
 
     Raises:
-        UserError: As `roll`, with the smallest substep too.
+        UserError: As `run`, with the smallest substep too.
     """
     for count in range(halvings + 1):
         try:
-            if count == 0:
-                return roll(prepared, operator, z), 0
-            source = prepared.source
-            finer = replace(source.scene, dt=source.scene.dt / 2**count)
-            simulator = Simulator(finer, source.body, density=source.density, device=prepared.simulator.device, graphs=False)
-            return roll(prepared._replace(simulator=simulator, every=prepared.every * 2**count), operator, z), count
+            return run(prepared if count == 0 else refine(prepared, 2**count)), count
         except UserError:
             if count == halvings:
                 raise
     raise AssertionError("unreachable")
+
+
+def refine(prepared: Prepared, times: int) -> Prepared:
+    """The same scene with a substep that is so many times smaller; its rollouts are not captured as graphs."""
+    source = prepared.source
+    finer = replace(source.scene, dt=source.scene.dt / times)
+    simulator = Simulator(finer, source.body, density=source.density, device=prepared.simulator.device, graphs=False)
+    return prepared._replace(simulator=simulator, every=prepared.every * times)
 
 
 def draw(prepared: Prepared, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:
