@@ -7,8 +7,8 @@ With F = U diag(sigma) V^T, sigma descending, and R = U V^T:
     elastic         tau = scale R X F^T
     plastic         F_hat = F + scale R X
 
-The derivative of R divides by sigma_i + sigma_j and holds at F = I. That of sigma does not exist where two are equal, since the networks treat
-them by rank: there the adjoint of each is the mean of theirs, which does not depend on the choice of the singular vectors.
+The derivative of R divides by sigma_i + sigma_j and holds at F = I. That of sigma does not exist where two are equal, since the networks
+treat them by rank: there the adjoint of each is the mean of theirs, which does not depend on the choice of the singular vectors.
 """
 
 import functools

@@ -1,7 +1,7 @@
 """NCLaw's networks as laws for the rollout (Ma et al. 2023, `InvariantFullMeta`): invariants of F through three layers without bias.
 
-The engine form is batched: Warp kernels make features and read-out (`invariant_kernels`), torch multiplies the matrices. Each engine owns its
-memory, so that a rollout with these laws is captured in a CUDA graph like any other. Calling a law runs its twin in plain torch.
+The engine form is batched: Warp kernels make features and read-out (`invariant_kernels`), torch multiplies the matrices. Each engine
+owns its memory, so that a rollout with these laws is captured in a CUDA graph like any other. Calling a law runs its twin in plain torch.
 """
 
 from collections.abc import Hashable, Sequence
