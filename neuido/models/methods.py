@@ -17,15 +17,12 @@ from torch import Tensor, nn
 from neuido.data.storage import publish, write
 from neuido.errors import UserError
 from neuido.models.encoder import DynamicsEncoder
-from neuido.models.pipeline import Prepared
+from neuido.models.pipeline import Laws, Prepared, roll_laws
 from neuido.physics.effects import Effects
-from neuido.physics.law import ElasticLaw, PlasticLaw
 from neuido.types import ParticleState
 
 FORMAT = "neuido-method/1"
 PARAMETERS, CARD = "parameters.safetensors", "method.json"
-
-Laws = tuple[ElasticLaw, PlasticLaw | None]
 
 
 class Method(nn.Module):
@@ -66,7 +63,7 @@ class Method(nn.Module):
         *,
         state: ParticleState | None = None,
         effects: Effects | None = None,
-        segment: int | None = None,
+        segment: int = 0,
     ) -> ParticleState:
         """The motion over the first `frames` frames, differentiable in parameters and `state`; another kind of simulation overrides it.
 
@@ -75,7 +72,7 @@ class Method(nn.Module):
             frames: Number of frames K, the start included.
             state: Start, (P, ...); the scene's body where absent.
             effects: Effects that act on top of the laws.
-            segment: As `Simulator.rollout`, in substeps.
+            segment: As `pipeline.roll_laws`, in frames.
 
         Returns:
             x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3).
@@ -83,8 +80,7 @@ class Method(nn.Module):
         Raises:
             UserError: As `Simulator.rollout`.
         """
-        options: dict[str, Any] = {"state": state, "effects": effects, "segment": segment}
-        return scene.simulator.rollout((frames - 1) * scene.every, *self.laws(scene), every=scene.every, **options)
+        return roll_laws(scene, self.laws(scene), frames, segment=segment, state=state, effects=effects)
 
     def trainable(self) -> dict[str, nn.Parameter]:
         """The parameters that are fitted, by name."""

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,11 +17,17 @@ from neuido.data.visual import VisualScene
 from neuido.errors import UserError
 from neuido.models.encoder import DynamicsEncoder
 from neuido.models.flow import as_bytes, frame_interval_of
-from neuido.models.gaussians import Binding, bind, deform, load_ply
+from neuido.models.gaussians import Binding, bind, deform, dress, load_ply
 from neuido.models.operator import IntrinsicDynamicsOperator
 from neuido.models.splatting import render
+from neuido.physics.law import ElasticLaw, PlasticLaw
 from neuido.physics.mpm import Simulator
 from neuido.types import Cameras, Gaussians, ParticleState
+
+UNEVEN = 50
+"""Frames of a rollout between two of a recording at uneven times."""
+
+Laws = tuple[ElasticLaw, PlasticLaw | None]
 
 
 class Prepared(NamedTuple):
@@ -30,9 +36,10 @@ class Prepared(NamedTuple):
     source: VisualScene
     simulator: Simulator
     gaussians: Gaussians
-    binding: Binding
+    binding: Binding | None
+    """None: Gaussian i is particle i."""
     every: int
-    """Substeps from one frame to the next."""
+    """Substeps from one frame of a rollout to the next."""
     images: Tensor
     """(V, T, H, W, 3) uint8."""
     masks: Tensor
@@ -45,11 +52,22 @@ class Prepared(NamedTuple):
     """Flow latents of the views that the encoder sees, (V', channels, T', h, w); none without an encoder."""
     conditions: Tensor | None
     """(V', 2)"""
+    picks: tuple[int, ...] | None = None
+    """Which frames of a rollout are the recording's, of T recorded at uneven times; none: all."""
 
     @property
     def frames(self) -> int:
         """T."""
         return self.images.shape[1]
+
+    @property
+    def stride(self) -> int:
+        """Substeps of the recording's mean frame interval, about."""
+        return self.every if self.picks is None else self.every * UNEVEN
+
+    def substeps(self, frames: int) -> int:
+        """Substeps of a rollout from the first to the last of so many frames."""
+        return self.every * (frames - 1 if self.picks is None else self.picks[frames - 1])
 
     @property
     def scoring(self) -> list[int]:
@@ -90,11 +108,8 @@ def prepare(
     Raises:
         UserError: Frames that are no whole number of substeps apart, no training view; what `Simulator` and `DynamicsEncoder.watch` refuse.
     """
-    batch, dt = scene.batch, scene.scene.dt
-    interval = frame_interval_of(batch.times)
-    every = round(interval / dt)
-    if every < 1 or abs(every * dt - interval) > 1e-3 * interval:
-        raise UserError(f"{scene.name}: frames are {interval:g} s apart, no whole number of substeps of {dt:g} s; change dt or frame_step")
+    batch = scene.batch
+    every, picks = clock(batch.times, scene.scene.dt, scene.name)
     training = (~batch.held_out).nonzero()[:, 0].tolist()
     if not training:
         raise UserError(f"{scene.name} has no training view: all {len(batch.held_out)} are held out")
@@ -103,13 +118,17 @@ def prepare(
         with torch.no_grad():
             velocities = encoder.watch(batch, training[: encoder_views or None], scene.body.x.mean(0), cache=cache)
             volume, conditions = (t.to(device) for t in encoder.embed(velocities))
-    gaussians = load_ply(scene.gaussians, device=device)
     simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device)
+    if scene.gaussians is None:
+        gaussians, binding = dress(simulator.state.x, simulator.volume), None
+    else:
+        gaussians = load_ply(scene.gaussians, device=device)
+        binding = bind(gaussians, simulator.state.x)
     return Prepared(
         source=scene,
         simulator=simulator,
         gaussians=gaussians,
-        binding=bind(gaussians, simulator.state.x),
+        binding=binding,
         every=every,
         images=as_bytes(batch.images).to(device),
         masks=as_bytes(batch.masks).to(device),
@@ -118,17 +137,58 @@ def prepare(
         training=training,
         volume=volume,
         conditions=conditions,
+        picks=picks,
     )
 
 
-def roll(prepared: Prepared, operator: IntrinsicDynamicsOperator, z: Tensor, frames: int | None = None) -> ParticleState:
-    """The motion under the law of z (d,): frames of the recording's times, the first `frames` or all.
+def clock(times: Tensor, dt: float, name: str) -> tuple[int, tuple[int, ...] | None]:
+    """Substeps from one frame of a rollout to the next, and which frames are the recording's, none where its times are even (to 1 %).
+
+    Uneven times are rounded to a fiftieth of the mean interval.
+
+    Raises:
+        UserError: Even times that are no whole number of substeps apart, two frames at one time.
+    """
+    steps = torch.as_tensor(times, dtype=torch.float64).diff()
+    if len(steps) and float((steps - steps.mean()).abs().max()) > 0.01 * float(steps.mean()) > 0:
+        every = max(1, int(float(steps.mean()) / (UNEVEN * dt)))
+        picks = tuple(((times - times[0]) / (every * dt)).round().long().tolist())
+        if any(b <= a for a, b in zip(picks, picks[1:])):
+            raise UserError(f"{name}: two frames are {float(steps.min()):g} s apart; leave one out (frame_step, frame_count)")
+        return every, picks
+    interval = frame_interval_of(times)
+    every = round(interval / dt)
+    if every < 1 or abs(every * dt - interval) > 1e-3 * interval:
+        raise UserError(f"{name}: frames are {interval:g} s apart, no whole number of substeps of {dt:g} s; change dt or frame_step")
+    return every, None
+
+
+def roll_laws(prepared: Prepared, laws: Laws, frames: int, *, segment: int = 0, **options: Any) -> ParticleState:
+    """The motion under an elastic and a plastic law: the first `frames` frames of the recording's.
+
+    Args:
+        prepared: The scene.
+        laws: As `Simulator.rollout` takes them.
+        frames: Number of frames K, the start included.
+        segment: Keep the state of a rollout with gradients every so many frames only; 0: of all.
+        options: Of `Simulator.rollout`.
 
     Raises:
         UserError: As `Simulator.rollout`: a law too stiff for the step, a particle lost.
     """
-    steps = ((frames or prepared.frames) - 1) * prepared.every
-    return prepared.simulator.rollout(steps, *operator.laws(z), every=prepared.every)
+    steps, piece = prepared.substeps(frames), segment * prepared.stride
+    if 0 < piece < steps:
+        options["segment"], steps = piece, piece * -(-steps // piece)  # whole pieces; the frames beyond are dropped
+    motion = prepared.simulator.rollout(steps, *laws, every=prepared.every, **options)
+    wanted = slice(frames) if prepared.picks is None else list(prepared.picks[:frames])
+    return ParticleState(*(t[wanted] for t in motion))
+
+
+def roll(
+    prepared: Prepared, operator: IntrinsicDynamicsOperator, z: Tensor, frames: int | None = None, *, segment: int = 0
+) -> ParticleState:
+    """`roll_laws` of the laws of z (d,), over the first `frames` frames or all."""
+    return roll_laws(prepared, operator.laws(z), frames or prepared.frames, segment=segment)
 
 
 def roll_surely(prepared: Prepared, run: Callable[[Prepared], ParticleState], halvings: int = 2) -> tuple[ParticleState, int]:
