@@ -77,13 +77,12 @@ class SpringMass(Method):
         self.volume = float(simulator.volume.sum())
         device, one = x.device, torch.ones(1, device=x.device)
         size = {"anchor": len(self.index), "spring": len(self.network.rest), "body": 1}[self.per]
-        self.soft = nn.Parameter(0.0 * one)
-        self.slide = nn.Parameter(-one)
-        self.stiffness = nn.Parameter(torch.zeros(size, device=device))
-        # the modulus is linear in the stiffness
-        self.stiffness.data += math.log10(self.young / float(self.modulus(self.springs()[0].detach())))
         start = math.log10(self.damping_start) if self.damping_start else 0.0
-        self.damping = nn.Parameter(torch.full((1,), start, device=device), requires_grad=self.fit_damping and self.damping_start > 0)
+        self.soft, self.slide = nn.Parameter(0.0 * one), nn.Parameter(-one)
+        self.damping = nn.Parameter(start * one, requires_grad=self.fit_damping and self.damping_start > 0)
+        self.stiffness = nn.Parameter(torch.zeros(size, device=device))
+        with torch.no_grad():  # the modulus is linear in the stiffness
+            self.stiffness += math.log10(self.young / float(self.modulus(self.springs()[0])))
 
     def springs(self) -> tuple[Tensor, Tensor]:
         """Stiffness [N/m] and damping [N s/m] of each spring, (N,)."""
@@ -111,7 +110,7 @@ class SpringMass(Method):
         *,
         state: ParticleState | None = None,
         effects: Effects | None = None,
-        segment: int | None = None,
+        segment: int = 0,
     ) -> ParticleState:
         """As `Method.roll`; F stays the identity, and `segment` has no use, since a state here is small.
 
@@ -126,7 +125,9 @@ class SpringMass(Method):
         parts = self.body.substeps(stiffness, damping, dt)
         start = (state.x[self.index], state.v[self.index])
         every = scene.every * parts
-        x, v = self.body.rollout((frames - 1) * every, dt / parts, *start, stiffness, damping, self.grip(), every=every)
+        x, v = self.body.rollout(scene.substeps(frames) * parts, dt / parts, *start, stiffness, damping, self.grip(), every=every)
+        wanted = slice(frames) if scene.picks is None else list(scene.picks[:frames])
+        x, v = x[wanted], v[wanted]
         both = torch.cat([x - x[:1], v - v[:1]], -1).transpose(0, 1)  # (A, K, 6)
         moved = torch.sparse.mm(self.follow, both.flatten(1)).view(len(state.x), frames, 6).transpose(0, 1)
         eye = torch.eye(3, device=x.device, dtype=x.dtype).expand(frames, len(state.x), 3, 3)
