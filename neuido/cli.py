@@ -46,6 +46,8 @@ MODULES = (  # so that their class names resolve without a path
     "neuido.models.pretrain_vae",
     "neuido.models.warmup",
     "neuido.models.align",
+    "neuido.models.adapt",
+    "neuido.models.adapter",
     "neuido.data.trajectories",
     "neuido.data.films",
     "neuido.data.visual_module",
@@ -194,4 +196,5 @@ def _quiet_lightning() -> None:
     warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).* is deprecated")
     warnings.filterwarnings("ignore", message=r".*tensorboardX.* has been removed")
     warnings.filterwarnings("ignore", message=r".*does not have many workers")  # the data sets are memory maps
+    warnings.filterwarnings("ignore", message=r".*but have no `validation_step`")  # adaptation scores before and after each scene
     warnings.filterwarnings("ignore", message=r".*in eval mode at the start of training")  # what is frozen is meant to be

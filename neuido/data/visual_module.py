@@ -11,7 +11,11 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
 from neuido.data.visual import VisualScene, load_visual
+from neuido.data.visual_known import load_known
 from neuido.errors import UserError
+
+KEYS = {"reconstruction": ("reconstruction", "recording", "views"), "particles": ("recording", "views", "dt", "crop")}
+"""What a scene's mapping takes beside `path`, by where its body comes from (`body`)."""
 
 
 def in_order(scenes: Sequence[VisualScene], *, rank: int = 0, ranks: int = 1) -> DataLoader:
@@ -70,11 +74,16 @@ class Turns:
             start = self._resume[1]
         self._resume = None
         self._next = start
+        order = self._order(epoch)
+        for k in range(start, len(order)):
+            self._next = k + 1
+            yield self.scenes[order[k]]
+
+    def _order(self, epoch: int) -> list[int]:
+        """Which scenes this process gets in an epoch."""
         count = len(self.scenes)
         order = np.random.default_rng([self.seed, epoch]).permutation(count).tolist()
-        for k in range(start, len(self)):
-            self._next = k + 1
-            yield self.scenes[order[(k * self.ranks + self.rank) % count]]
+        return [order[(k * self.ranks + self.rank) % count] for k in range(len(self))]
 
     def state_dict(self) -> dict[str, int]:
         return {"epoch": self.epoch, "step": self._next, "scenes": len(self.scenes), "ranks": self.ranks}
@@ -86,13 +95,28 @@ class Turns:
         self._resume = (state["epoch"], state["step"])
 
 
+class OneByOne(Turns):
+    """Each scene for so many steps: an epoch is one scene, in the order given."""
+
+    def __init__(self, scenes: Sequence[VisualScene], *, steps: int) -> None:
+        super().__init__(scenes)
+        self.steps = steps
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def _order(self, epoch: int) -> list[int]:
+        return [epoch] * self.steps if epoch < len(self.scenes) else []
+
+
 class VisualDataModule(LightningDataModule):
     """Scenes of `neuido simulate` or of one's own, each with what `neuido reconstruct` made of it (`data.visual`).
 
     Training and validation take `scenes`; test and predict take `scenes` and `unseen`. Under several processes each trains on its own.
 
     Args:
-        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them).
+        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them); with
+            `body: particles` instead of `recording`, `views`, `dt`, `crop` (as `load_known` takes them).
         unseen: Scenes that training never sees.
         root: Folder to which the paths of scenes are relative; none: the current one.
         reconstructions: Folder that holds a reconstruction for each scene under the name of the scene's folder; none: inside each scene.
@@ -122,6 +146,8 @@ class VisualDataModule(LightningDataModule):
         self.given, self.given_unseen, self.seed = list(scenes), list(unseen or []), seed
         self.root, self.reconstructions = root, reconstructions
         self.options: dict[str, Any] = {"frame_step": frame_step, "frame_count": frame_count, "width": width, "background": background}
+        self.steps_in_a_row: int | None = None
+        """Set by a model that fits one scene after the other: how many steps each takes, and an epoch is then one scene."""
 
     @cached_property
     def scenes(self) -> list[VisualScene]:
@@ -147,6 +173,8 @@ class VisualDataModule(LightningDataModule):
                 raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} are held out")
 
     def train_dataloader(self) -> Turns:
+        if self.steps_in_a_row is not None:
+            return OneByOne(self.scenes, steps=self.steps_in_a_row)
         return Turns(self.scenes, seed=self.seed, **self._share())
 
     def val_dataloader(self) -> DataLoader:
@@ -173,14 +201,17 @@ class VisualDataModule(LightningDataModule):
         options: dict[str, Any] = dict(given) if isinstance(given, dict) else {"path": given}
         if "path" not in options:
             raise UserError(f"{where} lacks the key 'path'")
-        known = ("path", "reconstruction", "recording", "views")
+        body = options.pop("body", "reconstruction")
+        if body not in KEYS:
+            raise UserError(f"{where}.body = {body!r}; one of {', '.join(KEYS)}")
+        known = ("path", "body", *KEYS[body])
         for key in options:
             if key not in known:
                 raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(known)}")
         path = Path(self.root or ".") / Path(options.pop("path")).expanduser()
-        if "reconstruction" not in options and self.reconstructions is not None:
+        if body == "reconstruction" and "reconstruction" not in options and self.reconstructions is not None:
             options["reconstruction"] = Path(self.reconstructions) / path.resolve().name
         try:
-            return load_visual(path, **options, **self.options)
+            return (load_known if body == "particles" else load_visual)(path, **options, **self.options)
         except UserError as error:
             raise UserError(f"{where}: {error}") from error

@@ -117,11 +117,14 @@ class Method(nn.Module):
         write_tensors(folder / PARAMETERS, tensors)
         self.write_card(folder)
 
+    def card(self) -> dict[str, Any]:
+        """What `method.json` says: the method's name and `describe`."""
+        return {"format": FORMAT, "method": type(self).__name__, "found": self.describe()}
+
     def write_card(self, folder: Path) -> None:
-        """Write `method.json`: the method's name and `describe`."""
+        """Write `method.json`."""
         folder.mkdir(parents=True, exist_ok=True)
-        content = {"format": FORMAT, "method": type(self).__name__, "found": self.describe()}
-        write(folder / CARD, json.dumps(content, indent=1) + "\n")
+        write(folder / CARD, json.dumps(self.card(), indent=1) + "\n")
 
     def load(self, folder: Path) -> None:
         """Take what `save` wrote.
@@ -138,8 +141,12 @@ class Method(nn.Module):
             with torch.no_grad():
                 p.copy_(given[name])
 
-    def check_card(self, folder: Path) -> None:
-        """Refuse a folder that another method wrote."""
+    def check_card(self, folder: Path) -> dict[str, Any]:
+        """The content of `method.json`.
+
+        Raises:
+            UserError: It is missing, or another method wrote it.
+        """
         path = folder / CARD
         try:
             content = json.loads(path.read_text())
@@ -148,6 +155,7 @@ class Method(nn.Module):
         if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("method") != type(self).__name__:
             found = content.get("method") if isinstance(content, dict) else None
             raise UserError(f"model.adapter: {path} is of method {found!r}, model.method is {type(self).__name__}")
+        return content
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
