@@ -13,7 +13,7 @@ from neuido.errors import UserError
 if TYPE_CHECKING:
     from neuido.demo_laws import LawsResult
     from neuido.demo_loop import LoopResult
-    from neuido.demo_video import VideoResult
+    from neuido.demo_video import Adapted, VideoResult
 
 PARTS = ("laws", "video", "loop")
 STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:1120px;margin:2em auto;padding:0 1em}
@@ -106,8 +106,18 @@ def video_section(result: "VideoResult") -> str:
         if result.losses
         else "Scores are those of views that were held out."
     )
+    few = "" if result.adapted is None else adapted_section(result.adapted)
     shown = "".join(f"<h3>{_text(s.name)}: recorded above, predicted below</h3>{_picture(s.picture)}" for s in result.scenes)
-    return f"<h2>Stage II: a law from video, in one pass</h2><p>{text}</p>{_table(head, rows)}{shown}"
+    return f"<h2>Stage II: a law from video, in one pass</h2><p>{text}</p>{_table(head, rows)}{shown}{few}"
+
+
+def adapted_section(result: "Adapted") -> str:
+    """Few-shot adaptation on the page: scores on the held-out view before and after."""
+    rows = [(name, scores.get("psnr", ""), scores.get("cd", ""), scores.get("rmse", "")) for name, scores in
+            (("zero-shot", result.before), (f"after {result.steps} steps, {result.seconds:.0f} s", result.after))]  # fmt: skip
+    text = "LoRA on both trunks and the latent, fitted to the training views of the scene that Stage II has not seen; scores of the others."
+    table = _table(("", "PSNR [dB]", "CD [1e-4]", "particle RMSE [m]"), rows)
+    return f"<h3>{_text(result.name)}: adapted to its images</h3><p>{text}</p>{table}{_picture(result.picture)}"
 
 
 def loop_section(result: "LoopResult", folder: Path) -> str:
