@@ -142,7 +142,7 @@ def test_a_known_law_finds_its_parameter(tmp_path, name, truth, start, plasticit
 
 METHODS = {
     "known": (lambda weights: KnownLaw(young=2e5), 12, 0.5),
-    "neuma": (lambda weights: NeuMA(weights, elastic_rate=1.0), 15, 0.8),
+    "neuma": (lambda weights: NeuMA(weights, elastic_rate=2.0), 16, 0.8),
     "uniphy": (lambda weights: UniPhy(), 12, 0.7),
     "springs": (lambda weights: SpringMass(anchors=60, neighbours=12, firm=4, binding=6, stiffness_rate=0.05), 12, 0.95),
     "sparse": (lambda weights: SparseLaw(young=2e5, interval=5, rounds=1, stiffness_rate=0.1), 14, 0.7),
