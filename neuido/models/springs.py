@@ -19,7 +19,7 @@ class SpringMass(Method):
     """Anchors among the particles carry the mass, springs join them, and all other particles follow the anchors near them.
 
     Spring-Gaus's parameters: k = 10^a / L with an a for each anchor (a spring has the mean of its ends), for each spring, or one for
-    all; the springs beyond a mass's nearest `firm` ones weaken with their rank, by how much is learned; damping 10^b / L; and the share
+    all; the springs beyond a mass's nearest `firm` ones weaken with their rank, by how much is learned; damping 10^b m / L; and the share
     of the tangential velocity that the ground leaves. Gaussians move with the particles and keep their shape. What differs: springs act
     on both ends, the stiffness starts from a modulus, and particles follow by their anchors' displacement, so that the first frame is
     exact.
@@ -32,7 +32,7 @@ class SpringMass(Method):
         firm: Nearest neighbours whose springs do not weaken.
         power: p of the force (`spring_kernels`).
         young: Young's modulus [Pa] that the body starts with (`modulus`).
-        damping: 10^b at the start [N s]; 0: none.
+        damping: 10^b at the start, for a mass m of one anchor [m/s]; 0: none.
         fit_damping: Whether b is fitted.
         stiffness_rate, other_rate: Rates of a, and of all others.
 
@@ -92,7 +92,7 @@ class SpringMass(Method):
         rest = self.body.rest
         rank = ((self.network.rank - self.firm).clamp(min=0) / max(1, self.neighbours - self.firm)).to(rest)
         weak = (2 - nn.functional.softplus(self.soft).exp() ** rank).clamp(0, 1)
-        damping = 10**self.damping / rest if self.damping_start else torch.zeros_like(rest)
+        damping = 10**self.damping * self.body.mass[0] / rest if self.damping_start else torch.zeros_like(rest)
         return 10**level * weak / rest, damping
 
     def modulus(self, stiffness: Tensor) -> Tensor:

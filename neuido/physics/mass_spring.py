@@ -19,6 +19,9 @@ from neuido.types import Scene
 SAFETY = 0.5
 """Share of the largest stable step that a rollout takes at most."""
 
+BLOCK = 32
+"""Threads a block: masses are few, and more blocks fill more of a GPU."""
+
 
 class Springs(NamedTuple):
     """N springs between A masses."""
@@ -171,7 +174,7 @@ class _Rollout(torch.autograd.Function):
         fixed = [dt, body.kernels.vec3(*body.gravity), body.power, *lists, body.mass, body.planes, body.kinds, *parameters]
         with torch_stream(body.device):
             for n in range(steps):
-                launch(body.kernels.step, len(x), [*fixed, xs[n], vs[n], before[n], xs[n + 1], vs[n + 1]], body.device)
+                launch(body.kernels.step, len(x), [*fixed, xs[n], vs[n], before[n], xs[n + 1], vs[n + 1]], body.device, block=BLOCK)
         ctx.body, ctx.dt = body, dt
         ctx.save_for_backward(xs, vs, before, *parameters)
         return xs, vs
@@ -187,9 +190,9 @@ class _Rollout(torch.autograd.Function):
         with torch_stream(body.device):
             for n in reversed(range(len(before))):
                 contact = [dt, body.mass, body.planes, body.kinds, grip, xs[n], before[n], *now, *then, force, g_grip]
-                launch(body.kernels.contact_adjoint, len(force), contact, body.device)
+                launch(body.kernels.contact_adjoint, len(force), contact, body.device, block=BLOCK)
                 springs = [body.power, *lists, stiffness, damping, xs[n], vs[n], force, *then, g_stiffness, g_damping]
-                launch(body.kernels.springs_adjoint, len(force), springs, body.device)
+                launch(body.kernels.springs_adjoint, len(force), springs, body.device, block=BLOCK)
                 then[0] += grad_x[n]
                 then[1] += grad_v[n]
                 now, then = then, now

@@ -225,6 +225,9 @@ def test_sparse_law_drops_what_does_not_count(tmp_path):
     assert float(law.surface[0]) == 9.0  # no strain reaches it: there is no yield
     assert "cohesion" not in law.describe() and law.describe()["terms"] == 3
     assert "q (A:A)/q I" in law.describe()["stress_kPa"]
+    again = SparseLaw(yields="yes").for_scene(prepared)
+    again.load_state_dict(law.state_dict())  # what a checkpoint keeps
+    assert again.describe() == law.describe()
 
 
 def test_springs_have_the_modulus_that_they_are_given(tmp_path):

@@ -9,20 +9,25 @@ from neuido.physics.invariants import InvariantElastic, InvariantPlastic, featur
 from neuido.physics.laws import AutogradElastic, AutogradPlastic
 from neuido.physics.mpm import Simulator
 from neuido.types import Particles, Scene
-from tests.physics.bodies import block
+from tests.physics.bodies import DEVICES, block
 from tests.physics.test_networks import OFFSETS, deformations, particles, run
 
 LAWS = {InvariantElastic: 1e4, InvariantPlastic: 1e2}
 
 
-def law(kind, scenes=3, shared=False, hidden=16, dtype=torch.float64, requires_grad=False):
+def law(kind, scenes=3, shared=False, hidden=16, dtype=torch.float64):
     generator = torch.Generator().manual_seed(1)
 
     def random(first, *shape, gain):
-        return (gain * torch.randn(first, *shape, generator=generator, dtype=torch.float64)).to(dtype).requires_grad_(requires_grad)
+        return (gain * torch.randn(first, *shape, generator=generator, dtype=torch.float64)).to(dtype)
 
     first = 1 if shared else scenes
     return kind(random(first, hidden, 13, gain=0.5), random(first, hidden, hidden, gain=0.3), random(scenes, 9, hidden, gain=LAWS[kind]))
+
+
+def on(device):
+    """`particles` on a device."""
+    return particles()._replace(scene=particles().scene.to(device))
 
 
 def weights_of(F):
@@ -36,18 +41,19 @@ def adjoint(the_law, F, grad_out, particles):
     return grad_F, grads
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("shared", [True, False], ids=["shared", "per-scene"])
 @pytest.mark.parametrize("kind", LAWS)
-def test_forward_and_adjoint_equal_the_twin(kind, shared):
+def test_forward_and_adjoint_equal_the_twin(kind, shared, device):
     """Rest, where all singular values are equal, is among the deformations."""
-    F = deformations()
-    the_law = law(kind, shared=shared, requires_grad=True)
+    F, of = deformations().to(device), on(device)
+    the_law = kind(*(W.to(device).requires_grad_() for W in law(kind, shared=shared).tensors()))
     F.requires_grad_(True)
-    expected = the_law(F, particles())
+    expected = the_law(F, of)
     grads = torch.autograd.grad(expected, (F, *the_law.tensors()), weights_of(F))
     F = F.detach()
-    torch.testing.assert_close(run(the_law, F, particles()), expected.detach(), rtol=1e-10, atol=1e-9)
-    grad_F, grad_tensors = adjoint(the_law, F, weights_of(F), particles())
+    torch.testing.assert_close(run(the_law, F, of), expected.detach(), rtol=1e-10, atol=1e-9)
+    grad_F, grad_tensors = adjoint(the_law, F, weights_of(F), of)
     for got, want in zip([grad_F, *grad_tensors], grads, strict=True):
         torch.testing.assert_close(got, want, rtol=1e-8, atol=1e-8 * float(want.abs().max()))
 

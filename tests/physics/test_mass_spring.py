@@ -8,6 +8,7 @@ import torch
 from neuido.errors import UserError
 from neuido.physics.mass_spring import MassSpring, Springs, connect
 from neuido.types import Plane, Scene, Walls
+from tests.physics.bodies import DEVICES
 
 FREE = Scene(gravity=(0.0, 0.0, 0.0), walls=None)
 ZERO = torch.zeros((), dtype=torch.float64)
@@ -19,7 +20,7 @@ def cloud(count=40, seed=0):
 
 
 def body(scene, x, neighbours=8, power=0.5):
-    mass = torch.linspace(0.5, 1.5, len(x), dtype=torch.float64)
+    mass = torch.linspace(0.5, 1.5, len(x), dtype=torch.float64, device=x.device)
     return MassSpring(scene, connect(x, neighbours), mass, power=power, dtype=torch.float64)
 
 
@@ -88,12 +89,13 @@ def leaves(one, x):
     v = torch.randn(x.shape, generator=g, dtype=torch.float64)
     k = 20 + 40 * torch.rand(one.rest.shape, generator=g, dtype=torch.float64)
     c = 0.2 * torch.rand(one.rest.shape, generator=g, dtype=torch.float64)
-    return [t.requires_grad_() for t in (x.clone(), v, k, c, torch.tensor(0.3, dtype=torch.float64))]
+    return [t.to(x.device).requires_grad_() for t in (x.clone(), v, k, c, torch.tensor(0.3, dtype=torch.float64))]
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("power", [0.0, 0.5])
-def test_rollout_and_adjoint_equal_the_twin(power):
-    x = cloud()
+def test_rollout_and_adjoint_equal_the_twin(power, device):
+    x = cloud().to(device)
     one = body(scene_with_every_contact(), x, power=power)
     inputs = leaves(one, x)
     xs, vs = one.rollout(30, 2e-3, *inputs, every=10)
@@ -105,7 +107,7 @@ def test_rollout_and_adjoint_equal_the_twin(power):
     expected = [torch.stack(part) for part in zip(*frames)]
     torch.testing.assert_close([xs, vs], expected, rtol=1e-11, atol=1e-11)
     g = torch.Generator().manual_seed(3)
-    weights = [torch.randn(t.shape, generator=g, dtype=torch.float64) for t in expected]
+    weights = [torch.randn(t.shape, generator=g, dtype=torch.float64).to(device) for t in expected]
     got = torch.autograd.grad([xs, vs], inputs, weights)
     want = torch.autograd.grad(expected, inputs, weights)
     for a, b in zip(got, want, strict=True):

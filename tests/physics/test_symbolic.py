@@ -8,9 +8,9 @@ from neuido.physics.laws import DruckerPrager, Sigma, VonMises, lame
 from neuido.physics.mpm import Simulator
 from neuido.physics.symbolic import SymbolicElastic, SymbolicPlastic, formula, generators, polynomial
 from neuido.types import Scene
-from tests.physics.bodies import block
-from tests.physics.test_invariant_networks import adjoint, weights_of
-from tests.physics.test_networks import deformations, particles, run
+from tests.physics.bodies import DEVICES, block
+from tests.physics.test_invariant_networks import adjoint, on, weights_of
+from tests.physics.test_networks import deformations, run
 
 
 def elastic(scenes=3):
@@ -23,15 +23,17 @@ def plastic(scenes=3):
     return SymbolicPlastic((1 + torch.rand(scenes, 3, 1, generator=g, dtype=torch.float64)).requires_grad_())
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("scenes", [1, 3])
 @pytest.mark.parametrize("build", [elastic, plastic])
-def test_forward_and_adjoint_equal_the_twin(build, scenes):
-    F, law = deformations().requires_grad_(True), build(scenes)
-    expected = law(F, particles())
+def test_forward_and_adjoint_equal_the_twin(build, scenes, device):
+    F, of, law = deformations().to(device).requires_grad_(True), on(device), build(scenes)
+    law = type(law)(law.coefficients.detach().to(device).requires_grad_())
+    expected = law(F, of)
     wanted = torch.autograd.grad(expected, (F, *law.tensors()), weights_of(F))
     F = F.detach()
-    torch.testing.assert_close(run(law, F, particles()), expected.detach(), rtol=1e-10, atol=1e-8)
-    grad_F, grads = adjoint(law, F, weights_of(F), particles())
+    torch.testing.assert_close(run(law, F, of), expected.detach(), rtol=1e-10, atol=1e-8)
+    grad_F, grads = adjoint(law, F, weights_of(F), of)
     for got, want in zip([grad_F, *grads], wanted, strict=True):
         torch.testing.assert_close(got, want, rtol=1e-8, atol=1e-9 * float(want.abs().max()))
 
