@@ -31,6 +31,10 @@ NETS = tuple(
         "baselines",
         "springs",
         "symbolic",
+        "methods",
+        "adapter",
+        "scene_fit",
+        "progress",
     )
 )
 ROOMS = {  # room: the parts of neuido that it may import, itself included

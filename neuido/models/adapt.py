@@ -1,5 +1,6 @@
 """Few-shot adaptation: a method's parameters are fitted to the images of one scene, one scene after the other (paper, "Few-Shot")."""
 
+import gc
 import sys
 import time
 from pathlib import Path
@@ -11,9 +12,9 @@ from torch import Tensor, nn
 
 from neuido.data.visual import VisualScene
 from neuido.errors import UserError
-from neuido.models import scores
+from neuido.models import filmed, scores
 from neuido.models.conditions import read_conditions, run_condition
-from neuido.models.filmed import FIGURES, FilmedModule, check_options, frames_at, image_losses, plainly, some_views, write_prediction
+from neuido.models.filmed import FIGURES, FilmedModule, plainly
 from neuido.models.methods import CARD, Method, scalars
 from neuido.models.pipeline import Laws, Prepared, folder_of, prepare, roll_surely
 from neuido.models.progress import Progress, restore, snapshot
@@ -32,7 +33,8 @@ class AdaptModule(FilmedModule):
     Args:
         method: What is fitted (`models.methods`).
         steps: Optimiser steps of each scene; none: the method's own number (ours: 100, the paper's).
-        views_per_step: Training views in a step, drawn anew for each; 0: all.
+        training_views: Training views that fitting sees, the first ones; 0: all.
+        views_per_step: Of these, views in a step, drawn anew for each; 0: all.
         encoder_views: Training views that the encoder sees; 0: all.
         fit_frames: Frames that fitting sees, the first ones; 0: all. Scores then have the rest apart, as `later_...`.
         curriculum: Shares of these frames that are rolled out, one after the other, for equal parts of `curriculum_share` of the steps.
@@ -61,6 +63,7 @@ class AdaptModule(FilmedModule):
         self,
         method: Method,
         steps: int | None = None,
+        training_views: int = 0,
         views_per_step: int = 2,
         encoder_views: int = 0,
         fit_frames: int = 0,
@@ -85,10 +88,10 @@ class AdaptModule(FilmedModule):
         condition_files: list[str] | None = None,
     ):
         super().__init__()
-        counts = {"steps": steps or 0, "views_per_step": views_per_step, "encoder_views": encoder_views, "fit_frames": fit_frames,
-                  "segment": segment, "velocity_steps": velocity_steps}  # fmt: skip
+        counts = {"steps": steps or 0, "fit_frames": fit_frames, "velocity_steps": velocity_steps, "segment": segment}
+        counts |= {"training_views": training_views, "views_per_step": views_per_step, "encoder_views": encoder_views}
         weights = {"image_weight": image_weight, "silhouette_weight": silhouette_weight, "velocity_lr": velocity_lr}
-        check_options(counts, weights, curriculum, curriculum_share)
+        filmed.check_options(counts, weights, curriculum, curriculum_share)
         if image_weight + silhouette_weight == 0:
             raise UserError("model.image_weight and silhouette_weight are both 0: nothing would be compared")
         if fit_frames == 1 or velocity_frames < 2:
@@ -123,9 +126,7 @@ class AdaptModule(FilmedModule):
         if stage != "fit" or len(self.fits):
             return
         if self.trainer.world_size > 1:
-            raise UserError(
-                f"trainer.devices: adaptation runs in one process, not in {self.trainer.world_size}; give scenes to several runs"
-            )
+            raise UserError(f"trainer.devices: adaptation runs in one process, not in {self.trainer.world_size}; use several runs")
         data = self.trainer.datamodule
         data.steps_in_a_row = self.ahead + self.steps
         self.trainer.fit_loop.max_epochs = len(data.scenes)
@@ -140,11 +141,13 @@ class AdaptModule(FilmedModule):
         return self.fits[self._names.index(name)]
 
     def _training_views(self, prepared: Prepared) -> list[int]:
+        """The views that are trained on."""
+        seen = prepared.training[: self.hparams.training_views or None]
         if self.hparams.stop_on != "view":
-            return prepared.training
-        if len(prepared.training) < 2:
+            return seen
+        if len(seen) < 2:
             raise UserError(f"model.stop_on = view: {prepared.source.name} has one training view, and none would be left; use loss or none")
-        return prepared.training[:-1]
+        return seen[:-1]
 
     def _frames(self, prepared: Prepared) -> int:
         """Frames that fitting sees."""
@@ -166,6 +169,7 @@ class AdaptModule(FilmedModule):
         for scene in self.trainer.datamodule.scenes:
             if not self.ahead + self.steps:  # Lightning then runs no epoch
                 self._begin(scene)
+                self.fit_of(scene.name).save(folder_of(self.hparams.out, scene.name) / "fit")
             elif scene.name in self._progress and self._progress[scene.name].done:  # killed between its last step and its scores
                 self._begin(scene)
                 self._finish()
@@ -178,6 +182,8 @@ class AdaptModule(FilmedModule):
         """Bring the scene to the device, and score it before its first step."""
         if self._current is None or self._current[0] != scene.name:
             self._finish()
+            self._current = None
+            gc.collect()  # the last scene's tapes, before the next one's are made
             self._current = scene.name, self.open_scene(scene, self.device, watched=False)
             if scene.name not in self._progress:
                 self._progress[scene.name] = Progress()
@@ -192,8 +198,8 @@ class AdaptModule(FilmedModule):
         motion = self._roll_or_undo(prepared, fit, frames)
         if motion is None:
             return fit.method.retreat()
-        views = some_views(self._training_views(prepared), self.hparams.views_per_step, step)
-        loss, silhouette = image_losses(prepared, motion, views)
+        views = filmed.some_views(self._training_views(prepared), self.hparams.views_per_step, step)
+        loss, silhouette = filmed.image_losses(prepared, motion, views)
         regular = fit.method.regulariser()
         self._log({"train/loss": loss, "train/silhouette": silhouette, "train/regulariser": regular, "train/frames": float(frames)})
         return self._weighted(loss, silhouette) + regular
@@ -223,7 +229,7 @@ class AdaptModule(FilmedModule):
         frames = self._frames(prepared)
         if step < self.ahead:
             return min(frames, self.hparams.velocity_frames)
-        return frames_at((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
+        return filmed.frames_at((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """A step whose gradient is not finite is left out."""
@@ -245,7 +251,8 @@ class AdaptModule(FilmedModule):
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
             progress.peak_memory_gb = max(progress.peak_memory_gb, torch.cuda.max_memory_allocated(self.device) / GIGABYTE)
-            progress.warp_memory_gb = wp.get_mempool_used_mem_high(str(self.device)) / GIGABYTE
+            if wp.is_mempool_enabled(str(self.device)):
+                progress.warp_memory_gb = wp.get_mempool_used_mem_high(str(self.device)) / GIGABYTE
         progress.seconds += time.perf_counter() - begun
         progress.done = progress.steps >= self.ahead + self.steps or progress.over
 
@@ -264,8 +271,9 @@ class AdaptModule(FilmedModule):
         motion = self._try(prepared, fit)
         if motion is None:
             return
-        views = prepared.training[-1:] if self.hparams.stop_on == "view" else prepared.training
-        value = float(self._weighted(*image_losses(prepared, motion, views)))
+        trained = self._training_views(prepared)
+        views = [prepared.training[len(trained)]] if self.hparams.stop_on == "view" else trained
+        value = float(self._weighted(*filmed.image_losses(prepared, motion, views)))
         self._log({"train/looked": value})
         progress.see(value, fit, self.hparams.patience)
 
@@ -274,6 +282,7 @@ class AdaptModule(FilmedModule):
 
     def on_train_end(self) -> None:
         self._finish()
+        self._say_absent()
 
     def _finish(self) -> None:
         """Score the current scene once its steps are done, and write what was found."""
@@ -318,13 +327,10 @@ class AdaptModule(FilmedModule):
         except UserError as error:
             return {"failed": str(error), **found}
         figures, particles, pictures = self.figures_of(prepared, motion)
-        folder = folder_of(self.hparams.out, prepared.source.name) / stage
-        scores.write_rows(folder / "particles.csv", particles)
-        scores.write_rows(folder / "images.csv", pictures)
+        filmed.write_by_frame(folder_of(self.hparams.out, prepared.source.name) / stage, particles, pictures)
         if self._frames(prepared) < prepared.frames:
-            later = [[row for row in rows if row["frame"] >= self._frames(prepared)] for rows in (particles, pictures)]
-            for rows in later:
-                figures |= {f"later_{key}": value for key, value in scores.mean_of(rows, FIGURES).items()}
+            later = scores.later(particles, pictures, self._frames(prepared), FIGURES)
+            figures |= {f"later_{key}": value for key, value in later.items()}
         return {**figures, "halvings": halvings, **found}
 
     def _show(self, row: dict[str, Any]) -> None:
@@ -387,7 +393,7 @@ class AdaptModule(FilmedModule):
         except UserError as error:
             print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
             return {"scene": scene.name, "folder": str(folder), "failed": str(error)}
-        write_prediction(folder, prepared, motion)
+        filmed.write_prediction(folder, prepared, motion)
         if self.hparams.condition_files:
             self._predicted.append((prepared, fit.method.laws(prepared)))
         self.print(f"{scene.name}: {folder}")

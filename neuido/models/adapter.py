@@ -54,7 +54,7 @@ class LowRankAdaptation(Method):
         rank: int = 16,
         alpha: float = 16.0,
         lr: float = 1e-3,
-        latent_lr: float = 1e-2,
+        latent_lr: float = 3e-2,
         prior_weight: float = 0.0,
         plausibility_weight: float = 1.0,
         seed: int = 0,

@@ -21,6 +21,7 @@ from neuido.models.filmed import (
     image_losses,
     plainly,
     some_views,
+    write_by_frame,
     write_prediction,
 )
 from neuido.models.pipeline import Laws, Prepared, folder_of, infer, prepare, roll, roll_surely
@@ -202,9 +203,7 @@ class AlignModule(FilmedModule):
         summary["unseen"] = int(unseen)
         if unseen and self.hparams.baselines and scene.truth is not None:
             summary |= self.score_baselines(self.prepared(scene))
-        folder = folder_of(self.hparams.out, scene.name)
-        scores.write_rows(folder / "particles.csv", particles)
-        scores.write_rows(folder / "images.csv", pictures)
+        write_by_frame(folder_of(self.hparams.out, scene.name), particles, pictures)
         self._rows.append(summary)
 
     def score_baselines(self, prepared: Prepared) -> dict[str, float]:

@@ -112,6 +112,12 @@ class FilmedModule(LightningModule):
             self.print(f"LPIPS is absent: {absent.reason}")
 
 
+def write_by_frame(folder: Path, particles: list[dict[str, Any]], pictures: list[dict[str, Any]]) -> None:
+    """Write the rows of `FilmedModule.figures_of`."""
+    scores.write_rows(folder / "particles.csv", particles)
+    scores.write_rows(folder / "images.csv", pictures)
+
+
 def write_prediction(folder: Path, prepared: Prepared, motion: ParticleState) -> None:
     """Write particles, and recorded frames beside predicted ones from one of the scoring views as a video and a picture."""
     view = prepared.scoring[0]

@@ -108,6 +108,12 @@ def mean_of(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, f
     return out
 
 
+def later(particles: Sequence[dict[str, Any]], pictures: Sequence[dict[str, Any]], first: int, names: Sequence[str]) -> dict[str, float]:
+    """`mean_of` the frames from `first` on, of the rows of particles and of images."""
+    parts = [mean_of([row for row in rows if row["frame"] >= first], names) for rows in (particles, pictures)]
+    return parts[0] | parts[1]
+
+
 def write_rows(path: str | os.PathLike, rows: Sequence[dict[str, Any]]) -> None:
     """Write rows as CSV, all at once; a value that a row lacks is empty."""
     path = Path(path)

@@ -222,6 +222,7 @@ def test_methods_without_parameters_or_without_laws(tmp_path):
     trainer(tmp_path).fit(module(tmp_path, method=Nothing(), steps=None), data)
     (row,) = rows_of(tmp_path / "out" / "scores.csv")
     assert (row["method"], row["stage"]) == ("Nothing", "before") and float(row["cd"]) > 0
+    assert module(tmp_path, method=Nothing(), adapter=str(tmp_path / "out")).load_fit(data.scenes[0])
     model = module(tmp_path, method=Still(), out=str(tmp_path / "still"), fit_frames=2)
     trainer(tmp_path).fit(model, data)
     before, after = rows_of(tmp_path / "still" / "scores.csv")
