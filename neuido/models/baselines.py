@@ -220,9 +220,19 @@ class NCLaw(Method):
         self.source, self.base = weights, base
 
     def build(self, scene: Prepared) -> None:
-        path = Path(data_root() / "peers" if self.source is None else self.source).expanduser()
         self.chosen = MATERIALS[scene.source.model["plasticity"]["law"]] if self.base == "auto" else self.base
-        self._take(*nclaw_weights(path / f"nclaw-{self.chosen}.npz" if path.is_dir() or self.source is None else path))
+        self._take(*nclaw_weights(self._file()))
+
+    def _file(self) -> Path:
+        given = Path(self.source).expanduser() if self.source is not None else None
+        if given is not None and not given.is_dir():
+            return given
+        if given is None:
+            try:
+                given = data_root() / "peers"
+            except UserError as error:
+                raise UserError("model.method.weights: give the folder of nclaw-*.npz, or set the variable NEUIDO_DATA") from error
+        return given / f"nclaw-{self.chosen}.npz"
 
     def _take(self, elastic: list[Tensor], plastic: list[Tensor]) -> None:
         for part, weights in zip(PARTS, (elastic, plastic)):

@@ -251,7 +251,8 @@ def test_anchors_and_what_follows_them():
     torch.testing.assert_close(weights[index], torch.eye(20), rtol=0, atol=1e-4)  # an anchor follows itself
 
 
-def test_impossible_options_are_named(tmp_path, weights):
+def test_impossible_options_are_named(tmp_path, weights, monkeypatch):
+    monkeypatch.delenv("NEUIDO_DATA", raising=False)
     scene = prepare(tiny_scene(tmp_path), None)
     for build, words in (
         (lambda: KnownLaw(young=-1.0), "young = -1"),
@@ -261,6 +262,7 @@ def test_impossible_options_are_named(tmp_path, weights):
         (lambda: NeuMA(weights, rank=0), "rank = 0"),
         (lambda: NeuMA(weights, alpha=0.0), "alpha = 0"),
         (lambda: NCLaw(str(tmp_path / "nowhere")).for_scene(scene), "are missing"),
+        (lambda: NCLaw().for_scene(scene), "model.method.weights: give"),
         (lambda: UniPhy(lr=0.0), "lr = 0"),
         (lambda: UniPhy(operator="nowhere.safetensors"), "nowhere.safetensors are missing"),
         (lambda: SpringMass(anchors=1), "anchors = 1: at least 2"),
