@@ -29,6 +29,8 @@ NETS = tuple(
         "gaussians",
         "filling",
         "baselines",
+        "springs",
+        "symbolic",
         "methods",
         "adapter",
         "scene_fit",
