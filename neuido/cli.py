@@ -52,6 +52,8 @@ MODULES = (  # so that their class names resolve without a path
     "neuido.models.pretrain_vae",
     "neuido.models.warmup",
     "neuido.models.align",
+    "neuido.models.adapt",
+    "neuido.models.adapter",
     "neuido.data.trajectories",
     "neuido.data.films",
     "neuido.data.visual_module",

@@ -100,8 +100,8 @@ class VisualScene(NamedTuple):
     """The believed material: density, elasticity, plasticity. Not the truth."""
     body: Body
     """The reconstructed particles at t = 0, with the velocity that is known."""
-    gaussians: Path
-    """The reconstructed first frame, a 3DGS PLY in the simulation's coordinates."""
+    gaussians: Path | None
+    """The reconstructed first frame, a 3DGS PLY in the simulation's coordinates; none: the particles stand for it."""
     batch: MultiViewBatch
     """Images of all views (held-out ones marked) and frames, with the cameras in the simulation's coordinates."""
     truth: Truth | None

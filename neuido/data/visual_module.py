@@ -70,11 +70,16 @@ class Turns:
             start = self._resume[1]
         self._resume = None
         self._next = start
+        order = self._order(epoch)
+        for k in range(start, len(order)):
+            self._next = k + 1
+            yield self.scenes[order[k]]
+
+    def _order(self, epoch: int) -> list[int]:
+        """Which scenes this process gets in an epoch."""
         count = len(self.scenes)
         order = np.random.default_rng([self.seed, epoch]).permutation(count).tolist()
-        for k in range(start, len(self)):
-            self._next = k + 1
-            yield self.scenes[order[(k * self.ranks + self.rank) % count]]
+        return [order[(k * self.ranks + self.rank) % count] for k in range(len(self))]
 
     def state_dict(self) -> dict[str, int]:
         return {"epoch": self.epoch, "step": self._next, "scenes": len(self.scenes), "ranks": self.ranks}
@@ -84,6 +89,20 @@ class Turns:
             if state.get(name) != now:
                 raise UserError(f"the checkpoint was written with {state.get(name)} {name}, now there are {now}: restore them to resume")
         self._resume = (state["epoch"], state["step"])
+
+
+class OneByOne(Turns):
+    """Each scene for so many steps: an epoch is one scene, in the order given."""
+
+    def __init__(self, scenes: Sequence[VisualScene], *, steps: int) -> None:
+        super().__init__(scenes)
+        self.steps = steps
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def _order(self, epoch: int) -> list[int]:
+        return [epoch] * self.steps if epoch < len(self.scenes) else []
 
 
 class VisualDataModule(LightningDataModule):
@@ -122,6 +141,8 @@ class VisualDataModule(LightningDataModule):
         self.given, self.given_unseen, self.seed = list(scenes), list(unseen or []), seed
         self.root, self.reconstructions = root, reconstructions
         self.options: dict[str, Any] = {"frame_step": frame_step, "frame_count": frame_count, "width": width, "background": background}
+        self.steps_in_a_row: int | None = None
+        """Set by a model that fits one scene after the other: how many steps each takes, and an epoch is then one scene."""
 
     @cached_property
     def scenes(self) -> list[VisualScene]:
@@ -147,6 +168,8 @@ class VisualDataModule(LightningDataModule):
                 raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} are held out")
 
     def train_dataloader(self) -> Turns:
+        if self.steps_in_a_row is not None:
+            return OneByOne(self.scenes, steps=self.steps_in_a_row)
         return Turns(self.scenes, seed=self.seed, **self._share())
 
     def val_dataloader(self) -> DataLoader:

@@ -1,14 +1,10 @@
 """Stage II: the projector learns from images which laws make the recorded motion (paper, "Visual-to-Dynamics Alignment")."""
 
-import functools
-import math
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
@@ -17,26 +13,21 @@ from neuido.errors import UserError
 from neuido.models import results, scores
 from neuido.models.branch import implausibility, open_branch, small_strain_modulus
 from neuido.models.conditions import read_conditions, run_condition
-from neuido.models.lpips import Absent, open_lpips
-from neuido.models.pipeline import Prepared, draw, folder_of, infer, prepare, roll_surely
+from neuido.models.filmed import (
+    FIGURES,
+    FilmedModule,
+    check_options,
+    frames_at,
+    image_losses,
+    plainly,
+    some_views,
+    write_prediction,
+)
+from neuido.models.pipeline import Laws, Prepared, folder_of, infer, prepare, roll, roll_surely
 from neuido.models.pretrain import run_length
 
 
-def plainly(method: Callable) -> Callable:
-    """Without gradients, but outside Lightning's inference mode: rollouts keep buffers, and training could not write to them afterwards."""
-
-    @functools.wraps(method)
-    def run(*arguments, **options):
-        with torch.inference_mode(False), torch.no_grad():
-            return method(*arguments, **options)
-
-    return run
-
-
-FIGURES = ("cd", "floor", "rmse", "psnr", "ssim", "lpips", "crop_psnr", "crop_ssim", "crop_lpips")
-
-
-class AlignModule(LightningModule):
+class AlignModule(FilmedModule):
     """Stage II, its scores, and zero-shot prediction. Trunks, heads and VAE are frozen; scenes take turns, one step each.
 
     The loss of a scene is the squared error of the images over all training views, divided by what a still image of the first frame would
@@ -104,25 +95,16 @@ class AlignModule(LightningModule):
         if not lr > 0:
             raise UserError(f"model.lr = {lr}: it must be positive")
         counts = {"views_per_step": views_per_step, "encoder_views": encoder_views, "segment": segment, "baselines": baselines}
-        for name, value in {
-            **counts,
-            "silhouette_weight": silhouette_weight,
-            "prior_weight": prior_weight,
-            "plausibility_weight": plausibility_weight,
-        }.items():
-            if value < 0:
-                raise UserError(f"model.{name} = {value}: it must not be negative")
-        if not all(0 < share <= 1 for share in curriculum) or not 0 <= curriculum_share <= 1:
-            raise UserError(f"model.curriculum = {curriculum} and curriculum_share = {curriculum_share} must be shares, from 0 to 1")
+        weights = {"silhouette_weight": silhouette_weight, "prior_weight": prior_weight, "plausibility_weight": plausibility_weight}
+        check_options(counts, weights, curriculum, curriculum_share)
         self.save_hyperparameters()
         flow = {"flow_size": flow_size, "flow_encoding": flow_encoding, "speed_scale": speed_scale}
         sizes = {"width": width, "heads": heads, "conditions": conditions, "dropout": dropout}
         self.operator, self.encoder = open_branch(operator, init_from, vae, **flow, **sizes)  # type: ignore[arg-type]
         self._prepared: dict[str, Prepared] = {}
         self._start: dict[str, Tensor] = {}
-        self._floors: dict[str, Tensor] = {}
         self._rows: list[dict[str, Any]] = []
-        self._predicted: list[tuple[Prepared, Tensor]] = []
+        self._predicted: list[tuple[Prepared, Laws]] = []
         self._total = 1
 
     # What there is of a scene.
@@ -145,11 +127,8 @@ class AlignModule(LightningModule):
 
     def frames_now(self, prepared: Prepared) -> int:
         """Frames of a rollout at this point of the run."""
-        shares, done = self.hparams.curriculum, self.global_step / max(1, self._total)
-        if not shares or done >= self.hparams.curriculum_share:
-            return prepared.frames
-        share = shares[min(int(done / self.hparams.curriculum_share * len(shares)), len(shares) - 1)]
-        return min(prepared.frames, max(2, math.ceil(share * prepared.frames)))
+        done = self.global_step / max(1, self._total)
+        return frames_at(done, prepared.frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
     def training_step(self, scene: VisualScene, batch_idx: int) -> Tensor:
         prepared = self.prepared(scene)
@@ -157,17 +136,13 @@ class AlignModule(LightningModule):
         z = self.encoder(prepared.volume, prepared.conditions)
         start = self._start.setdefault(scene.name, z.detach().clone())
         try:
-            motion = prepared.simulator.rollout(
-                (frames - 1) * prepared.every,
-                *self.operator.laws(z),
-                every=prepared.every,
-                segment=self._segment(prepared, frames),
-            )
+            motion = roll(prepared, self.operator, z, frames, segment=self.hparams.segment)
         except UserError as error:  # a law that cannot run has no image: back towards laws that can
             print(f"{scene.name}: {error}", file=sys.stderr)
             self._log({"train/failed": 1.0})
             return (z - self._haven(z)).square().mean()
-        loss, silhouette = self.image_losses(prepared, motion, self._views(prepared))
+        views = some_views(prepared.training, self.hparams.views_per_step, self.global_step)
+        loss, silhouette = image_losses(prepared, motion, views)
         total = loss + self.hparams.silhouette_weight * silhouette + self.hparams.prior_weight * (z - start).square().mean()
         if self.hparams.plausibility_weight:
             implausible = implausibility(self.operator, z)
@@ -176,37 +151,9 @@ class AlignModule(LightningModule):
         self._log({"train/loss": loss, f"train/{scene.name}": loss, "train/silhouette": silhouette, "train/frames": float(frames)})
         return total
 
-    def image_losses(self, prepared: Prepared, motion, views: list[int]) -> tuple[Tensor, Tensor]:
-        """Squared errors of the images and of the silhouettes, over those of a still first frame."""
-        frames = len(motion.x)
-        images, alphas = draw(prepared, motion, views)
-        recorded, masks = prepared.recorded(views, frames), prepared.silhouettes(views, frames)
-        still = (recorded - recorded[:1]).square().mean(), (masks - masks[:1]).square().mean()
-        floors = (1e-6, 1e-5)  # of a body at rest
-        return tuple(  # type: ignore[return-value]
-            (a - b).square().mean() / (s + floor) for a, b, s, floor in zip((images, alphas), (recorded, masks), still, floors)
-        )
-
-    def _views(self, prepared: Prepared) -> list[int]:
-        count = self.hparams.views_per_step
-        if not 0 < count < len(prepared.training):
-            return prepared.training
-        # of the step alone, so that a resumed run draws as the interrupted one would have
-        order = torch.randperm(len(prepared.training), generator=torch.Generator().manual_seed(self.global_step))
-        return [prepared.training[i] for i in order[:count].tolist()]
-
-    def _segment(self, prepared: Prepared, frames: int) -> int | None:
-        steps, segment = (frames - 1) * prepared.every, self.hparams.segment * prepared.every
-        return segment if segment and steps % segment == 0 and steps > segment else None
-
     def _haven(self, z: Tensor) -> Tensor:
         """The mean latent of Stage I, whose law runs."""
         return self.operator.latents.mean(0).to(z) if len(self.operator.latents) else torch.zeros_like(z)
-
-    def _log(self, values: dict[str, Tensor | float]) -> None:
-        if self._trainer is not None:
-            plain = {name: value.detach() if isinstance(value, Tensor) else value for name, value in values.items()}
-            self.log_dict(plain, prog_bar=False, batch_size=1)
 
     # Scores.
 
@@ -218,26 +165,12 @@ class AlignModule(LightningModule):
         summary["modulus"] = float(small_strain_modulus(self.operator, found.z[None])[0])
         try:
             with torch.no_grad():
-                motion, halvings = roll_surely(prepared, self.operator, found.z)
+                motion, halvings = roll_surely(prepared, lambda scene: roll(scene, self.operator, found.z))
             summary["halvings"] = halvings
         except UserError as error:
             return summary | {"failed": str(error)}, [], []
-        particles = scores.score_motion(prepared, motion, self._floor(prepared))
-        pictures = scores.score_images(prepared, motion, prepared.scoring, self._lpips()) if images else []
-        return summary | scores.mean_of(particles, FIGURES) | scores.mean_of(pictures, FIGURES), particles, pictures
-
-    def _floor(self, prepared: Prepared) -> Tensor | None:
-        """Measured once a scene: it depends on the truth alone."""
-        name = prepared.source.name
-        if prepared.source.truth is not None and name not in self._floors:
-            self._floors[name] = scores.floor_by_frame(prepared)
-        return self._floors.get(name)
-
-    def _lpips(self):
-        if not hasattr(self, "_lpips_module"):
-            opened = open_lpips(self.hparams.lpips_backbone, self.hparams.lpips_net, self.device)
-            object.__setattr__(self, "_lpips_module", opened)  # no part of the checkpoint
-        return self._lpips_module
+        figures, particles, pictures = self.figures_of(prepared, motion, images=images)
+        return summary | figures, particles, pictures
 
     @plainly
     def validation_step(self, scene: VisualScene, batch_idx: int) -> None:
@@ -286,7 +219,7 @@ class AlignModule(LightningModule):
             for z in candidates.to(self.device):
                 try:
                     with torch.no_grad():
-                        motion, _ = roll_surely(prepared, self.operator, z)
+                        motion, _ = roll_surely(prepared, lambda scene, z=z: roll(scene, self.operator, z))
                 except UserError:
                     continue
                 values.append(float(scores.chamfer_by_frame(prepared, motion).mean()))
@@ -305,9 +238,7 @@ class AlignModule(LightningModule):
     @rank_zero_only
     def _write_table(self, rows: list[dict[str, Any]]) -> None:
         scores.write_rows(Path(self.hparams.out) / "scores.csv", rows)
-        absent = self._lpips()
-        if isinstance(absent, Absent):
-            self.print(f"LPIPS is absent: {absent.reason}")
+        self._say_absent()
         for row in rows:
             shown = [f"{name} {row[name]:.4g}" for name in (*FIGURES, "cd_mean", "cd_random", "cd_trained", "seconds") if name in row]
             self.print(f"{row['scene']:16s} {'unseen ' if row.get('unseen') else ''}{', '.join(shown)}{row.get('failed', '')}")
@@ -324,27 +255,22 @@ class AlignModule(LightningModule):
         results.save_law(folder / "law.safetensors", self.operator, found.z, card)
         with torch.no_grad():
             try:
-                motion, halvings = roll_surely(prepared, self.operator, found.z)
+                motion, halvings = roll_surely(prepared, lambda scene: roll(scene, self.operator, found.z))
             except UserError as error:
                 print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
                 return {"scene": scene.name, "folder": str(folder), "seconds": found.seconds, "failed": str(error)}
             if halvings:
                 print(f"{scene.name}: the law runs with a step of dt / {2**halvings} only", file=sys.stderr)
-            view = prepared.scoring[0]
-            images = draw(prepared, motion, [view])[0][:, 0]
-        recorded = prepared.recorded([view])[:, 0]
-        results.write_plys(folder / "particles", motion)
-        results.write_video(folder / "prediction.mp4", torch.cat([recorded, images], 2))
-        results.contact_sheet(folder / "prediction.png", [recorded, images])
+            write_prediction(folder, prepared, motion)
         self.print(f"{scene.name}: law in {1e3 * found.seconds:.1f} ms; {folder}")
-        self._predicted.append((prepared, found.z))
+        self._predicted.append((prepared, self.operator.laws(found.z)))
         return {"scene": scene.name, "folder": str(folder), "seconds": found.seconds}
 
     @plainly
     def on_predict_epoch_end(self) -> None:
         for path in self.hparams.condition_files or []:
             condition = read_conditions(path)
-            folder = run_condition(condition, self.operator, self._predicted, self.hparams.out)
+            folder = run_condition(condition, self._predicted, self.hparams.out)
             self.print(f"condition {condition.name}: {folder}")
         self._predicted = []
 

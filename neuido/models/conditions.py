@@ -18,15 +18,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from neuido.data import scenes
 from neuido.data.shapes import rigid_velocity
 from neuido.errors import UserError
 from neuido.models import results
-from neuido.models.gaussians import bind, colours_of, deform, harmonics_of
-from neuido.models.operator import IntrinsicDynamicsOperator
-from neuido.models.pipeline import Prepared, folder_of
+from neuido.models.gaussians import bind, colours_of, deform, dress
+from neuido.models.pipeline import Laws, Prepared, folder_of
 from neuido.models.splatting import render
 from neuido.physics.composite import by_body
 from neuido.physics.mpm import Simulator
@@ -93,15 +91,12 @@ def _body(entry: Any, where: str) -> BodyCondition:
     return BodyCondition(entry["of"], **vectors, shape=shape)
 
 
-def simulate_condition(
-    condition: Condition, operator: IntrinsicDynamicsOperator, known: list[tuple[Prepared, Tensor]]
-) -> tuple[ParticleState, Gaussians, Prepared]:
+def simulate_condition(condition: Condition, known: list[tuple[Prepared, Laws]]) -> tuple[ParticleState, Gaussians, Prepared]:
     """Roll a condition out.
 
     Args:
         condition: The condition.
-        operator: The operator.
-        known: Scenes that were predicted, with their latents.
+        known: Scenes that were predicted, with their laws.
 
     Returns:
         Frames of all particles, all Gaussians in these frames, and the scene that lends its surroundings and cameras.
@@ -120,14 +115,14 @@ def simulate_condition(
         if any(prepared.source.density != density for prepared, _ in chosen):
             raise UserError("the bodies have different densities; one scene takes one")
         simulator = Simulator(first.source.scene, joined, density=density, device=device, graphs=len(chosen) == 1)
-        steps = ((condition.frames or first.frames) - 1) * first.every
-        pairs = [operator.laws(z) for _, z in chosen]
+        steps = ((condition.frames or first.frames) - 1) * first.stride
+        pairs = [laws for _, laws in chosen]
         if len(pairs) == 1:
             laws = pairs[0]
         else:
             laws = by_body([e for e, _ in pairs], [p for _, p in pairs], [len(body.x) for body, _ in placed], simulator.order)
         with torch.no_grad():
-            motion = simulator.rollout(steps, *laws, every=first.every)
+            motion = simulator.rollout(steps, *laws, every=first.stride)
     except UserError as error:
         raise UserError(f"condition {condition.name}: {error}") from error
     parts, at = [], 0
@@ -144,11 +139,9 @@ def simulate_condition(
     return motion, together, first
 
 
-def run_condition(
-    condition: Condition, operator: IntrinsicDynamicsOperator, known: list[tuple[Prepared, Tensor]], out: str | os.PathLike
-) -> Path:
+def run_condition(condition: Condition, known: list[tuple[Prepared, Laws]], out: str | os.PathLike) -> Path:
     """`simulate_condition`, and write its particles, video and picture; the folder."""
-    motion, gaussians, first = simulate_condition(condition, operator, known)
+    motion, gaussians, first = simulate_condition(condition, known)
     with torch.no_grad():
         images = render(gaussians, first.views([first.scoring[0]]), background=first.background)[0][:, 0]
     folder = folder_of(out, f"condition-{condition.name}")
@@ -158,7 +151,7 @@ def run_condition(
     return folder
 
 
-def _find(known: list[tuple[Prepared, Tensor]], of: int | str) -> tuple[Prepared, Tensor]:
+def _find(known: list[tuple[Prepared, Laws]], of: int | str) -> tuple[Prepared, Laws]:
     names = [prepared.source.name for prepared, _ in known]
     if isinstance(of, str):
         if of not in names:
@@ -175,7 +168,6 @@ def _place(body: BodyCondition, prepared: Prepared) -> tuple[Body, Gaussians]:
     if body.shape is not None:
         shape = body.shape
         spread = 0.6 * float(shape.volume.mean()) ** (1 / 3)
-        covariance = (spread**2 * torch.eye(3)).expand(len(shape.x), 3, 3).contiguous()
         # stripes of the two commonest shades of the recorded body, so that a motion can be seen
         shades = colours_of(gaussians.harmonics, None, degree=0).cpu().clamp(0, 1)
         order = shades.mean(1).argsort()
@@ -183,7 +175,7 @@ def _place(body: BodyCondition, prepared: Prepared) -> tuple[Body, Gaussians]:
         stripe = ((shape.x - shape.x.mean(0)) / (4 * spread)).floor().long().sum(1) % 2
         colours = torch.where(stripe[:, None] == 0, 0.8 * dark, light)
         like = gaussians.means
-        dressed = Gaussians(shape.x, covariance, torch.full((len(shape.x),), 0.95), harmonics_of(colours))
+        dressed = dress(shape.x, shape.volume, colours, spread=0.6)
         own, gaussians = shape, Gaussians(*(None if t is None else t.to(like) for t in dressed))
     shift = torch.tensor(body.shift, dtype=own.x.dtype)
     x, v = own.x + shift, own.v

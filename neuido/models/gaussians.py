@@ -73,6 +73,23 @@ def harmonics_of(colours: Tensor) -> Tensor:
     return ((colours - 0.5) / C0).unsqueeze(-2)
 
 
+def dress(x: Tensor, volume: Tensor, colours: Tensor | None = None, *, spread: float = 0.3, opacity: float = 0.95) -> Gaussians:
+    """A body's particles as Gaussians, one each.
+
+    Args:
+        x: Positions [m], (P, 3).
+        volume: Volumes [m^3], (P,).
+        colours: RGB, (P, 3); black where absent.
+        spread: Standard deviation in units of the cube root of the mean volume; at 0.3 the outline of a body that is some particles thick
+            lies 0.15 of that root outside its surface, and no hole shows.
+        opacity: Of each.
+    """
+    side = float(volume.mean()) ** (1 / 3)
+    covariances = ((spread * side) ** 2 * torch.eye(3).to(x)).expand(len(x), 3, 3).contiguous()
+    colours = torch.zeros_like(x) if colours is None else colours
+    return Gaussians(x, covariances, torch.full_like(x[:, 0], opacity), harmonics_of(colours))
+
+
 class Binding(NamedTuple):
     """Which particles carry each Gaussian."""
 

@@ -52,7 +52,7 @@ class Trunk(nn.Module):
     def contract(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """The last layer of the effective networks of S materials: lambda (S, D) -> W3 (S, n, hidden_dim), b3 (S, n)."""
         weight, bias = affine(self.out)
-        weight = weight.view(self.basis_dim, -1)
+        weight = weight.reshape(self.basis_dim, -1)
         return (coefficients @ weight).view(-1, self.outputs, self.out.in_features), coefficients @ bias.view(self.basis_dim, -1)
 
 

@@ -5,9 +5,10 @@ images -> flow -> frozen VAE -> projector -> z -> laws -> rollout -> Gaussians -
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,11 +17,17 @@ from neuido.data.visual import VisualScene
 from neuido.errors import UserError
 from neuido.models.encoder import DynamicsEncoder
 from neuido.models.flow import as_bytes, frame_interval_of
-from neuido.models.gaussians import Binding, bind, deform, load_ply
+from neuido.models.gaussians import Binding, bind, deform, dress, load_ply
 from neuido.models.operator import IntrinsicDynamicsOperator
 from neuido.models.splatting import render
+from neuido.physics.law import ElasticLaw, PlasticLaw
 from neuido.physics.mpm import Simulator
 from neuido.types import Cameras, Gaussians, ParticleState
+
+UNEVEN = 50
+"""Frames of a rollout between two of a recording at uneven times."""
+
+Laws = tuple[ElasticLaw, PlasticLaw | None]
 
 
 class Prepared(NamedTuple):
@@ -29,9 +36,10 @@ class Prepared(NamedTuple):
     source: VisualScene
     simulator: Simulator
     gaussians: Gaussians
-    binding: Binding
+    binding: Binding | None
+    """None: Gaussian i is particle i."""
     every: int
-    """Substeps from one frame to the next."""
+    """Substeps from one frame of a rollout to the next."""
     images: Tensor
     """(V, T, H, W, 3) uint8."""
     masks: Tensor
@@ -40,15 +48,26 @@ class Prepared(NamedTuple):
     background: Tensor
     training: list[int]
     """Views that are not held out."""
-    volume: Tensor
-    """Flow latents of the views that the encoder sees, (V', channels, T', h, w)."""
-    conditions: Tensor
+    volume: Tensor | None
+    """Flow latents of the views that the encoder sees, (V', channels, T', h, w); none without an encoder."""
+    conditions: Tensor | None
     """(V', 2)"""
+    picks: tuple[int, ...] | None = None
+    """Which frames of a rollout are the recording's, of T recorded at uneven times; none: all."""
 
     @property
     def frames(self) -> int:
         """T."""
         return self.images.shape[1]
+
+    @property
+    def stride(self) -> int:
+        """Substeps of the recording's mean frame interval, about."""
+        return self.every if self.picks is None else self.every * UNEVEN
+
+    def substeps(self, frames: int) -> int:
+        """Substeps of a rollout from the first to the last of so many frames."""
+        return self.every * (frames - 1 if self.picks is None else self.picks[frames - 1])
 
     @property
     def scoring(self) -> list[int]:
@@ -71,7 +90,7 @@ class Prepared(NamedTuple):
 
 def prepare(
     scene: VisualScene,
-    encoder: DynamicsEncoder,
+    encoder: DynamicsEncoder | None,
     *,
     device: str | torch.device = "cpu",
     encoder_views: int = 0,
@@ -81,7 +100,7 @@ def prepare(
 
     Args:
         scene: The scene.
-        encoder: Its frozen VAE makes the flow latents.
+        encoder: Its frozen VAE makes the flow latents; none: they are not needed.
         device: Where it will run.
         encoder_views: How many of the training views the encoder sees, the first ones; 0: all.
         cache: Folder in which flows are kept.
@@ -89,64 +108,110 @@ def prepare(
     Raises:
         UserError: Frames that are no whole number of substeps apart, no training view; what `Simulator` and `DynamicsEncoder.watch` refuse.
     """
-    batch, dt = scene.batch, scene.scene.dt
-    interval = frame_interval_of(batch.times)
-    every = round(interval / dt)
-    if every < 1 or abs(every * dt - interval) > 1e-3 * interval:
-        raise UserError(f"{scene.name}: frames are {interval:g} s apart, no whole number of substeps of {dt:g} s; change dt or frame_step")
+    batch = scene.batch
+    every, picks = clock(batch.times, scene.scene.dt, scene.name)
     training = (~batch.held_out).nonzero()[:, 0].tolist()
     if not training:
         raise UserError(f"{scene.name} has no training view: all {len(batch.held_out)} are held out")
-    seen = training[: encoder_views or None]
-    with torch.no_grad():
-        velocities = encoder.watch(batch, seen, scene.body.x.mean(0), cache=cache)
-        volume, conditions = encoder.embed(velocities)
-    gaussians = load_ply(scene.gaussians, device=device)
+    volume = conditions = None
+    if encoder is not None:
+        with torch.no_grad():
+            velocities = encoder.watch(batch, training[: encoder_views or None], scene.body.x.mean(0), cache=cache)
+            volume, conditions = (t.to(device) for t in encoder.embed(velocities))
     simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device)
+    if scene.gaussians is None:
+        gaussians, binding = dress(simulator.state.x, simulator.volume), None
+    else:
+        gaussians = load_ply(scene.gaussians, device=device)
+        binding = bind(gaussians, simulator.state.x)
     return Prepared(
         source=scene,
         simulator=simulator,
         gaussians=gaussians,
-        binding=bind(gaussians, simulator.state.x),
+        binding=binding,
         every=every,
         images=as_bytes(batch.images).to(device),
         masks=as_bytes(batch.masks).to(device),
         cameras=batch.cameras._replace(viewmats=batch.cameras.viewmats.to(device), Ks=batch.cameras.Ks.to(device)),
         background=batch.background.to(device),
         training=training,
-        volume=volume.to(device),
-        conditions=conditions.to(device),
+        volume=volume,
+        conditions=conditions,
+        picks=picks,
     )
 
 
-def roll(prepared: Prepared, operator: IntrinsicDynamicsOperator, z: Tensor, frames: int | None = None) -> ParticleState:
-    """The motion under the law of z (d,): frames of the recording's times, the first `frames` or all.
+def clock(times: Tensor, dt: float, name: str) -> tuple[int, tuple[int, ...] | None]:
+    """Substeps from one frame of a rollout to the next, and which frames are the recording's, none where its times are even (to 1 %).
+
+    Uneven times are rounded to a fiftieth of the mean interval.
+
+    Raises:
+        UserError: Even times that are no whole number of substeps apart, two frames at one time.
+    """
+    steps = torch.as_tensor(times, dtype=torch.float64).diff()
+    if len(steps) and float((steps - steps.mean()).abs().max()) > 0.01 * float(steps.mean()) > 0:
+        every = max(1, int(float(steps.mean()) / (UNEVEN * dt)))
+        picks = tuple(((times - times[0]) / (every * dt)).round().long().tolist())
+        if any(b <= a for a, b in zip(picks, picks[1:])):
+            raise UserError(f"{name}: two frames are {float(steps.min()):g} s apart; leave one out (frame_step, frame_count)")
+        return every, picks
+    interval = frame_interval_of(times)
+    every = round(interval / dt)
+    if every < 1 or abs(every * dt - interval) > 1e-3 * interval:
+        raise UserError(f"{name}: frames are {interval:g} s apart, no whole number of substeps of {dt:g} s; change dt or frame_step")
+    return every, None
+
+
+def roll_laws(prepared: Prepared, laws: Laws, frames: int, *, segment: int = 0, **options: Any) -> ParticleState:
+    """The motion under an elastic and a plastic law: the first `frames` frames of the recording's.
+
+    Args:
+        prepared: The scene.
+        laws: As `Simulator.rollout` takes them.
+        frames: Number of frames K, the start included.
+        segment: Keep the state of a rollout with gradients every so many frames only; 0: of all.
+        options: Of `Simulator.rollout`.
 
     Raises:
         UserError: As `Simulator.rollout`: a law too stiff for the step, a particle lost.
     """
-    steps = ((frames or prepared.frames) - 1) * prepared.every
-    return prepared.simulator.rollout(steps, *operator.laws(z), every=prepared.every)
+    steps, piece = prepared.substeps(frames), segment * prepared.stride
+    if 0 < piece < steps:
+        options["segment"], steps = piece, piece * -(-steps // piece)  # whole pieces; the frames beyond are dropped
+    motion = prepared.simulator.rollout(steps, *laws, every=prepared.every, **options)
+    wanted = slice(frames) if prepared.picks is None else list(prepared.picks[:frames])
+    return ParticleState(*(t[wanted] for t in motion))
 
 
-def roll_surely(prepared: Prepared, operator: IntrinsicDynamicsOperator, z: Tensor, halvings: int = 2) -> tuple[ParticleState, int]:
-    """`roll`, and where it fails the same with half the substep, at most `halvings` times; the frames, and how often it was halved.
+def roll(
+    prepared: Prepared, operator: IntrinsicDynamicsOperator, z: Tensor, frames: int | None = None, *, segment: int = 0
+) -> ParticleState:
+    """`roll_laws` of the laws of z (d,), over the first `frames` frames or all."""
+    return roll_laws(prepared, operator.laws(z), frames or prepared.frames, segment=segment)
+
+
+def roll_surely(prepared: Prepared, run: Callable[[Prepared], ParticleState], halvings: int = 2) -> tuple[ParticleState, int]:
+    """The frames of `run`, and how often the substep was halved, at most `halvings` times, because it had failed.
 
     Raises:
-        UserError: As `roll`, with the smallest substep too.
+        UserError: As `run`, with the smallest substep too.
     """
     for count in range(halvings + 1):
         try:
-            if count == 0:
-                return roll(prepared, operator, z), 0
-            source = prepared.source
-            finer = replace(source.scene, dt=source.scene.dt / 2**count)
-            simulator = Simulator(finer, source.body, density=source.density, device=prepared.simulator.device, graphs=False)
-            return roll(prepared._replace(simulator=simulator, every=prepared.every * 2**count), operator, z), count
+            return run(prepared if count == 0 else refine(prepared, 2**count)), count
         except UserError:
             if count == halvings:
                 raise
     raise AssertionError("unreachable")
+
+
+def refine(prepared: Prepared, times: int) -> Prepared:
+    """The same scene with a substep that is so many times smaller; its rollouts are not captured as graphs."""
+    source = prepared.source
+    finer = replace(source.scene, dt=source.scene.dt / times)
+    simulator = Simulator(finer, source.body, density=source.density, device=prepared.simulator.device, graphs=False)
+    return prepared._replace(simulator=simulator, every=prepared.every * times)
 
 
 def draw(prepared: Prepared, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:

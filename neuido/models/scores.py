@@ -54,21 +54,32 @@ def score_motion(prepared: Prepared, motion: ParticleState, floor: Tensor | None
 
 @torch.no_grad()
 def score_images(prepared: Prepared, motion: ParticleState, views: Sequence[int], lpips: LPIPS | Absent) -> list[dict[str, Any]]:
-    """PSNR [dB], SSIM and LPIPS of each frame after the first and each view: the full frame, and the crop around the body (`crop_`).
+    """PSNR [dB], SSIM, LPIPS and the silhouettes' intersection over union of each frame after the first and each view.
+
+    The image measures are of the full frame, and of the crop around the body (`crop_`).
 
     A value that there is no way to compute is absent.
     """
     rows = []
     for view in views:
-        images, _ = draw(prepared, motion, [view])
+        images, alphas = draw(prepared, motion, [view])
         recorded = prepared.recorded([view], len(images))
         whole = _image_rows(images[1:, 0].clamp(0, 1), recorded[1:, 0], lpips)
-        top, left, side = window(prepared.silhouettes([view], len(images))[:, 0])
+        masks = prepared.silhouettes([view], len(images))[:, 0]
+        overlap = intersection_over_union(alphas[1:, 0], masks[1:]).tolist()
+        top, left, side = window(masks)
         cut = (slice(1, None), 0, slice(top, top + side), slice(left, left + side))
         crop = _image_rows(images[cut].clamp(0, 1), recorded[cut], lpips)
-        for k, (a, b) in enumerate(zip(whole, crop)):
-            rows.append({"frame": k + 1, "view": view, **a, **{f"crop_{name}": value for name, value in b.items()}})
+        for k, (a, b, iou) in enumerate(zip(whole, crop, overlap)):
+            rows.append({"frame": k + 1, "view": view, **a, "iou": iou, **{f"crop_{name}": value for name, value in b.items()}})
     return rows
+
+
+def intersection_over_union(alphas: Tensor, masks: Tensor) -> Tensor:
+    """Of silhouettes (K, H, W), the pixels of which more than half is covered; (K,), one where both are empty."""
+    a, b = alphas > 0.5, masks > 0.5
+    either = (a | b).sum((1, 2))
+    return torch.where(either > 0, (a & b).sum((1, 2)) / either.clamp(min=1), 1.0)
 
 
 def _image_rows(images: Tensor, recorded: Tensor, lpips: LPIPS | Absent) -> list[dict[str, float]]:

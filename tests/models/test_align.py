@@ -16,6 +16,7 @@ from neuido.errors import UserError
 from neuido.models.align import AlignModule
 from neuido.models.branch import small_strain_modulus
 from neuido.models.encoder import DynamicsEncoder
+from neuido.models.filmed import some_views
 from neuido.models.flow_vae import FlowVAE
 from tests.models.visual_samples import TinyScenes, tiny_scene
 
@@ -83,7 +84,8 @@ def test_curriculum_and_views(vae, tmp_path):
         frames.append(model.frames_now(prepared))
     del type(model).global_step
     assert frames == [3, 3, 5, 5, 6, 6, 6, 6]
-    assert len(model._views(prepared)) == 1 and model._views(prepared)[0] in prepared.training
+    drawn = [some_views(prepared.training, 1, step) for step in range(8)]
+    assert all(len(views) == 1 for views in drawn) and {view for views in drawn for view in views} == set(prepared.training)
 
 
 def test_a_law_that_cannot_run_is_drawn_back(vae, tmp_path, capsys):

@@ -118,16 +118,16 @@ def test_predict_writes_law_particles_and_video(tools, tmp_path):
 def test_two_bodies_meet(tools, tmp_path):
     operator, encoder, prepared = tools
     (tmp_path / "two.yaml").write_text(TWO.replace("frames: 4", "frames: 6"))
-    known = [(each, operator.latent("jelly")) for each in prepared]
+    known = [(each, operator.laws(operator.latent("jelly"))) for each in prepared]
     both = read_conditions(tmp_path / "two.yaml")
-    motion, gaussians, first = simulate_condition(both, operator, known)
+    motion, gaussians, first = simulate_condition(both, known)
     assert motion.x.shape[1] == gaussians.means.shape[1] and len(gaussians.opacities) == motion.x.shape[1]
-    lower_alone, *_ = simulate_condition(both._replace(bodies=both.bodies[1:]), operator, known)
+    lower_alone, *_ = simulate_condition(both._replace(bodies=both.bodies[1:]), known)
     count = len(lower_alone.x[0])
     pressed = motion.x[-1, -count:, 1].max() - lower_alone.x[-1, :, 1].max()
     assert pressed < -0.005  # the ball pushes the lower body's top down
     with torch.no_grad():
-        images, _ = draw(prepared[0], roll(prepared[0], operator, known[0][1]), [0])
+        images, _ = draw(prepared[0], roll(prepared[0], operator, operator.latent("jelly")), [0])
     assert images.shape == (6, 1, 32, 32, 3) and first is prepared[0]
 
 
@@ -152,7 +152,7 @@ def test_impossible_conditions_are_named(tools, tmp_path, change, word):
     path = tmp_path / "two.yaml"
     path.write_text(TWO.replace(*change))
     with pytest.raises(UserError, match=word):
-        simulate_condition(read_conditions(path), operator, [(each, operator.latent("jelly")) for each in prepared])
+        simulate_condition(read_conditions(path), [(each, operator.laws(operator.latent("jelly"))) for each in prepared])
 
 
 def test_names_stay_inside(tmp_path):

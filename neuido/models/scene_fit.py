@@ -1,0 +1,74 @@
+"""What is fitted of one scene: a method's parameters and, where it is estimated, the start of the motion."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from neuido.errors import UserError
+from neuido.models.methods import Method, read_tensors, write_tensors
+from neuido.models.pipeline import Prepared
+from neuido.physics.effects import Effects
+from neuido.physics.mpm import Simulator
+from neuido.types import ParticleState
+
+START = "start.safetensors"
+
+
+class SceneFit(nn.Module):
+    """One scene's method and, where it is estimated, what its initial velocity lacks.
+
+    Args:
+        method: Of `Method.for_scene`.
+        estimate_velocity: Whether a rigid motion is added to the body's known velocity.
+    """
+
+    def __init__(self, method: Method, estimate_velocity: bool):
+        super().__init__()
+        self.method = method
+        self.twist = nn.Parameter(torch.zeros(2, 3)) if estimate_velocity else None
+        """Velocity of the centre [m/s] and angular velocity about it [rad/s]."""
+
+    def roll(self, scene: Prepared, frames: int, effects: Effects | None = None, segment: int = 0) -> ParticleState:
+        """`Method.roll` from the start of this fit."""
+        return self.method.roll(scene, frames, state=self.start(scene.simulator), effects=effects, segment=segment)
+
+    def start(self, simulator: Simulator) -> ParticleState | None:
+        """The state at t = 0; none: the body's own."""
+        if self.twist is None:
+            return None
+        linear, angular = self.twist.to(simulator.dtype)
+        x, v, C, F = simulator.state
+        centre = (simulator.mass[:, None] * x).sum(0) / simulator.mass.sum()
+        zero = angular.new_zeros(())
+        a, b, c = angular
+        spin = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).view(3, 3)
+        return ParticleState(x, v + linear + (x - centre) @ spin.T, C + spin, F)
+
+    def save(self, folder: Path) -> None:
+        """`Method.save`, and the correction of the velocity."""
+        self.method.save(folder)
+        if self.twist is not None:
+            write_tensors(folder / START, {"twist": self.twist.detach().cpu().clone()})
+
+    def load(self, folder: Path) -> None:
+        """Take what `save` wrote.
+
+        Raises:
+            UserError: As `Method.load`; a file without `twist`.
+        """
+        self.method.load(folder)
+        if (folder / START).is_file():
+            found = read_tensors(folder / START).get("twist")
+            if found is None or found.shape != (2, 3):
+                raise UserError(f"model.adapter: {folder / START} holds no twist of shape (2, 3)")
+            self.twist = nn.Parameter(found.to(next(self.buffers(), found).device))
+
+    def describe(self) -> dict[str, Any]:
+        """What was found, the correction of the velocity included."""
+        found = self.method.describe()
+        if self.twist is None:
+            return found
+        linear, angular = self.twist.detach().tolist()
+        return found | {"velocity_added": linear, "angular_velocity_added": angular}
