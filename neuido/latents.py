@@ -61,15 +61,17 @@ def latents(
 
 
 def _space(operator: "IntrinsicDynamicsOperator", folder: Path, perplexity: float, seed: int) -> None:
+    import numpy as np
+
     from neuido.data.tables import write_rows
     from neuido.models.latents import embed, idle, silhouettes
 
-    found = silhouettes(operator)
+    points = embed(operator, perplexity=perplexity, seed=seed)
+    write_rows(folder / "embedding.csv", points)
+    found = silhouettes(operator, np.array([(p["x"], p["y"]) for p in points]))
     write_rows(folder / "silhouettes.csv", found)
     for row in found:
         print(f"silhouette by family, {row['space']:22s}{row['silhouette']:7.3f}  ({row['meaning']})")
-    points = embed(operator, perplexity=perplexity, seed=seed)
-    write_rows(folder / "embedding.csv", points)
     write_rows(folder / "directions.csv", idle(operator))
     draw_embedding(points, folder / "embedding.png")
 

@@ -15,6 +15,8 @@ MEASURES = {  # name: (title, whether higher is better)
     "cd": ("Chamfer distance [1e-4, unit cube]", False),
     "rmse": ("RMSE of matched particles [m]", False),
     "iou": ("Silhouettes, intersection over union", True),
+    "later_iou": ("Silhouettes of the frames that no fit has seen, intersection over union", True),
+    "later_cd": ("Chamfer distance of the frames that no fit has seen [1e-4, unit cube]", False),
     "psnr": ("PSNR on held-out views [dB]", True),
     "ssim": ("SSIM on held-out views", True),
     "lpips": ("LPIPS on held-out views", False),
@@ -140,7 +142,7 @@ def _scores(entries: list[Entry], quoted: list[dict[str, Any]]) -> list[str]:
 
 def _costs(entries: list[Entry]) -> list[str]:
     """Means over the scenes of all further figures: steps, seconds, memory."""
-    known = ("scene", "failed", "unseen", "floor", *MEASURES)
+    known = ("scene", "failed", "unseen", "floor", "stage", "found_", "later_", *MEASURES)  # of beginnings
     columns = list(dict.fromkeys(c for e in entries for row in e.rows for c in row if not c.startswith(known)))
     rows = [(e.label, *(mean([row[c] for row in e.rows if isinstance(row.get(c), float)]) for c in columns)) for e in entries if e.rows]
     told = [i for i in range(len(columns)) if any(math.isfinite(row[i + 1]) for row in rows)]
@@ -152,7 +154,7 @@ def _costs(entries: list[Entry]) -> list[str]:
 
 def _last_logged(entries: list[Entry]) -> list[str]:
     """Of runs of sweeps: parameters, and the last value of what they logged."""
-    runs = [e for e in entries if e.parameters]
+    runs = [e for e in entries if e.parameters and e.stage != "before"]
     parameters = dict.fromkeys(p for e in runs for p in e.parameters)
     last = [{name: points[-1][1] for name, points in curves(e.root).items()} for e in runs]
     names = [n for n in dict.fromkeys(n for own in last for n in own) if not n.startswith("train/") and n.count("/") == 1]
@@ -169,7 +171,7 @@ def _quoted(rows: list[dict[str, Any]]) -> list[str]:
 
 def _spread(entries: list[Entry]) -> list[str]:
     """Over runs that differ in their seeds alone: least, greatest, mean and deviation of the Chamfer distance."""
-    seeds = [e for e in entries if e.parameters and e.rows and all("seed" in name for name in e.parameters)]
+    seeds = [e for e in entries if e.stage != "before" and e.parameters and e.rows and all("seed" in name for name in e.parameters)]
     if len(seeds) < 2:
         return []
     rows = []
@@ -220,7 +222,7 @@ def _logged(entries: list[Entry]) -> list[str]:
     """What the runs logged, a panel a quantity; those that are averages over scenes or families."""
     found: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for entry in entries:
-        for name, points in curves(entry.root).items():
+        for name, points in curves(entry.root).items() if entry.stage != "before" else ():
             if name.count("/") <= 1 and len(points) > 1:
                 found.setdefault(name, {})[entry.label] = points
     order = sorted(found, key=lambda name: (not name.startswith("train/"), not name.startswith("val/")))[:MOST_PANELS]

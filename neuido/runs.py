@@ -23,6 +23,8 @@ class Entry(NamedTuple):
     """scores.csv, a row a scene."""
     parameters: dict[str, Any]
     """Of a run of a sweep."""
+    stage: str = ""
+    """`before` or `after` fitting, or a later `test`, where the scores say so."""
 
     def of(self, scene: str) -> dict[str, Any]:
         """The row of a scene; empty where there is none."""
@@ -36,13 +38,13 @@ class Entry(NamedTuple):
 
     def by_frame(self, scene: str) -> list[dict[str, Any]]:
         """particles.csv of a scene, a row a time step."""
-        folder = self.folder(scene)
-        return read_rows(folder / "particles.csv") if folder and (folder / "particles.csv").is_file() else []
+        path = (self.folder(scene) or Path()) / self.stage / "particles.csv"
+        return read_rows(path) if self.scores is not None and path.is_file() else []
 
     def videos(self, scene: str) -> list[Path]:
-        """The videos of a scene."""
+        """The videos of a scene; those of a fit are of what came out of it."""
         folder = self.folder(scene)
-        return sorted(folder.glob("*.mp4")) if folder and folder.is_dir() else []
+        return sorted(folder.glob("*.mp4")) if folder and folder.is_dir() and self.stage != "before" else []
 
 
 def open_runs(given: Sequence[str]) -> list[Entry]:
@@ -63,18 +65,32 @@ def open_runs(given: Sequence[str]) -> list[Entry]:
         sweep = sorted(each for each in folder.iterdir() if status_of(each).get("status") == "done")
         found = [entry for each in sweep or [folder] for entry in _entries(each, label, status_of(each).get("parameters", {}))]
         if not found:
-            raise UserError(f"runs: {folder} holds neither scores.csv nor metrics.csv: run `neuido fit` or `neuido test` first")
+            raise UserError(f"runs: {folder} holds neither scores.csv, test.csv nor metrics.csv: run `neuido fit` or `neuido test` first")
         entries += found
     return _distinct(entries)
 
 
 def _entries(folder: Path, label: str, parameters: dict[str, Any]) -> list[Entry]:
     own = f"{label} {folder.name}".strip() if parameters else label or _name(folder)
-    tables = sorted(folder.rglob("scores.csv"))
-    if tables:
-        names = [own if len(tables) == 1 else f"{own}, {path.parent.relative_to(folder)}" for path in tables]
-        return [Entry(name, folder, path.parent, read_rows(path), parameters) for name, path in zip(names, tables)]
-    return [Entry(own, folder, None, [], parameters)] if logs(folder) else []
+    found = tables(folder)
+    if not found:
+        return [Entry(own, folder, None, [], parameters)] if logs(folder) else []
+    out = []
+    for place, rows in found.items():
+        name = own if len(found) == 1 else f"{own}, {place.relative_to(folder)}"
+        stages = list(dict.fromkeys(str(row.get("stage", "")) for row in rows))
+        if all(row.get("steps") == 0 for row in rows if row.get("stage") == "after"):  # nothing was fitted: both are the same
+            stages = [stage for stage in stages if stage != "before"]
+        for stage in stages:
+            part = [row for row in rows if str(row.get("stage", "")) == stage]
+            out.append(Entry(f"{name}, {stage}" if len(stages) > 1 else name, folder, place, part, parameters, stage))
+    return out
+
+
+def tables(folder: Path) -> dict[Path, list[dict[str, Any]]]:
+    """The scores below a folder by where they are: rows of scores.csv, and of test.csv, in which a finished fit was scored again."""
+    paths = sorted({*folder.rglob("scores.csv"), *folder.rglob("test.csv")}, key=lambda path: (path.parent, path.name))
+    return {place: [row for path in paths if path.parent == place for row in read_rows(path)] for place in {p.parent: 0 for p in paths}}
 
 
 def _name(folder: Path) -> str:

@@ -65,7 +65,7 @@ def sweep(
         collect(plan, runs, folder)
     rows = collect(plan, runs, folder)
     _summarise(rows, plan.metric, folder)
-    if report and any(True for run in runs for _ in (folder / run.name).rglob("scores.csv")):
+    if report and any(name.startswith("scores/") for row in rows for name in row):
         _report(folder, path)
     return int(any(row["status"] == "failed" for row in rows if row["run"] in {run.name for run in own}))
 
@@ -164,8 +164,21 @@ def logged(folder: Path) -> dict[str, float]:
     return values
 
 
+def scored(folder: Path) -> dict[str, float]:
+    """Means over the scenes of each score below a folder, as `scores/...`; of a fit those after it, or of a later test."""
+    from neuido.runs import tables
+
+    values: dict[str, float] = {}
+    for rows in tables(folder).values():
+        last = [row for row in rows if row.get("stage") == "test"] or [row for row in rows if row.get("stage") != "before"]
+        for name in dict.fromkeys(name for row in last for name in row):
+            own = [row[name] for row in last if isinstance(row.get(name), float)]
+            values |= {f"scores/{name}": sum(own) / len(own)} if own else {}
+    return values
+
+
 def collect(plan: SweepFile, runs: list[Run], folder: Path) -> list[dict[str, Any]]:
-    """Write results.csv, a row a run that was begun: name, status, seconds, parameters, the metric, then all else that it logged."""
+    """Write results.csv, a row a run that was begun: name, status, seconds, parameters, the metric, then all that it logged and scored."""
     first = [plan.metric.name] if plan.metric else []
     with (folder / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # of two shards the later one has all rows
@@ -175,7 +188,8 @@ def collect(plan: SweepFile, runs: list[Run], folder: Path) -> list[dict[str, An
             if not state:
                 continue
             row = {"run": run.name, "status": state["status"], "seconds": state.get("seconds", ""), **run.parameters}
-            values = logged(folder / run.name) if state["status"] == "done" else {}
+            own = folder / run.name
+            values = logged(own) | scored(own) if state["status"] == "done" else {}
             row |= {name: "" for name in first} | values
             rows.append(row | ({"error": state["error"]} if "error" in state else {}))
         write_rows(folder / "results.csv", rows)

@@ -27,6 +27,7 @@ SPACES = {
     "elastic coefficients": "lambda of the elastic head",
     "plastic coefficients": "lambda of the plastic head",
     "laws": "what the laws answer to fixed deformations: direction of the stress, and plastic correction",
+    "t-sne": "the plane of t-SNE, which is no metric space",
 }
 
 
@@ -70,7 +71,7 @@ def spaces(operator: IntrinsicDynamicsOperator) -> dict[str, np.ndarray]:
     elastic, plastic = (c.double().cpu().numpy() for c in operator.coefficients(z))
     return {
         "raw": raw,
-        "cosine": raw / np.linalg.norm(raw, axis=1, keepdims=True),
+        "cosine": raw,
         "standardised": (raw - raw.mean(0)) / raw.std(0).clip(1e-12),
         "pca": PCA(2).fit_transform(raw),
         "elastic coefficients": elastic,
@@ -79,21 +80,31 @@ def spaces(operator: IntrinsicDynamicsOperator) -> dict[str, np.ndarray]:
     }
 
 
-def silhouettes(operator: IntrinsicDynamicsOperator) -> list[dict[str, Any]]:
+def silhouettes(operator: IntrinsicDynamicsOperator, plane: np.ndarray | None = None) -> list[dict[str, Any]]:
     """The mean silhouette by family in each space, over all latents and over each family's own; the first row is the latents' own.
+
+    `neighbours` is the share of the latents whose nearest other one is of their family.
+
+    Args:
+        operator: The operator.
+        plane: The latents in the plane of t-SNE, (M, 2), for a row of their own.
 
     Raises:
         UserError: No scikit-learn, or latents of fewer than two families.
     """
     need_sklearn("a silhouette")
-    from sklearn.metrics import silhouette_samples
+    from sklearn.metrics import pairwise_distances, silhouette_samples
 
     families = _families(operator)
     rows = []
-    for name, points in spaces(operator).items():
-        own = silhouette_samples(points, families, metric="cosine" if name == "cosine" else "euclidean")
+    for name, points in {**spaces(operator), **({} if plane is None else {"t-sne": plane})}.items():
+        distances = pairwise_distances(points, metric="cosine" if name == "cosine" else "euclidean")
+        np.fill_diagonal(distances, 0.0)
+        own = silhouette_samples(distances, families, metric="precomputed")
         each = {family: float(own[families == family].mean()) for family in dict.fromkeys(families.tolist())}
-        rows.append({"space": name, "silhouette": float(own.mean()), **each, "meaning": SPACES[name]})
+        nearest = (distances + np.diag(np.full(len(families), np.inf))).argmin(1)
+        neighbours = float((families[nearest] == families).mean())
+        rows.append({"space": name, "silhouette": float(own.mean()), **each, "neighbours": neighbours, "meaning": SPACES[name]})
     return rows
 
 
