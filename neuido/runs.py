@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neuido.data.tables import read_rows
+from neuido.data.tables import folder_of, read_rows
 from neuido.errors import UserError
 from neuido.sweep import status_of
 
@@ -32,8 +32,6 @@ class Entry(NamedTuple):
 
     def folder(self, scene: str) -> Path | None:
         """Where the results of a scene are."""
-        from neuido.models.pipeline import folder_of
-
         return None if self.scores is None else folder_of(self.scores, scene)
 
     def by_frame(self, scene: str) -> list[dict[str, Any]]:

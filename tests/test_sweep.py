@@ -102,7 +102,11 @@ def wandb_says(sweep_file, run) -> list[str]:
 def test_command_is_that_of_wandbs_agent(tmp_path, macro, monkeypatch):
     monkeypatch.setenv("PLACE", "here")
     command = ["${env}", "${interpreter}", "${program}", "at ${envvar:PLACE}!", 7, f"${{{macro}}}"]
-    parameters = {"a": {"values": [True, False]}, "b.c": {"value": "x y"}, "d": {"parameters": {"e": {"values": [1.5]}, "f": {"value": None}}}}
+    parameters = {
+        "a": {"values": [True, False]},
+        "b.c": {"value": "x y"},
+        "d": {"parameters": {"e": {"values": [1.5]}, "f": {"value": None}}},
+    }
     file = read_sweep(write(tmp_path, command=command, parameters=parameters))
     for run in runs_of(file):
         assert command_of(file, run, os.environ) == wandb_says(file, run)
@@ -270,9 +274,9 @@ def test_redirect():
 def test_real_fits_with_wandb_offline(tmp_path):
     """A plain sweep file over `neuido fit`: everything goes to each run's folder, wandb's offline run included."""
     pytest.importorskip("wandb")
-    options = ["--data.root", str(tmp_path / "data"), "--data.generate.instances", "1", "--data.generate.particles_per_side", "3",
-               "--data.generate.steps", "40", "--data.batch_size", "90", "--trainer.max_epochs", "1", "--trainer.limit_train_batches", "4",
-               "--trainer.enable_progress_bar", "false", "--model.instance_steps", "0", "--model.save_to", "operator.safetensors"]  # fmt: skip
+    options = ["--data.root", str(tmp_path / "data"), "--data.generate.instances=1", "--data.generate.particles_per_side=3",
+               "--data.generate.steps=40", "--data.batch_size=90", "--trainer.max_epochs=1", "--trainer.limit_train_batches=4",
+               "--trainer.enable_progress_bar=false", "--model.instance_steps=0", "--model.save_to=operator.safetensors"]  # fmt: skip
     configs = ["--config", "quickstart", "--config", "loggers/wandb"]
     path = write(
         tmp_path,

@@ -1,4 +1,4 @@
-"""Tables as CSV files: scores, results of sweeps, figures of latents. Light: no torch at import."""
+"""Results on disk: tables as CSV files, and the folder of each scene. No torch at import."""
 
 import csv
 import io
@@ -43,3 +43,9 @@ def number(text: str) -> float | str:
         return float(text)
     except (TypeError, ValueError):
         return text
+
+
+def folder_of(out: str | os.PathLike, name: str) -> Path:
+    """The folder of a scene's results, under a name that stays inside `out`."""
+    clean = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).lstrip(".") or "scene"
+    return Path(out) / clean

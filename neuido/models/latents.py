@@ -54,11 +54,18 @@ def strains(count: int = 48, *, seed: int = 0) -> Tensor:
 
 @torch.no_grad()
 def answers(operator: IntrinsicDynamicsOperator, z: Tensor) -> Tensor:
-    """What the laws of z (S, d) say on `strains`, (S, 18 n): stress over its norm, and plastic correction over the largest norm of all."""
+    """What the laws of z (S, d) say on `strains`, (S, 18 n): stress over its norm, and plastic correction over the largest norm of a
+    training trajectory's.
+    """
+    stress, plastic = _said(operator, z)
+    scale = _said(operator, operator.latents.to(z))[1].norm(dim=1).max().clamp(min=1e-12)
+    return torch.cat([stress / stress.norm(dim=1, keepdim=True), plastic / scale], 1)
+
+
+def _said(operator: IntrinsicDynamicsOperator, z: Tensor) -> tuple[Tensor, Tensor]:
     F = strains().to(z)
     F = F.expand(len(z), *F.shape)
-    stress, plastic = operator.elastic(z, F).flatten(1), (operator.plastic(z, F) - F).flatten(1)
-    return torch.cat([stress / stress.norm(dim=1, keepdim=True), plastic / plastic.norm(dim=1).max().clamp(min=1e-12)], 1)
+    return operator.elastic(z, F).flatten(1), (operator.plastic(z, F) - F).flatten(1)
 
 
 @torch.no_grad()
@@ -134,16 +141,15 @@ def embed(operator: IntrinsicDynamicsOperator, *, perplexity: float = 10.0, seed
     return [{"name": name, "family": family, "x": at[0], "y": at[1], "modulus": modulus} for name, family, at, modulus in names]
 
 
-def idle(operator: IntrinsicDynamicsOperator, *, kept: Sequence[int] = (2, 5, 10, 20, 40), samples: int = 256) -> list[dict[str, Any]]:
-    """How few directions of the latents the laws feel: the reason why a silhouette of the raw latents is low.
+def idle(operator: IntrinsicDynamicsOperator, *, kept: Sequence[int] = (2, 5, 10, 20, 40)) -> list[dict[str, Any]]:
+    """How few directions of the latents the laws feel: the rest is what the start of Stage I left, and widens the families.
 
     The directions are those along which the answers of the laws change most: the leading eigenvectors of the mean of J^T J, J the
-    derivative of `answers` by z, found from differences along random directions at each latent.
+    derivative of `answers` by z, by central differences at each latent.
 
     Args:
         operator: The operator.
         kept: Numbers of directions.
-        samples: Random directions at each latent.
 
     Returns:
         A row for each number: share of the latents' variance along these directions, silhouette on them alone, and the median change
@@ -153,7 +159,7 @@ def idle(operator: IntrinsicDynamicsOperator, *, kept: Sequence[int] = (2, 5, 10
     from sklearn.metrics import silhouette_score
 
     families, z = _families(operator), operator.latents.to(operator.elastic_trunk.fc1.weight)
-    V = _felt(operator, z, samples)
+    V = _felt(operator, z)
     centred = (z - z.mean(0)) @ V
     variance, before = centred.var(0), answers(operator, z)
     rows = []
@@ -170,15 +176,13 @@ def idle(operator: IntrinsicDynamicsOperator, *, kept: Sequence[int] = (2, 5, 10
     return rows
 
 
-def _felt(operator: IntrinsicDynamicsOperator, z: Tensor, samples: int, step: float = 0.05) -> Tensor:
+def _felt(operator: IntrinsicDynamicsOperator, z: Tensor, step: float = 0.05) -> Tensor:
     """Orthonormal directions (d, d), those that the laws feel most first."""
-    generator = torch.Generator().manual_seed(0)
+    steps = step * torch.eye(z.shape[1]).to(z)
     gram = torch.zeros(z.shape[1], z.shape[1], dtype=torch.float64)
     for own in z:
-        U = torch.linalg.qr(torch.randn(z.shape[1], z.shape[1], generator=generator).to(z)).Q[:, :samples]
-        change = (answers(operator, own + step * U.T) - answers(operator, own - step * U.T)) / (2 * step)
-        J = (change.T @ U.T).double().cpu()
-        gram += J.T @ J
+        J = ((answers(operator, own + steps) - answers(operator, own - steps)) / (2 * step)).double().cpu()  # transposed
+        gram += J @ J.T
     return torch.linalg.eigh(gram).eigenvectors.flip(1).to(z)
 
 
