@@ -208,4 +208,5 @@ def _quiet_lightning() -> None:
     warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).* is deprecated")
     warnings.filterwarnings("ignore", message=r".*tensorboardX.* has been removed")
     warnings.filterwarnings("ignore", message=r".*does not have many workers")  # the data sets are memory maps
+    warnings.filterwarnings("ignore", message=r".*but have no `validation_step`")  # adaptation scores before and after each scene
     warnings.filterwarnings("ignore", message=r".*in eval mode at the start of training")  # what is frozen is meant to be

@@ -11,7 +11,7 @@ from neuido.page import escaped, page, picture, table
 if TYPE_CHECKING:
     from neuido.demo_laws import LawsResult
     from neuido.demo_loop import LoopResult
-    from neuido.demo_video import VideoResult
+    from neuido.demo_video import Adapted, VideoResult
 
 PARTS = ("laws", "video", "loop")
 
@@ -100,8 +100,18 @@ def video_section(result: "VideoResult") -> str:
         if result.losses
         else "Scores are those of views that were held out."
     )
+    few = "" if result.adapted is None else adapted_section(result.adapted)
     shown = "".join(f"<h3>{escaped(s.name)}: recorded above, predicted below</h3>{picture(s.picture)}" for s in result.scenes)
-    return f"<h2>Stage II: a law from video, in one pass</h2><p>{text}</p>{table(head, rows, digits=3)}{shown}"
+    return f"<h2>Stage II: a law from video, in one pass</h2><p>{text}</p>{table(head, rows, digits=3)}{shown}{few}"
+
+
+def adapted_section(result: "Adapted") -> str:
+    """Few-shot adaptation on the page: scores on the held-out view before and after."""
+    rows = [(name, scores.get("psnr", ""), scores.get("cd", ""), scores.get("rmse", "")) for name, scores in
+            (("zero-shot", result.before), (f"after {result.steps} steps, {result.seconds:.0f} s", result.after))]  # fmt: skip
+    text = "LoRA on both trunks and the latent, fitted to the training views of the scene that Stage II has not seen; scores of the others."
+    compared = table(("", "PSNR [dB]", "CD [1e-4]", "particle RMSE [m]"), rows, digits=3)
+    return f"<h3>{escaped(result.name)}: adapted to its images</h3><p>{text}</p>{compared}{picture(result.picture)}"
 
 
 def loop_section(result: "LoopResult", folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""The demonstration's visual half: small filmed scenes, reconstruction, Stage II, and the law of a body that training has not seen."""
+"""The demonstration's visual half: small filmed scenes, reconstruction, Stage II, the law of an unseen body, and its adaptation."""
 
 import csv
 from pathlib import Path
@@ -22,6 +22,19 @@ class SceneResult(NamedTuple):
     video: Path
 
 
+class Adapted(NamedTuple):
+    """Few-shot adaptation of the unseen scene: scores on the view that was held out, before and after."""
+
+    name: str
+    before: dict[str, float]
+    """As `SceneResult.scores`."""
+    after: dict[str, float]
+    steps: int
+    seconds: float
+    """Of the steps [s]."""
+    picture: Path
+
+
 class VideoResult(NamedTuple):
     """What the demonstration shows."""
 
@@ -30,10 +43,13 @@ class VideoResult(NamedTuple):
     """Stage II's image loss at each logged step; 1 explains nothing of the motion."""
     encoder: Path
     """The encoder after Stage II."""
+    adapted: Adapted | None = None
 
 
-def demo_video(out: str = "runs/demo/video", *, epochs: int = 8, init_from: str | None = "pretrained") -> VideoResult:
-    """Film three small bodies, train Stage II on two of them, and read the law of the third from its video in one pass.
+def demo_video(
+    out: str = "runs/demo/video", *, epochs: int = 8, init_from: str | None = "pretrained", adaptation_steps: int = 25
+) -> VideoResult:
+    """Film three small bodies, train Stage II on two of them, read the law of the third from its video in one pass, and adapt it.
 
     Takes minutes on a CPU core; scenes and reconstructions that are there are used again.
 
@@ -41,6 +57,7 @@ def demo_video(out: str = "runs/demo/video", *, epochs: int = 8, init_from: str 
         out: Folder for scenes, run and results.
         epochs: Of Stage II, two steps each.
         init_from: Encoder to start from; none: a new projector.
+        adaptation_steps: Of the adaptation to the third.
     """
     import yaml
 
@@ -52,13 +69,13 @@ def demo_video(out: str = "runs/demo/video", *, epochs: int = 8, init_from: str 
     folder = Path(out)
     settings = yaml.safe_load(Path(find_config("scenes/ten_small")).read_text())
     chosen = [scene for scene in settings["scenes"] if scene["name"] in (*TRAINING, *UNSEEN)]
-    print("[video 1/4] filming three small bodies", flush=True)
+    print("[video 1/5] filming three small bodies", flush=True)
     film = {key: tuple(value) if isinstance(value, list) else value for key, value in settings["film"].items()}
     simulate(str(folder / "scenes"), scenes=chosen, film=Film(**film), device="cpu", progress=False)
-    print("[video 2/4] reconstructing them from their first frame", flush=True)
+    print("[video 2/5] reconstructing them from their first frame", flush=True)
     for name in (*TRAINING, *UNSEEN):
         reconstruct(str(folder / "scenes" / name), device="cpu", progress=False, **RECONSTRUCTION)
-    print("[video 3/4] Stage II: learning from the images of two", flush=True)
+    print("[video 3/5] Stage II: learning from the images of two", flush=True)
     encoder, results = folder / "encoder.safetensors", folder / "results"
     data = ["--data.root", str(folder / "scenes"), "--data.scenes", _listed(TRAINING), "--data.unseen", _listed(UNSEEN)]
     common = ["--config", find_config("stage2_small"), *data, "--model.cache", str(folder / "flow"), "--model.out", str(results)]
@@ -69,7 +86,7 @@ def demo_video(out: str = "runs/demo/video", *, epochs: int = 8, init_from: str 
     fitted = run_lightning(["fit", *common, *start, *length])
     with (Path(fitted.trainer.log_dir) / "metrics.csv").open() as file:
         losses = tuple(float(row["train/loss"]) for row in csv.DictReader(file) if row.get("train/loss"))
-    print("[video 4/4] zero-shot: the law of each video in one pass", flush=True)
+    print("[video 4/5] zero-shot: the law of each video in one pass", flush=True)
     trained = ["--model.init_from", str(encoder), "--model.baselines", "0"]
     run_lightning(["predict", *common, *trained])
     run_lightning(["test", *common, *trained])
@@ -77,7 +94,26 @@ def demo_video(out: str = "runs/demo/video", *, epochs: int = 8, init_from: str 
         scenes = tuple(_result(row, results) for row in csv.DictReader(file))
     for scene in scenes:
         print(f"{scene.name}: law in {1e3 * scene.seconds:.1f} ms from its flow latents{' (unseen)' if scene.unseen else ''}")
-    return VideoResult(scenes, losses, encoder)
+    print("[video 5/5] few-shot: the law of the unseen one, adapted to its images", flush=True)
+    return VideoResult(scenes, losses, encoder, _adapt(folder, encoder, adaptation_steps))
+
+
+def _adapt(folder: Path, encoder: Path, steps: int) -> Adapted:
+    from neuido.cli import find_config, run_lightning
+
+    results = folder / "adapted"
+    common = ["--config", find_config("adapt_small"), "--data.root", str(folder / "scenes"), "--data.scenes", _listed(UNSEEN)]
+    common += ["--model.method.init_args.init_from", str(encoder), "--model.cache", str(folder / "flow"), "--model.out", str(results)]
+    common += ["--trainer.default_root_dir", str(folder), "--trainer.logger.init_args.save_dir", str(folder)]
+    common += ["--trainer.enable_progress_bar", "false"]
+    run_lightning(["fit", *common, "--model.steps", str(steps)])
+    run_lightning(["predict", *common, "--model.adapter", str(results)])
+    with (results / "scores.csv").open() as file:
+        before, after = csv.DictReader(file)
+    figures = [_scores(row) for row in (before, after)]
+    picture = results / after["scene"] / "prediction.png"
+    print(f"{after['scene']}: held-out PSNR {figures[0]['psnr']:.2f} dB before, {figures[1]['psnr']:.2f} dB after {after['steps']} steps")
+    return Adapted(after["scene"], *figures, int(after["steps"]), float(after["seconds"]), picture)
 
 
 def _listed(names: tuple[str, ...]) -> str:
@@ -85,8 +121,11 @@ def _listed(names: tuple[str, ...]) -> str:
 
 
 def _result(row: dict[str, str], results: Path) -> SceneResult:
-    words = ("scene", "unseen", "seconds", "failed")
-    scores = {name: float(value) for name, value in row.items() if value and name not in words}
     folder = results / row["scene"]
     picture, video = folder / "prediction.png", folder / "prediction.mp4"
-    return SceneResult(row["scene"], row["unseen"] == "1", scores, float(row["seconds"]), picture, video)
+    return SceneResult(row["scene"], row["unseen"] == "1", _scores(row), float(row["seconds"]), picture, video)
+
+
+def _scores(row: dict[str, str]) -> dict[str, float]:
+    words = ("scene", "method", "stage", "unseen", "seconds", "failed")
+    return {name: float(value) for name, value in row.items() if value and name not in words}

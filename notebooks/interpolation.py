@@ -17,8 +17,8 @@
 # Is a point between two latents a material between theirs? The laws on the line from the softest to the stiffest elastic latent move
 # a ball that falls onto a floor, all in one launch. The command `neuido latents` does it and writes tables; this notebook reads them.
 #
-# Open it with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/interpolation.py`. `NEUIDO_NOTEBOOK_OUT`
-# is the folder of the tables, made where they are missing; `NEUIDO_NOTEBOOK_SMALL=1` takes fewer laws.
+# Open it with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/interpolation.py`.
+# `NEUIDO_NOTEBOOK_OUT` is the folder of the tables, made where they are missing; `NEUIDO_NOTEBOOK_SMALL=1` takes fewer laws.
 
 # %%
 import os

@@ -17,8 +17,8 @@
 # Stage I gives each of its 90 trajectories a latent z. Do latents of one family lie together? The command `neuido latents` measures
 # it and writes tables; this notebook reads them.
 #
-# Open it with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/latent_space.py`. `NEUIDO_NOTEBOOK_OUT`
-# is the folder of the tables; they are made where they are missing. `NEUIDO_OPERATOR` names another operator than the package's.
+# Open it with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/latent_space.py`.
+# `NEUIDO_NOTEBOOK_OUT` is the folder of the tables; they are made where they are missing. `NEUIDO_OPERATOR` names another operator.
 
 # %%
 import os

@@ -10,7 +10,7 @@ import yaml
 
 import neuido
 from neuido import demo, demo_laws, demo_loop
-from neuido.demo_video import SceneResult, VideoResult
+from neuido.demo_video import Adapted, SceneResult, VideoResult
 from neuido.errors import UserError
 
 TINY = {"instances": 1, "held_out": 0, "particles_per_side": 4, "steps": 60, "device": "cpu", "progress": False}
@@ -98,4 +98,7 @@ def test_page_shows_the_scenes(tmp_path):
     assert "a&lt;b" in text and "a<b" not in text
     assert all(word in text for word in ("3.4 ms", "12.5 ms", "24.2", "unseen", "from 1 to 0.25 over 2"))
     assert text.count("data:image/png") == 2
-    assert "SSIM" not in text
+    assert "SSIM" not in text and "adapted" not in text
+    adapted = Adapted("other", {"psnr": 21.5}, {"psnr": 23.5, "cd": 1.25}, 6, 7.0, picture)
+    text = demo.video_section(VideoResult(scenes, (), tmp_path / "encoder", adapted))
+    assert all(word in text for word in ("21.5", "23.5", "1.25", "after 6 steps, 7 s")) and text.count("data:image/png") == 3

@@ -11,8 +11,12 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
 from neuido.data.visual import VisualScene, load_visual
+from neuido.data.visual_known import load_known
 from neuido.errors import UserError
 from neuido.types import MultiViewBatch
+
+KEYS = {"reconstruction": ("reconstruction", "recording", "views"), "particles": ("recording", "views", "dt", "crop")}
+"""What a scene's mapping takes beside `path`, by where its body comes from (`body`)."""
 
 
 def in_order(scenes: Sequence[VisualScene], *, rank: int = 0, ranks: int = 1) -> DataLoader:
@@ -136,7 +140,8 @@ class VisualDataModule(LightningDataModule):
     Training and validation take `scenes`; test and predict take `scenes` and `unseen`. Under several processes each trains on its own.
 
     Args:
-        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them).
+        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them); with
+            `body: particles` instead of `recording`, `views`, `dt`, `crop` (as `load_known` takes them).
         unseen: Scenes that training never sees.
         root: Folder to which the paths of scenes are relative; none: the current one.
         reconstructions: Folder that holds a reconstruction for each scene under the name of the scene's folder; none: inside each scene.
@@ -229,14 +234,17 @@ class VisualDataModule(LightningDataModule):
         options: dict[str, Any] = dict(given) if isinstance(given, dict) else {"path": given}
         if "path" not in options:
             raise UserError(f"{where} lacks the key 'path'")
-        known = ("path", "reconstruction", "recording", "views")
+        body = options.pop("body", "reconstruction")
+        if body not in KEYS:
+            raise UserError(f"{where}.body = {body!r}; one of {', '.join(KEYS)}")
+        known = ("path", "body", *KEYS[body])
         for key in options:
             if key not in known:
                 raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(known)}")
         path = Path(self.root or ".") / Path(options.pop("path")).expanduser()
-        if "reconstruction" not in options and self.reconstructions is not None:
+        if body == "reconstruction" and "reconstruction" not in options and self.reconstructions is not None:
             options["reconstruction"] = Path(self.reconstructions) / path.resolve().name
         try:
-            return load_visual(path, **options, **self.options)
+            return (load_known if body == "particles" else load_visual)(path, **options, **self.options)
         except UserError as error:
             raise UserError(f"{where}: {error}") from error

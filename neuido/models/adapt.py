@@ -16,8 +16,9 @@ from neuido.models.conditions import read_conditions, run_condition
 from neuido.models.filmed import FIGURES, FilmedModule, check_options, frames_at, image_losses, plainly, some_views, write_prediction
 from neuido.models.methods import CARD, Method, scalars
 from neuido.models.pipeline import Laws, Prepared, folder_of, prepare, roll_surely
-from neuido.models.plateau import Plateau
+from neuido.models.progress import Progress, restore, snapshot
 from neuido.models.scene_fit import SceneFit
+from neuido.types import ParticleState
 
 GIGABYTE = 1e9
 
@@ -40,7 +41,7 @@ class AdaptModule(FilmedModule):
         silhouette_weight: Of the silhouettes' squared error.
         estimate_velocity: Estimate a rigid motion at t = 0 that is added to the body's known one.
         velocity_lr: Its rate, in m/s and rad/s a step.
-        velocity_steps: Steps at the start in which it is fitted alone.
+        velocity_steps: Steps before the others in which it is fitted alone, with a cosine of their own.
         velocity_frames: Frames that these steps see.
         stop_on: When to end a scene early: `none`, `loss` (no lower loss on all training views), `view` (no lower loss on the last
             training view, which is then not trained on). The best parameters are kept.
@@ -67,8 +68,8 @@ class AdaptModule(FilmedModule):
         image_weight: float = 1.0,
         silhouette_weight: float = 0.1,
         estimate_velocity: bool = False,
-        velocity_lr: float = 0.05,
-        velocity_steps: int = 20,
+        velocity_lr: float = 0.2,
+        velocity_steps: int = 40,
         velocity_frames: int = 8,
         stop_on: Literal["none", "loss", "view"] = "none",
         patience: int = 20,
@@ -95,11 +96,12 @@ class AdaptModule(FilmedModule):
         self.save_hyperparameters(ignore=["method"])
         object.__setattr__(self, "plan", method)  # its copies are trained, one a scene
         self.steps = method.steps if steps is None else steps
+        self.ahead = velocity_steps if estimate_velocity else 0
+        """Steps of the velocity alone, before those of the method."""
         self.fits = nn.ModuleList()
         self._names: list[str] = []
         self._current: tuple[str, Prepared] | None = None
-        self._progress: dict[str, dict[str, float]] = {}
-        self._plateaus: dict[str, Plateau] = {}
+        self._progress: dict[str, Progress] = {}
         self._rows: list[dict[str, Any]] = []
         self._predicted: list[tuple[Prepared, Laws]] = []
 
@@ -122,7 +124,7 @@ class AdaptModule(FilmedModule):
                 f"trainer.devices: adaptation runs in one process, not in {self.trainer.world_size}; give scenes to several runs"
             )
         data = self.trainer.datamodule
-        data.steps_in_a_row = self.steps
+        data.steps_in_a_row = self.ahead + self.steps
         self.trainer.fit_loop.max_epochs = len(data.scenes)
         for scene in data.scenes:
             prepared = self.open_scene(scene, self.trainer.strategy.root_device, watched=True)
@@ -155,19 +157,19 @@ class AdaptModule(FilmedModule):
                 rate = self.hparams.velocity_lr
                 own.append({"params": [fit.twist], "lr": rate, "of": i, "start_lr": rate, "twist": True})
             groups += own
-        return self.plan.optimizer(groups) if groups and self.steps else None
+        return self.plan.optimizer(groups) if groups and self.ahead + self.steps else None
 
     def on_fit_start(self) -> None:
         for scene in self.trainer.datamodule.scenes:
-            if not self.steps:  # Lightning then runs no epoch
+            if not self.ahead + self.steps:  # Lightning then runs no epoch
                 self._begin(scene)
-            elif self._progress.get(scene.name, {}).get("done"):  # killed between its last step and its scores
+            elif scene.name in self._progress and self._progress[scene.name].done:  # killed between its last step and its scores
                 self._begin(scene)
                 self._finish()
 
     def on_train_batch_start(self, batch: VisualScene, batch_idx: int) -> int | None:
         self._begin(batch)
-        return -1 if self._progress[batch.name]["done"] else None
+        return -1 if self._progress[batch.name].done else None
 
     def _begin(self, scene: VisualScene) -> Prepared:
         """Bring the scene to the device, and score it before its first step."""
@@ -175,20 +177,17 @@ class AdaptModule(FilmedModule):
             self._finish()
             self._current = scene.name, self.open_scene(scene, self.device, watched=False)
             if scene.name not in self._progress:
-                self._progress[scene.name] = {"steps": 0, "seconds": 0.0, "peak_memory_gb": 0.0, "warp_memory_gb": 0.0, "done": 0}
+                self._progress[scene.name] = Progress()
                 self._score_fit("before")
             if self.device.type == "cuda":
                 torch.cuda.reset_peak_memory_stats(self.device)
         return self._current[1]
 
     def training_step(self, scene: VisualScene, batch_idx: int) -> Tensor:
-        prepared, fit, step = self._begin(scene), self.fit_of(scene.name), int(self._progress[scene.name]["steps"])
+        prepared, fit, step = self._begin(scene), self.fit_of(scene.name), self._progress[scene.name].steps
         frames = self.frames_now(prepared, step)
-        try:
-            motion = fit.roll(prepared, frames, segment=self.hparams.segment)
-        except UserError as error:  # a law that cannot run has no image: back towards laws that can
-            print(f"{scene.name}: {error}", file=sys.stderr)
-            self._log({"train/failed": 1.0})
+        motion = self._roll_or_undo(prepared, fit, frames)
+        if motion is None:
             return fit.method.retreat()
         views = some_views(self._training_views(prepared), self.hparams.views_per_step, step)
         loss, silhouette = image_losses(prepared, motion, views)
@@ -196,18 +195,32 @@ class AdaptModule(FilmedModule):
         self._log({"train/loss": loss, "train/silhouette": silhouette, "train/regulariser": regular, "train/frames": float(frames)})
         return self._weighted(loss, silhouette) + regular
 
+    def _roll_or_undo(self, prepared: Prepared, fit: SceneFit, frames: int) -> ParticleState | None:
+        """The motion; where it fails that of the last parameters that ran, to which the fit returns with half the rates; or none."""
+        name = prepared.source.name
+        progress = self._progress[name]
+        for _ in range(2):
+            try:
+                motion = fit.roll(prepared, frames, segment=self.hparams.segment)
+                progress.good = snapshot(fit)
+                return motion
+            except UserError as error:  # a law that cannot run has no image
+                print(f"{name}: {error}", file=sys.stderr)
+                self._log({"train/failed": 1.0})
+            if not restore(fit, progress.good):
+                return None
+            progress.damping *= 0.5
+        return None
+
     def _weighted(self, loss: Tensor, silhouette: Tensor) -> Tensor:
         return self.hparams.image_weight * loss + self.hparams.silhouette_weight * silhouette
 
     def frames_now(self, prepared: Prepared, step: int) -> int:
         """Frames of a rollout at this step of a scene."""
         frames = self._frames(prepared)
-        if self._velocity_alone(step):
+        if step < self.ahead:
             return min(frames, self.hparams.velocity_frames)
-        return frames_at(step / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
-
-    def _velocity_alone(self, step: int) -> bool:
-        return self.hparams.estimate_velocity and step < self.hparams.velocity_steps
+        return frames_at((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """A step whose gradient is not finite is left out."""
@@ -220,42 +233,38 @@ class AdaptModule(FilmedModule):
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
         name, prepared = self._current  # type: ignore[misc]
         progress = self._progress[name]
-        self._set_rates(optimizer, name, int(progress["steps"]))
+        self._set_rates(optimizer, name, progress)
         begun = time.perf_counter()
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
-        progress["steps"] += 1
-        if self.hparams.stop_on != "none" and progress["steps"] % self.hparams.check_every == 0:
-            self._look(prepared, int(progress["steps"]))
+        progress.steps += 1
+        if self.hparams.stop_on != "none" and progress.steps >= self.ahead and progress.steps % self.hparams.check_every == 0:
+            self._look(prepared, progress)
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
-            progress["peak_memory_gb"] = max(progress["peak_memory_gb"], torch.cuda.max_memory_allocated(self.device) / GIGABYTE)
-            high = wp.get_mempool_used_mem_high(str(self.device))  # of the process: Warp does not reset it
-            progress["warp_memory_gb"] = max(progress["warp_memory_gb"], high / GIGABYTE)
-        progress["seconds"] += time.perf_counter() - begun
-        progress["done"] = int(progress["steps"] >= self.steps or self._plateau(name).over)
+            progress.peak_memory_gb = max(progress.peak_memory_gb, torch.cuda.max_memory_allocated(self.device) / GIGABYTE)
+            progress.warp_memory_gb = wp.get_mempool_used_mem_high(str(self.device)) / GIGABYTE
+        progress.seconds += time.perf_counter() - begun
+        progress.done = progress.steps >= self.ahead + self.steps or progress.over
 
-    def _set_rates(self, optimizer: Any, name: str, step: int) -> None:
-        factor = self.plan.rate(step / max(1, self.steps))
+    def _set_rates(self, optimizer: Any, name: str, progress: Progress) -> None:
+        step, ahead = progress.steps, self.ahead
+        share = step / ahead if step < ahead else (step - ahead) / max(1, self.steps)
+        factor = progress.damping * self.plan.rate(share)
         for group in optimizer.param_groups:
-            waits = self._velocity_alone(step) and not group["twist"]
+            waits = step < ahead and not group["twist"]
             group["lr"] = 0.0 if waits or group["of"] != self._names.index(name) else factor * group["start_lr"]
 
-    def _plateau(self, name: str) -> Plateau:
-        return self._plateaus.setdefault(name, Plateau())
-
     @plainly
-    def _look(self, prepared: Prepared, step: int) -> None:
+    def _look(self, prepared: Prepared, progress: Progress) -> None:
         """The loss of all frames on all training views, or on the one that is kept from training."""
-        name = prepared.source.name
-        fit = self.fit_of(name)
-        try:
-            motion = fit.roll(prepared, self._frames(prepared))
-        except UserError:
+        fit = self.fit_of(prepared.source.name)
+        motion = self._try(prepared, fit)
+        if motion is None:
             return
         views = prepared.training[-1:] if self.hparams.stop_on == "view" else prepared.training
         value = float(self._weighted(*image_losses(prepared, motion, views)))
         self._log({"train/looked": value})
-        self._plateau(name).see(step, value, fit.state_dict(), self.hparams.patience)
+        progress.see(value, fit, self.hparams.patience)
 
     def on_train_epoch_end(self) -> None:
         self._finish()
@@ -265,16 +274,26 @@ class AdaptModule(FilmedModule):
 
     def _finish(self) -> None:
         """Score the current scene once its steps are done, and write what was found."""
-        name = None if self._current is None else self._current[0]
-        if name is None:
+        if self._current is None:
             return
-        if self._progress[name]["done"] and not any(row["scene"] == name and row["stage"] == "after" for row in self._rows):
-            plateau, fit = self._plateau(name), self.fit_of(name)
-            if plateau.best is not None:
-                fit.load_state_dict(plateau.best)
-            fit.save(folder_of(self.hparams.out, name) / "fit")
-            self._score_fit("after")
-            self._current = None
+        name, prepared = self._current
+        progress, fit = self._progress[name], self.fit_of(name)
+        if not progress.done or any(row["scene"] == name and row["stage"] == "after" for row in self._rows):
+            return
+        if not restore(fit, progress.best) and self._try(prepared, fit) is None:  # the last step's law was never run
+            restore(fit, progress.good)
+        progress.best, progress.good = {}, {}
+        fit.save(folder_of(self.hparams.out, name) / "fit")
+        self._score_fit("after")
+        self._current = None
+
+    @plainly
+    def _try(self, prepared: Prepared, fit: SceneFit) -> ParticleState | None:
+        """The motion over all frames that fitting sees, none where it fails."""
+        try:
+            return fit.roll(prepared, self._frames(prepared))
+        except UserError:
+            return None
 
     @plainly
     def _score_fit(self, stage: str) -> None:
@@ -282,9 +301,8 @@ class AdaptModule(FilmedModule):
         fit = self.fit_of(name)
         row = {"scene": name, "method": type(self.plan).__name__, "stage": stage}
         if stage == "after":
-            row |= {key: self._progress[name][key] for key in ("steps", "seconds")}
-            if self.device.type == "cuda":
-                row |= {key: self._progress[name][key] for key in ("peak_memory_gb", "warp_memory_gb")}
+            keys = ("steps", "seconds", "peak_memory_gb", "warp_memory_gb") if self.device.type == "cuda" else ("steps", "seconds")
+            row |= {key: getattr(self._progress[name], key) for key in keys}
         self._rows.append(row | self.score(prepared, fit, stage))
         scores.write_rows(Path(self.hparams.out) / "scores.csv", self._rows)
         self._show(self._rows[-1])
@@ -313,15 +331,15 @@ class AdaptModule(FilmedModule):
     # Checkpoints.
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        plateaus = {name: plateau.state() for name, plateau in self._plateaus.items()}
-        checkpoint["adaptation"] = {"progress": self._progress, "rows": self._rows, "plateaus": plateaus}
+        progress = {name: progress.state() for name, progress in self._progress.items()}
+        checkpoint["adaptation"] = {"progress": progress, "rows": self._rows}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         kept = checkpoint.get("adaptation")
         if kept is None:
             raise UserError("ckpt_path is no checkpoint of an adaptation")
-        self._progress, self._rows = kept["progress"], kept["rows"]
-        self._plateaus = {name: Plateau(**state) for name, state in kept["plateaus"].items()}
+        self._progress = {name: Progress(**state) for name, state in kept["progress"].items()}
+        self._rows = kept["rows"]
 
     # Test and prediction, with what a fit wrote.
 

@@ -34,8 +34,8 @@ class LowRankAdaptation(Method):
 
     Args:
         operator: File of the operator, or `pretrained`; all of it stays frozen.
-        start: Where z starts: `encoder` (its zero-shot value), `mean` (of Stage I's latents), the name of one of these, or a law file of
-            `neuido predict`.
+        start: Where z starts: `encoder` (its zero-shot value), `mean` (of Stage I's latents), a family of these (`elastic`: their mean) or
+            the name of one, or a law file of `neuido predict`.
         init_from: The encoder, a file or `pretrained`; read only for `start: encoder`.
         rank: r of LoRA (paper: 16); 0: no adapter, z alone is refined.
         alpha: Of LoRA (paper: 16); the adapter's product is scaled with alpha / r.
@@ -87,12 +87,11 @@ class LowRankAdaptation(Method):
         return self.tuned if isinstance(self.tuned, IntrinsicDynamicsOperator) else self.tuned.get_base_model()
 
     def _named_start(self) -> Tensor:
-        """The latent of `mean`, of a Stage I trajectory, or of a law file."""
+        """The latent of `mean`, of a family, of a Stage I trajectory, or of a law file."""
         latents = self.operator.latents
-        if self.start == "mean":
-            if not len(latents):
-                raise UserError("model.method.start = mean: the operator has no Stage I latents")
-            return latents.mean(0)
+        own = [i for i, family in enumerate(self.operator.latent_families) if self.start in ("mean", family)]
+        if own:
+            return latents[own].mean(0)
         if not self.start.endswith(".safetensors"):
             return self.operator.latent(self.start)
         _, tensors, _ = read_weights(self.start, LAW_FORMAT, "model.method.start")
@@ -184,7 +183,10 @@ class LowRankAdaptation(Method):
         with torch.no_grad():
             self.z.copy_(latent["z"])
             self.origin.copy_(latent["origin"])
-        plain = self.tuned if isinstance(self.tuned, IntrinsicDynamicsOperator) else self.tuned.unload()
+        plain = copy.deepcopy(self.tuned)
+        if not isinstance(plain, IntrinsicDynamicsOperator):
+            plain = plain.unload()
+            vars(plain).pop("peft_config", None)  # or PEFT would take it for a second adapter
         self.rank = 0
         self.tuned = plain
         if (folder / PEFT_FILES[0]).exists() or content.get("found", {}).get("rank"):

@@ -120,7 +120,8 @@ def prepare(
             volume, conditions = (t.to(device) for t in encoder.embed(velocities))
     simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device)
     if scene.gaussians is None:
-        gaussians, binding = dress(simulator.state.x, simulator.volume), None
+        rest = simulator.volume / torch.linalg.det(simulator.state.F)  # a body may start deformed
+        gaussians, binding = dress(simulator.state.x, rest), None
     else:
         gaussians = load_ply(scene.gaussians, device=device)
         binding = bind(gaussians, simulator.state.x)

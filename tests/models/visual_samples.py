@@ -9,7 +9,7 @@ from lightning.pytorch import LightningDataModule
 from neuido.data.cameras import orbit
 from neuido.data.shapes import ball, box
 from neuido.data.visual import Truth, VisualScene
-from neuido.data.visual_module import Turns, in_order
+from neuido.data.visual_module import OneByOne, Turns, in_order
 from neuido.models.gaussians import deform, harmonics_of, save_ply
 from neuido.models.splatting import render
 from neuido.physics.laws import material
@@ -82,6 +82,7 @@ class TinyScenes(LightningDataModule):
     def __init__(self, folder: str, youngs: tuple[float, ...] = (4e4, 2e5), unseen: tuple[float, ...] = (), seed: int = 0):
         super().__init__()
         self.folder, self.youngs, self.unseen_youngs, self.seed = Path(folder), youngs, unseen, seed
+        self.steps_in_a_row = None
 
     @cached_property
     def scenes(self):
@@ -96,6 +97,8 @@ class TinyScenes(LightningDataModule):
         return [scene.name for scene in self.unseen]
 
     def train_dataloader(self):
+        if self.steps_in_a_row is not None:
+            return OneByOne(self.scenes, steps=self.steps_in_a_row)
         return Turns(self.scenes, seed=self.seed, **self._share())
 
     def val_dataloader(self):

@@ -1,0 +1,60 @@
+"""How far the fit of one scene has come: its clock and memory, its best parameters, and the last ones whose law ran."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+LEAST = 0.01
+"""The share by which a loss must fall to count as lower."""
+
+
+@dataclass
+class Progress:
+    """What a checkpoint keeps of a scene beside its parameters; plain figures and tensors alone."""
+
+    steps: int = 0
+    """Optimiser steps done."""
+    seconds: float = 0.0
+    """Time of these steps."""
+    peak_memory_gb: float = 0.0
+    """Of torch, on a GPU."""
+    warp_memory_gb: float = 0.0
+    """Of Warp's pool, since the process began."""
+    done: bool = False
+    damping: float = 1.0
+    """Factor on the rates; it is halved when a step has led to a law that does not run."""
+    lowest: float = float("inf")
+    lowest_at: int = 0
+    over: bool = False
+    """Whether the loss has not fallen for too long."""
+    best: dict[str, Tensor] = field(default_factory=dict)
+    """The parameters of the lowest loss."""
+    good: dict[str, Tensor] = field(default_factory=dict)
+    """The last parameters that ran."""
+
+    def see(self, value: float, fit: nn.Module, patience: int) -> None:
+        """Take the loss of a fit; `over` becomes true after `patience` steps without a lower one."""
+        if value < (1 - LEAST) * self.lowest:
+            self.lowest, self.lowest_at, self.best = value, self.steps, snapshot(fit)
+        elif self.steps - self.lowest_at >= patience:
+            self.over = True
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint: `Progress(**state)` is this again."""
+        return dict(vars(self))
+
+
+def snapshot(fit: nn.Module) -> dict[str, Tensor]:
+    """Copies of a module's trainable parameters."""
+    return {name: p.detach().clone() for name, p in fit.named_parameters() if p.requires_grad}
+
+
+@torch.no_grad()
+def restore(fit: nn.Module, kept: dict[str, Tensor]) -> bool:
+    """Put a `snapshot` back; whether there was one."""
+    parameters = dict(fit.named_parameters())
+    for name, value in kept.items():
+        parameters[name].copy_(value)
+    return bool(kept)

@@ -1,0 +1,344 @@
+"""Few-shot adaptation: it improves what was held out, scene after scene, and a killed run goes on where it was."""
+
+import csv
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from lightning.pytorch import Trainer, seed_everything
+from safetensors.torch import load_file
+
+from neuido.errors import UserError
+from neuido.models.adapt import AdaptModule
+from neuido.models.adapter import LowRankAdaptation
+from neuido.models.filmed import image_losses
+from neuido.models.methods import Method
+from neuido.models.operator import IntrinsicDynamicsOperator
+from neuido.models.pipeline import prepare
+from neuido.models.progress import Progress
+from neuido.models.scene_fit import SceneFit
+from tests.models.visual_samples import TinyScenes, tiny_scene
+
+ROOT = Path(__file__).parents[2]
+
+
+def module(tmp_path, *, start="mean", **options):
+    seed_everything(0)
+    method = options.pop("method", None) or LowRankAdaptation(start=start, latent_lr=0.03)
+    return AdaptModule(method, **{"steps": 12, "curriculum": [], "out": str(tmp_path / "out"), **options})
+
+
+def trainer(tmp_path, **options):
+    options = {"logger": False, "enable_checkpointing": False, "num_sanity_val_steps": 0, "limit_val_batches": 0, **options}
+    options = {"max_epochs": -1, "gradient_clip_val": 1.0, **options}
+    return Trainer(accelerator="cpu", default_root_dir=tmp_path, enable_progress_bar=False, enable_model_summary=False, **options)
+
+
+def rows_of(path):
+    return list(csv.DictReader(path.open()))
+
+
+def test_scenes_one_after_the_other(tmp_path):
+    data = TinyScenes(str(tmp_path), youngs=(4e4, 2e5))
+    model = module(tmp_path)
+    frozen = IntrinsicDynamicsOperator.load().state_dict()
+    seen = []
+    step = model.training_step
+    model.training_step = lambda batch, batch_idx: seen.append(batch.name) or step(batch, batch_idx)
+    trainer(tmp_path).fit(model, data)
+    assert seen == ["tiny-0"] * 12 + ["tiny-1"] * 12
+    rows = rows_of(tmp_path / "out" / "scores.csv")
+    assert [(row["scene"], row["stage"]) for row in rows] == [(f"tiny-{i}", stage) for i in (0, 1) for stage in ("before", "after")]
+    for before, after in (rows[:2], rows[2:]):
+        assert float(after["psnr"]) > float(before["psnr"]) + 1 and float(after["cd"]) < 0.7 * float(before["cd"])
+        assert after["method"] == "LowRankAdaptation" and int(after["steps"]) == 12 and float(after["seconds"]) > 0
+        assert float(before["found_latent_moved"]) == 0 < float(after["found_latent_moved"])
+    images = rows_of(tmp_path / "out" / "tiny-0" / "after" / "images.csv")
+    assert {row["view"] for row in images} == {"2"}  # the one that is held out
+    assert "lpips" not in rows[0]  # absent, not zero
+    found = model.fit_of("tiny-0").method.tuned.unload().state_dict()
+    assert all(torch.equal(found[name], value) for name, value in frozen.items())
+
+    # what was written scores the same, and predicts
+    again = module(tmp_path, adapter=str(tmp_path / "out"))
+    trainer(tmp_path).test(again, data, verbose=False)
+    tested = rows_of(tmp_path / "out" / "test.csv")
+    expected = [float(row["cd"]) for row in rows if row["stage"] == "after"]
+    assert [float(row["cd"]) for row in tested] == pytest.approx(expected, rel=1e-4)
+    one = module(tmp_path, adapter=str(tmp_path / "out" / "tiny-1" / "fit"), out=str(tmp_path / "other"))  # one scene's, for both
+    answers = trainer(tmp_path).predict(one, data)
+    assert [Path(answer["folder"]).name for answer in answers] == ["tiny-0", "tiny-1"]
+    assert len(list((tmp_path / "other" / "tiny-0" / "particles").glob("*.ply"))) == 6
+    assert (tmp_path / "other" / "tiny-0" / "prediction.mp4").is_file()
+
+
+def test_curriculum_and_frames_of_the_fit(tmp_path):
+    model = module(tmp_path, steps=10, curriculum=[0.5, 0.75], curriculum_share=0.4, fit_frames=4)
+    prepared = prepare(tiny_scene(tmp_path), None)
+    assert [model.frames_now(prepared, step) for step in range(6)] == [2, 2, 3, 3, 4, 4]
+    fit = SceneFit(LowRankAdaptation(start="jelly").for_scene(prepared), False)
+    with torch.no_grad():
+        scored = model.score(prepared, fit, "before")
+    late = [row for row in rows_of(tmp_path / "out" / "tiny" / "before" / "particles.csv") if int(row["frame"]) >= 4]
+    assert scored["later_cd"] == pytest.approx(sum(float(row["cd"]) for row in late) / len(late), rel=1e-4)
+
+
+def test_silhouettes_alone(tmp_path):
+    """Colours that say nothing do not matter where they have no weight."""
+    scene = tiny_scene(tmp_path, young=2e5)
+    noise = torch.rand(scene.batch.images.shape, generator=torch.Generator().manual_seed(0))
+    data = TinyScenes(str(tmp_path))
+    data.scenes = [scene._replace(batch=scene.batch._replace(images=noise), gaussians=None)]
+    trainer(tmp_path).fit(module(tmp_path, image_weight=0.0, silhouette_weight=1.0), data)
+    before, after = rows_of(tmp_path / "out" / "scores.csv")
+    assert float(after["iou"]) > float(before["iou"]) + 0.02 and float(after["rmse"]) < 0.8 * float(before["rmse"])
+
+
+def test_velocity_is_estimated_from_the_first_frames(tmp_path):
+    scene = tiny_scene(tmp_path, young=1e5, poisson=0.2, velocity=(0.8, -1.5, 0.3), spin=(0.0, 0.0, 0.0))  # jelly
+    body = scene.body._replace(v=torch.zeros_like(scene.body.v))
+    data = TinyScenes(str(tmp_path))
+    data.scenes = [scene._replace(body=body)]
+    options = {"estimate_velocity": True, "velocity_steps": 40, "velocity_frames": 4, "velocity_lr": 0.3, "steps": 2}
+    model = module(tmp_path, start="jelly", **options)
+    trainer(tmp_path).fit(model, data)
+    linear, _ = model.fit_of("tiny").twist.detach()
+    assert torch.allclose(linear, torch.tensor([0.8, -1.5, 0.3]), atol=0.15), linear
+    again = module(tmp_path, start="jelly", adapter=str(tmp_path / "out"), **options)
+    _, loaded = again.load_fit(data.scenes[0])
+    assert torch.equal(loaded.twist, model.fit_of("tiny").twist)
+
+
+def test_start_is_a_rigid_motion(tmp_path):
+    prepared = prepare(tiny_scene(tmp_path, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, 0.0)), None)
+    fit = SceneFit(LowRankAdaptation(start="jelly").for_scene(prepared), True)
+    with torch.no_grad():
+        fit.twist.copy_(torch.tensor([[1.0, 2.0, 3.0], [0.5, -1.0, 2.0]]))
+        state = fit.start(prepared.simulator)
+    x, v = state.x.double(), state.v.double()
+    arm = x - x.mean(0)
+    assert torch.allclose(v, torch.tensor([1.0, 2.0, 3.0]) + torch.linalg.cross(torch.tensor([[0.5, -1.0, 2.0]]).double(), arm), atol=1e-5)
+    assert torch.allclose(state.C[0] @ arm[0].float(), (v[0] - v.mean(0)).float(), atol=1e-5)
+
+
+def test_early_stop_keeps_the_best(tmp_path, monkeypatch):
+    values = itertools.chain([1.0, 0.5, 0.7, 0.6], itertools.repeat(0.9))
+    model = module(tmp_path, stop_on="view", check_every=2, patience=4, steps=20)
+    kept = []
+
+    def see(self, value, fit, patience):
+        Progress.seen(self, next(values), fit, patience)
+        kept.append(fit.method.z.detach().clone())
+
+    monkeypatch.setattr(Progress, "seen", Progress.see, raising=False)
+    monkeypatch.setattr(Progress, "see", see)
+    trainer(tmp_path).fit(model, TinyScenes(str(tmp_path), youngs=(5e4, 6e4)))
+    assert model._progress["tiny-0"].steps == 8  # the lowest at step 4, and none lower until step 8
+    assert torch.equal(model.fit_of("tiny-0").method.z, kept[1])
+    assert len(rows_of(tmp_path / "out" / "scores.csv")) == 4
+
+
+def test_a_step_into_a_law_that_cannot_run_is_undone(tmp_path, capsys):
+    model = module(tmp_path, steps=4, start="jelly")
+    step = model.optimizer_step
+
+    def thrown(*arguments):
+        step(*arguments)
+        if model._progress["tiny-0"].steps == 2:
+            with torch.no_grad():
+                model.fit_of("tiny-0").method.z += 60.0
+
+    model.optimizer_step = thrown
+    trainer(tmp_path).fit(model, TinyScenes(str(tmp_path), youngs=(5e4,)))
+    assert "tiny-0:" in capsys.readouterr().err
+    assert model._progress["tiny-0"].damping == 0.5
+    after = rows_of(tmp_path / "out" / "scores.csv")[-1]
+    assert after["stage"] == "after" and float(after["psnr"]) > 20
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path):
+    model = module(tmp_path, start="jelly")
+    p = torch.nn.Parameter(torch.ones(3))
+    p.grad = torch.tensor([1.0, float("nan"), 2.0])
+    model.on_before_optimizer_step(torch.optim.SGD([p], lr=1.0))
+    assert torch.equal(p.grad, torch.zeros(3))
+
+
+class Nothing(Method):
+    """A law that is given."""
+
+    steps = 0
+
+    def laws(self, scene):
+        operator = IntrinsicDynamicsOperator.load()
+        return operator.laws(operator.latent("jelly"))
+
+
+class Still(Method):
+    """No law: the body falls as a point, at a height that is fitted; it stands for simulations of other kinds."""
+
+    lr = 0.05
+
+    def build(self, scene):
+        self.pull = torch.nn.Parameter(torch.tensor(0.0))
+
+    def roll(self, scene, frames, *, state=None, effects=None, segment=0):
+        start = scene.simulator.state
+        t = torch.arange(frames) * (scene.every * scene.source.scene.dt)
+        x = start.x + t[:, None, None] * start.v + 0.5 * t.square()[:, None, None] * self.pull * start.x.new_tensor([0.0, -1.0, 0.0])
+        return type(start)(x, *(s.expand(frames, *s.shape) for s in start[1:]))
+
+    def describe(self):
+        return {"pull": float(self.pull.detach())}
+
+
+def test_methods_without_parameters_or_without_laws(tmp_path):
+    data = TinyScenes(str(tmp_path), youngs=(5e4,))
+    trainer(tmp_path).fit(module(tmp_path, method=Nothing(), steps=None), data)
+    (row,) = rows_of(tmp_path / "out" / "scores.csv")
+    assert (row["method"], row["stage"]) == ("Nothing", "before") and float(row["cd"]) > 0
+    model = module(tmp_path, method=Still(), out=str(tmp_path / "still"), fit_frames=2)
+    trainer(tmp_path).fit(model, data)
+    before, after = rows_of(tmp_path / "still" / "scores.csv")
+    assert 0 < float(after["found_pull"]) < 10 and float(before["found_pull"]) == 0
+    assert set(load_file(tmp_path / "still" / "tiny-0" / "fit" / "parameters.safetensors")) == {"pull"}
+    again = module(tmp_path, method=Still(), adapter=str(tmp_path / "still"))
+    assert torch.equal(again.load_fit(data.scenes[0])[1].method.pull, model.fit_of("tiny-0").method.pull)
+    with pytest.raises(UserError, match="of method 'Still'"):
+        module(tmp_path, adapter=str(tmp_path / "still")).load_fit(data.scenes[0])
+
+
+@pytest.mark.parametrize("segment", [0, 2])
+def test_uneven_frames_and_segments(tmp_path, segment):
+    scene = tiny_scene(tmp_path, frames=4)
+    times = scene.batch.times + torch.tensor([0.0, 4e-3, -3e-3, 0.0])
+    prepared = prepare(scene._replace(batch=scene.batch._replace(times=times)), None)
+    assert prepared.every == 1 and prepared.picks == (0, 17, 28, 45)
+    method = LowRankAdaptation(start="jelly").for_scene(prepared)
+    motion = method.roll(prepared, 4, segment=segment)
+    with torch.no_grad():
+        whole = prepared.simulator.rollout(45, *method.laws(prepared))
+    assert torch.allclose(motion.x, whole.x[[0, 17, 28, 45]], atol=1e-6)
+    image_losses(prepared, motion, [0])[0].backward()
+    assert float(method.z.grad.abs().max()) > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"steps": -1}, "steps"),
+        ({"fit_frames": 1}, "fit_frames"),
+        ({"image_weight": 0.0, "silhouette_weight": 0.0}, "silhouette_weight"),
+        ({"curriculum": [2.0]}, "curriculum"),
+        ({"patience": 0}, "patience"),
+        ({"segment": -1}, "segment"),
+        ({"image_weight": float("nan")}, "image_weight"),
+    ],
+)
+def test_impossible_options_are_named(tmp_path, options, word):
+    with pytest.raises(UserError, match=word):
+        module(tmp_path, **options)
+
+
+def test_impossible_runs_are_named(tmp_path):
+    data = TinyScenes(str(tmp_path), youngs=(5e4,))
+    with pytest.raises(UserError, match="nowhere"):
+        trainer(tmp_path).test(module(tmp_path, adapter=str(tmp_path / "nowhere")), data)
+    scene = data.scenes[0]
+    held = scene.batch.held_out.clone()
+    held[1] = True
+    data.scenes = [scene._replace(batch=scene.batch._replace(held_out=held))]
+    with pytest.raises(UserError, match="stop_on"):
+        trainer(tmp_path).fit(module(tmp_path, stop_on="view"), data)
+    fine = replace(scene.scene, dt=0.0171)
+    with pytest.raises(UserError, match="whole number"):
+        prepare(scene._replace(scene=fine), None)
+
+
+SCRIPT = """
+import sys, time
+import torch
+from lightning.pytorch import Callback, Trainer, seed_everything
+from lightning.pytorch.callbacks import ModelCheckpoint
+from neuido.models.adapt import AdaptModule
+from neuido.models.adapter import LowRankAdaptation
+from tests.models.visual_samples import TinyScenes
+
+torch.set_num_threads(1)
+out, pause, resume = sys.argv[1], float(sys.argv[2]), sys.argv[3]
+
+class Record(Callback):
+    def on_train_batch_end(self, trainer, module, outputs, batch, index):
+        with open(f"{out}/losses.txt", "a") as file:
+            print(batch.name, index, f"{float(outputs['loss']):.9g}", file=file)
+        time.sleep(pause)
+
+if __name__ == "__main__":
+    seed_everything(0)
+    method = LowRankAdaptation(start="mean", latent_lr=0.03)
+    model = AdaptModule(method, steps=4, curriculum=[0.5], views_per_step=1, out=f"{out}/out", stop_on="loss", check_every=2)
+    keep = ModelCheckpoint(dirpath=out, save_last=True, save_top_k=0, every_n_train_steps=1)
+    options = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "num_sanity_val_steps": 0}
+    options |= {"limit_val_batches": 0, "gradient_clip_val": 1.0, "max_epochs": -1}
+    trainer = Trainer(accelerator="cpu", devices=1, callbacks=[Record(), keep], **options)
+    trainer.fit(model, TinyScenes(out), ckpt_path=None if resume == "no" else resume, weights_only=True)
+"""
+
+
+def start(folder, pause=0.0, resume="no"):
+    folder.mkdir(exist_ok=True)
+    script = folder / "run.py"
+    script.write_text(SCRIPT)
+    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    arguments = [sys.executable, str(script), str(folder), str(pause), resume]
+    return subprocess.Popen(arguments, env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def finish(process):
+    printed, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, printed[-3000:]
+
+
+def losses(folder):
+    path = folder / "losses.txt"
+    rows = [line.split() for line in path.read_text().splitlines()] if path.is_file() else []
+    return {(name, int(index)): float(loss) for name, index, loss in rows}
+
+
+def kill_after(process, folder, steps):
+    """Kill a run in the pause after so many steps, whose checkpoint is written."""
+    deadline = time.monotonic() + 120
+    while len(losses(folder)) < steps and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL and steps <= len(losses(folder)) < 8
+
+
+def test_a_killed_run_goes_on_where_it_was(tmp_path):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    finish(start(whole))
+    last = str(broken / "last.ckpt")
+    kill_after(start(broken, pause=0.6), broken, 4)  # after the first scene's last step, before its scores
+    kill_after(start(broken, pause=0.6, resume=last), broken, 6)
+    finish(start(broken, resume=last))
+    expected, resumed = losses(whole), losses(broken)
+    assert expected.keys() == resumed.keys()
+    for key, loss in expected.items():
+        assert resumed[key] == pytest.approx(loss, rel=1e-5), key
+    tables = [rows_of(folder / "out" / "scores.csv") for folder in (whole, broken)]
+    assert [{k: v for k, v in row.items() if k != "seconds"} for row in tables[0]] == [
+        {k: v for k, v in row.items() if k != "seconds"} for row in tables[1]
+    ]
+    for name in ("tiny-0", "tiny-1"):
+        one, two = (load_file(folder / "out" / name / "fit" / "adapter_model.safetensors") for folder in (whole, broken))
+        assert all(torch.allclose(one[key], two[key], atol=1e-6) for key in one)
