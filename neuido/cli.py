@@ -11,18 +11,16 @@ import importlib
 import inspect
 import itertools
 import json
-import logging
 import os
-import re
 import signal
 import sys
-import warnings
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, get_origin
 
 import neuido
+from neuido.chatter import quiet_lightning
 from neuido.errors import UserError, one_line
 from neuido.sweep import own_folder, redirect
 
@@ -113,7 +111,7 @@ def _run_light(name: str, args: list[str]) -> int:
 
 def run_lightning(args: list[str]) -> "LightningCLI":
     """Run a command of the trainer; the model, the data module and the trainer are attributes of what it returns."""
-    _quiet_lightning()
+    quiet_lightning()
     from lightning.pytorch import LightningDataModule, LightningModule
     from lightning.pytorch.cli import LightningCLI, SaveConfigCallback
 
@@ -197,16 +195,3 @@ def _help() -> str:
 def _fail(line: str, status: int) -> None:
     print(f"neuido: {line}", file=sys.stderr)
     sys.exit(status)
-
-
-def _quiet_lightning() -> None:
-    """Drop lightning's advertisements and the warnings about its own code."""
-    logging.getLogger("lightning.fabric.utilities.seed").setLevel(logging.WARNING)  # config.yaml states the seed
-    chatter = re.compile(r".*Tip: |TPU available|GPU available: False")
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda record: not chatter.match(record.getMessage()))
-    warnings.filterwarnings("ignore", message=r".*LightningCLI's args parameter is intended")  # sys.argv is passed on as it is
-    warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).* is deprecated")
-    warnings.filterwarnings("ignore", message=r".*tensorboardX.* has been removed")
-    warnings.filterwarnings("ignore", message=r".*does not have many workers")  # the data sets are memory maps
-    warnings.filterwarnings("ignore", message=r".*but have no `validation_step`")  # adaptation scores before and after each scene
-    warnings.filterwarnings("ignore", message=r".*in eval mode at the start of training")  # what is frozen is meant to be

@@ -134,6 +134,8 @@ def _scores(entries: list[Entry], quoted: list[dict[str, Any]]) -> list[str]:
         lines = lines_of(name, entries, quoted)
         if any(line.counts and line.values for line in lines):
             parts.append(f"<h2>{title}, {'higher' if higher else 'lower'} is better</h2>{score_table(name, lines, scenes, unseen)}")
+    if scenes and not any("lpips" in row for e in entries for row in e.rows):
+        parts.append('<p class="note">LPIPS is absent: no run was given the weights of its network (--model.lpips_backbone).</p>')
     failed = [(e.label, row["scene"], row["failed"]) for e in entries for row in e.rows if row.get("failed")]
     if failed:
         parts.append("<h2>Failed</h2>" + table(("run", "scene", "reason"), failed))

@@ -55,6 +55,8 @@ def sweep(
         raise UserError(f"count = {count}: at least 1 is needed")
     path = Path(find_config(file, "FILE"))
     plan = read_sweep(path)
+    if plan.early_terminate:
+        print("early_terminate is for wandb's server: all runs go to their end here", file=sys.stderr)
     runs = runs_of(plan, count=count, seed=seed)
     folder = Path(out or f"runs/sweeps/{plan.name}").absolute()
     folder.mkdir(parents=True, exist_ok=True)

@@ -72,6 +72,8 @@ class SweepFile(NamedTuple):
     """The specification of each parameter by its path; a parameter that is not nested has a path of one name."""
     metric: Metric | None
     run_cap: int | None
+    early_terminate: bool
+    """Whether the file asks wandb's server to stop runs early, which nobody does here."""
 
 
 def read_sweep(path: str | os.PathLike) -> SweepFile:
@@ -118,7 +120,9 @@ def _parse(content: Any, name: str) -> SweepFile:
     if run_cap is not None and (not isinstance(run_cap, int) or run_cap < 1):
         raise UserError(f"run_cap = {run_cap!r}: it must be a whole number of at least 1")
     leaves = dict(_leaves(_mapping(content.get("parameters"), "parameters"), (), method))
-    return SweepFile(name, method, command, str(program or ""), leaves, _metric(content.get("metric")), run_cap)
+    return SweepFile(
+        name, method, command, str(program or ""), leaves, _metric(content.get("metric")), run_cap, "early_terminate" in content
+    )
 
 
 def _metric(given: Any) -> Metric | None:

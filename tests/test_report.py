@@ -75,6 +75,7 @@ def test_tables_show_the_files_and_mark_the_best(runs, tmp_path):
     assert [text for text, _ in chamfer["resampling floor"]] == ["1", "1", "1", "1"]
     assert cells.table("PSNR on")["theirs"] == [("32.5", True), ("31.5", False), ("32", False)]
     assert cells.table("Cost")["a"] == [("2", False)]
+    assert "LPIPS is absent" in (tmp_path / "page.html").read_text()
 
 
 def test_page_needs_nothing_else_and_shows_curves_and_videos(runs, tmp_path):

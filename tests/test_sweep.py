@@ -181,6 +181,14 @@ def test_runs_are_collected_and_skipped(plan, tmp_path, capsys):
     assert table(tmp_path / "out") == rows
 
 
+def test_stopping_early_is_said_to_be_left_out(plan, tmp_path, capsys):
+    content = yaml.safe_load(Path(plan).read_text()) | {"early_terminate": {"type": "hyperband", "min_iter": 3}}
+    Path(plan).write_text(yaml.safe_dump(content))
+    assert sweep(plan, out=str(tmp_path / "out")) == 0
+    assert "early_terminate" in capsys.readouterr().err
+    assert len(table(tmp_path / "out")) == 3
+
+
 def test_shards_share_the_runs(plan, tmp_path):
     out = tmp_path / "out"
     assert sweep(plan, out=str(out), shard=1, shards=2) == 0
