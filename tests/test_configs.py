@@ -81,7 +81,7 @@ def commands_of(path) -> list[list[str]]:
     own = [word for word in words[words.index("neuido") + 1 :]]
     script = re.sub(r"\\\n", " ", words[3]).replace('"$@"', shlex.join(own)).replace("$run", "nowhere")
     data = re.search(r'^data="(.*)"$', script, flags=re.MULTILINE)
-    script = script.replace("$data", data[1] if data else "")
+    script = script.replace("$data", data[1] if data else "").replace(" $lpips", "")
     return [shlex.split(line)[1:] for line in script.splitlines() if line.strip().startswith("neuido ")]
 
 
