@@ -46,15 +46,9 @@ HEAVY = {
 }
 
 MODULES = (  # so that their class names resolve without a path
-    "neuido.models.pretrain",
-    "neuido.models.pretrain_vae",
-    "neuido.models.warmup",
-    "neuido.models.align",
-    "neuido.models.adapt",
-    "neuido.models.adapter",
-    "neuido.data.trajectories",
-    "neuido.data.films",
-    "neuido.data.visual_module",
+    *(f"neuido.models.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt", "adapter")),
+    *(f"neuido.data.{name}" for name in ("trajectories", "films", "visual_module")),
+    "neuido.discrepancy.diagnosed",
 )
 
 

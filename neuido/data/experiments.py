@@ -115,7 +115,7 @@ def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None 
             raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
         name = _text(content["name"], "name")
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
-        believed, free = _model(content["model"] if model is None else model)
+        believed, free = read_model_part(content["model"] if model is None else model, folder=folder)
         entries = content["recordings"]
         if not isinstance(entries, list) or not entries:
             raise UserError(f"recordings must be a list of at least one recording, got {entries!r}")
@@ -182,15 +182,31 @@ def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
     return out, {"grid": scene.cells, "dt": scene.dt}
 
 
-def _model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
+def read_model_part(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The key `model` of an experiment, checked, and its free parameters.
+
+    Args:
+        given: density, elasticity, plasticity, free, effects; and `law`, a neural law's file with a factor on its stress (`stiffness`),
+            which takes the place of elasticity and plasticity.
+        folder: What the law's file is relative to.
+
+    Raises:
+        UserError: An unknown key, an impossible material, an unknown effect.
+    """
     given = scenes._mapping(given, "model")
+    law = given.pop("law", None)
     free = given.pop("free", [])
     effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY))
     for part in ("elasticity", "plasticity"):
         if isinstance(given.get(part), Mapping):
             _text(given[part].get("law"), f"model.{part}.law")
     model = scenes.model_from_dict(given)
-    known = ["density", *(key for part in ("elasticity", "plasticity") for key in model[part] if key != "law")]
+    if law is not None:
+        law = scenes._mapping(law, "model.law")
+        scenes._keys(law, "model.law", ("file", "stiffness"), ("stiffness",))
+        file = Path(_text(law["file"], "model.law.file")).expanduser()
+        model["law"] = {"file": str(folder / file), "stiffness": number(law.get("stiffness", 1.0), "model.law.stiffness", above=0.0)}
+    known = ["density", *(key for part in ("elasticity", "plasticity", "law") for key in model.get(part, {}) if key not in ("law", "file"))]
     if not isinstance(free, list):
         raise UserError(f"model.free must be a list of parameters, got {free!r}")
     for key in free:

@@ -1,5 +1,6 @@
 """Filmed and reconstructed bodies as data for Stage II, scoring and prediction: a batch is one scene."""
 
+import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
+from neuido.data.scenes import VARIABLE, data_root
 from neuido.data.visual import VisualScene, load_visual
 from neuido.data.visual_known import load_known
 from neuido.errors import UserError
@@ -143,7 +145,7 @@ class VisualDataModule(LightningDataModule):
         scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them); with
             `body: particles` instead of `recording`, `views`, `dt`, `crop` (as `load_known` takes them).
         unseen: Scenes that training never sees.
-        root: Folder to which the paths of scenes are relative; none: the current one.
+        root: Folder to which the paths of scenes are relative; none: the current one, and what is not there is sought in NEUIDO_DATA.
         reconstructions: Folder that holds a reconstruction for each scene under the name of the scene's folder; none: inside each scene.
         frame_step: Take each n-th frame.
         frame_count: Number of frames; none: all.
@@ -230,6 +232,12 @@ class VisualDataModule(LightningDataModule):
             return scenes
         return [scene._replace(batch=train_on(scene.batch, self.training_views)) for scene in scenes]
 
+    def _find(self, path: Path) -> Path:
+        own = Path(self.root or ".") / path
+        if self.root is None and not own.exists() and os.environ.get(VARIABLE):
+            return data_root() / path
+        return own
+
     def _open(self, given: str | dict[str, Any], where: str) -> VisualScene:
         options: dict[str, Any] = dict(given) if isinstance(given, dict) else {"path": given}
         if "path" not in options:
@@ -241,7 +249,7 @@ class VisualDataModule(LightningDataModule):
         for key in options:
             if key not in known:
                 raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(known)}")
-        path = Path(self.root or ".") / Path(options.pop("path")).expanduser()
+        path = self._find(Path(options.pop("path")).expanduser())
         if body == "reconstruction" and "reconstruction" not in options and self.reconstructions is not None:
             options["reconstruction"] = Path(self.reconstructions) / path.resolve().name
         try:

@@ -16,6 +16,7 @@ import neuido
 from neuido.data.storage import write as write_text
 from neuido.discrepancy import ceiling, next_experiment, report, residual
 from neuido.discrepancy.attribution import Diagnosis
+from neuido.discrepancy.declared import beside
 from neuido.discrepancy.problem import Problem
 from neuido.discrepancy.rounds import ALPHA, Round, Trial
 
@@ -36,6 +37,8 @@ class Details:
     """Of each recording of a body."""
     ceilings: dict[str, ceiling.Ceiling] = field(default_factory=dict)
     """`before` and `after`."""
+    silhouettes: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Of each recording of a filmed body: masks, those drawn before and after, and their scores."""
 
 
 def write(
@@ -70,7 +73,7 @@ def write(
     for made in details:
         for name, arrays in made.motion.items():
             _save(out / "predicted" / f"{name}.npz", arrays)
-    models = {_body(d): d.problem.model_after(d.after, [t.candidate.name for t in d.effects]) for d, _ in found}
+    models = {_body(d): beside(out, d.problem.model_after(d.after, [t.candidate.name for t in d.effects])) for d, _ in found}
     model = {"bodies": models} if len(found) > 1 else next(iter(models.values()))
     write_text(out / "model_after.yaml", yaml.safe_dump(_plain(model), sort_keys=False, default_flow_style=None))
     traces = [trace(d) for d, _ in found]
@@ -119,7 +122,12 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
     }
     if "body" in d.problem.labels:
         content["body"] = d.problem.labels["body"]
-    return Details(_plain(content), motion, series, ceilings)
+    drawn = d.problem.silhouettes(d) if hasattr(d.problem, "silhouettes") else {}
+    if drawn:
+        content["silhouettes"] = {name: own["scores"] for name, own in drawn.items()}
+        for name, own in drawn.items():
+            motion[name] |= {key: np.round(255 * own[key]).astype(np.uint8) for key in ("masks", "drawn_before", "drawn_after")}
+    return Details(_plain(content), motion, series, ceilings, drawn)
 
 
 def errors(d: Diagnosis, when: str) -> dict[str, Any]:
@@ -233,7 +241,7 @@ def motions(d: Diagnosis) -> dict[str, dict[str, np.ndarray]]:
     problem: Problem = d.problem
     for n, recording in enumerate(problem.recordings):
         own = {when: ceiling.as_seen(d, point, n) for when, point in (("before", d.before), ("after", d.after))}
-        if not hasattr(problem, "motion"):
+        if not getattr(problem, "tracked", hasattr(problem, "motion")):
             out[recording.name] = {"times": recording.times, "groups": recording.groups, "measured": recording.y, **own}
             continue
         r = problem.measured[n]

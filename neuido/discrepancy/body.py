@@ -14,17 +14,24 @@ from torch import Tensor
 
 from neuido.data.experiments import Experiment
 from neuido.data.experiments import Recording as Measured
+from neuido.discrepancy.declared import CLASSICAL, classical, laws_of
 from neuido.discrepancy.library import KNOTS, active_effects, body_candidates, effects_of, present
 from neuido.discrepancy.problem import Parameter, Point, Problem, Recording
 from neuido.errors import UserError
 from neuido.physics.finite_elements import FiniteElements
-from neuido.physics.laws import material
 from neuido.physics.mpm import Simulator
 from neuido.types import Body, ParticleState, Scene
 
-LOG_STEPS = {"young": 0.1, "density": 0.05, "yield_stress": 0.1}
-RANGES = {"young": (1e2, 1e13), "poisson": (0.0, 0.495), "density": (1.0, 3e4), "yield_stress": (1e-2, 1e12), "friction_angle": (1.0, 80.0)}
-UNITS = {"young": "Pa", "poisson": "1", "density": "kg/m^3", "yield_stress": "Pa", "friction_angle": "degrees"}
+LOG_STEPS = {"young": 0.1, "density": 0.05, "yield_stress": 0.1, "stiffness": 0.1}
+RANGES = {
+    "stiffness": (1e-3, 1e3),
+    "young": (1e2, 1e13),
+    "poisson": (0.0, 0.495),
+    "density": (1.0, 3e4),
+    "yield_stress": (1e-2, 1e12),
+    "friction_angle": (1.0, 80.0),
+}
+UNITS = {"stiffness": "1", "young": "Pa", "poisson": "1", "density": "kg/m^3", "yield_stress": "Pa", "friction_angle": "degrees"}
 STEPS = {"poisson": 0.03, "friction_angle": 2.0}
 
 NUISANCES = (  # name, unit, prior standard deviation; of the frame interval, of one, of the speed
@@ -38,7 +45,10 @@ NUISANCES = (  # name, unit, prior standard deviation; of the frame interval, of
     ("spin_y", "rad/s", 0.01),
     ("spin_z", "rad/s", 0.01),
 )
+INSTRUMENTS = ("release_time", "time_base", "length_scale")
 NEIGHBOURS = 12
+SEGMENT = 2000
+"""Substeps that are launched as one piece where launches are captured or a tape is kept."""
 WINDOWS = 6
 """In time, of the patterns of an unknown discretisation error."""
 
@@ -67,13 +77,17 @@ class BodyProblem(Problem):
     device: str = "cpu"
     batch: int = 0
     """Parameter sets in a launch; 0: as the device likes."""
+    instruments: tuple[str, ...] = INSTRUMENTS
+    """Nuisances that change what is seen of a motion, and not the motion."""
+    tracked: bool = True
+    """Whether the data are positions of points."""
     _simulators: dict[Any, Simulator] = field(default_factory=dict, repr=False)
     _maps: dict[int, Any] = field(default_factory=dict, repr=False)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         # instruments alone need no further run: points that move alike share one
         name = self.measured[recording].name
-        instruments = tuple(f"{kind}:{name}" for kind in ("release_time", "time_base", "length_scale"))
+        instruments = tuple(f"{kind}:{name}" for kind in self.instruments)
         unique: dict[tuple, list[int]] = {}
         for i, point in enumerate(points):
             key = tuple(sorted((k, v) for k, v in point.items() if k not in instruments and (":" not in k or k.endswith(f":{name}"))))
@@ -122,6 +136,12 @@ class BodyProblem(Problem):
         x, _ = self._roll([point], recording, setting)
         return x[0]
 
+    def simulated(self, recording: int) -> Measured:
+        """The recording as the declared model has it, with its effects and without noise."""
+        r = self.measured[recording]
+        x = torch.from_numpy(self.motion({}, recording)).float()
+        return replace(r, x=x, noise=None, video=None, gaussians=None)
+
     def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
         model = {key: dict(value) if isinstance(value, Mapping) else value for key, value in self.experiment.model.items()}
         for p in self.declared:
@@ -162,7 +182,8 @@ class BodyProblem(Problem):
         centre = x[0].mean(axis=0)
         return centre + (1.0 + value["length_scale"]) * (x + (value["release_time"] + value["time_base"] * t) * v - centre)
 
-    def _roll(self, points: Sequence[Point], recording: int, setting: int) -> tuple[np.ndarray, np.ndarray]:
+    def _move(self, points: Sequence[Point], recording: int, setting: int) -> list[ParticleState]:
+        """The frames of the recording under each point, (T, P, ...) each."""
         r = self.measured[recording]
         wanted = len(points)
         if self.device != "cpu":  # few sizes: each has buffers of its own
@@ -181,32 +202,28 @@ class BodyProblem(Problem):
         every, steps, exact = _frames(r, scene.dt)
         with torch.no_grad():
             out = simulator.rollout(
-                steps, elasticity, plasticity, state=self._start(simulator, full, recording), every=every, effects=effects
+                steps,
+                elasticity,
+                plasticity,
+                state=self._start(simulator, full, recording),
+                every=every,
+                segment=_segment(steps, every),
+                effects=effects,
             )
-        index, weight = self._map(recording)
         count = len(r.body.x)
-        xs, vs = [], []
-        for s in range(wanted):
-            x, v = (t[:, s * count : (s + 1) * count] for t in (out.x, out.v))
-            x, v = (_gather(t, index, weight) for t in (x, v))
-            if not exact:
-                x, v = _at_times(x, v, every * scene.dt, r.t.to(x))
-            xs.append(x.double().cpu().numpy())
-            vs.append(v.double().cpu().numpy())
-        return np.stack(xs), np.stack(vs)
+        own = [ParticleState(*(t[:, s * count : (s + 1) * count] for t in out)) for s in range(wanted)]
+        return own if exact else [_at_times(frames, every * scene.dt, r.t.to(out.x)) for frames in own]
+
+    def _roll(self, points: Sequence[Point], recording: int, setting: int) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities of the tracked points, (S, T, N, 3) each."""
+        index, weight = self._map(recording)
+        moved = self._move(points, recording, setting)
+        x, v = (torch.stack([_gather(getattr(frames, key), index, weight) for frames in moved]) for key in "xv")
+        return x.double().cpu().numpy(), v.double().cpu().numpy()
 
     def laws(self, points: Sequence[Mapping[str, float]]):
         """The declared laws of several points, a row each."""
-
-        def filled(part: str) -> dict[str, Any]:
-            given = dict(self.experiment.model[part])
-            for p in self.declared:
-                if p.name in given:
-                    given[p.name] = torch.tensor([point[p.name] for point in points], dtype=torch.float64)
-            return given
-
-        elasticity, plasticity = filled("elasticity"), filled("plasticity")
-        return material(elasticity, plasticity)
+        return laws_of(self.experiment.model, points)
 
     def simulator(self, recording: int, setting: int, count: int) -> Simulator:
         """`count` copies of a recording's scene, kept for the next call."""
@@ -290,9 +307,7 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
         raise UserError("no recording has the role fit: set it on at least one in experiment.yaml")
     declared = []
     for name in experiment.free:
-        value = next(
-            part[name] for part in (experiment.model["elasticity"], experiment.model["plasticity"], experiment.model) if name in part
-        )
+        value = next(part[name] for part in _parts(experiment.model) if name in part)
         log = name in LOG_STEPS
         declared.append(Parameter(name, UNITS[name], float(value), LOG_STEPS.get(name, STEPS.get(name, 1.0)), *RANGES[name], log=log))
     nuisances = []
@@ -304,18 +319,21 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
             )
             scale = relative * unit_size
             nuisances.append(Parameter(f"{name}:{r.name}", unit, 0.0, scale, -8 * scale, 8 * scale, prior=1.0))
+    neural = CLASSICAL if "law" in experiment.model else {}
+    candidates = tuple(c for c in body_candidates(classical(experiment)) if c.name not in neural)
     return BodyProblem(
         name=experiment.name,
         measure="rmse",
         unit="m",
         declared=tuple(declared),
         nuisances=tuple(nuisances),
-        candidates=present(body_candidates(experiment), experiment.model.get("effects", {})),
+        candidates=present(candidates, experiment.model.get("effects", {})),
         recordings=tuple(_recording(r) for r in measured),
         settings=len(SETTINGS),
         solvers=(0, 4),
         experiment=experiment,
         measured=tuple(measured),
+        labels={"excluded": neural},
         device=device,
         batch=batch,
     )
@@ -349,6 +367,12 @@ def _frames(r: Measured, dt: float) -> tuple[int, int, bool]:
     return every, every * int(np.ceil(t[-1] / (every * dt) + 1e-9)), False
 
 
+def _segment(steps: int, every: int) -> int:
+    """Substeps of a piece of a rollout: a divisor of `steps` and a multiple of `every`, of `SEGMENT` at the most where there is one."""
+    frames = steps // every
+    return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
+
+
 def _gather(x: Tensor, index: Tensor, weight: Tensor) -> Tensor:
     """Weighted sums over particles, (K, P, 3) -> (K, N, 3)."""
     if bool((weight[:, 1:] == 0).all()):
@@ -356,13 +380,15 @@ def _gather(x: Tensor, index: Tensor, weight: Tensor) -> Tensor:
     return torch.einsum("nk,tnkc->tnc", weight.to(x), x[:, index])
 
 
-def _at_times(x: Tensor, v: Tensor, step: float, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Cubic Hermite interpolation of frames that are `step` apart."""
+def _at_times(frames: ParticleState, step: float, t: Tensor) -> ParticleState:
+    """Frames that are `step` apart at other times: cubic Hermite interpolation of x, linear of the rest."""
+    x, v, C, F = frames
     k = (t / step).floor().long().clamp(max=len(x) - 2)
     u = (t / step - k)[:, None, None]
     x0, x1, v0, v1 = x[k], x[k + 1], v[k] * step, v[k + 1] * step
     place = (1 + 2 * u) * (1 - u) ** 2 * x0 + u * (1 - u) ** 2 * v0 + u**2 * (3 - 2 * u) * x1 + u**2 * (u - 1) * v1
-    return place, ((1 - u) * v0 + u * v1) / step
+    w = u[..., None]
+    return ParticleState(place, ((1 - u) * v0 + u * v1) / step, (1 - w) * C[k] + w * C[k + 1], (1 - w) * F[k] + w * F[k + 1])
 
 
 def _first_seen(r: Measured) -> Tensor:
@@ -392,8 +418,13 @@ def _follow(x: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
     return index, kernel * (basis @ first)[..., 0]
 
 
+def _parts(model: Mapping[str, Any]) -> list[Any]:
+    """The parts of a model that hold figures."""
+    return [model["elasticity"], model["plasticity"], model.get("law", {}), model]
+
+
 def _place(model: dict[str, Any], name: str, value: float) -> None:
-    for part in (model["elasticity"], model["plasticity"], model):
+    for part in _parts(model):
         if name in part:
             part[name] = float(value)
 

@@ -62,7 +62,7 @@ def _samples(
     """Features (n, k), residuals (n, c) and weights (n,) of a part."""
     problem, n = d.problem, part.recording
     r = problem.recordings[n]
-    if not hasattr(problem, "motion"):
+    if not getattr(problem, "tracked", hasattr(problem, "motion")):
         velocity = _slope(predicted, r.times, r.groups)
         channels = r.groups[:, None] == np.unique(r.groups)[None]
         features = np.concatenate([r.times[:, None], predicted[:, None], velocity[:, None], channels], axis=1)
@@ -129,7 +129,7 @@ def train(parts: list[tuple[bool, np.ndarray, np.ndarray, np.ndarray]], *, noise
         with torch.no_grad():
             left = r - size * net(inputs(f)).double().numpy()
         over = max(float(np.mean(r**2)) - noise**2, 1e-300)
-        shares[name] = (float(np.mean(r**2)) - float(np.mean(left**2))) / max(over, 1e-3 * float(np.mean(r**2)))
+        shares[name] = min((float(np.mean(r**2)) - float(np.mean(left**2))) / max(over, 1e-3 * float(np.mean(r**2))), 1.0)
 
     def joined(which: bool) -> float:
         own = [(len(p[1]), shares[n]) for n, p in zip(names, parts, strict=True) if p[0] == which]

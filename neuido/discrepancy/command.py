@@ -5,14 +5,17 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
+    from neuido.data.experiments import Experiment
     from neuido.discrepancy.attribution import Diagnosis
+    from neuido.discrepancy.body import BodyProblem
     from neuido.discrepancy.problem import Problem
 
+DATA = ("auto", "points", "video")
 KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}
 
 
@@ -21,6 +24,8 @@ def diagnose(
     *,
     out: str,
     model: str | None = None,
+    law: str | None = None,
+    data: str = "auto",
     effects: str | None = None,
     draws: int = 199,
     seed: int = 0,
@@ -38,6 +43,8 @@ def diagnose(
         folder: Measured data: a folder with experiment.yaml, test.yaml or track.yaml.
         out: Folder to write: diagnosis.json, report.html, model_after.yaml, trace.json, log.csv and the predicted motion.
         model: File with a model in place of the folder's own, for example an earlier model_after.yaml.
+        law: Neural law of `neuido predict` in place of the folder's elasticity and plasticity; a factor on its stress is fitted.
+        data: Of an experiment: points (tracked ones), video (silhouettes), or auto: points where every recording has them.
         effects: Names of the effects to consider, with commas; all that make sense where absent.
         draws: Draws of the parametric bootstrap; p-values come in steps of 1 / (draws + 1).
         seed: Seed of the draws.
@@ -64,9 +71,11 @@ def diagnose(
     from neuido.discrepancy.attribution import diagnose as infer
 
     chosen = choose_device(device)
-    problems = [restricted(problem, effects) for problem in problems_of(kind, place, model, chosen)]
-    given = Path(model).expanduser().read_text() if model else None
-    options = {"model": given, "effects": effects, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": answer.VERSION}
+    problems = [restricted(problem, effects) for problem in problems_of(kind, place, model, chosen, law=law, data=data)]
+    files = {"model": model, "law": law}
+    given = {key: Path(file).expanduser().read_bytes().hex() if file else None for key, file in files.items()}
+    options = {"effects": effects, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": answer.VERSION, "data": data}
+    options |= given
     plan = store.plan_of(place, options, out=target)
     target.mkdir(parents=True, exist_ok=True)
     work = store.workplace(target, plan, resume=resume)
@@ -104,18 +113,26 @@ def kind_of(folder: str) -> tuple[str, Path]:
     return KINDS[there[0]], given
 
 
-def problems_of(kind: str, folder: Path, model: str | None, device: str) -> "Sequence[Problem]":
+def problems_of(
+    kind: str, folder: Path, model: str | None, device: str, *, law: str | None = None, data: str = "auto"
+) -> "Sequence[Problem]":
     """The problems of a folder: one, or one for each body of a track folder.
 
     Raises:
-        UserError: The folder or the model's file is not as its format says.
+        UserError: The folder, the model's file or the law is not as its format says, or an option that is for experiments alone.
     """
-    given = None if model is None else _model_file(model)
+    if data not in DATA:
+        raise UserError(f"data = {data!r} is not known; use {', '.join(DATA)}")
+    from neuido.discrepancy.declared import read_model, with_law
+
+    given = None if model is None else read_model(model)
     if kind == "experiment":
         from neuido.data.experiments import read_experiment
-        from neuido.discrepancy.body import body_problem
 
-        return [body_problem(read_experiment(folder, model=given), device=device)]
+        found = read_experiment(folder, model=given)
+        return [experiment_problem(found if law is None else with_law(found, law), data, device)]
+    if law is not None or data != "auto":
+        raise UserError(f"{'law' if law is not None else 'data'} is for experiments, and {folder} is a {kind}: leave it out")
     if kind == "material test":
         from neuido.data.material_tests import read_material_tests
         from neuido.discrepancy.material import MaterialProblem
@@ -132,17 +149,22 @@ def problems_of(kind: str, folder: Path, model: str | None, device: str) -> "Seq
     return [TrackProblem(read_tracks(folder, model=given["bodies"][body]), body) for body in bodies]
 
 
-def _model_file(path: str) -> dict[str, Any]:
-    from neuido.data.scenes import read_yaml
+def experiment_problem(experiment: "Experiment", data: str, device: str) -> "BodyProblem":
+    """The problem of an experiment: its tracked points, or its videos.
 
-    file = Path(path).expanduser()
-    if not file.is_file():
-        raise UserError(f"model = {path}: there is no such file")
-    try:
-        content = read_yaml(file)
-    except (UnicodeDecodeError, RecursionError) as error:
-        raise UserError(f"model = {path} is not valid YAML: {error}") from error
-    return content["model"] if set(content) == {"model"} and isinstance(content["model"], dict) else content
+    Raises:
+        UserError: Recordings that lack what is asked for.
+    """
+    from neuido.discrepancy.body import body_problem
+
+    if data == "auto":
+        tracked = [r.x is not None for r in experiment.recordings]
+        data = "points" if all(tracked) or all(r.video is None for r in experiment.recordings) else "video"
+    if data == "points":
+        return body_problem(experiment, device=device)
+    from neuido.discrepancy.video import video_problem
+
+    return video_problem(experiment, device=device)
 
 
 def restricted(problem: "Problem", effects: str | None) -> "Problem":

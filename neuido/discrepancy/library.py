@@ -220,10 +220,11 @@ def effects_of(
     values: dict[str, torch.Tensor] = {
         name: torch.tensor(row, dtype=torch.float64) for name, row in rows.items() if name.split(".")[0] in active
     }
+    interval = max(values.pop("time_force.interval", torch.zeros(1)).tolist())  # of a declared force; all points have it
     waves = {name: values.pop(name) for name in [n for n in values if n.startswith("time_force.") and not n[-1].isdigit()]}
     made = Effects.of(values, x=x, scene=scene)
     if made.time_force is not None and made.time_force_interval is None:
-        made = made._replace(time_force_interval=duration / (KNOTS - 1))
+        made = made._replace(time_force_interval=interval or duration / (KNOTS - 1))
     if waves:
         made = _with_waves(made, waves, duration)
     return made

@@ -47,7 +47,7 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
         return None
     inner = getattr(d.problem, "problem", d.problem)
     if hasattr(inner, "motion"):
-        catalogue = _bodies(inner, rivals[0].point, d.setting)
+        catalogue = _bodies(inner if inner.tracked else inner.as_tracked(), rivals[0].point, d.setting)
     elif hasattr(inner, "tests"):
         catalogue = _materials(inner)
     else:

@@ -8,6 +8,7 @@ import numpy as np
 
 from neuido.discrepancy import next_experiment
 from neuido.discrepancy import report_figures as draw
+from neuido.discrepancy import report_silhouettes as pictures
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.rounds import ALPHA
 from neuido.page import escaped, table
@@ -75,6 +76,8 @@ def _one(made: "Details", d: Diagnosis) -> list[str]:
             at = ", ".join(f"{v:.3g}" for v in p["from_centre"])
             where = f"{place}: the missing force is largest at ({at}) m from the centre, {p['over_median']:.1f} times the median."
             out.append(f"<p>{escaped(where)}</p>")
+    elif made.silhouettes:
+        out += pictures.section(made.silhouettes)
     else:
         out += ["<h2>Data before and after</h2>", draw.data_curves(made.motion, d.problem.unit)]
     out += _ranking(d)

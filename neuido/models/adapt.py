@@ -17,7 +17,7 @@ from neuido.models.filmed import FIGURES, FilmedModule, check_options, frames_at
 from neuido.models.methods import CARD, Method, scalars
 from neuido.models.pipeline import Laws, Prepared, folder_of, prepare, roll_surely
 from neuido.models.progress import Progress, restore, snapshot
-from neuido.models.scene_fit import SceneFit
+from neuido.models.scene_fit import EffectSource, SceneFit
 from neuido.types import ParticleState
 
 GIGABYTE = 1e9
@@ -48,6 +48,7 @@ class AdaptModule(FilmedModule):
         patience: Steps without an improvement by 1 % after which a scene ends.
         check_every: Steps between two looks at that loss.
         segment: Keep the state of a rollout every so many frames only (`Simulator.rollout`); 0: of all. Saves memory.
+        effects: Effects that act on top of the law, of a diagnosis say; none: none.
         adapter: Folder of a fit, for test and predict: `out` of one, or what is in `out/<scene>/fit`.
         cache: Folder in which optical flow is kept.
         out: Folder for results.
@@ -75,6 +76,7 @@ class AdaptModule(FilmedModule):
         patience: int = 20,
         check_every: int = 5,
         segment: int = 0,
+        effects: EffectSource | None = None,
         adapter: str | None = None,
         cache: str | None = None,
         out: str = "runs/adapt",
@@ -93,8 +95,9 @@ class AdaptModule(FilmedModule):
             raise UserError(f"model.fit_frames = {fit_frames}, velocity_frames = {velocity_frames}: a motion needs at least 2 frames")
         if patience < 1 or check_every < 1:
             raise UserError(f"model.patience = {patience}, check_every = {check_every}: at least 1 is needed")
-        self.save_hyperparameters(ignore=["method"])
+        self.save_hyperparameters(ignore=["method", "effects"])
         object.__setattr__(self, "plan", method)  # its copies are trained, one a scene
+        self.effects = effects
         self.steps = method.steps if steps is None else steps
         self.ahead = velocity_steps if estimate_velocity else 0
         """Steps of the velocity alone, before those of the method."""
@@ -114,7 +117,7 @@ class AdaptModule(FilmedModule):
 
     def new_fit(self, prepared: Prepared) -> SceneFit:
         """A fit that has not begun."""
-        return SceneFit(self.plan.for_scene(prepared), self.hparams.estimate_velocity).to(prepared.images.device)
+        return SceneFit(self.plan.for_scene(prepared), self.hparams.estimate_velocity, self.effects).to(prepared.images.device)
 
     def setup(self, stage: str) -> None:
         if stage != "fit" or len(self.fits):

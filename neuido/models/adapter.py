@@ -93,6 +93,9 @@ class LowRankAdaptation(Method):
         if own:
             return latents[own].mean(0)
         if not self.start.endswith(".safetensors"):
+            if self.start not in self.operator.latent_names:
+                known = ", ".join(["encoder", "mean", *sorted(set(self.operator.latent_families)), *self.operator.latent_names[:3]])
+                raise UserError(f"model.method.start = {self.start!r}: one of {known}, ..., or a law file (.safetensors)")
             return self.operator.latent(self.start)
         _, tensors, _ = read_weights(self.start, LAW_FORMAT, "model.method.start")
         if "z" not in tensors or tensors["z"].shape != (self.operator.latent_dim,):

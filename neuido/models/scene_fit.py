@@ -16,22 +16,32 @@ from neuido.types import ParticleState
 START = "start.safetensors"
 
 
+class EffectSource:
+    """Where effects come from that act on top of a scene's law, known and not fitted; YAML gives a subclass by `class_path`."""
+
+    def of(self, scene: Prepared) -> Effects:
+        """The effects for a rollout of the scene, whose step may be finer than the recording's."""
+        raise NotImplementedError
+
+
 class SceneFit(nn.Module):
     """One scene's method and, where it is estimated, what its initial velocity lacks.
 
     Args:
         method: Of `Method.for_scene`.
         estimate_velocity: Whether a rigid motion is added to the body's known velocity.
+        effects: What else acts on the body; none: nothing.
     """
 
-    def __init__(self, method: Method, estimate_velocity: bool):
+    def __init__(self, method: Method, estimate_velocity: bool = False, effects: EffectSource | None = None):
         super().__init__()
-        self.method = method
+        self.method, self.effects = method, effects
         self.twist = nn.Parameter(torch.zeros(2, 3)) if estimate_velocity else None
         """Velocity of the centre [m/s] and angular velocity about it [rad/s]."""
 
-    def roll(self, scene: Prepared, frames: int, effects: Effects | None = None, segment: int = 0) -> ParticleState:
+    def roll(self, scene: Prepared, frames: int, segment: int = 0) -> ParticleState:
         """`Method.roll` from the start of this fit."""
+        effects = None if self.effects is None else self.effects.of(scene)
         return self.method.roll(scene, frames, state=self.start(scene.simulator), effects=effects, segment=segment)
 
     def start(self, simulator: Simulator) -> ParticleState | None:

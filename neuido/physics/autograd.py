@@ -22,7 +22,8 @@ def run(plan: Plan, inputs: tuple[Tensor, ...], segment: int | None = None) -> t
         UserError: What `Plan.check` finds.
     """
     differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-    if differentiable and segment is not None and segment < plan.steps:
+    captured = plan.simulator.device.type == "cuda"  # a graph of many thousand substeps would be large and slow to make
+    if (differentiable or captured) and segment is not None and segment < plan.steps:
         return _Segments.apply(plan, segment, *inputs)
     if plan.simulator.pool is not None:
         return ThreadedRollout.apply(Scenes(plan), differentiable, *inputs)

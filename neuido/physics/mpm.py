@@ -285,7 +285,8 @@ class Simulator:
             mass: [kg], (P,); density times volume where absent.
             every: Keep a frame every so many substeps.
             segment: For a long rollout with gradients: keep only the state every so many substeps, and make the rest again in the
-                backward pass, piece by piece (a third more time). It must divide `steps` and be a multiple of `every`.
+                backward pass, piece by piece (a third more time); on CUDA also without gradients: one captured piece serves all of them.
+                It must divide `steps` and be a multiple of `every`.
             check: Compare the step with the stability limit first.
 
         Returns:

@@ -7,7 +7,11 @@ import numpy as np
 import torch
 import yaml
 
+from neuido.data.cameras import orbit
 from neuido.data.experiments import Experiment, Recording, write_experiment
+from neuido.data.formats import nerfstudio
+from neuido.data.synthetic import dress
+from neuido.models.splatting import rasterize
 from neuido.physics.effects import Effects
 from neuido.physics.laws import material
 from neuido.physics.mpm import Simulator
@@ -61,6 +65,38 @@ def experiment(
                 track=pick,
             )
         )
+    believed = {**MODEL, "elasticity": {**MODEL["elasticity"], "young": 7e4}}
+    made = Experiment("block", folder, scene, believed, ("young",), tuple(recordings))
+    write_experiment(made, folder)
+    return made
+
+
+def filmed(
+    folder: Path, effects: dict[str, float], *, particles: bool = True, views: int = 2, frames: int = 14, width: int = 96, side: int = 5
+) -> Experiment:
+    """Write the block of `experiment` as silhouettes from some views, a throw and one held out; `particles`: with x0, v0 and volume."""
+    scene = Scene(cells=14, dt=1e-3, colliders=(Plane((0.0, 0.1, 0.0), (0.0, 1.0, 0.0), "separate", 0.2),))
+    cameras = orbit(views, radius=2.4, elevations=(12.0, 24.0), target=(0.5, 0.35, 0.5), width=width, height=width, angle=32.0)
+    recordings = []
+    for name, role, b in (
+        ("throw", "fit", body((0.9, 0.6, 0.2), 5.0, 0.42, side)),
+        ("drop", "held_out", body((-0.4, -1.0, 0.3), -4.0, 0.6, side)),
+    ):
+        simulator = Simulator(scene, b, density=1000.0)
+        with torch.no_grad():
+            out = simulator.rollout(
+                20 * (frames - 1), *material(MODEL["elasticity"], MODEL["plasticity"]), every=20, effects=Effects.of(effects)
+            )
+        dense = dress(b, 27, seed=name)
+        means, covariances = dense.at(out.x, out.F)
+        alphas = rasterize(means, covariances, torch.full((means.shape[1],), 0.9), dense.colour, *cameras)[1]
+        shot = np.zeros((views, frames, width, width, 4), np.uint8)
+        shot[..., 3] = (255 * alphas.transpose(0, 1)).round().byte().numpy()
+        times = torch.arange(frames, dtype=torch.float64) * 0.02
+        own = folder.with_name(f"{folder.name}-film") / name
+        nerfstudio.write(own, cameras, times, shot)
+        given = {"x": out.x[:, :1], "body": b, "t": times, "track": torch.zeros(1, dtype=torch.int64)} if particles else {}
+        recordings.append(Recording(name=name, role=role, scene=scene, frame_interval=0.02, video=nerfstudio.read(own), **given))
     believed = {**MODEL, "elasticity": {**MODEL["elasticity"], "young": 7e4}}
     made = Experiment("block", folder, scene, believed, ("young",), tuple(recordings))
     write_experiment(made, folder)

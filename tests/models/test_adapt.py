@@ -23,7 +23,8 @@ from neuido.models.methods import Method
 from neuido.models.operator import IntrinsicDynamicsOperator
 from neuido.models.pipeline import prepare
 from neuido.models.progress import Progress
-from neuido.models.scene_fit import SceneFit
+from neuido.models.scene_fit import EffectSource, SceneFit
+from neuido.physics.effects import Effects
 from tests.models.visual_samples import TinyScenes, tiny_scene
 
 ROOT = Path(__file__).parents[2]
@@ -114,6 +115,23 @@ def test_velocity_is_estimated_from_the_first_frames(tmp_path):
     again = module(tmp_path, start="jelly", adapter=str(tmp_path / "out"), **options)
     _, loaded = again.load_fit(data.scenes[0])
     assert torch.equal(loaded.twist, model.fit_of("tiny").twist)
+
+
+class Drag(EffectSource):
+    def of(self, scene):
+        return Effects(drag_linear=3.0)
+
+
+def test_effects_act_on_top_of_the_law(tmp_path):
+    scene = tiny_scene(tmp_path)
+    model = module(tmp_path, start="jelly", effects=Drag())
+    prepared, fit = model.load_fit(scene)
+    with torch.no_grad():
+        moved = fit.roll(prepared, prepared.frames)
+        steps = prepared.substeps(prepared.frames)
+        expected = prepared.simulator.rollout(steps, *fit.method.laws(prepared), every=prepared.every, effects=Effects(drag_linear=3.0))
+        free = fit.method.roll(prepared, prepared.frames)
+    assert torch.equal(moved.x, expected.x) and not torch.allclose(moved.x, free.x, atol=1e-3)
 
 
 def test_start_is_a_rigid_motion(tmp_path):

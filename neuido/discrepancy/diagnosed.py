@@ -1,0 +1,30 @@
+"""What a diagnosis has found, for a law that is fitted to images: the effects of its `model_after.yaml` act on top of the law."""
+
+from neuido.discrepancy.declared import read_model, ready
+from neuido.models.pipeline import Prepared
+from neuido.models.scene_fit import EffectSource
+from neuido.physics.effects import Effects
+from neuido.physics.mpm import Simulator
+
+
+class DiagnosedEffects(EffectSource):
+    """The effects of a model; its law is left aside.
+
+    Args:
+        path: A `model_after.yaml` of `neuido diagnose`, or a file with the key `model`.
+
+    Raises:
+        UserError: No such file, an impossible material, an unknown effect.
+    """
+
+    def __init__(self, path: str):
+        self.model = read_model(path)
+        self._made: tuple[Simulator, Effects] | None = None
+
+    def of(self, scene: Prepared) -> Effects:
+        """The effects on the scene's body."""
+        if self._made is None or self._made[0] is not scene.simulator:
+            times = scene.source.batch.times
+            effects = ready(self.model, scene.simulator, duration=float(times[-1] - times[0])).effects
+            self._made = scene.simulator, effects
+        return self._made[1]

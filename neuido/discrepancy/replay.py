@@ -1,0 +1,45 @@
+"""Recordings as a model has them: an experiment rolled out under its declared model and effects, written as another experiment."""
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from neuido.data.experiments import read_experiment, write_experiment
+from neuido.data.storage import publish_folder
+from neuido.discrepancy.command import choose_device, experiment_problem
+from neuido.discrepancy.declared import beside, read_model
+from neuido.errors import UserError
+
+
+def replay(folder: str, out: str | os.PathLike, *, model: str | None = None, device: str = "auto", progress: bool = True) -> None:
+    """Simulate the recordings of an experiment under a model, and write them as an experiment's folder without noise.
+
+    The tracked points are those of the experiment; of a video, whose points nobody tracked, they are all particles.
+
+    Args:
+        folder: The experiment.
+        out: Folder to write; it appears when it is whole.
+        model: File with the model, for example a model_after.yaml; the experiment's own where absent.
+        device: auto, cpu or cuda.
+        progress: Show a progress bar.
+
+    Raises:
+        UserError: What readers and rollouts refuse, or a folder that is there already.
+    """
+    target = Path(out).expanduser()
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise UserError(f"out = {out} is there already: give another folder")
+    experiment = read_experiment(folder, model=None if model is None else read_model(model))
+    problem = experiment_problem(experiment, "auto", choose_device(device))
+    names = tqdm(range(len(problem.measured)), unit="recording", disable=not progress)
+    recordings = tuple(problem.simulated(n) for n in names)
+
+    hidden = target.with_name(f".{target.name}.tmp")
+    shutil.rmtree(hidden, ignore_errors=True)
+    hidden.mkdir(parents=True)
+    write_experiment(replace(experiment, model=beside(hidden, experiment.model), recordings=recordings), hidden)
+    read_experiment(hidden)  # what cannot be read again is not published
+    publish_folder(hidden, target)

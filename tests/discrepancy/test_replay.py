@@ -1,0 +1,148 @@
+"""model_after.yaml goes back: into `neuido simulate`, into `neuido diagnose`, and into a rollout of one's own."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from neuido.cli import main
+from neuido.data.experiments import read_experiment
+from neuido.discrepancy.body import SEGMENT, _segment, body_problem
+from neuido.discrepancy.declared import ready
+from neuido.errors import UserError
+from neuido.physics.laws import FixedCorotated
+from neuido.physics.mpm import Simulator
+from tests.discrepancy import made
+
+EFFECTS = {"drag_linear.k": 3.0}
+
+
+def run(capsys, *args) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in args])
+    out, err = capsys.readouterr()
+    return stop.value.code, out, err
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("replay") / "block"
+    made.experiment(path, EFFECTS, frames=10, side=4, noise=1e-4)
+    return path
+
+
+@pytest.fixture(scope="module")
+def after(folder):
+    """What a diagnosis that finds the drag leaves behind, as `body.model_after` writes it."""
+    problem = body_problem(read_experiment(folder))
+    path = folder.parent / "model_after.yaml"
+    path.write_text(yaml.safe_dump(problem.model_after({"young": 6e4, **EFFECTS}, ["drag_linear"])))
+    return path
+
+
+def test_simulate_repeats_the_recordings_under_the_model(folder, after, tmp_path, capsys):
+    status, _, err = run(capsys, "simulate", "--experiment", folder, "--model", after, "--out", tmp_path / "again", "--device", "cpu")
+    assert status == 0, err
+    measured, again = read_experiment(folder), read_experiment(tmp_path / "again")
+    assert again.model["effects"] == EFFECTS
+    assert [r.name for r in again.recordings] == [r.name for r in measured.recordings]
+    for a, b in zip(again.recordings, measured.recordings, strict=True):
+        assert a.noise is None
+        assert (a.x - b.x)[b.seen].square().mean().sqrt() < 1.2e-4  # the noise of the measured one
+    plain = body_problem(measured).motion({}, 0)
+    assert np.abs(again.recordings[0].x.numpy() - plain).max() > 0.01
+
+
+def test_diagnose_of_the_repeated_recordings_answers_none(folder, after, tmp_path, capsys):
+    run(capsys, "simulate", "--experiment", folder, "--model", after, "--out", tmp_path / "again", "--device", "cpu")
+    options = ["--effects", "drag_linear,viscosity_shear", "--draws", "19", "--device", "cpu"]
+    status, out, err = run(capsys, "diagnose", tmp_path / "again", "--out", tmp_path / "out", *options)
+    assert status == 0, err
+    assert out.startswith("none; ")
+    content = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert content["after"]["young"]["value"] == pytest.approx(6e4, rel=0.02)
+
+
+def test_ready_is_what_the_problem_simulates(folder, after):
+    r = read_experiment(folder)["throw"]
+    simulator = Simulator(r.scene, r.body, density=1000.0)
+    law = ready(after, simulator)
+    with torch.no_grad():
+        out = simulator.rollout(90, law.elasticity, law.plasticity, effects=law.effects, every=10)
+    problem = body_problem(read_experiment(folder, model=yaml.safe_load(after.read_text())))
+    np.testing.assert_allclose(out.x[:, r.track].numpy(), problem.motion({}, 0), atol=1e-5)
+
+
+def test_ready_takes_fields_over_the_body_and_forces_in_time(folder):
+    r = read_experiment(folder)["throw"]
+    simulator = Simulator([r.scene] * 2, [r.body] * 2, density=1000.0)
+    base = {"density": 1000.0, "elasticity": {"law": "fixed_corotated", "young": 6e4, "poisson": 0.3}, "free": ["young"]}
+    for effects in ({"stiffness_gradient.x": 0.5}, {"time_force.y0": 2.0, "time_force.y4": -2.0, "time_force.interval": 0.02}):
+        law = ready({**base, "effects": effects}, simulator)
+        problem = body_problem(read_experiment(folder, model={**base, "plasticity": {"law": "identity"}, "effects": effects}))
+        with torch.no_grad():
+            out = simulator.rollout(90, law.elasticity, law.plasticity, effects=law.effects, every=10)
+        count = len(r.body.x)
+        for s in range(2):
+            np.testing.assert_allclose(out.x[:, s * count : (s + 1) * count][:, r.track].numpy(), problem.motion({}, 0), atol=1e-5)
+    with pytest.raises(UserError, match="interval"):
+        ready({**base, "effects": {"time_force.y0": 2.0}}, simulator)
+
+
+@pytest.mark.parametrize(
+    ("more", "word"),
+    [
+        (["--model", "nowhere.yaml", "--experiment", "FOLDER"], "nowhere.yaml"),
+        (["--model", "nowhere.yaml"], "experiment"),
+        (["--experiment", "FOLDER", "--undeclared", "3"], "undeclared"),
+        (["--experiment", "nowhere"], "nowhere"),
+        (["--experiment", "FOLDER", "--device", "abacus"], "abacus"),
+    ],
+)
+def test_wrong_option_is_one_line(more, word, folder, tmp_path, capsys):
+    given = [str(folder) if part == "FOLDER" else part for part in more]
+    status, _, err = run(capsys, "simulate", "--out", tmp_path / "out", *given)
+    assert (status, len(err.splitlines())) == (2, 1), err
+    assert word in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_there_is_not_overwritten(folder, capsys):
+    status, _, err = run(capsys, "simulate", "--experiment", folder, "--out", folder)
+    assert (status, len(err.splitlines())) == (2, 1)
+    assert "already" in err
+
+
+def test_long_recordings_run_in_pieces(folder, monkeypatch):
+    """Pieces fit their recording, and what is kept of one of many substeps are its frames: memory does not grow with the substeps."""
+    for steps, every in ((32_000, 400), (26_910, 1), (26_911, 1), (90, 10), (5000, 5000)):
+        piece = _segment(steps, every)
+        assert steps % piece == 0
+        assert piece % every == 0
+        assert piece == every or piece <= SEGMENT
+    assert _segment(32_000, 400) == 2000
+    monkeypatch.setattr("neuido.discrepancy.body.SEGMENT", 30)
+    problem = body_problem(read_experiment(folder))
+    asked, rollout = [], Simulator.rollout
+
+    def watched(self, steps, *args, **options):
+        asked.append((steps, options["segment"]))
+        return rollout(self, steps, *args, **options)
+
+    monkeypatch.setattr(Simulator, "rollout", watched)
+    problem.predict([{}], 0)
+    assert asked == [(90, 30)]
+    (kept,) = problem.simulator(0, 0, 1).cache._kept.values()
+    assert len(kept.tape.x) == 10
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_pieces_on_a_gpu_are_the_whole(folder):
+    r = read_experiment(folder)["throw"]
+    simulator = Simulator(r.scene, r.body, density=1000.0, device="cuda")
+    with torch.no_grad():
+        whole, pieces = (simulator.rollout(90, FixedCorotated(6e4, 0.3), every=10, segment=segment) for segment in (None, 30))
+    torch.testing.assert_close(whole.x, pieces.x, atol=1e-5, rtol=0.0)
