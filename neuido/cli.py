@@ -47,6 +47,7 @@ HEAVY = {
 
 MODULES = (  # so that their class names resolve without a path
     *(f"neuido.models.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt", "adapter")),
+    *(f"neuido.models.{name}" for name in ("baselines", "springs", "symbolic")),
     *(f"neuido.data.{name}" for name in ("trajectories", "films", "visual_module")),
     "neuido.discrepancy.diagnosed",
 )

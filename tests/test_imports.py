@@ -29,6 +29,8 @@ NETS = tuple(
         "gaussians",
         "filling",
         "baselines",
+        "springs",
+        "symbolic",
     )
 )
 ROOMS = {  # room: the parts of neuido that it may import, itself included

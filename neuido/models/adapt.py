@@ -252,7 +252,7 @@ class AdaptModule(FilmedModule):
     def _set_rates(self, optimizer: Any, name: str, progress: Progress) -> None:
         step, ahead = progress.steps, self.ahead
         share = step / ahead if step < ahead else (step - ahead) / max(1, self.steps)
-        factor = progress.damping * self.plan.rate(share)
+        factor = progress.damping * self.fit_of(name).method.rate(share)
         for group in optimizer.param_groups:
             waits = step < ahead and not group["twist"]
             group["lr"] = 0.0 if waits or group["of"] != self._names.index(name) else factor * group["start_lr"]

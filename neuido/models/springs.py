@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from neuido.errors import UserError
 from neuido.models.baselines import positive
-from neuido.models.methods import Method
+from neuido.models.methods import Laws, Method
 from neuido.models.pipeline import Prepared
 from neuido.physics.effects import Effects
 from neuido.physics.mass_spring import MassSpring, connect
@@ -103,6 +103,9 @@ class SpringMass(Method):
         """Share of the tangential velocity that a step on the ground leaves (Spring-Gaus, `fric_k`), (1,)."""
         return (1.2 * self.slide.sigmoid() - 0.1).clamp(0, 1)
 
+    def laws(self, scene: Prepared) -> Laws:
+        raise UserError("model.method = SpringMass has no law of F: leave condition_files out")
+
     def roll(
         self,
         scene: Prepared,
@@ -169,4 +172,5 @@ def following(x: Tensor, anchors: Tensor, nearest: int) -> Tensor:
     weight = 1 / (distance.sqrt() + 1e-14)
     weight = (weight / weight.sum(1, keepdim=True)).to(x)
     rows = torch.arange(len(x)).repeat_interleave(nearest)
-    return torch.sparse_coo_tensor(torch.stack([rows, index.flatten()]).to(x.device), weight.flatten(), (len(x), len(anchors))).coalesce()
+    place = torch.stack([rows, index.flatten()]).to(x.device)
+    return torch.sparse_coo_tensor(place, weight.flatten(), (len(x), len(anchors)), check_invariants=True).coalesce()

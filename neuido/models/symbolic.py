@@ -7,7 +7,7 @@ add little are dropped in rounds, and the rest is fitted again (sequential thres
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -39,15 +39,17 @@ REACHED = 1e-3
 class SparseLaw(Method):
     """28 terms of stress and three of a yield surface (cohesion, friction, a limit of expansion), fitted and thinned out.
 
-    The start is Hencky's law with a surface that yields early: one that no particle reaches would never learn.
+    The start is Hencky's law. Where the scene's believed model yields (NeuMA chooses its networks by it too), there is a yield surface that
+    is reached early: one that no particle reaches would never learn.
 
     Args:
         young, poisson: Start of the two linear terms [Pa], [-].
-        cohesion: Start of the radius of yield in Hencky strain [-].
-        friction: Start of its growth with compression [-].
+        yields: Whether there is a yield surface; `auto`: by the believed model.
+        cohesion: Start of its radius in Hencky strain [-].
+        friction: Start of the radius's growth with compression [-].
         expansion: Start of the largest expansion [-].
         threshold: Share of the stress's root mean square below which a term is dropped; of the radius, below which a yield term is.
-        interval: Steps between two rounds.
+        interval: Steps before the first round, and between two.
         rounds: Rounds of dropping; after the last one what is left is fitted to the end.
         sparsity: Weight of the sum of the sizes of all terms but the two linear ones.
         plausibility_weight: Keeps the stress where it can run (`branch.implausible_stress`).
@@ -63,9 +65,10 @@ class SparseLaw(Method):
         self,
         young: float = 1e5,
         poisson: float = 0.25,
-        cohesion: float = 1e-2,
-        friction: float = 0.1,
-        expansion: float = 1e-2,
+        yields: Literal["auto", "yes", "no"] = "auto",
+        cohesion: float = 3e-2,
+        friction: float = 0.2,
+        expansion: float = 3e-2,
         threshold: float = 0.05,
         interval: int = 40,
         rounds: int = 4,
@@ -78,13 +81,14 @@ class SparseLaw(Method):
         super().__init__()
         radii = {"cohesion": cohesion, "friction": friction, "expansion": expansion}
         positive(young=young, **radii, stiffness_rate=stiffness_rate, shape_rate=shape_rate, yield_rate=yield_rate)
-        if not 0 < poisson < 0.5 or not 0 < threshold < 1:
-            raise UserError(f"model.method.poisson = {poisson} must lie between 0 and 0.5, threshold = {threshold} between 0 and 1")
+        for name, value, most in (("poisson", poisson, 0.5), ("threshold", threshold, 1.0)):
+            if not 0 < value < most:
+                raise UserError(f"model.method.{name} = {value}: it must lie between 0 and {most:g}")
         if interval < 1 or min(rounds, sparsity, plausibility_weight) < 0:
             raise UserError(
                 f"model.method: interval = {interval} must be 1 or more, rounds = {rounds} and sparsity = {sparsity} not negative"
             )
-        self.young, self.poisson, self.radii = young, poisson, tuple(radii.values())
+        self.young, self.poisson, self.yields, self.radii = young, poisson, yields, tuple(radii.values())
         self.threshold, self.interval, self.rounds, self.sparsity = threshold, interval, rounds, sparsity
         self.plausibility_weight = plausibility_weight
         self.rates = (stiffness_rate, shape_rate, yield_rate)
@@ -93,10 +97,11 @@ class SparseLaw(Method):
         mu, lam = (float(t) for t in lame(torch.tensor(self.young), torch.tensor(self.poisson)))
         shape = torch.zeros(4, 7)
         shape[0, 0], shape[1, 0] = 1.0, 2 * mu / (lam + 2 * mu / 3)
-        units = (STRAIN_SCALE, 1.0, STRAIN_SCALE)
+        yields = self.yields == "yes" or (self.yields == "auto" and scene.source.model["plasticity"]["law"] != "identity")
+        radii = [math.log10(radius / unit) for radius, unit in zip(self.radii, (STRAIN_SCALE, 1.0, STRAIN_SCALE))]
         self.level = nn.Parameter(torch.tensor(math.log10((lam + 2 * mu / 3) / STRESS_SCALE)))
         self.shape = nn.Parameter(shape)
-        self.surface = nn.Parameter(torch.tensor([math.log10(radius / unit) for radius, unit in zip(self.radii, units)]))
+        self.surface = nn.Parameter(torch.tensor(radii if yields else [NEVER, NOTHING, NEVER]))
         self.register_buffer("gain", (1 / (LINEAR * STRAIN)) ** torch.tensor(DEGREE))
         self.register_buffer("active", torch.ones(4, 7))
         self.register_buffer("runs", torch.zeros((), dtype=torch.int64))
@@ -167,6 +172,11 @@ class SparseLaw(Method):
         alive = (torch.ones_like(self.level), self.active, (self.surface.abs() < NEVER - 1).detach())
         ways = [(p - start.to(p)).mul(part).abs().sum() for p, start, part in zip(self.trainable().values(), self._start, alive)]
         return torch.stack(ways).sum()
+
+    def save(self, folder: Path) -> None:
+        with torch.no_grad():
+            self.shape.mul_(self.active)  # zeros say what was dropped
+        super().save(folder)
 
     def load(self, folder: Path) -> None:
         super().load(folder)

@@ -6,7 +6,6 @@ Unlike there a spring acts on both its ends, so that momentum is kept; there eac
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -42,23 +41,19 @@ def connect(x: Tensor, neighbours: int) -> Springs:
     Raises:
         UserError: Fewer than two masses, or no neighbour asked for.
     """
-    from scipy.spatial import cKDTree
-
     if len(x) < 2 or neighbours < 1:
         raise UserError(f"{len(x)} masses with {neighbours} neighbours each: springs need two masses and one neighbour at least")
-    points = x.detach().double().cpu().numpy()
-    k = min(neighbours, len(points) - 1)
-    index = cKDTree(points).query(points, k=k + 1)[1].reshape(len(points), k + 1)
-    own = np.arange(len(points))[:, None]
-    ends = np.stack(np.broadcast_arrays(own, index), -1).reshape(-1, 2)
-    rank = np.broadcast_to(np.arange(k + 1), index.shape).reshape(-1)
-    ends, rank = ends[ends[:, 0] != ends[:, 1]], rank[ends[:, 0] != ends[:, 1]]
-    pairs, which = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
-    least = np.full(len(pairs), k)
-    np.minimum.at(least, which.reshape(-1), np.maximum(rank - 1, 0))
-    length = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1)
+    points, k = x.detach().double(), min(neighbours, len(x) - 1)
+    near = torch.cat([torch.cdist(part, points).topk(k + 1, largest=False).indices for part in points.split(2048)])
+    own = torch.arange(len(x), device=x.device)[:, None].expand_as(near)
+    ends = torch.stack([own, near], -1).flatten(0, 1)
+    rank = torch.arange(-1, k, device=x.device).clamp(min=0).expand_as(near).flatten()
+    other = ends[:, 0] != ends[:, 1]
+    pairs, which = ends[other].sort(1).values.unique(dim=0, return_inverse=True)
+    least = torch.full((len(pairs),), k, device=x.device).scatter_reduce(0, which, rank[other], "amin")
+    length = (points[pairs[:, 1]] - points[pairs[:, 0]]).norm(dim=1)
     apart = length > 1e-6 * length.mean()  # two masses in one place are joined by nothing
-    return Springs(*(torch.as_tensor(part[apart]).to(x.device) for part in (pairs, length, least)))
+    return Springs(pairs[apart], length[apart], least[apart])
 
 
 class MassSpring:
