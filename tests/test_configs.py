@@ -3,6 +3,7 @@
 import inspect
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 import yaml
@@ -71,10 +72,8 @@ def test_command_line_accepts(path, capsys):
 SWEEPS = [path for path in CONFIGS if "parameters" in content(path)]
 
 
-def commands_of(path) -> list[list[str]]:
-    """Every `neuido ...` of the first run of a sweep, as a shell would split it."""
-    file = read_sweep(path)
-    run = runs_of(file)[-1]
+def commands_of(file, run) -> list[list[str]]:
+    """Every `neuido ...` of a run of a sweep, as a shell would split it."""
     words = sweep_command(file, run, {})
     if words[1] != "sh":
         return [words[2:]]
@@ -85,12 +84,19 @@ def commands_of(path) -> list[list[str]]:
     return [shlex.split(line)[1:] for line in script.splitlines() if line.strip().startswith("neuido ")]
 
 
-@pytest.mark.parametrize("path", SWEEPS, ids=lambda p: p.stem)
-def test_command_line_accepts_the_runs_of_a_sweep(path, capsys, monkeypatch):
+def runs_to_try(path) -> list:
+    """The last run of a sweep; all of one over whole configurations."""
+    runs = runs_of(read_sweep(path))
+    return runs if "config" in runs[0].parameters else runs[-1:]
+
+
+@pytest.mark.parametrize(
+    ("path", "run"), [(path, run) for path in SWEEPS for run in runs_to_try(path)], ids=lambda v: getattr(v, "stem", None)
+)
+def test_command_line_accepts_the_runs_of_a_sweep(path, run, capsys, monkeypatch):
     monkeypatch.chdir(ROOT.parent)  # from where the file says that it is run
-    commands = commands_of(path)
+    commands = commands_of(read_sweep(path), run)
     assert commands
-    values = [value for value in runs_of(read_sweep(path))[-1].parameters.values() if not isinstance(value, list)]
     printed = ""
     for words in commands:
         with pytest.raises(SystemExit) as stop:
@@ -98,8 +104,14 @@ def test_command_line_accepts_the_runs_of_a_sweep(path, capsys, monkeypatch):
         out, err = capsys.readouterr()
         assert stop.value.code == 0, err
         printed += out
-    for value in values:
-        assert re.search(rf"[:\-] {re.escape(str(value))}$", printed, flags=re.MULTILINE), value
+    for name, value in run.parameters.items():
+        if name != "config" and not isinstance(value, list):
+            assert re.search(rf"[.:\- ]{re.escape(str(value))}$", printed, flags=re.MULTILINE), value
+
+
+def test_the_first_table_has_every_method():
+    table = {Path(run.parameters["config"]) for run in runs_of(read_sweep(ROOT / "experiments" / "table1.yaml"))}
+    assert table == {Path("configs/adapt.yaml"), *(Path("configs/baselines", path.name) for path in (ROOT / "baselines").glob("*.yaml"))}
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.paper.csv")), ids=lambda p: p.name)
