@@ -84,7 +84,7 @@ class Line(NamedTuple):
 
 
 def lines_of(name: str, entries: Sequence[Entry], quoted: Sequence[dict[str, Any]]) -> list[Line]:
-    """The lines of a measure: a run each, and one more for each of a run's own rivals (`cd_random`, `psnr_before`); floor; paper."""
+    """The lines of a measure: a run each, and one more for each of a run's own rivals (`cd_random`); floor; paper."""
     out = []
     for entry in entries:
         known = set(MEASURES)
@@ -156,7 +156,7 @@ def _costs(entries: list[Entry]) -> list[str]:
 
 def _last_logged(entries: list[Entry]) -> list[str]:
     """Of runs of sweeps: parameters, and the last value of what they logged."""
-    runs = [e for e in entries if e.parameters and e.stage != "before"]
+    runs = [e for e in entries if e.parameters and e.last]
     parameters = dict.fromkeys(p for e in runs for p in e.parameters)
     last = [{name: points[-1][1] for name, points in curves(e.root).items()} for e in runs]
     names = [n for n in dict.fromkeys(n for own in last for n in own) if not n.startswith("train/") and n.count("/") == 1]
@@ -173,7 +173,7 @@ def _quoted(rows: list[dict[str, Any]]) -> list[str]:
 
 def _spread(entries: list[Entry]) -> list[str]:
     """Over runs that differ in their seeds alone: least, greatest, mean and deviation of the Chamfer distance."""
-    seeds = [e for e in entries if e.stage != "before" and e.parameters and e.rows and all("seed" in name for name in e.parameters)]
+    seeds = [e for e in entries if e.last and e.parameters and e.rows and all("seed" in name for name in e.parameters)]
     if len(seeds) < 2:
         return []
     rows = []
@@ -224,7 +224,7 @@ def _logged(entries: list[Entry]) -> list[str]:
     """What the runs logged, a panel a quantity; those that are averages over scenes or families."""
     found: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for entry in entries:
-        for name, points in curves(entry.root).items() if entry.stage != "before" else ():
+        for name, points in curves(entry.root).items() if entry.last else ():
             if name.count("/") <= 1 and len(points) > 1:
                 found.setdefault(name, {})[entry.label] = points
     order = sorted(found, key=lambda name: (not name.startswith("train/"), not name.startswith("val/")))[:MOST_PANELS]

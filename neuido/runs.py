@@ -25,6 +25,8 @@ class Entry(NamedTuple):
     """Of a run of a sweep."""
     stage: str = ""
     """`before` or `after` fitting, or a later `test`, where the scores say so."""
+    last: bool = True
+    """Whether it is the last stage of its run."""
 
     def of(self, scene: str) -> dict[str, Any]:
         """The row of a scene; empty where there is none."""
@@ -40,9 +42,9 @@ class Entry(NamedTuple):
         return read_rows(path) if self.scores is not None and path.is_file() else []
 
     def videos(self, scene: str) -> list[Path]:
-        """The videos of a scene; those of a fit are of what came out of it."""
+        """The videos of a scene: of what came out of a run."""
         folder = self.folder(scene)
-        return sorted(folder.glob("*.mp4")) if folder and folder.is_dir() and self.stage != "before" else []
+        return sorted(folder.glob("*.mp4")) if folder and folder.is_dir() and self.last else []
 
 
 def open_runs(given: Sequence[str]) -> list[Entry]:
@@ -77,11 +79,10 @@ def _entries(folder: Path, label: str, parameters: dict[str, Any]) -> list[Entry
     for place, rows in found.items():
         name = own if len(found) == 1 else f"{own}, {place.relative_to(folder)}"
         stages = list(dict.fromkeys(str(row.get("stage", "")) for row in rows))
-        if all(row.get("steps") == 0 for row in rows if row.get("stage") == "after"):  # nothing was fitted: both are the same
-            stages = [stage for stage in stages if stage != "before"]
         for stage in stages:
             part = [row for row in rows if str(row.get("stage", "")) == stage]
-            out.append(Entry(f"{name}, {stage}" if len(stages) > 1 else name, folder, place, part, parameters, stage))
+            told = f"{name}, {stage}" if len(stages) > 1 else name
+            out.append(Entry(told, folder, place, part, parameters, stage, stage == stages[-1]))
     return out
 
 

@@ -167,15 +167,22 @@ def logged(folder: Path) -> dict[str, float]:
 
 
 def scored(folder: Path) -> dict[str, float]:
-    """Means over the scenes of each score below a folder, as `scores/...`; of a fit those after it, or of a later test."""
+    """Means over the scenes of each score below a folder, as `scores/...`; of a fit those after it, or of a later test.
+
+    `scores/failed` counts the scenes whose law could not run; their means are over the others.
+    """
     from neuido.runs import tables
 
     values: dict[str, float] = {}
     for rows in tables(folder).values():
-        last = [row for row in rows if row.get("stage") == "test"] or [row for row in rows if row.get("stage") != "before"]
+        stages = {row.get("stage") for row in rows}
+        stage = next((each for each in ("test", "after", "before") if each in stages), None)  # nothing fitted: there is but one
+        last = [row for row in rows if row.get("stage") == stage]
         for name in dict.fromkeys(name for row in last for name in row):
             own = [row[name] for row in last if isinstance(row.get(name), float)]
             values |= {f"scores/{name}": sum(own) / len(own)} if own else {}
+        if failed := sum("failed" in row for row in last):
+            values["scores/failed"] = float(failed)
     return values
 
 

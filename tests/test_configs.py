@@ -81,6 +81,7 @@ def commands_of(file, run) -> list[list[str]]:
     script = re.sub(r"\\\n", " ", words[3]).replace('"$@"', shlex.join(own)).replace("$run", "nowhere")
     data = re.search(r'^data="(.*)"$', script, flags=re.MULTILINE)
     script = script.replace("$data", data[1] if data else "").replace(" $lpips", "")
+    script = re.sub(r"\$\{fits:\+(.*?)\}", r"\1", script)
     return [shlex.split(line)[1:] for line in script.splitlines() if line.strip().startswith("neuido ")]
 
 

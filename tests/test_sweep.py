@@ -14,8 +14,9 @@ import yaml
 
 import neuido
 from neuido.cli import main
+from neuido.data.tables import write_rows
 from neuido.errors import UserError
-from neuido.sweep import own_folder, redirect, sweep
+from neuido.sweep import own_folder, redirect, scored, sweep
 from neuido.sweep_file import command_of, read_sweep, runs_of
 
 ROOT = Path(neuido.__file__).parents[1]
@@ -187,6 +188,19 @@ def test_stopping_early_is_said_to_be_left_out(plan, tmp_path, capsys):
     assert sweep(plan, out=str(tmp_path / "out")) == 0
     assert "early_terminate" in capsys.readouterr().err
     assert len(table(tmp_path / "out")) == 3
+
+
+def test_scores_are_means_of_the_last_stage(tmp_path):
+    rows = [("Ball", "before", 9.0), ("Ball", "after", 3.0), ("Cat", "after", 5.0)]
+    write_rows(tmp_path / "results" / "scores.csv", [{"scene": "Ball", "stage": "before", "cd": 9.0}])
+    assert scored(tmp_path) == {"scores/cd": 9.0}  # of a method that learns nothing
+    write_rows(tmp_path / "results" / "scores.csv", [{"scene": s, "stage": stage, "cd": cd} for s, stage, cd in rows])
+    assert scored(tmp_path) == {"scores/cd": 4.0}
+    write_rows(
+        tmp_path / "results" / "test.csv",
+        [{"scene": "Ball", "stage": "test", "cd": 7.0}, {"scene": "Cat", "stage": "test", "failed": "NaN"}],
+    )
+    assert scored(tmp_path) == {"scores/cd": 7.0, "scores/failed": 1.0}
 
 
 def test_shards_share_the_runs(plan, tmp_path):
