@@ -61,8 +61,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, digits: int = 4
 
 def picture(path: Path) -> str:
     """A PNG file."""
-    data = base64.b64encode(path.read_bytes()).decode()
-    return f'<p><img alt="{escaped(path.stem)}" src="data:image/png;base64,{data}"></p>'
+    return png(path.read_bytes(), path.stem)
+
+
+def png(data: bytes, name: str) -> str:
+    """A picture from the bytes of a PNG file."""
+    return f'<p><img alt="{escaped(name)}" src="data:image/png;base64,{base64.b64encode(data).decode()}"></p>'
 
 
 def video(path: Path, caption: str, *, width: int = 520) -> str | None:

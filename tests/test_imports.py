@@ -43,7 +43,7 @@ ROOMS = {  # room: the parts of neuido that it may import, itself included
     "neuido.physics": (*GROUND, "neuido.physics"),
     "neuido.data": (*GROUND, "neuido.physics", "neuido.data"),
     "neuido.models": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.metrics", "neuido.losses"),
-    "neuido.discrepancy": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.discrepancy"),
+    "neuido.discrepancy": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.discrepancy", "neuido.page"),
     "neuido.losses": GROUND,
     "neuido.metrics": (*GROUND, "neuido.physics", "neuido.losses"),
 }
