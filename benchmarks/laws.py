@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 
-from neuido.data.generate import PUBLISHED, laws
+from neuido.data.families import PUBLISHED, laws
 from neuido.data.scenes import load_scene, scene_names
 from neuido.errors import UserError
 from neuido.models.baselines import nclaw

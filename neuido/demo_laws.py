@@ -79,7 +79,7 @@ def demo_laws(out: str = "runs/demo", *, settings: str = "quickstart") -> LawsRe
 def _compare(operator: "IntrinsicDynamicsOperator", name: str, family: str, parameters: dict[str, float]) -> Comparison:
     import torch
 
-    from neuido.data.generate import laws
+    from neuido.data.families import laws
     from neuido.data.shapes import ball
     from neuido.physics.mpm import Simulator
     from neuido.types import Scene, Walls

@@ -47,7 +47,7 @@ class VideoResult(NamedTuple):
 
 
 def demo_video(
-    out: str = "runs/demo/video", *, epochs: int = 8, init_from: str | None = "pretrained", adaptation_steps: int = 25
+    out: str = "runs/demo/video", *, epochs: int = 8, init_from: str | None = "pretrained-small", adaptation_steps: int = 25
 ) -> VideoResult:
     """Film three small bodies, train Stage II on two of them, read the law of the third from its video in one pass, and adapt it.
 

@@ -82,14 +82,14 @@ def reconstruct(
 
     import torch
 
-    from neuido.data.generate import _device
     from neuido.data.storage import write
     from neuido.data.visual import RECONSTRUCTION, load_views, read_truth, write_setting
+    from neuido.physics.device import choose_device
     from neuido.types import Gaussians
 
     source = Path(folder).expanduser()
     target = Path(out).expanduser() if out is not None else source / RECONSTRUCTION
-    chosen = _device(device)
+    chosen = choose_device(device)
     around = _setting(source, setting, recording, scale, shift, up)
     batch = load_views(source, placing=around.placing, recording=recording, frame_count=1, width=width)
     if (trained := int((~batch.held_out).sum())) < 2:

@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "neuido"
 MODULES = sorted(path.relative_to(PACKAGE.parent).with_suffix("").as_posix().replace("/", ".") for path in PACKAGE.rglob("*.py"))
 
-ROOT = ("neuido.__version__", "neuido.configs_root")
+ROOT = ("neuido", "neuido.__version__", "neuido.configs_root")
 GROUND = ("neuido.types", "neuido.errors")
 NETS = tuple(
     f"neuido.models.{name}"
@@ -41,6 +41,7 @@ ROOMS = {  # room: the parts of neuido that it may import, itself included
     "neuido.physics": (*GROUND, "neuido.physics"),
     "neuido.data": (*GROUND, "neuido.physics", "neuido.data"),
     "neuido.models": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.metrics", "neuido.losses"),
+    "neuido.discrepancy": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.discrepancy"),
     "neuido.losses": GROUND,
     "neuido.metrics": (*GROUND, "neuido.physics", "neuido.losses"),
 }

@@ -16,13 +16,12 @@ from torch import Tensor
 from neuido.data import scenes
 from neuido.data.formats import nerfstudio
 from neuido.data.formats.layout import MultiView, inside, number
-from neuido.data.measured import read_effects
+from neuido.data.measured import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
 from neuido.errors import UserError
 from neuido.physics.effects import LIBRARY
 from neuido.types import Body, Box, Plane, Scene, Walls
 
 FORMAT = "neuido-experiment/1"
-ROLES = ("fit", "held_out")
 OVERRIDES = ("gravity", "attached_masses", "colliders")
 NEEDED, OPTIONAL = ("x", "t", "x0", "v0", "volume"), ("F0", "track", "anchor")
 
@@ -100,35 +99,17 @@ def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None 
         UserError: An unknown or missing key, a missing file, a figure outside its physical range, a shape that does not fit, a box
             that picks no particle; one line that names the file and the key.
     """
-    given = Path(path).expanduser()
-    folder = given.parent if given.is_file() else given
-    file = folder / "experiment.yaml"
-    if not file.is_file():
-        raise UserError(f"{file} is missing: {folder} is no experiment's folder")
-    try:
-        content = scenes.read_yaml(file)
-    except (UnicodeDecodeError, RecursionError) as error:
-        raise UserError(f"{file} is not valid YAML: {error}") from error
-    try:
+    file, content = read_header(Path(path), "experiment.yaml", FORMAT)
+    folder = file.parent
+    with errors_of(file):
         scenes._keys(content, "the file", ("format", "name", "scene", "model", "discretisation", "recordings"))
-        if content["format"] != FORMAT:
-            raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
-        name = _text(content["name"], "name")
+        name = read_text(content["name"], "name")
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
-        believed, free = read_model_part(content["model"] if model is None else model, folder=folder)
-        entries = content["recordings"]
-        if not isinstance(entries, list) or not entries:
-            raise UserError(f"recordings must be a list of at least one recording, got {entries!r}")
-        recordings: list[Recording] = []
-        for i, entry in enumerate(entries):
-            recordings.append(_recording(entry, f"recordings[{i}]", content, folder))
-            if recordings[-1].name in [recording.name for recording in recordings[:-1]]:
-                raise UserError(f"recordings[{i}].name = {recordings[-1].name!r} is taken by another recording")
-    except UserError as error:
-        raise UserError(f"{file}: {error}") from error
-    except OverflowError as error:
-        raise UserError(f"{file}: a number is too large: {error}") from error
-    return Experiment(name, folder, scene, believed, free, tuple(recordings))
+        believed, free = read_belief(content["model"] if model is None else model, folder=folder)
+        recordings = read_entries(
+            content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, content, folder)
+        )
+    return Experiment(name, folder, scene, believed, free, recordings)
 
 
 def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
@@ -182,49 +163,52 @@ def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
     return out, {"grid": scene.cells, "dt": scene.dt}
 
 
-def read_model_part(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The key `model` of an experiment, checked, and its free parameters.
+def read_belief(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """`read_model` for a body, whose model may have a key `law`: a neural law in place of elasticity and plasticity.
 
     Args:
-        given: density, elasticity, plasticity, free, effects; and `law`, a neural law's file with a factor on its stress (`stiffness`),
-            which takes the place of elasticity and plasticity.
+        given: As `read_model` takes it, and `law`: a `file` and a factor on its stress, `stiffness`, which may be free.
         folder: What the law's file is relative to.
 
     Raises:
         UserError: An unknown key, an impossible material, an unknown effect.
     """
     given = scenes._mapping(given, "model")
-    law = given.pop("law", None)
+    if "law" not in given:
+        return read_model(given)
+    law = scenes._mapping(given.pop("law"), "model.law")
+    scenes._keys(law, "model.law", ("file", "stiffness"), ("stiffness",))
+    file = folder / Path(read_text(law["file"], "model.law.file")).expanduser()
+    stiffness = number(law.get("stiffness", 1.0), "model.law.stiffness", above=0.0)
+    free = given.get("free", [])
+    scaled = isinstance(free, list) and "stiffness" in free
+    if scaled:
+        given["free"] = [name for name in free if name != "stiffness"]
+    model, own = read_model(given)
+    return {**model, "law": {"file": str(file), "stiffness": stiffness}}, ("stiffness", *own) if scaled else own
+
+
+def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The key `model` of a file: what is believed, and which of its figures are free."""
+    given = scenes._mapping(given, "model")
     free = given.pop("free", [])
     effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY))
     for part in ("elasticity", "plasticity"):
         if isinstance(given.get(part), Mapping):
-            _text(given[part].get("law"), f"model.{part}.law")
+            read_text(given[part].get("law"), f"model.{part}.law")
     model = scenes.model_from_dict(given)
-    if law is not None:
-        law = scenes._mapping(law, "model.law")
-        scenes._keys(law, "model.law", ("file", "stiffness"), ("stiffness",))
-        file = Path(_text(law["file"], "model.law.file")).expanduser()
-        model["law"] = {"file": str(folder / file), "stiffness": number(law.get("stiffness", 1.0), "model.law.stiffness", above=0.0)}
-    known = ["density", *(key for part in ("elasticity", "plasticity", "law") for key in model.get(part, {}) if key not in ("law", "file"))]
-    if not isinstance(free, list):
-        raise UserError(f"model.free must be a list of parameters, got {free!r}")
-    for key in free:
-        if key not in known:
-            raise UserError(f"model.free has {key!r}, which the model lacks; one of {', '.join(known)}")
-    if len(set(free)) < len(free):
-        raise UserError(f"model.free names a parameter twice: {free}")
+    known = ["density", *(key for part in ("elasticity", "plasticity") for key in model[part] if key != "law")]
+    free = read_free(free, tuple(known))
     if effects:
         model["effects"] = effects
-    return model, tuple(free)
+    return model, free
 
 
 def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path) -> Recording:
     scenes._keys(entry, where, ("name", "role", "frame_interval", "noise", *OVERRIDES), ("noise", *OVERRIDES))
-    name = _text(entry["name"], f"{where}.name")
+    name = read_text(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
-    if entry["role"] not in ROLES:
-        raise UserError(f"{where}.role = {entry['role']!r} is not known; one of {', '.join(ROLES)}")
+    role = read_role(entry["role"], where)
     interval = number(entry["frame_interval"], f"{where}.frame_interval", above=0.0)
     noise = number(entry["noise"], f"{where}.noise", least=0.0) if entry.get("noise") is not None else None
     merged = dict(content["scene"]) | {key: entry[key] for key in OVERRIDES if key in entry}
@@ -246,7 +230,7 @@ def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path)
     gaussians = own / "gaussians.ply"
     return Recording(
         name=name,
-        role=entry["role"],
+        role=role,
         scene=scene,
         frame_interval=interval,
         noise=noise,
@@ -352,9 +336,3 @@ def _write_files(recording: Recording, folder: Path) -> None:
         shutil.copyfile(source / "transforms.json", folder / "transforms.json")
     if recording.gaussians is not None:
         shutil.copyfile(recording.gaussians, folder / "gaussians.ply")
-
-
-def _text(given: Any, where: str) -> str:
-    if not isinstance(given, str) or not given.strip():
-        raise UserError(f"{where} must be text, got {given!r}")
-    return given

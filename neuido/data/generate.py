@@ -16,28 +16,16 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from neuido.data.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.shapes import cube
-from neuido.data.storage import COLUMNS, FORMAT, complete, publish, write
+from neuido.data.storage import COLUMNS, FORMAT, claim, complete, publish, write
 from neuido.errors import UserError
-from neuido.physics.laws import DruckerPrager, ElasticLaw, FixedCorotated, Identity, PlasticLaw, Sigma, VonMises
+from neuido.physics.device import choose_device
+from neuido.physics.law import ElasticLaw, PlasticLaw
 from neuido.physics.mpm import Simulator
-from neuido.types import Body, Particles, ParticleState, Scene, Vector, Walls
+from neuido.types import Body, ParticleState, Scene, Vector, Walls
 
 SEGMENT = 100  # substeps held in memory at a time
-
-PARAMETERS = {
-    "elastic": ("young", "poisson"),
-    "plasticine": ("young", "poisson", "yield_stress"),
-    "sand": ("young", "poisson", "friction_angle"),
-}
-LOGARITHMIC = ("young", "yield_stress")
-LIMITS = {"young": (0.0, math.inf), "poisson": (-1.0, 0.5), "yield_stress": (0.0, math.inf), "friction_angle": (0.0, 90.0)}
-PUBLISHED = {
-    "elastic": ("jelly", {"young": 1e5, "poisson": 0.2}),
-    "plasticine": ("plasticine", {"young": 3e5, "poisson": 0.25, "yield_stress": 5e3}),
-    "sand": ("sand", {"young": 1e6, "poisson": 0.2, "friction_angle": 25.0}),
-}
-"""NCLaw's published materials (its experiments/configs/env/blob), instance 0 of each family."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +60,7 @@ class Setup:
         if not self.families:
             raise UserError(f"families is empty: name at least one of {', '.join(PARAMETERS)}")
         for family, ranges in self.families.items():
-            _check_ranges(family, ranges)
+            check_ranges(family, ranges)
 
     @property
     def scene(self) -> Scene:
@@ -107,15 +95,6 @@ def plan(setup: Setup) -> list[Instance]:
     return made
 
 
-def laws(family: str, parameters: list[dict[str, float]]) -> tuple[ElasticLaw, PlasticLaw]:
-    """The laws of several instances of one family as one batched pair (S = len(parameters))."""
-    columns = {name: torch.tensor([p[name] for p in parameters], dtype=torch.float64) for name in PARAMETERS[family]}
-    stiffness = {name: columns[name] for name in ("young", "poisson")}
-    if family == "elastic":
-        return FixedCorotated(**stiffness), Identity()
-    return Sigma(**stiffness), VonMises(**columns) if family == "plasticine" else DruckerPrager(**columns)
-
-
 def generate(
     setup: Setup, out: str | os.PathLike, *, shard: int = 0, shards: int = 1, device: str = "auto", batch: int = 0, progress: bool = True
 ) -> None:
@@ -129,10 +108,12 @@ def generate(
         raise UserError(f"shard must lie in 0..{shards - 1} (shards = {shards}), got {shard}")
     if batch < 0:
         raise UserError(f"batch must be 0 (automatic) or positive, got {batch}")
-    chosen = _device(device)
+    chosen = choose_device(device)
     everything = plan(setup)
     _check_steps(setup, everything)
-    folder = _claim(Path(out), setup, everything)
+    folder = Path(out)
+    content = {"format": FORMAT, "setup": asdict(setup), "trajectories": [asdict(instance) for instance in everything]}
+    claim(folder, _json(content), "trajectories of another set-up", compared="setup")
     files = {instance.name: folder / f"{instance.name}.npy" for instance in everything}
 
     mine = [instance for i, instance in enumerate(everything) if i % shards == shard]
@@ -210,83 +191,17 @@ def _samples(setup: Setup, F: Tensor, C: Tensor, elastic: ElasticLaw, plastic: P
     """
     last = torch.arange(setup.record_every, len(F), setup.record_every, device=F.device)
     trial = (F[last - 1].double() + setup.dt * C[last].double() @ F[last - 1].double()).float()
-    corrected = _evaluate(plastic, trial)
-    stress = _evaluate(elastic, corrected)
+    corrected = evaluate(plastic, trial)
+    stress = evaluate(elastic, corrected)
     return torch.cat([part.flatten(-2) for part in (trial, corrected, stress)], dim=-1)
-
-
-def _evaluate(law: ElasticLaw | PlasticLaw, F: Tensor) -> Tensor:
-    """A law of float32 F (..., 3, 3) computed in float64, in float32."""
-    if isinstance(law, Identity):
-        return F
-    flat = F.reshape(-1, 3, 3).double()
-    everywhere = Particles(torch.zeros(len(flat), dtype=torch.int32, device=F.device), (0, len(flat)))
-    out = torch.empty_like(flat)
-    law.forward(law.tensors(), flat, out, everywhere)
-    return out.float().reshape(F.shape)
 
 
 def _instance(setup: Setup, family: str, number: int, split: str) -> Instance:
     if number == 0:
         name, parameters = PUBLISHED[family]
         return Instance(name, family, dict(parameters), split)
-    generator = np.random.default_rng([setup.seed, list(PARAMETERS).index(family), number])
-    drawn = {}
-    for name in PARAMETERS[family]:
-        low, high = setup.families[family][name]
-        u = generator.random()
-        drawn[name] = float(low * (high / low) ** u) if name in LOGARITHMIC else float(low + (high - low) * u)
-    return Instance(f"{family}-{number:03d}", family, drawn, split)
-
-
-def _check_ranges(family: str, ranges: dict[str, tuple[float, float]]) -> None:
-    if family not in PARAMETERS:
-        raise UserError(f"unknown family {family!r} in families: choose from {', '.join(PARAMETERS)}")
-    if set(ranges) != set(PARAMETERS[family]):
-        raise UserError(f"families.{family} must give {', '.join(PARAMETERS[family])}, got {', '.join(ranges) or 'nothing'}")
-    for name, bounds in ranges.items():
-        low, high = bounds
-        if low > high:
-            raise UserError(f"families.{family}.{name} runs backwards: [{low}, {high}]; put the smaller figure first")
-        floor, ceiling = LIMITS[name]
-        if not (floor < low and high < ceiling):
-            bounds = f"strictly between {floor:g} and {ceiling:g}"
-            raise UserError(f"families.{family}.{name} = [{low}, {high}] is impossible: it must lie {bounds}")
-
-
-def _device(name: str) -> torch.device:
-    if name not in ("auto", "cpu", "cuda"):
-        raise UserError(f"device must be auto, cpu or cuda, got {name!r}")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise UserError("device cuda was asked for and there is none here: use device auto or cpu")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-def _claim(folder: Path, setup: Setup, everything: list[Instance]) -> Path:
-    """Make the folder and its plan, or check that its plan is this one."""
-    text = _json({"format": FORMAT, "setup": asdict(setup), "trajectories": [asdict(instance) for instance in everything]})
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise UserError(f"out = {folder} cannot be a folder: {error.filename} is a file") from error
-    except PermissionError as error:
-        raise UserError(f"out = {folder} cannot be made: permission denied for {error.filename}") from error
-    path = folder / "plan.json"
-    if not path.exists():
-        write(path, text)
-    elif path.read_text() != text:
-        raise UserError(f"{folder} holds trajectories of another set-up{_difference(path, setup)}: give another out, or remove the folder")
-    return folder
-
-
-def _difference(path: Path, setup: Setup) -> str:
-    try:
-        old = json.loads(path.read_text())["setup"]
-    except (ValueError, KeyError):
-        return ""
-    new = json.loads(_json(asdict(setup)))
-    changed = [f"{key} {old.get(key)} there, {value} here" for key, value in new.items() if old.get(key) != value]
-    return f" ({'; '.join(changed)})" if changed else ""
+    random = np.random.default_rng([setup.seed, list(PARAMETERS).index(family), number])
+    return Instance(f"{family}-{number:03d}", family, draw_parameters(family, setup.families[family], random), split)
 
 
 def _write_index(folder: Path, setup: Setup, everything: list[Instance]) -> None:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from neuido.data import scenes
-from neuido.data.experiments import _model, _text
+from neuido.data.experiments import read_model
 from neuido.data.formats.layout import number
-from neuido.data.measured import read_columns, read_effects, read_header, read_role, rising
+from neuido.data.measured import errors_of, read_columns, read_effects, read_entries, read_header, read_role, read_text, rising
 from neuido.errors import UserError
 from neuido.types import Vector
 
@@ -113,38 +113,27 @@ def read_material_tests(path: str | os.PathLike, *, model: Mapping[str, Any] | N
     """
     file, content = read_header(Path(path), "test.yaml", FORMAT)
     folder = file.parent
-    try:
+    with errors_of(file):
         scenes._keys(content, "the file", ("format", "name", "model", "tests"))
-        name = _text(content["name"], "name")
+        name = read_text(content["name"], "name")
         given = scenes._mapping(content["model"] if model is None else model, "model")
         incompressible = given.pop("incompressible", False)
         if not isinstance(incompressible, bool):
             raise UserError(f"model.incompressible must be true or false, got {incompressible!r}")
         effects = read_effects(given.pop("effects", None), "model.effects", known=EFFECTS)
-        believed, free = _model(given)
-        entries = content["tests"]
-        if not isinstance(entries, list) or not entries:
-            raise UserError(f"tests must be a list of at least one test, got {entries!r}")
-        tests: list[MaterialTest] = []
-        for i, entry in enumerate(entries):
-            tests.append(_test(entry, f"tests[{i}]", folder))
-            if tests[-1].name in [test.name for test in tests[:-1]]:
-                raise UserError(f"tests[{i}].name = {tests[-1].name!r} is taken by another test")
+        believed, free = read_model(given)
+        tests = read_entries(content["tests"], "tests", "test", lambda entry, where: _test(entry, where, folder))
         if not any(test.role == "fit" for test in tests):
             raise UserError("tests has none whose role is fit")
         if incompressible and believed["plasticity"]["law"] == "drucker_prager":
             raise UserError("model.incompressible: drucker_prager depends on the pressure, which an incompressible law does not know")
-    except UserError as error:
-        raise UserError(f"{file}: {error}") from error
-    except OverflowError as error:
-        raise UserError(f"{file}: a number is too large: {error}") from error
-    return MaterialTests(name, folder, believed, free, incompressible, effects, tuple(tests))
+    return MaterialTests(name, folder, believed, free, incompressible, effects, tests)
 
 
 def _test(entry: Any, where: str, folder: Path) -> MaterialTest:
     optional = ("scale", "rows", "direction")
     scenes._keys(entry, where, ("name", "file", "mode", "columns", "role", *optional), optional)
-    name = _text(entry["name"], f"{where}.name")
+    name = read_text(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     if not isinstance(entry["mode"], str) or entry["mode"] not in MODES:
         raise UserError(f"{where}.mode = {entry['mode']!r} is not known; one of {', '.join(MODES)}")

@@ -1,9 +1,10 @@
-"""What the readers of measured tables share: columns of a CSV file, effects that a model declares, roles. The files are not trusted."""
+"""What the readers of measured data share: columns of a CSV file, effects that a model declares, roles. The files are not trusted."""
 
+import contextlib
 import csv
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from neuido.data.formats.layout import inside, number
 from neuido.errors import UserError
 from neuido.physics.effects import LIBRARY, Effects
 
+Entry = TypeVar("Entry")
 ROLES = ("fit", "held_out")
 WAVES = ["frequency", *(f"{part}{a}" for part in "sc" for a in "xyz")]
 """Parameters of a harmonic `time_force`, s sin(2 pi f t) + c cos(2 pi f t) [m/s^2], beside its knots."""
@@ -34,6 +36,39 @@ def read_header(folder: Path, name: str, form: str) -> tuple[Path, dict[str, Any
     if content.get("format") != form:
         raise UserError(f"{file}: format is {content.get('format')!r}, not {form!r}")
     return file, content
+
+
+@contextlib.contextmanager
+def errors_of(file: Path) -> Iterator[None]:
+    """Say of what is wrong with its content which file it stands in."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from error
+    except OverflowError as error:
+        raise UserError(f"{file}: a number is too large: {error}") from error
+
+
+def read_entries(given: Any, key: str, what: str, read: Callable[[Any, str], Entry]) -> tuple[Entry, ...]:
+    """The entries of a list that is not empty, each of another name.
+
+    Args:
+        given: The list.
+        key: What it is called in an error.
+        what: What an entry is.
+        read: Of an entry and what it is called; its result has a `name`.
+
+    Raises:
+        UserError: No such list, or a name that comes twice.
+    """
+    if not isinstance(given, list) or not given:
+        raise UserError(f"{key} must be a list of at least one {what}, got {given!r}")
+    entries: list[Entry] = []
+    for i, entry in enumerate(given):
+        entries.append(read(entry, f"{key}[{i}]"))
+        if entries[-1].name in [other.name for other in entries[:-1]]:  # type: ignore[attr-defined]
+            raise UserError(f"{key}[{i}].name = {entries[-1].name!r} is taken by another {what}")  # type: ignore[attr-defined]
+    return tuple(entries)
 
 
 def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: Mapping[str, float]) -> tuple[dict[str, np.ndarray], range]:
@@ -127,6 +162,13 @@ def read_free(given: Any, known: tuple[str, ...], where: str = "model.free") -> 
     if len(set(given)) < len(given):
         raise UserError(f"{where} names a figure twice: {given}")
     return tuple(given)
+
+
+def read_text(given: Any, where: str) -> str:
+    """Text that is not blank."""
+    if not isinstance(given, str) or not given.strip():
+        raise UserError(f"{where} must be text, got {given!r}")
+    return given
 
 
 def read_role(given: Any, where: str) -> str:

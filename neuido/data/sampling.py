@@ -5,8 +5,8 @@ of a trajectory serves all trajectories of an epoch, each from an offset of its 
 and no memory for each trajectory. It is a function of (seed, epoch, step) alone.
 """
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from neuido.errors import UserError
 from neuido.types import TrajectoryBatch
+
+T = TypeVar("T")
 
 
 class Step(NamedTuple):
@@ -57,11 +59,57 @@ class Order:
         return self._shuffled[(self._offsets + positions) % len(self.rows)]
 
 
-class Steps:
-    """The training loader: the steps of an epoch, from where a resumed run stopped.
+class Resumable(Generic[T]):
+    """A training loader whose epochs go on where a resumed run stopped.
 
     Lightning calls `sampler.set_epoch` before the first batch of an epoch and stores `state_dict` in its checkpoints. The state
     counts the batches that were handed out, so workers that read ahead do not disturb it.
+
+    Args:
+        identity: What must be the same when a run is resumed.
+    """
+
+    def __init__(self, identity: dict[str, int]) -> None:
+        self.identity = identity
+        self.epoch = 0
+        self._next = 0
+        self._resume: tuple[int, int] | None = None
+
+    def batches(self, epoch: int, start: int) -> Iterable[T]:
+        """The batches of an epoch from number `start` on."""
+        raise NotImplementedError
+
+    @property
+    def sampler(self) -> "Resumable":
+        """Where Lightning looks for `set_epoch`."""
+        return self
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __iter__(self) -> Iterator[T]:
+        # A generator: Lightning makes the iterator before it sets the epoch, and nothing here runs before the first batch.
+        epoch, start = self.epoch, 0
+        if self._resume is not None and self._resume[0] == epoch:
+            start = self._resume[1]
+        self._resume = None
+        self._next = start
+        for batch in self.batches(epoch, start):
+            self._next += 1
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:
+        return {"epoch": self.epoch, "step": self._next, **self.identity}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        changed = [f"{key} {state.get(key)} then, {value} now" for key, value in self.identity.items() if state.get(key) != value]
+        if changed:
+            raise UserError(f"the checkpoint was written with other data options ({'; '.join(changed)}): restore them to resume")
+        self._resume = (state["epoch"], state["step"])
+
+
+class Steps(Resumable[Step | TrajectoryBatch]):
+    """The steps of an epoch.
 
     Args:
         order: The order of the samples.
@@ -74,54 +122,16 @@ class Steps:
     def __init__(
         self, order: Order, gather: Callable[[int, int], TrajectoryBatch] | None, *, workers: int = 0, rank: int = 0, ranks: int = 1
     ) -> None:
+        count = {"trajectories": order.trajectory_count, "samples": order.samples, "rows": len(order.rows)}
+        super().__init__({"seed": order.seed, **count, "ranks": ranks})
         self.order, self.gather, self.workers, self.rank, self.ranks = order, gather, workers, rank, ranks
-        self.epoch = 0
-        self._next = 0
-        self._resume: tuple[int, int] | None = None
-
-    @property
-    def sampler(self) -> "Steps":
-        """Where Lightning looks for `set_epoch`."""
-        return self
-
-    def set_epoch(self, epoch: int) -> None:
-        self.epoch = epoch
 
     def __len__(self) -> int:
         return len(self.order) // self.ranks
 
-    def __iter__(self) -> Iterator[Step | TrajectoryBatch]:
-        # A generator: Lightning makes the iterator before it sets the epoch, and nothing here runs before the first batch.
-        epoch, start = self.epoch, 0
-        if self._resume is not None and self._resume[0] == epoch:
-            start = self._resume[1]
-        self._resume = None
-        self._next = start
+    def batches(self, epoch: int, start: int) -> Iterable[Step | TrajectoryBatch]:
         steps = [Step(epoch, k * self.ranks + self.rank) for k in range(start, len(self))]
-        loader = steps if self.gather is None else DataLoader(_Gathered(self.gather, steps), batch_size=None, num_workers=self.workers)
-        for batch in loader:
-            self._next += 1
-            yield batch
-
-    def state_dict(self) -> dict[str, int]:
-        return {"epoch": self.epoch, "step": self._next, **self._identity}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        changed = [f"{key} {state.get(key)} then, {value} now" for key, value in self._identity.items() if state.get(key) != value]
-        if changed:
-            raise UserError(f"the checkpoint was written with other data options ({'; '.join(changed)}): restore them to resume")
-        self._resume = (state["epoch"], state["step"])
-
-    @property
-    def _identity(self) -> dict[str, int]:
-        order = self.order
-        return {
-            "seed": order.seed,
-            "trajectories": order.trajectory_count,
-            "samples": order.samples,
-            "rows": len(order.rows),
-            "ranks": self.ranks,
-        }
+        return steps if self.gather is None else DataLoader(_Gathered(self.gather, steps), batch_size=None, num_workers=self.workers)
 
 
 class _Gathered(Dataset):

@@ -5,6 +5,7 @@ trajectory's statistics). A trajectory is (T, P, 27) float32: for each recorded 
 the corrected one and the Kirchhoff stress [Pa], nine numbers each. A file appears under its name only when it is whole.
 """
 
+import json
 import os
 import uuid
 from functools import cached_property
@@ -15,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.errors import UserError
 from neuido.types import TrajectoryBatch
 
 FORMAT = "neuido-trajectories/1"
@@ -37,6 +39,41 @@ def write(path: Path, text: str) -> None:
     hidden = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     hidden.write_text(text)
     publish(hidden, path)
+
+
+def claim(folder: Path, text: str, held: str, *, compared: str | None = None) -> None:
+    """Make a folder with `plan.json`, or check that its plan is this one.
+
+    Args:
+        folder: Where several runs, one after the other or at once, make the same files.
+        text: The plan, JSON.
+        held: What the folder of another plan is said to hold.
+        compared: Key of the plan whose entries the error compares.
+
+    Raises:
+        UserError: The folder cannot be made, or has another plan.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise UserError(f"out = {folder} cannot be a folder: {error.filename} is a file") from error
+    except OSError as error:
+        raise UserError(f"out = {folder} cannot be made: {str(error.strerror).lower()} for {error.filename}") from error
+    path = folder / "plan.json"
+    if not path.exists():
+        write(path, text)
+    elif path.read_text() != text:
+        changed = "" if compared is None else _difference(path, text, compared)
+        raise UserError(f"{folder} holds {held}{changed}: give another out, or remove the folder")
+
+
+def _difference(path: Path, text: str, key: str) -> str:
+    try:
+        old: dict[str, Any] = json.loads(path.read_text())[key]
+    except (ValueError, KeyError):
+        return ""
+    changed = [f"{name} {old.get(name)} there, {value} here" for name, value in json.loads(text)[key].items() if old.get(name) != value]
+    return f" ({'; '.join(changed)})" if changed else ""
 
 
 def publish(hidden: Path, path: Path) -> None:

@@ -26,12 +26,12 @@ from neuido.data import cameras as convert
 from neuido.data import scenes
 from neuido.data.experiments import Experiment, Recording, read_experiment, write_experiment
 from neuido.data.formats import nerfstudio
-from neuido.data.generate import _device
 from neuido.data.shapes import rigid_velocity
 from neuido.data.simulate import Film
-from neuido.data.storage import publish_folder, write
+from neuido.data.storage import claim, publish_folder, write
 from neuido.data.visual import Motion, write_motion
 from neuido.errors import UserError
+from neuido.physics.device import choose_device
 from neuido.physics.laws import material
 from neuido.physics.mpm import Simulator
 from neuido.types import Body, Cameras, ParticleState, Scene
@@ -167,13 +167,13 @@ def make_scenes(
         UserError: What `plan_scene` and the simulator refuse, or a folder that holds other scenes.
     """
     _check(film)
-    chosen = _device(device)
+    chosen = choose_device(device)
     plans = [plan_scene(entry, film, data_root=data_root) for entry in entries]
     if not plans or len({plan.name for plan in plans}) < len(plans):
         raise UserError("scenes must name at least one scene, and each once")
     folder = Path(out).expanduser()
     text = json.dumps({"format": FORMAT, "film": asdict(film), "scenes": entries}, indent=1, default=list) + "\n"
-    _claim(folder, text)
+    claim(folder, text, "other scenes, or the same filmed otherwise")
     paths = [folder / plan.name for plan in plans]
     missing = [(plan, path) for plan, path in zip(plans, paths) if not (path / "experiment.yaml").is_file()]
     images = film.views * film.frames
@@ -357,16 +357,3 @@ def _check(film: Film) -> None:
         raise UserError(f"film.held_out = {list(film.held_out)} must name some of the views 0..{film.views - 1}, not all")
     if not 0 <= film.compression <= 9:
         raise UserError(f"film.compression must lie in 0..9, got {film.compression}")
-
-
-def _claim(folder: Path, text: str) -> None:
-    """Make the folder and its plan, or check that its plan is this one."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise UserError(f"out = {folder} cannot be a folder: {error.filename} is a file") from error
-    path = folder / "plan.json"
-    if not path.exists():
-        write(path, text)
-    elif path.read_text() != text:
-        raise UserError(f"{folder} holds other scenes, or the same filmed otherwise: give another out, or remove the folder")

@@ -9,9 +9,18 @@ from typing import Any
 import numpy as np
 
 from neuido.data import scenes
-from neuido.data.experiments import _text
 from neuido.data.formats.layout import number
-from neuido.data.measured import read_columns, read_effects, read_free, read_header, read_role, rising
+from neuido.data.measured import (
+    errors_of,
+    read_columns,
+    read_effects,
+    read_entries,
+    read_free,
+    read_header,
+    read_role,
+    read_text,
+    rising,
+)
 from neuido.errors import UserError
 from neuido.types import Vector
 
@@ -76,31 +85,22 @@ def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = No
             one line that names the file and the key.
     """
     file, content = read_header(Path(path), "track.yaml", FORMAT)
-    try:
+    with errors_of(file):
         scenes._keys(content, "the file", ("format", "name", "model", "nuisances", "bodies", "recordings"), ("nuisances",))
-        name = _text(content["name"], "name")
+        name = read_text(content["name"], "name")
         gravity, effects, free = _model(content["model"] if model is None else model)
         nuisances = dict.fromkeys(NUISANCES, 0.0)
         given = scenes._mapping(content.get("nuisances") or {}, "nuisances")
         scenes._keys(given, "nuisances", NUISANCES, NUISANCES)
         nuisances |= {key: number(value, f"nuisances.{key}", least=0.0) for key, value in given.items()}
         bodies = _bodies(content["bodies"])
-        entries = content["recordings"]
-        if not isinstance(entries, list) or not entries:
-            raise UserError(f"recordings must be a list of at least one recording, got {entries!r}")
-        recordings: list[Track] = []
-        for i, entry in enumerate(entries):
-            recordings.append(_recording(entry, f"recordings[{i}]", bodies, file.parent))
-            if recordings[-1].name in [recording.name for recording in recordings[:-1]]:
-                raise UserError(f"recordings[{i}].name = {recordings[-1].name!r} is taken by another recording")
+        recordings = read_entries(
+            content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, bodies, file.parent)
+        )
         for body in bodies:
             if not any(track.body == body and track.role == "fit" for track in recordings):
                 raise UserError(f"recordings has none of the body {body!r} whose role is fit")
-    except UserError as error:
-        raise UserError(f"{file}: {error}") from error
-    except OverflowError as error:
-        raise UserError(f"{file}: a number is too large: {error}") from error
-    return Tracks(name, file.parent, gravity, effects, free, nuisances, bodies, tuple(recordings))
+    return Tracks(name, file.parent, gravity, effects, free, nuisances, bodies, recordings)
 
 
 def _model(given: Any) -> tuple[Vector, dict[str, float], tuple[str, ...]]:
@@ -116,7 +116,7 @@ def _bodies(given: Any) -> dict[str, dict[str, float]]:
         raise UserError("bodies names no body")
     out = {}
     for name, figures in bodies.items():
-        _text(name, "the name of a body")
+        read_text(name, "the name of a body")
         figures = scenes._mapping(figures or {}, f"bodies.{name}")
         scenes._keys(figures, f"bodies.{name}", FIGURES, FIGURES)
         out[name] = {key: number(value, f"bodies.{name}.{key}", above=0.0) for key, value in figures.items()}
@@ -126,7 +126,7 @@ def _bodies(given: Any) -> dict[str, dict[str, float]]:
 def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) -> Track:
     optional = ("rows", "spin", "noise")
     scenes._keys(entry, where, ("name", "body", "file", "columns", "role", *optional), optional)
-    name = _text(entry["name"], f"{where}.name")
+    name = read_text(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     if not isinstance(entry["body"], str) or entry["body"] not in bodies:
         raise UserError(f"{where}.body = {entry['body']!r} is not known; one of {', '.join(bodies)}")

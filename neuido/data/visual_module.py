@@ -1,7 +1,7 @@
 """Filmed and reconstructed bodies as data for Stage II, scoring and prediction: a batch is one scene."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
+from neuido.data.sampling import Resumable
 from neuido.data.scenes import VARIABLE, data_root
 from neuido.data.visual import VisualScene, load_visual
 from neuido.data.visual_known import load_known
@@ -40,10 +41,8 @@ def _only(samples: list[VisualScene]) -> VisualScene:
     return samples[0]
 
 
-class Turns:
-    """Scenes one after the other, in an order that is a function of seed and epoch alone, from where a resumed run stopped.
-
-    Lightning calls `sampler.set_epoch` before the first batch of an epoch and stores `state_dict` in its checkpoints.
+class Turns(Resumable[VisualScene]):
+    """Scenes one after the other, in an order that is a function of seed and epoch alone.
 
     Args:
         scenes: The scenes.
@@ -53,62 +52,30 @@ class Turns:
     """
 
     def __init__(self, scenes: Sequence[VisualScene], *, seed: int = 0, rank: int = 0, ranks: int = 1) -> None:
+        super().__init__({"scenes": len(scenes), "ranks": ranks})
         self.scenes, self.seed, self.rank, self.ranks = list(scenes), seed, rank, ranks
-        self.epoch = 0
-        self._next = 0
-        self._resume: tuple[int, int] | None = None
-
-    @property
-    def sampler(self) -> "Turns":
-        """Where Lightning looks for `set_epoch`."""
-        return self
-
-    def set_epoch(self, epoch: int) -> None:
-        self.epoch = epoch
 
     def __len__(self) -> int:
         return -(-len(self.scenes) // self.ranks)
 
-    def __iter__(self) -> Iterator[VisualScene]:
-        # a generator: Lightning makes the iterator before it sets the epoch, and nothing here runs before the first batch
-        epoch, start = self.epoch, 0
-        if self._resume is not None and self._resume[0] == epoch:
-            start = self._resume[1]
-        self._resume = None
-        self._next = start
-        order = self._order(epoch)
-        for k in range(start, len(order)):
-            self._next = k + 1
-            yield self.scenes[order[k]]
-
-    def _order(self, epoch: int) -> list[int]:
-        """Which scenes this process gets in an epoch."""
+    def batches(self, epoch: int, start: int) -> Iterable[VisualScene]:
         count = len(self.scenes)
         order = np.random.default_rng([self.seed, epoch]).permutation(count).tolist()
-        return [order[(k * self.ranks + self.rank) % count] for k in range(len(self))]
-
-    def state_dict(self) -> dict[str, int]:
-        return {"epoch": self.epoch, "step": self._next, "scenes": len(self.scenes), "ranks": self.ranks}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        for name, now in (("scenes", len(self.scenes)), ("ranks", self.ranks)):
-            if state.get(name) != now:
-                raise UserError(f"the checkpoint was written with {state.get(name)} {name}, now there are {now}: restore them to resume")
-        self._resume = (state["epoch"], state["step"])
+        return (self.scenes[order[(k * self.ranks + self.rank) % count]] for k in range(start, len(self)))
 
 
-class OneByOne(Turns):
+class OneByOne(Resumable[VisualScene]):
     """Each scene for so many steps: an epoch is one scene, in the order given."""
 
     def __init__(self, scenes: Sequence[VisualScene], *, steps: int) -> None:
-        super().__init__(scenes)
-        self.steps = steps
+        super().__init__({"scenes": len(scenes), "steps": steps})
+        self.scenes, self.steps = list(scenes), steps
 
     def __len__(self) -> int:
         return self.steps
 
-    def _order(self, epoch: int) -> list[int]:
-        return [epoch] * self.steps if epoch < len(self.scenes) else []
+    def batches(self, epoch: int, start: int) -> Iterable[VisualScene]:
+        return [self.scenes[epoch]] * (self.steps - start) if epoch < len(self.scenes) else []
 
 
 class VisualDataModule(LightningDataModule):
@@ -174,7 +141,7 @@ class VisualDataModule(LightningDataModule):
             if bool(scene.batch.held_out.all()):
                 raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} are held out")
 
-    def train_dataloader(self) -> Turns:
+    def train_dataloader(self) -> Turns | OneByOne:
         if self.steps_in_a_row is not None:
             return OneByOne(self.scenes, steps=self.steps_in_a_row)
         return Turns(self.scenes, seed=self.seed, **self._share())

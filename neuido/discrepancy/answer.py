@@ -16,7 +16,7 @@ import neuido
 from neuido.data.storage import write as write_text
 from neuido.discrepancy import ceiling, next_experiment, report, residual
 from neuido.discrepancy.attribution import Diagnosis
-from neuido.discrepancy.declared import beside
+from neuido.discrepancy.believed import beside
 from neuido.discrepancy.problem import Problem
 from neuido.discrepancy.rounds import ALPHA, Round, Trial
 

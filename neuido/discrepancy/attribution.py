@@ -1,13 +1,15 @@
 """From a residual to a name: grow the model by one effect at a time, drop what became needless, and say how sure the answer is."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.fit import Fit, levenberg_marquardt
+from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
+from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import ALPHA, LEAST_GAIN, Inference, Round, Start, Tell, Trial
 
@@ -35,7 +37,13 @@ class Diagnosis:
     intervals: dict[str, tuple[float, float]]
     declared_intervals: dict[str, tuple[float, float]]
     setting: int
-    evaluations: int
+    work: Mapping[str, Work]
+    """What each step ran."""
+
+    @property
+    def evaluations(self) -> int:
+        """Simulations in all."""
+        return sum(w.simulations for w in self.work.values())
 
     @property
     def effects(self) -> list[Trial]:
@@ -53,10 +61,11 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         most: Effects that may be added.
         tell: Called with a line of progress.
     """
+    memo = Memo(problem)
     tried: list[Inference] = []
     starts: list[Start] = []
     for n in problem.solvers:
-        inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell)
+        inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo)
         if starts and (tried[-1].is_noise(starts[-1].errors) or not inference.runs(starts[0].fit.point)):
             continue
         tried.append(inference)
@@ -90,7 +99,6 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         floor = inference.floor(base.point)
         rounds.append(inference.round(base, floor, found))
     base, found = drop(inference, base, floor, found)
-    inference.evaluations = sum(i.evaluations for i in tried)
     return conclude(inference, start.fit.point, base, found, rounds, floor)
 
 
@@ -104,7 +112,7 @@ def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> t
         rest = [t for t in found if t is not trial]
         extra = tuple(p for t in rest for p in t.candidate.parameters)
         start = {k: v for k, v in base.point.items() if k.split(".")[0] != trial.candidate.name}
-        (fit,) = inference.fits([levenberg_marquardt((*inference.problem.declared, *extra), start)], floor)
+        (fit,) = inference.fits([inference.request((*inference.problem.declared, *extra), start)], floor)
         without, with_it = inference.mean_squares([fit.point, base.point], floor)
         if evidence.gain(without, with_it, inference.fitted) < LEAST_GAIN / 2:
             base, found = fit, rest
@@ -150,7 +158,7 @@ def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial],
     if found:
         classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
         answer = "class" if max(classes) > 1 else "effect"
-    elif float(np.exp(np.mean(np.log(over)))) > UNEXPLAINED:
+    elif float(np.exp(np.mean(np.log(np.maximum(over, 1e-150))))) > UNEXPLAINED:
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"
@@ -176,7 +184,7 @@ def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial],
         after,
         declared,
         inference.setting,
-        inference.evaluations,
+        inference.memo.work,
     )
 
 

@@ -4,7 +4,10 @@ Points that follow a particle are compared with that particle; points with an an
 moving least-squares map of the nearest particles that reproduces every affine motion exactly.
 """
 
+import functools
+import threading
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,25 +17,22 @@ from torch import Tensor
 
 from neuido.data.experiments import Experiment
 from neuido.data.experiments import Recording as Measured
-from neuido.discrepancy.declared import CLASSICAL, classical, laws_of
-from neuido.discrepancy.library import KNOTS, active_effects, body_candidates, effects_of, present
+from neuido.discrepancy.believed import CLASSICAL, classical, laws_of
+from neuido.discrepancy.declared import declared
+from neuido.discrepancy.library import body_candidates, effects_of, present
 from neuido.discrepancy.problem import Parameter, Point, Problem, Recording
 from neuido.errors import UserError
+from neuido.physics import effect_kernels, law_kernels
+from neuido.physics.device import real_of
+from neuido.physics.effect_library import KNOTS
 from neuido.physics.finite_elements import FiniteElements
+from neuido.physics.meshing import follow
 from neuido.physics.mpm import Simulator
-from neuido.types import Body, ParticleState, Scene
+from neuido.physics.threads import _one_thread_each, pool
+from neuido.types import ParticleState
 
-LOG_STEPS = {"young": 0.1, "density": 0.05, "yield_stress": 0.1, "stiffness": 0.1}
-RANGES = {
-    "stiffness": (1e-3, 1e3),
-    "young": (1e2, 1e13),
-    "poisson": (0.0, 0.495),
-    "density": (1.0, 3e4),
-    "yield_stress": (1e-2, 1e12),
-    "friction_angle": (1.0, 80.0),
-}
-UNITS = {"stiffness": "1", "young": "Pa", "poisson": "1", "density": "kg/m^3", "yield_stress": "Pa", "friction_angle": "degrees"}
-STEPS = {"poisson": 0.03, "friction_angle": 2.0}
+POISSON = 0.0, 0.495
+"""What the simulators take: waves grow without bound towards 0.5."""
 
 NUISANCES = (  # name, unit, prior standard deviation; of the frame interval, of one, of the speed
     ("release_time", "s", 0.1),
@@ -49,6 +49,8 @@ INSTRUMENTS = ("release_time", "time_base", "length_scale")
 NEIGHBOURS = 12
 SEGMENT = 2000
 """Substeps that are launched as one piece where launches are captured or a tape is kept."""
+KEPT = 24
+"""Simulators that are kept: of each recording, setting, and number of parameter sets or thread."""
 WINDOWS = 6
 """In time, of the patterns of an unknown discretisation error."""
 
@@ -76,13 +78,14 @@ class BodyProblem(Problem):
     measured: tuple[Measured, ...] = ()
     device: str = "cpu"
     batch: int = 0
-    """Parameter sets in a launch; 0: as the device likes."""
+    """Parameter sets in a launch on a GPU; 0: 96. On the CPU each runs alone, as many at a time as there are cores."""
     instruments: tuple[str, ...] = INSTRUMENTS
     """Nuisances that change what is seen of a motion, and not the motion."""
     tracked: bool = True
     """Whether the data are positions of points."""
     _simulators: dict[Any, Simulator] = field(default_factory=dict, repr=False)
     _maps: dict[int, Any] = field(default_factory=dict, repr=False)
+    _lock: Any = field(default_factory=threading.RLock, repr=False)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         # instruments alone need no further run: points that move alike share one
@@ -93,21 +96,24 @@ class BodyProblem(Problem):
             key = tuple(sorted((k, v) for k, v in point.items() if k not in instruments and (":" not in k or k.endswith(f":{name}"))))
             unique.setdefault(key, []).append(i)
         groups = list(unique.values())
-        # on the CPU a launch pays for the effects of all its points: those of a kind go together
-        cpu = self.device == "cpu"
-        size = self.batch or (4 if cpu else 96)
-        kinds = [active_effects(points[g[0]]) for g in groups]
-        order = sorted(range(len(groups)), key=lambda i: sorted(kinds[i]) if cpu else i)
         out = np.empty((len(points), len(self.recordings[recording].y)))
-        at = 0
-        while at < len(order):
-            end = at + 1
-            while end < min(at + size, len(order)) and (not cpu or kinds[order[end]] == kinds[order[at]]):
-                end += 1
-            own = [groups[i] for i in order[at:end]]
-            self._predict(points, own, recording, setting, out)
-            at = end
+        if self.device == "cpu":
+            with _one_thread_each():
+                list(_workers().map(lambda own: self._predict(points, [own], recording, setting, out), groups))
+            return out
+        size = self.batch or 96
+        for at in range(0, len(groups), size):
+            self._predict(points, groups[at : at + size], recording, setting, out)
         return out
+
+    @property
+    def together(self) -> bool:
+        return self.device != "cpu"
+
+    def effort(self, recording: int, setting: int = 0) -> float:
+        """Particle-substeps; inner steps of the finite elements count as one."""
+        r = self.measured[recording]
+        return float(len(r.body.x) * _frames(r, r.scene.dt * SETTINGS[setting].dt)[1])
 
     def error(self, residual: np.ndarray, recording: int) -> float:
         return float(np.sqrt(3.0 * np.mean(residual**2)))
@@ -182,8 +188,8 @@ class BodyProblem(Problem):
         centre = x[0].mean(axis=0)
         return centre + (1.0 + value["length_scale"]) * (x + (value["release_time"] + value["time_base"] * t) * v - centre)
 
-    def _move(self, points: Sequence[Point], recording: int, setting: int) -> list[ParticleState]:
-        """The frames of the recording under each point, (T, P, ...) each."""
+    def _move(self, points: Sequence[Point], recording: int, setting: int) -> ParticleState:
+        """The frames of the recording under each point, (T, S, P, ...)."""
         r = self.measured[recording]
         wanted = len(points)
         if self.device != "cpu":  # few sizes: each has buffers of its own
@@ -210,35 +216,34 @@ class BodyProblem(Problem):
                 segment=_segment(steps, every),
                 effects=effects,
             )
-        count = len(r.body.x)
-        own = [ParticleState(*(t[:, s * count : (s + 1) * count] for t in out)) for s in range(wanted)]
-        return own if exact else [_at_times(frames, every * scene.dt, r.t.to(out.x)) for frames in own]
+        frames = ParticleState(*(t.unflatten(1, (len(points), len(r.body.x)))[:, :wanted] for t in out))
+        return frames if exact else _at_times(frames, every * scene.dt, r.t.to(out.x))
 
     def _roll(self, points: Sequence[Point], recording: int, setting: int) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities of the tracked points, (S, T, N, 3) each."""
+        frames = self._move(points, recording, setting)
         index, weight = self._map(recording)
-        moved = self._move(points, recording, setting)
-        x, v = (torch.stack([_gather(getattr(frames, key), index, weight) for frames in moved]) for key in "xv")
-        return x.double().cpu().numpy(), v.double().cpu().numpy()
+        x, v = (_gather(t, index, weight) for t in (frames.x, frames.v))
+        return tuple(t.transpose(0, 1).double().cpu().numpy() for t in (x, v))
 
     def laws(self, points: Sequence[Mapping[str, float]]):
         """The declared laws of several points, a row each."""
         return laws_of(self.experiment.model, points)
 
     def simulator(self, recording: int, setting: int, count: int) -> Simulator:
-        """`count` copies of a recording's scene, kept for the next call."""
-        key = (recording, setting, count)
-        if key not in self._simulators:
-            r, s = self.measured[recording], SETTINGS[setting]
-            scene = replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)
-            if len(self._simulators) > 12:  # they hold buffers
-                self._simulators.pop(next(iter(self._simulators)))
-            options = {"density": self.experiment.model["density"], "device": self.device}
-            if s.solver == "finite_elements":
-                self._simulators[key] = FiniteElements([scene] * count, [r.body] * count, **options)
-            else:
-                self._simulators[key] = Simulator([scene] * count, [r.body] * count, **options)
-        return self._simulators[key]
+        """`count` copies of a recording's scene, kept for the next call of this thread: they hold buffers."""
+        key = (recording, setting, count, threading.get_ident())
+        with self._lock:
+            found = self._simulators.pop(key, None)
+            if found is None:
+                r, s = self.measured[recording], SETTINGS[setting]
+                scene = replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)
+                kind = FiniteElements if s.solver == "finite_elements" else Simulator
+                found = kind([scene] * count, [r.body] * count, density=self.experiment.model["density"], device=self.device)
+                while len(self._simulators) >= KEPT:
+                    self._simulators.pop(next(iter(self._simulators)))
+            self._simulators[key] = found  # the last one used is the last one to go
+        return found
 
     def _start(self, simulator: Simulator, points: Sequence[Point], recording: int) -> ParticleState:
         """The start with the velocities and spins of each point."""
@@ -274,8 +279,8 @@ class BodyProblem(Problem):
         straight, turned = float((x - y).abs().max()), float((x @ R.T - y).abs().max())
         return R if turned < 0.01 * size and turned < 0.5 * straight else eye
 
-    def _map(self, recording: int) -> tuple[Tensor, Tensor]:
-        """Particles (N, k) and weights (N, k) of each tracked point."""
+    def _map(self, recording: int) -> tuple[Tensor, Tensor | None]:
+        """Particles (N, k) and weights (N, k) of each tracked point; particles (N,) alone where each point is one."""
         if recording not in self._maps:
             r = self.measured[recording]
             x = r.body.x.double()
@@ -283,11 +288,13 @@ class BodyProblem(Problem):
                 places, known = r.anchor.double(), torch.full((len(r.anchor),), -1)
             else:
                 places, known = _first_seen(r), r.track
-            index, weight = _follow(x, places)
+            index, weight = follow(x, places, near=NEIGHBOURS, falloff=2.0)
             for n in torch.nonzero(known >= 0)[:, 0].tolist():
                 index[n], weight[n] = known[n], 0.0
                 weight[n, 0] = 1.0
-            self._maps[recording] = (index.to(self.device), weight.float().to(self.device))
+            alone = bool((weight[:, 1:] == 0).all())
+            weight = None if alone else weight.float().to(self.device)
+            self._maps[recording] = ((index[:, 0] if alone else index).to(self.device), weight)
         return self._maps[recording]
 
 
@@ -305,11 +312,10 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
             raise UserError(f"recording {r.name} has {len(r.t)} frames; a diagnosis needs at least 4")
     if not any(r.role == "fit" for r in measured):
         raise UserError("no recording has the role fit: set it on at least one in experiment.yaml")
-    declared = []
+    free = []
     for name in experiment.free:
         value = next(part[name] for part in _parts(experiment.model) if name in part)
-        log = name in LOG_STEPS
-        declared.append(Parameter(name, UNITS[name], float(value), LOG_STEPS.get(name, STEPS.get(name, 1.0)), *RANGES[name], log=log))
+        free.append(declared(name, value, within=POISSON if name == "poisson" else None))
     nuisances = []
     for r in measured:
         speed, spin = _typical(r)
@@ -325,7 +331,7 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
         name=experiment.name,
         measure="rmse",
         unit="m",
-        declared=tuple(declared),
+        declared=tuple(free),
         nuisances=tuple(nuisances),
         candidates=present(candidates, experiment.model.get("effects", {})),
         recordings=tuple(_recording(r) for r in measured),
@@ -337,6 +343,14 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
         device=device,
         batch=batch,
     )
+
+
+@functools.cache
+def _workers() -> ThreadPoolExecutor:
+    """Threads for single scenes; what they launch is built before, for two threads must not build the same kernels."""
+    for build in (effect_kernels.build, law_kernels.kernels):
+        build(real_of(torch.float32))
+    return pool()
 
 
 def _recording(r: Measured) -> Recording:
@@ -373,18 +387,16 @@ def _segment(steps: int, every: int) -> int:
     return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
 
 
-def _gather(x: Tensor, index: Tensor, weight: Tensor) -> Tensor:
-    """Weighted sums over particles, (K, P, 3) -> (K, N, 3)."""
-    if bool((weight[:, 1:] == 0).all()):
-        return x[:, index[:, 0]]
-    return torch.einsum("nk,tnkc->tnc", weight.to(x), x[:, index])
+def _gather(x: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
+    """Weighted sums over particles, (K, S, P, 3) -> (K, S, N, 3); no weights: the particles themselves."""
+    return x[:, :, index] if weight is None else torch.einsum("nk,tsnkc->tsnc", weight.to(x), x[:, :, index])
 
 
 def _at_times(frames: ParticleState, step: float, t: Tensor) -> ParticleState:
-    """Frames that are `step` apart at other times: cubic Hermite interpolation of x, linear of the rest."""
+    """Frames (K, S, P, ...) that are `step` apart at other times: cubic Hermite interpolation of x, linear of the rest."""
     x, v, C, F = frames
     k = (t / step).floor().long().clamp(max=len(x) - 2)
-    u = (t / step - k)[:, None, None]
+    u = (t / step - k)[:, None, None, None]
     x0, x1, v0, v1 = x[k], x[k + 1], v[k] * step, v[k + 1] * step
     place = (1 + 2 * u) * (1 - u) ** 2 * x0 + u * (1 - u) ** 2 * v0 + u**2 * (3 - 2 * u) * x1 + u**2 * (u - 1) * v1
     w = u[..., None]
@@ -405,19 +417,6 @@ def _first_seen(r: Measured) -> Tensor:
     return torch.where(place.isnan(), r.body.x.double().mean(dim=0), place)
 
 
-def _follow(x: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-    """Nearest particles (N, k) and weights (N, k) by moving least squares of degree one: affine motions are reproduced."""
-    k = min(NEIGHBOURS, len(x))
-    distance, index = torch.cdist(places, x).topk(k, largest=False)
-    arm = x[index] - places[:, None]
-    scale = distance[:, -1:, None].clamp(min=1e-12)
-    basis = torch.cat([torch.ones_like(arm[..., :1]), arm / scale], dim=-1)
-    kernel = torch.exp(-2.0 * (distance / scale[:, :, 0]) ** 2)
-    normal = torch.einsum("nk,nka,nkb->nab", kernel, basis, basis) + 1e-9 * torch.eye(4, dtype=x.dtype)
-    first = torch.linalg.solve(normal, torch.eye(4, dtype=x.dtype)[:, :1].expand(len(places), 4, 1))
-    return index, kernel * (basis @ first)[..., 0]
-
-
 def _parts(model: Mapping[str, Any]) -> list[Any]:
     """The parts of a model that hold figures."""
     return [model["elasticity"], model["plasticity"], model.get("law", {}), model]
@@ -427,6 +426,3 @@ def _place(model: dict[str, Any], name: str, value: float) -> None:
     for part in _parts(model):
         if name in part:
             part[name] = float(value)
-
-
-__all__ = ["Body", "BodyProblem", "Scene", "body_problem"]

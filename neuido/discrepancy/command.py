@@ -3,7 +3,7 @@
 import csv
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from neuido.data.experiments import Experiment
     from neuido.discrepancy.attribution import Diagnosis
     from neuido.discrepancy.body import BodyProblem
+    from neuido.discrepancy.memo import Work
     from neuido.discrepancy.problem import Problem
 
 DATA = ("auto", "points", "video")
@@ -92,6 +93,8 @@ def diagnose(
     log.name = ""
     answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
     store.clear(target)
+    for diagnosis, _ in found:
+        log.work(diagnosis.work)
     log.close(answer.summary(found))
 
 
@@ -123,9 +126,9 @@ def problems_of(
     """
     if data not in DATA:
         raise UserError(f"data = {data!r} is not known; use {', '.join(DATA)}")
-    from neuido.discrepancy.declared import read_model, with_law
+    from neuido.discrepancy.believed import read_model_file, with_law
 
-    given = None if model is None else read_model(model)
+    given = None if model is None else read_model_file(model)
     if kind == "experiment":
         from neuido.data.experiments import read_experiment
 
@@ -235,6 +238,14 @@ class Log:
             self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, stage, self.count])
             self.file.flush()
             self._show()
+
+    def work(self, steps: "Mapping[str, Work]") -> None:
+        """What each step of a diagnosis ran, the dearest first."""
+        for step, w in sorted(steps.items(), key=lambda item: -item[1].effort):
+            line = f"{step}: {w.simulations} simulations, {w.reused} reused, {w.effort:.3g} particle-substeps or data, {w.seconds:.1f} s"
+            self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, line, self.count])
+            if self.shown and self.terminal:
+                print(f"\r\x1b[K{line}", file=sys.stderr)
 
     def _show(self) -> None:
         self.last = time.monotonic()

@@ -1,6 +1,6 @@
 """What a diagnosis has found, for a law that is fitted to images: the effects of its `model_after.yaml` act on top of the law."""
 
-from neuido.discrepancy.declared import read_model, ready
+from neuido.discrepancy.believed import read_model_file, ready
 from neuido.models.pipeline import Prepared
 from neuido.models.scene_fit import EffectSource
 from neuido.physics.effects import Effects
@@ -18,7 +18,7 @@ class DiagnosedEffects(EffectSource):
     """
 
     def __init__(self, path: str):
-        self.model = read_model(path)
+        self.model = read_model_file(path)
         self._made: tuple[Simulator, Effects] | None = None
 
     def of(self, scene: Prepared) -> Effects:

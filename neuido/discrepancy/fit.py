@@ -5,12 +5,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Parameter, Point, Problem
 
 STEP = 0.02
 """Difference step, in typical steps of a parameter."""
 DAMPINGS = (0.1, 1.0, 10.0)
-"""Tried at once, as factors of the present damping."""
+"""Tried as factors of the present damping."""
+KEPT_PROMISE = 0.7
+"""Share of the gain that the linear model promises at which a step is taken without trying other dampings."""
+NOTHING = 2e-4
+"""Relative gain, as the linear model promises it, that is not worth a run."""
+BEHIND = 4.0
+"""A fit that would end above so many times the lowest cost of a race, at the pace of its last step, is given up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,69 +68,101 @@ class Fit:
 Request = Generator[list[Point], list[np.ndarray | None], Fit]
 
 
+class Race:
+    """Fits that are compared with each other; one that cannot catch up any more stops."""
+
+    def __init__(self, best: float = np.inf) -> None:
+        self.best = best
+
+    def lost(self, costs: Sequence[float], left: int) -> bool:
+        """Whether a fit with these costs, one an iteration, has lost with so many iterations left."""
+        self.best = min(self.best, costs[-1])
+        if len(costs) < 3:
+            return False
+        failed = costs[-1] == costs[-2]  # one step that fails says only that it was too bold
+        pace = (costs[-1] / max(costs[-3], 1e-300)) ** 0.5 if failed else costs[-1] / costs[-2]
+        return costs[-1] * pace**left > BEHIND * self.best
+
+
 def levenberg_marquardt(
-    parameters: Sequence[Parameter], start: Point, *, iterations: int = 12, tolerance: float = 2e-3, damping: float = 1e-2
+    parameters: Sequence[Parameter],
+    start: Point,
+    *,
+    iterations: int = 12,
+    tolerance: float = 2e-3,
+    damping: float = 1e-2,
+    together: bool = True,
+    race: Race | None = None,
 ) -> Request:
-    """One fit as a generator: it yields the points that it wants and receives their whitened residuals (None: not runnable)."""
+    """One fit as a generator: it yields the points that it wants and receives their whitened residuals (None: not runnable).
+
+    Args:
+        parameters: What moves.
+        start: Where, with the values of all that does not move.
+        iterations: At most.
+        tolerance: Relative gain of an iteration that ends the fit.
+        damping: Of the first step.
+        together: Ask for all dampings of a step at once, where a launch of several points costs as one; else for the boldest one first.
+        race: The fits that it is compared with.
+    """
     names = tuple(p.name for p in parameters)
     fixed = {k: v for k, v in start.items() if k not in names}
     q = np.array([p.coordinate(start.get(p.name, p.value)) for p in parameters])
     low = np.array([_bound(p, p.lower) for p in parameters])
     high = np.array([_bound(p, p.upper) for p in parameters])
+    count = 0
 
-    def point(q: np.ndarray) -> Point:
-        return fixed | {p.name: p.physical(v) for p, v in zip(parameters, q, strict=True)}
-
-    def with_priors(r: np.ndarray | None, q: np.ndarray) -> np.ndarray | None:
-        if r is None:
-            return None
-        priors = [(v - p.coordinate(p.value)) / p.prior for p, v in zip(parameters, q, strict=True) if p.prior is not None]
-        return np.concatenate([r, priors]) if priors else r
-
-    (r,) = yield [point(q)]
-    r = with_priors(r, q)
-    count = 1
-    if r is None or not len(names):
-        return Fit(
-            point(q), names, np.inf if r is None else float(r @ r), np.empty((0 if r is None else len(r), 0)), r, count, r is not None
-        )
-    cost = float(r @ r)
-    J, converged = None, False
-    for _ in range(iterations):
-        steps = np.where(q + STEP > high, -STEP, STEP)
-        asked = [q + np.eye(len(q))[i] * steps[i] for i in range(len(q))]
-        answers = yield [point(a) for a in asked]
+    def ask(asked: Sequence[np.ndarray]):
+        """Residuals at coordinates, priors included."""
+        nonlocal count
         count += len(asked)
-        columns = [with_priors(answer, a) for answer, a in zip(answers, asked, strict=True)]
+        answers = yield [fixed | {p.name: p.physical(v) for p, v in zip(parameters, a, strict=True)} for a in asked]
+        return [None if r is None else _with_priors(r, parameters, a) for r, a in zip(answers, asked, strict=True)]
+
+    (r,) = yield from ask([q])
+    cost = np.inf if r is None else float(r @ r)
+    J, converged, costs = np.empty((0 if r is None else len(r), 0)), r is not None, [cost]
+    for n in range(iterations if r is not None and names else 0):
+        converged = False
+        steps = np.where(q + STEP > high, -STEP, STEP)
+        columns = yield from ask([q + np.eye(len(q))[i] * steps[i] for i in range(len(q))])
         J = np.stack([np.zeros_like(r) if c is None else (c - r) / s for c, s in zip(columns, steps, strict=True)], axis=1)
         A, g = J.T @ J, J.T @ r
-        scale = np.maximum(np.diag(A), 1e-12 * max(A.diagonal().max(), 1e-300))
-        tried = []
-        for factor in DAMPINGS:
-            move = -np.linalg.lstsq(A + damping * factor * np.diag(scale), g, rcond=None)[0]
-            move *= min(1.0, 5.0 / max(np.abs(move).max(), 1e-30))  # at most five typical steps at once
-            tried.append(np.clip(q + move, low, high))
-        answers = yield [point(t) for t in tried]
-        count += len(tried)
-        found = [with_priors(answer, t) for answer, t in zip(answers, tried, strict=True)]
-        costs = [np.inf if f is None else float(f @ f) for f in found]
-        best = int(np.argmin(costs))
-        if costs[best] < cost:
-            gain, moved = (cost - costs[best]) / cost, np.abs(tried[best] - q).max()
-            q, r, cost = tried[best], found[best], costs[best]
+        tried = [np.clip(q + move, low, high) for move in _moves(A, g, damping)]
+        promise = [-float((t - q) @ (2 * g + A @ (t - q))) for t in tried]
+        if max(promise) < NOTHING * cost and np.abs(tried[0] - q).max() < 0.5:
+            converged = True
+            break
+        found = yield from ask(tried if together else tried[:1])
+        if not together and (found[0] is None or cost - float(found[0] @ found[0]) < KEPT_PROMISE * promise[0]):
+            found += yield from ask(tried[1:])
+        ends = [np.inf if f is None else float(f @ f) for f in found]
+        best = int(np.argmin(ends))
+        gain, moved = (cost - ends[best]) / cost if cost > 0 else 0.0, np.abs(tried[best] - q).max()
+        if ends[best] < cost:
+            q, r, cost = tried[best], found[best], ends[best]
             damping = max(damping * DAMPINGS[best], 1e-6)
-            if gain < tolerance and moved < 0.5:
-                converged = True
-                break
+            converged = gain < tolerance and moved < 0.5
         else:
-            if damping > 1e3:
-                converged = True
-                break
+            converged = damping > 1e3 or np.abs(tried[0] - q).max() < 1e-3
             damping *= 30.0
-            if np.abs(tried[0] - q).max() < 1e-3:
-                converged = True
-                break
-    return Fit(point(q), names, cost, J, r, count, converged)
+        costs.append(cost)
+        if converged or (race is not None and race.lost(costs, iterations - n - 1)):
+            break
+    point = fixed | {p.name: p.physical(v) for p, v in zip(parameters, q, strict=True)}
+    return Fit(point, names, cost, J, r, count, converged)
+
+
+def _moves(A: np.ndarray, g: np.ndarray, damping: float) -> list[np.ndarray]:
+    """Steps with each damping for the normal matrix A and the slope g; at most five typical steps at once."""
+    scale = np.maximum(np.diag(A), 1e-12 * max(A.diagonal().max(), 1e-300))
+    moves = [-np.linalg.lstsq(A + damping * factor * np.diag(scale), g, rcond=None)[0] for factor in DAMPINGS]
+    return [move * min(1.0, 5.0 / max(np.abs(move).max(), 1e-30)) for move in moves]
+
+
+def _with_priors(r: np.ndarray, parameters: Sequence[Parameter], q: np.ndarray) -> np.ndarray:
+    priors = [(v - p.coordinate(p.value)) / p.prior for p, v in zip(parameters, q, strict=True) if p.prior is not None]
+    return np.concatenate([r, priors]) if priors else r
 
 
 def _bound(p: Parameter, value: float) -> float:
@@ -131,7 +170,7 @@ def _bound(p: Parameter, value: float) -> float:
 
 
 def run(
-    problem: Problem,
+    problem: Problem | Memo,
     requests: Sequence[Request],
     whiten: Callable[[np.ndarray, int], np.ndarray],
     recordings: Sequence[int],
@@ -171,7 +210,11 @@ def run(
 
 
 def residuals(
-    problem: Problem, points: Sequence[Point], whiten: Callable[[np.ndarray, int], np.ndarray], recordings: Sequence[int], setting: int = 0
+    problem: Problem | Memo,
+    points: Sequence[Point],
+    whiten: Callable[[np.ndarray, int], np.ndarray],
+    recordings: Sequence[int],
+    setting: int = 0,
 ) -> list[np.ndarray | None]:
     """Whitened residuals of each point over the recordings, joined; None where one of them cannot run."""
     parts: list[list[np.ndarray]] = [[] for _ in points]

@@ -14,10 +14,9 @@ import torch
 
 from neuido.data.experiments import Experiment
 from neuido.discrepancy.problem import Candidate, Parameter
+from neuido.physics.effect_library import KNOTS
 from neuido.physics.effects import Effects
 
-KNOTS = 5
-"""Values in time of a force that varies with it."""
 REST = {"maxwell.time": 1.0, "stiffness_gradient.radius": 1e-6, "time_force.frequency": 0.0}
 """What parameters of shape take in a launch beside points that lack the effect."""
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from neuido.data.material_tests import MaterialTest, MaterialTests, read_material_tests
+from neuido.discrepancy.declared import declared
 from neuido.discrepancy.noise import high_pass, monotone_pieces
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem, Recording
 from neuido.errors import UserError
@@ -15,12 +16,6 @@ from neuido.physics.effects import LIBRARY, Effects
 from neuido.physics.laws import material
 from neuido.physics.material_point import Specimen, stress_along, turn
 
-DECLARED = {  # unit, typical step, range (a factor of the declared value where the fit moves the logarithm), logarithm
-    "young": ("Pa", 0.1, (1e-3, 1e3), True),
-    "poisson": ("1", 0.03, (-0.9, 0.4999), False),
-    "yield_stress": ("Pa", 0.1, (1e-3, 1e3), True),
-    "friction_angle": ("degrees", 2.0, (1.0, 80.0), False),
-}
 STAGES = {
     "strain_stiffening": "large strain",
     "second_invariant": "biaxiality",
@@ -50,14 +45,15 @@ class MaterialProblem(Problem):
 
     def __init__(self, folder: str | os.PathLike | MaterialTests) -> None:
         tests = folder if isinstance(folder, MaterialTests) else read_material_tests(folder)
-        declared = tuple(_declared(tests, name) for name in tests.free if name != "density")
+        law = tests.model["elasticity"] | tests.model["plasticity"]
+        free = tuple(declared(name, law[name]) for name in tests.free if name != "density")
         chains = tests.histories()
         noises = [_noise_in(tests, next(chain for chain in chains if i in chain), i) for i in range(len(tests.tests))]
         super().__init__(
             name=tests.name,
             measure="rmse",
             unit="Pa",
-            declared=declared,
+            declared=free,
             nuisances=(),
             candidates=material_candidates(tests),
             recordings=tuple(_recording(test, noise) for test, noise in zip(tests.tests, noises, strict=True)),
@@ -225,12 +221,6 @@ def _angles(tests: MaterialTests) -> list[str]:
     if (np.abs(d[:, 2]) < 1e-9).all():
         return ["elevation"]  # in the plane x, y
     return ["azimuth"] if (np.abs(d[:, 1]) < 1e-9).all() else ["azimuth", "elevation"]
-
-
-def _declared(tests: MaterialTests, name: str) -> Parameter:
-    value = next(float(part[name]) for part in (tests.model["elasticity"], tests.model["plasticity"]) if name in part)
-    unit, scale, (lower, upper), log = DECLARED[name]
-    return Parameter(name, unit, value, scale, lower * value if log else lower, upper * value if log else upper, log=log)
 
 
 def _recording(test: MaterialTest, noise: float | None) -> Recording:

@@ -111,6 +111,15 @@ class Problem:
         """The data that each point predicts, (len(points), n); a row of NaN where the model cannot run there."""
         raise NotImplementedError
 
+    def effort(self, recording: int, setting: int = 0) -> float:
+        """What one prediction costs, in a unit of the model's own (particle-substeps of a body); data where that says enough."""
+        return float(len(self.recordings[recording].y))
+
+    @property
+    def together(self) -> bool:
+        """Whether several points cost about as much as one, so that a fit asks for all that it may want at once."""
+        return True
+
     def directions(self, recording: int) -> np.ndarray:
         """Smooth patterns in which an unknown part of the discretisation error may lie, (n, k), of mean square one together."""
         return np.empty((len(self.recordings[recording].y), 0))

@@ -9,8 +9,8 @@ from tqdm import tqdm
 
 from neuido.data.experiments import read_experiment, write_experiment
 from neuido.data.storage import publish_folder
+from neuido.discrepancy.believed import beside, read_model_file
 from neuido.discrepancy.command import choose_device, experiment_problem
-from neuido.discrepancy.declared import beside, read_model
 from neuido.errors import UserError
 
 
@@ -32,7 +32,7 @@ def replay(folder: str, out: str | os.PathLike, *, model: str | None = None, dev
     target = Path(out).expanduser()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise UserError(f"out = {out} is there already: give another folder")
-    experiment = read_experiment(folder, model=None if model is None else read_model(model))
+    experiment = read_experiment(folder, model=None if model is None else read_model_file(model))
     problem = experiment_problem(experiment, "auto", choose_device(device))
     names = tqdm(range(len(problem.measured)), unit="recording", disable=not progress)
     recordings = tuple(problem.simulated(n) for n in names)

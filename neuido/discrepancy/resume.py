@@ -16,6 +16,8 @@ from neuido.discrepancy.problem import Point, Problem
 
 CHUNK = 32
 """Points in one stored call: what a kill can cost. It holds with and without a store, so that both compute the same."""
+HEAVY, LEAST = 2e8, 4
+"""Particle-substeps of one stored call, about a minute or two of a CPU, and the points that one has at the least."""
 LIMIT = 2_000_000_000
 """Bytes that a store may take; what comes after is computed again by a run that is resumed."""
 
@@ -52,8 +54,18 @@ class CachedProblem(Problem):
         return getattr(self.problem, name)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
-        parts = [self._part(points[i : i + CHUNK], recording, setting) for i in range(0, len(points), CHUNK)]
+        size = CHUNK
+        if not self.problem.together:  # each point runs alone: long ones are stored, and told of, in smaller calls
+            size = min(max(int(HEAVY / max(self.problem.effort(recording, setting), 1.0)), LEAST), CHUNK)
+        parts = [self._part(points[i : i + size], recording, setting) for i in range(0, len(points), size)]
         return np.concatenate(parts) if parts else self.problem.predict([], recording, setting)
+
+    def effort(self, recording: int, setting: int = 0) -> float:
+        return self.problem.effort(recording, setting)
+
+    @property
+    def together(self) -> bool:
+        return self.problem.together
 
     def directions(self, recording: int) -> np.ndarray:
         return self.problem.directions(recording)

@@ -7,14 +7,17 @@ recordings that were held out against a parametric bootstrap of the largest gain
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.fit import Fit, levenberg_marquardt, run
+from neuido.discrepancy.fit import Fit, Race, Request, levenberg_marquardt, run
 from neuido.discrepancy.floors import Floor, Part, over_time, split
+from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
+from neuido.discrepancy.trials import Round, Start, Trial, unphysical
 
 ALPHA = 0.05
 """Family-wise level of a named effect."""
@@ -30,53 +33,14 @@ GAIN_IN_FLOOR = math.log(4.0)
 """What it takes where the residual is no larger than the floor: only an effect that the data show far below it."""
 NOISE_ALONE = 1.8
 """Mean squares up to so many times that of the noise are noise."""
+ROUGH = 0.02
+"""Relative gain that ends the fit before the floors are known."""
+MANY = 5
+"""Parameters above which a candidate is fitted after the others."""
 POLISHED = 3
 """Candidates whose fits are refined from further starts."""
 
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """The declared model, fitted."""
-
-    fit: Fit
-    floor: Floor
-    errors: np.ndarray
-    """Mean squares of each part."""
-
-
-@dataclass(eq=False)
-class Trial:
-    """One candidate fitted in full."""
-
-    candidate: Candidate
-    fit: Fit
-    errors: np.ndarray
-    """Mean squares of each part."""
-    gain: float
-    reason: str = ""
-    """Why it is rejected; empty: it is not."""
-
-    @property
-    def score(self) -> float:
-        """Mean logarithm of its errors: lower is better."""
-        return float(np.mean(np.log(np.maximum(self.errors, 1e-300))))
-
-
-@dataclass(eq=False)
-class Round:
-    """One step of the growth."""
-
-    base: Point
-    errors: np.ndarray
-    trials: list[Trial]
-    chosen: Trial | None
-    members: list[Trial]
-    p_value: float
-    floor: Floor
-    cosines: dict[str, float] = field(default_factory=dict)
-    null: np.ndarray = field(default_factory=lambda: np.empty(0))
 
 
 class Inference:
@@ -89,14 +53,23 @@ class Inference:
         draws: Of the bootstrap.
         seed: Of the draws.
         tell: Called with a line of progress.
+        memo: Predictions that are shared with the inferences of other settings.
     """
 
     def __init__(
-        self, problem: Problem, *, setting: int = 0, keep: int = 7, draws: int = 199, seed: int = 0, tell: Tell | None = None
+        self,
+        problem: Problem,
+        *,
+        setting: int = 0,
+        keep: int = 7,
+        draws: int = 199,
+        seed: int = 0,
+        tell: Tell | None = None,
+        memo: Memo | None = None,
     ) -> None:
         self.problem, self.setting, self.keep, self.draws, self.seed = problem, setting, keep, draws, seed
         self.tell = tell or (lambda line: None)
-        self.evaluations = 0
+        self.memo = memo or Memo(problem)
         self.parts = split(problem)
         self.fitted = [p.fitted for p in self.parts]
 
@@ -106,17 +79,17 @@ class Inference:
         rows = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
 
         def tick(count: int) -> None:
-            self.evaluations += count * len(rows)
-            self.tell(f"{self.evaluations} simulations")
+            self.tell(f"{self.memo.simulations} simulations")
 
-        return run(self.problem, requests, floor.whitener(self.parts), rows, setting=self.setting, tick=tick)
+        with self.memo.during("fits"):
+            return run(self.memo, requests, floor.whitener(self.parts), rows, setting=self.setting, tick=tick)
 
     def mean_squares(self, points: Sequence[Point], floor: Floor) -> list[np.ndarray]:
         """Of each part, at several points, the nuisances at their most probable values."""
         found = np.full((len(points), len(self.parts)), np.inf)
         for n in dict.fromkeys(p.recording for p in self.parts):
-            rows = self.problem.predict(points, n, self.setting) - self.problem.recordings[n].y
-            self.evaluations += len(points)
+            with self.memo.during("errors of fits"):
+                rows = self.memo.predict(points, n, self.setting) - self.problem.recordings[n].y
             for j, part in enumerate(self.parts):
                 if part.recording == n:
                     for i, row in enumerate(rows):
@@ -147,9 +120,9 @@ class Inference:
             return replace(plain, nuisances=self.nuisances(point, list(plain.noise)))
         differences, spread, weight = {}, {}, {}
         for n in plain.noise:
-            here = self.problem.predict([point], n, self.setting)[0]
-            there = [self.problem.predict([point], n, s)[0] for s in others]
-            self.evaluations += 1 + len(others)
+            with self.memo.during("discretisation"):
+                here = self.memo.predict([point], n, self.setting)[0]
+                there = [self.memo.predict([point], n, s)[0] for s in others]
             D = np.stack([t - here for t in there if np.isfinite(t).all()] or [np.zeros_like(here)], axis=1)
             differences[n] = D
             spread[n] = over_time(np.sqrt(np.mean(D**2, axis=1)), self.problem.recordings[n].times)
@@ -157,13 +130,17 @@ class Inference:
             self.tell(f"discretisation of {self.problem.recordings[n].name}")
         return Floor(plain.noise, weight, differences, spread, self.nuisances(point, list(plain.noise)))
 
-    def base(self, starts: Sequence[Point], floor: Floor) -> Fit:
-        """The declared parameters fitted from several starts; the best one after a few iterations goes on."""
+    def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
+        """A fit; options of `levenberg_marquardt`."""
+        return levenberg_marquardt(parameters, start, together=self.problem.together, **options)
+
+    def base(self, starts: Sequence[Point], floor: Floor, **options: Any) -> Fit:
+        """The declared parameters fitted from several starts; the best one after a few iterations goes on, with options of the fit."""
         free = self.problem.declared
         if len(starts) > 1:
-            short = self.fits([levenberg_marquardt(free, s, iterations=3) for s in starts], floor)
+            short = self.fits([self.request(free, s, iterations=3) for s in starts], floor)
             starts = [min(short, key=lambda f: f.cost).point]
-        return self.fits([levenberg_marquardt(free, starts[0])], floor)[0]
+        return self.fits([self.request(free, starts[0], **options)], floor)[0]
 
     def starts(self, point: Point) -> list[Point]:
         """A point, and half and twice each parameter whose logarithm is fitted."""
@@ -175,15 +152,16 @@ class Inference:
         return out
 
     def start(self, near: Point | None = None) -> "Start":
-        """The base fit, with what noise and discretisation do to it; from the declared values, and from `near` where that is given."""
-        fit = self.base([*self.starts({}), *([near] if near else [])], self.noise())
+        """The base fit, with what noise and discretisation do to it; from about the declared values, or from them and from `near`."""
+        # the first fit only says where the floor is to be found
+        fit = self.base([{}, near] if near else self.starts({}), self.noise(), iterations=6, tolerance=ROUGH)
         floor = self.floor(fit.point)
         fit = self.base([fit.point], floor)
         return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows."""
-        return all(bool(np.isfinite(self.problem.predict([point], p.recording, self.setting)).all()) for p in self.parts)
+        return all(bool(np.isfinite(self.memo.predict([point], p.recording, self.setting)).all()) for p in self.parts)
 
     def is_noise(self, errors: np.ndarray) -> bool:
         """Whether nothing but noise is left in any part."""
@@ -205,9 +183,8 @@ class Inference:
                     places.append((c.key, i))
         out: dict[tuple[str, int], dict[int, np.ndarray]] = {place: {} for place in places}
         for n in recordings:
-            here = self.problem.predict([point], n, self.setting)[0]
-            rows = self.problem.predict(asked, n, self.setting)
-            self.evaluations += len(asked) + 1
+            with self.memo.during("screening"):
+                here, *rows = self.memo.predict([point, *asked], n, self.setting)
             self.tell(f"directions of {len(asked)} effects in {self.problem.recordings[n].name}")
             for place in out:
                 out[place][n] = np.stack([row - here for row, p in zip(rows, places, strict=True) if p == place], axis=1)
@@ -223,8 +200,8 @@ class Inference:
             asked += [dict(point) | {p.name: end} for end in ends]
             spans.append(max(p.coordinate(ends[0]) - p.coordinate(ends[1]), 1e-9))
         for n in recordings:
-            rows = self.problem.predict(asked, n, self.setting) if asked else np.empty((0, len(self.problem.recordings[n].y)))
-            self.evaluations += len(asked)
+            with self.memo.during("slopes"):
+                rows = self.memo.predict(asked, n, self.setting)
             parts = [(rows[2 * i] - rows[2 * i + 1]) / span for i, span in enumerate(spans)]
             out[n] = np.stack([np.where(np.isfinite(part), part, 0.0) for part in parts], axis=1) if parts else np.empty((rows.shape[1], 0))
         return out
@@ -265,7 +242,7 @@ class Inference:
         return ranked, columns
 
     def residual(self, point: Point, n: int) -> np.ndarray:
-        return self.problem.predict([point], n, self.setting)[0] - self.problem.recordings[n].y
+        return self.memo.predict([point], n, self.setting)[0] - self.problem.recordings[n].y
 
     def weighted(self, columns: np.ndarray, part: Part, floor: Floor) -> np.ndarray:
         w = floor.weight[part.recording][part.rows]
@@ -294,18 +271,13 @@ class Inference:
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
                 starts.append((c, begin))
         self.tell(f"fitting {', '.join(chosen)}")
-        requests = [levenberg_marquardt((*free, *c.parameters), begin) for c, begin in starts]
-        fits = self.fits(requests, floor)
-        best: dict[str, tuple[Candidate, Fit]] = {}
-        for (c, _), fit in zip(starts, fits, strict=True):
-            if c.key not in best or fit.cost < best[c.key][1].cost:
-                best[c.key] = (c, fit)
+        best = self.contest(free, starts, floor)
         best |= self.polish(free, best, base, floor)
         squares = self.mean_squares([fit.point for _, fit in best.values()], floor)
         trials = []
         for (c, fit), square in zip(best.values(), squares, strict=True):
             trial = Trial(c, fit, square, evidence.gain(errors, square, self.fitted))
-            trial.reason = _unphysical(c, fit.point)
+            trial.reason = unphysical(c, fit.point)
             trials.append(trial)
         trials.sort(key=lambda t: t.score)
         model = self._linear(base.point, floor, slopes, columns, chosen, everywhere, candidates)
@@ -339,6 +311,23 @@ class Inference:
         share = min(max(over / math.log(1.5), 0.0), 1.0)  # from the floor itself to half as much again
         return GAIN_IN_FLOOR + share * (LEAST_GAIN - GAIN_IN_FLOOR)
 
+    def contest(
+        self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """The best fit of each candidate; fits that cannot catch up with the best one stop.
+
+        Where every point costs, candidates of many parameters come last, when it is known what they must reach.
+        """
+        best: dict[str, tuple[Candidate, Fit]] = {}
+        race = Race()
+        few, many = ([(c, begin) for c, begin in starts if (len(c.parameters) > MANY) == most] for most in (False, True))
+        for own in [starts] if self.problem.together else [few, many]:
+            fits = self.fits([self.request((*free, *c.parameters), begin, race=race) for c, begin in own], floor)
+            for (c, _), fit in zip(own, fits, strict=True):
+                if c.key not in best or fit.cost < best[c.key][1].cost:
+                    best[c.key] = (c, fit)
+        return best
+
     def polish(
         self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], base: Fit, floor: Floor
     ) -> dict[str, tuple[Candidate, Fit]]:
@@ -347,11 +336,11 @@ class Inference:
         top = sorted(best.values(), key=lambda entry: entry[1].cost)[:POLISHED]
         if not top or top[0][1].cost < 1.2 * data or top[0][1].cost > 0.7 * base.cost:
             return {}
-        requests, of = [], []
+        requests, of, race = [], [], Race(top[0][1].cost)
         for c, fit in top:
             begin = dict(fit.point)
             for start in (begin, begin | {p.name: p.value for p in self.problem.declared}):
-                requests.append(levenberg_marquardt((*free, *c.parameters), start))
+                requests.append(self.request((*free, *c.parameters), start, race=race))
                 of.append((c, fit))
         self.tell(f"refining {', '.join(c.key for c, _ in top)}")
         out: dict[str, tuple[Candidate, Fit]] = {}
@@ -406,23 +395,11 @@ class Inference:
             name = self.problem.recordings[n].name
             own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{name}")]
             moved = [dict(point) | {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + p.prior)} for p in own]
-            rows = self.problem.predict([point, *moved], n, self.setting)
-            self.evaluations += len(rows)
+            with self.memo.during("nuisances"):
+                rows = self.memo.predict([point, *moved], n, self.setting)
             out[n] = (
                 np.stack([np.where(np.isfinite(row).all(), row - rows[0], 0.0) for row in rows[1:]], axis=1)
                 if own
                 else np.empty((rows.shape[1], 0))
             )
         return out
-
-
-def _unphysical(c: Candidate, point: Point) -> str:
-    for p in c.size_parameters:
-        value = point[p.name]
-        for bound in (p.lower, p.upper):
-            zero = abs(bound) < 1e-12
-            if (zero and abs(value) < 1e-3 * p.scale and len(c.size_parameters) == 1 and not p.log) or (
-                not zero and abs(value - bound) < 1e-6 * abs(bound)
-            ):
-                return f"{p.name} ends at {value:.3g} {p.unit}, the edge of its physical range" if not zero else "its size fits as zero"
-    return ""

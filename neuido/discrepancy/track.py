@@ -13,6 +13,7 @@ from neuido.data.tracks import AXES, Track, Tracks, read_tracks
 from neuido.discrepancy.noise import SeriesError, correlation, high_pass
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem, Recording
 from neuido.discrepancy.released import Released, settle, settled_error
+from neuido.physics.effect_library import KNOTS
 from neuido.physics.effects import LIBRARY
 from neuido.physics.point_mass import Forces
 
@@ -26,8 +27,6 @@ LIGHTEST, SMALLEST = 30.0, 0.02
 """What a body whose figures are not given has at least: density [kg/m^3], diameter [m]."""
 LARGEST_DRAG = 2.0
 """Drag coefficient that no body of compact shape exceeds."""
-KNOTS = 5
-"""Values in time of a force that varies with it."""
 IMPACT = 4.0
 """Loss of speed from frame to frame that is an impact, in standard deviations of the noise."""
 DISAGREE = 1e-3

@@ -37,6 +37,8 @@ UNSEEN = 6.0
 """And those of a launch that was estimated from the images."""
 FAINT = 0.15
 """Least noise of an outline [px of the compared silhouettes]."""
+LEAST_OVERLAP = 0.4
+"""Of the drawn body and the silhouette of the first frame (area of both over that of either)."""
 TRACKED = 60
 """Particles that stand for the body where a proposal for a further experiment wants points."""
 
@@ -87,7 +89,7 @@ class VideoProblem(BodyProblem):
     def _scored(self, point: Point, recording: int, setting: int = 0) -> tuple[np.ndarray, dict[str, Score]]:
         """Drawn silhouettes (T, V, H, W), and how well those of the fitted and of the other frames agree with the film's."""
         f = self.footage[recording]
-        drawn = self._drawn(self._move([point], recording, setting)[0], recording, point)
+        drawn = self._drawn(_alone(self._move([point], recording, setting), 0), recording, point)
         frames = self.fitted_frames(recording)
         scores = {}
         for name, chosen in (("fit", frames), ("held_out", ~frames)):
@@ -123,7 +125,7 @@ class VideoProblem(BodyProblem):
     def simulated(self, recording: int) -> Measured:
         """All particles as the declared model moves them: nobody tracked a point."""
         r = self.measured[recording]
-        x = self._move([{}], recording, 0)[0].x.cpu().float()
+        x = self._move([{}], recording, 0).x[:, 0].cpu().float()
         return replace(r, x=x, track=torch.arange(x.shape[1]), noise=None, video=None, gaussians=None)
 
     def as_tracked(self) -> BodyProblem:
@@ -153,7 +155,8 @@ class VideoProblem(BodyProblem):
                 out[groups[0]] = np.nan
             return
         f = self.footage[recording]
-        for g, motion in zip(groups, moved, strict=True):
+        for s, g in enumerate(groups):
+            motion = _alone(moved, s)
             drawn: dict[tuple[float, float], Tensor] = {}
             for i in g:
                 clock = self._clock(points[i], recording)
@@ -204,6 +207,11 @@ class VideoProblem(BodyProblem):
         return torch.stack(out, 1).cpu().numpy()
 
 
+def _alone(frames: ParticleState, s: int) -> ParticleState:
+    """The frames of one point, (T, P, ...), of those of several."""
+    return ParticleState(*(t[:, s].contiguous() for t in frames))
+
+
 def _warped(masks: Tensor, view: View) -> Tensor:
     """Masks (T, H, W) as a camera shows them that is off."""
     height, width = masks.shape[-2:]
@@ -232,7 +240,7 @@ def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0
     plain = replace(experiment, recordings=tuple(measured))
     base = body_problem(plain, device=device, batch=batch)
     # the declared motion of some particles stands for that of the body: typical speeds and places are taken from it
-    moved = [base._move([{}], n, 0)[0] for n in range(len(measured))]
+    moved = [_alone(base._move([{}], n, 0), 0) for n in range(len(measured))]
     tracked = [_some(r, m) for r, m in zip(measured, moved, strict=True)]
     base = body_problem(replace(experiment, recordings=tuple(tracked)), device=device, batch=batch)
     footage = [_footage(r, experiment, film, m, device) for r, film, m in zip(tracked, films, moved, strict=True)]
@@ -290,7 +298,7 @@ def _register(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Param
         UserError: The body is not where the images show it.
     """
     drawn = f.look.draw(ParticleState(*(t[:1] for t in moved)), f.cameras)[0]
-    factor, out, left = f.film.factor, [], []
+    factor, out, left, overlap = f.film.factor, [], [], 1.0
     for v in range(len(f.film.views)):
         given = [0.0] * len(CAMERA)
         if v in f.first_views:
@@ -300,13 +308,14 @@ def _register(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Param
             target = silhouettes.features(measured, at)
             given, rest = _settle(drawn[v][None], at, target, factor)
             left.append(rest)
+            overlap = min(overlap, silhouettes.score(drawn[v][None].cpu().numpy(), f.film.masks[:1, v]).iou)
         for (key, unit, deviation), value in zip(CAMERA, given, strict=True):
             name, far = f"camera_{key}{v}:{r.name}", 8 * deviation
             out.append(Parameter(name, unit, value, deviation, value - far, value + far, prior=1.0))
     rest = np.concatenate(left)
-    if not np.isfinite(rest).all() or np.sqrt(np.mean(rest**2)) > 0.8 * silhouettes.REACH:
+    if overlap < LEAST_OVERLAP or not np.isfinite(rest).all():
         raise UserError(
-            f"recording {r.name}: the first frame's body is {factor * np.sqrt(np.mean(rest**2)):.3g} px from its silhouette: check "
+            f"recording {r.name}: body and silhouette of the first frame have an overlap of {overlap:.2f}, below {LEAST_OVERLAP}: check "
             "transform_matrix, intrinsics and x0"
         )
     return out, factor * float(np.hypot(FAINT, np.sqrt(np.mean(rest**2))))

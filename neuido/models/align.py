@@ -25,7 +25,7 @@ from neuido.models.filmed import (
     write_prediction,
 )
 from neuido.models.pipeline import Laws, Prepared, folder_of, infer, prepare, roll, roll_surely
-from neuido.models.pretrain import run_length
+from neuido.models.training import publish, run_length
 
 
 class AlignModule(FilmedModule):
@@ -274,14 +274,5 @@ class AlignModule(FilmedModule):
         self._predicted = []
 
     def on_train_end(self) -> None:
-        self._publish()
-
-    @rank_zero_only
-    def _publish(self) -> None:
-        figures = {k: float(v) for k, v in self.trainer.callback_metrics.items() if k.startswith("val/")}
-        for name, value in figures.items():
-            if name.count("/") == 1:
-                self.print(f"{name:40s} {value:.4g}")
-        if self.hparams.save_to is not None:
-            names = [scene.name for scene in self.trainer.datamodule.scenes]
-            self.encoder.save(self.hparams.save_to, {"stage": "II", "steps": self.global_step, "scenes": names, "figures": figures})
+        names = [scene.name for scene in self.trainer.datamodule.scenes]
+        publish(self, self.encoder.save, {"stage": "II", "steps": self.global_step, "scenes": names})

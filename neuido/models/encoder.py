@@ -17,12 +17,14 @@ from torch.nn import functional
 
 from neuido.errors import UserError
 from neuido.models.flow import ENCODINGS, Velocities, encode_flow, measure
-from neuido.models.flow_vae import CHANNELS, FlowVAE, load_state, read_weights, write_weights
+from neuido.models.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, load_state, read_weights, write_weights
 from neuido.models.video_vae import CogVideoXVAE, open_vae
 from neuido.types import MultiViewBatch
 
-FORMAT = "neuido-encoder/1"
-PRETRAINED = Path(__file__).parent / "weights" / "stage2.safetensors"
+PRETRAINED = {
+    "pretrained": Path(__file__).parent / "weights" / "stage2.safetensors",
+    "pretrained-small": Path(__file__).parent / "weights" / "stage2_small.safetensors",
+}
 CLOCK, CELL = 5e-3, 1e-2
 """The frame interval [s] and the side of a cell [m] at which the projector's two conditions are zero."""
 
@@ -213,17 +215,17 @@ class DynamicsEncoder(nn.Module):
         config = {"flow": self.flow, "projector": self.projector.config, "source": self.source, "vae": getattr(self.vae, "config", None)}
         if self.source is not None:
             config["vae"] = None
-        write_weights(path, FORMAT, config, tensors, {"date": date.today().isoformat(), **(card or {})})
+        write_weights(path, ENCODER_FORMAT, config, tensors, {"date": date.today().isoformat(), **(card or {})})
 
     @classmethod
     def load(cls, path: str | os.PathLike = "pretrained") -> Self:
-        """Read what `save` wrote; `pretrained` is the file that comes with neuido.
+        """Read what `save` wrote. `pretrained` comes with neuido; so does `pretrained-small`, for few, coarse frames on a CPU.
 
         Raises:
             UserError: No such file, or not one of this kind.
         """
-        file = PRETRAINED if str(path) == "pretrained" else Path(path)
-        config, tensors, card = read_weights(file, FORMAT, "encoder")
+        file = PRETRAINED.get(str(path)) or Path(path)
+        config, tensors, card = read_weights(file, (ENCODER_FORMAT,), "encoder")
         vae = config["source"] or FlowVAE(**config["vae"])
         sizes = {key: config["projector"][key] for key in ("latent_dim", "width", "heads", "conditions")}
         encoder = cls(vae, **config["flow"], **sizes)

@@ -21,6 +21,8 @@ def film(
     seed: int = 0,
     device: str = "auto",
     batch: int = 0,
+    shard: int = 0,
+    shards: int = 1,
     progress: bool = True,
 ) -> None:
     """Film simulated bodies of many materials: training data of the flow VAE and of the projector's warm-up.
@@ -46,6 +48,8 @@ def film(
         seed: Seed; each clip depends on the seed and its number alone.
         device: auto, cpu or cuda.
         batch: Clips simulated in one launch; 0 chooses 1 on the CPU and 16 on a GPU.
+        shard: Number of this part of the clips, from 0; parts may be filmed side by side, into one folder.
+        shards: Number of parts.
         progress: Show a progress bar.
 
     Raises:
@@ -68,4 +72,4 @@ def film(
         samples=samples,
         seed=seed,
     )
-    make(plan, out, device=device, batch=batch, progress=progress)
+    make(plan, out, device=device, batch=batch, shard=shard, shards=shards, progress=progress)

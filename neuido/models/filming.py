@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,14 +18,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 from neuido.data.cameras import intrinsics, look_at
+from neuido.data.families import PARAMETERS, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.films import FORMAT, complete
-from neuido.data.generate import LOGARITHMIC, PARAMETERS, _check_ranges, _device, _evaluate, laws
 from neuido.data.shapes import rigid_velocity
-from neuido.data.storage import publish, write
+from neuido.data.storage import claim, publish, write
 from neuido.errors import UserError
 from neuido.models.flow import PRESETS, measure
 from neuido.models.gaussians import deform, harmonics_of
 from neuido.models.splatting import render
+from neuido.physics.device import choose_device
 from neuido.physics.mpm import COURANT_LIMIT, Simulator
 from neuido.types import Body, Cameras, Gaussians, ParticleState, Scene, Walls
 
@@ -62,7 +63,7 @@ class Plan:
         if not self.families:
             raise UserError(f"families is empty: name at least one of {', '.join(PARAMETERS)}")
         for family, ranges in self.families.items():
-            _check_ranges(family, ranges)
+            check_ranges(family, ranges)
 
 
 HALVINGS = 2
@@ -81,17 +82,23 @@ class Clip(NamedTuple):
     cameras: Cameras
 
 
-def make(plan: Plan, out: str | os.PathLike, *, device: str = "auto", batch: int = 0, progress: bool = True) -> None:
-    """Make what is missing of the clips, and the index when none is missing any more."""
-    folder, chosen = Path(out), _device(device)
+def make(
+    plan: Plan, out: str | os.PathLike, *, device: str = "auto", batch: int = 0, shard: int = 0, shards: int = 1, progress: bool = True
+) -> None:
+    """Make what is missing of a shard's clips; whoever finds none missing any more writes the index."""
+    folder, chosen = Path(out), choose_device(device)
+    if not 0 <= shard < shards:
+        raise UserError(f"shard = {shard} must be from 0 to shards - 1 = {shards - 1}")
     if batch < 0:
         raise UserError(f"batch must be 0 (automatic) or positive, got {batch}")
-    _claim(folder, plan)
+    text = json.dumps({"format": FORMAT, "plan": asdict(plan)}, indent=1) + "\n"
+    claim(folder, text, "clips of another set-up", compared="plan")
     names = [f"clip-{i:05d}" for i in range(plan.count)]
-    missing = [i for i, name in enumerate(names) if not complete(folder / f"{name}.npz")]
+    own = range(shard, plan.count, shards)
+    missing = [i for i in own if not complete(folder / f"{names[i]}.npz")]
     size = batch or (16 if chosen.type == "cuda" else 1)
     kinds = list(plan.families)
-    with tqdm(total=plan.count, initial=plan.count - len(missing), unit="clip", disable=not progress) as bar:
+    with tqdm(total=len(own), initial=len(own) - len(missing), unit="clip", disable=not progress) as bar:
         for k in range(len(kinds)):
             wanted = [i for i in missing if i % len(kinds) == k]
             for start in range(0, len(wanted), size):
@@ -100,7 +107,7 @@ def make(plan: Plan, out: str | os.PathLike, *, device: str = "auto", batch: int
                     shots = shoot(plan, group, chosen)
                     list(pool.map(lambda pair: _finish(plan, folder, *pair), zip(group, shots)))
                 bar.update(len(group))
-    if missing or not (folder / "index.json").exists():
+    if (missing or not (folder / "index.json").exists()) and all(complete(folder / f"{name}.npz") for name in names):
         entries = []
         for i, name in enumerate(names):
             family, parameters = _material(plan, np.random.default_rng([plan.seed, i]), i)
@@ -181,23 +188,21 @@ def _samples(motion: ParticleState, clip: Clip, count: int, seed: int) -> dict[s
     F, C = motion.F[1:].flatten(0, 1).double(), motion.C[1:].flatten(0, 1).double()
     pick = torch.randint(len(F), (count,), generator=torch.Generator().manual_seed(seed)).to(F.device)
     trial = (F[pick] + clip.scene.dt * C[pick] @ F[pick]).float()
-    corrected = _evaluate(plastic, trial)
-    return {"trial": trial.cpu(), "corrected": corrected.cpu(), "stress": _evaluate(elastic, corrected).cpu()}
+    corrected = evaluate(plastic, trial)
+    return {"trial": trial.cpu(), "corrected": corrected.cpu(), "stress": evaluate(elastic, corrected).cpu()}
 
 
 def _material(plan: Plan, random: np.random.Generator, number: int) -> tuple[str, dict[str, float]]:
     family = list(plan.families)[number % len(plan.families)]
-    drawn = {}
-    for name in PARAMETERS[family]:
-        low, high = plan.families[family][name]
-        u = random.random()
-        drawn[name] = float(low * (high / low) ** u) if name in LOGARITHMIC else float(low + (high - low) * u)
-    return family, drawn
+    return family, draw_parameters(family, plan.families[family], random)
 
 
 def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, float]:
-    """Points (P, 3) of a ball, box, cylinder or a union of three ellipsoids about the origin, turned at random, and their volume [m^3]."""
-    kind = random.choice(["ball", "box", "cylinder", "blob"])
+    """Points (P, 3) of a ball, box, cylinder or a union of ellipsoids about the origin, turned at random, and their volume [m^3].
+
+    Half of all bodies are unions: three thick ellipsoids, or a trunk with four thin limbs, since those bend long before the trunk yields.
+    """
+    kind = random.choice(["ball", "box", "cylinder", "blob", "limbs", "limbs"])
     half = random.uniform(0.09, 0.24, 3)
     points = random.uniform(-1, 1, (max(20_000, 25 * particles), 3))
     if kind == "ball":
@@ -206,6 +211,9 @@ def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, flo
         inside = np.ones(len(points), dtype=bool)
     elif kind == "cylinder":
         inside = points[:, 0] ** 2 + points[:, 2] ** 2 < 1
+    elif kind == "limbs":
+        half = random.uniform(0.17, 0.3, 3)
+        inside = (((points / random.uniform(0.3, 0.6, 3)) ** 2).sum(1) < 1) | _limbs(random, points)
     else:
         centres, radii = random.uniform(-0.45, 0.45, (3, 3)), random.uniform(0.35, 0.55, (3, 1, 3))
         inside = ((((points - centres[:, None]) / radii) ** 2).sum(2) < 1).any(0)
@@ -217,6 +225,15 @@ def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, flo
     cell = np.unique(place @ np.array([10**10, 10**5, 1]), return_index=True)[1]
     turn, _ = np.linalg.qr(random.standard_normal((3, 3)))
     return filled[cell] @ turn, volume
+
+
+def _limbs(random: np.random.Generator, points: np.ndarray) -> np.ndarray:
+    """Which points lie in one of four capsules that stick out of the origin."""
+    tips = random.standard_normal((4, 3))
+    tips *= random.uniform(0.5, 0.95, (4, 1)) / np.linalg.norm(tips, axis=1, keepdims=True)
+    along = np.clip(points @ tips.T / (tips**2).sum(1), 0, 1)
+    distance = np.linalg.norm(points[:, None] - along[..., None] * tips, axis=2)
+    return (distance < random.uniform(0.12, 0.3, 4)).any(1)
 
 
 def _texture(random: np.random.Generator, body: Body, volume: float) -> Gaussians:
@@ -240,26 +257,3 @@ def _cameras(random: np.random.Generator, plan: Plan, target: tuple[float, float
         views.append(look_at(tuple(t + o for t, o in zip(target, offset)), target))  # type: ignore[arg-type]
     K = intrinsics(plan.width, plan.width, angle=math.radians(random.uniform(35, 45))).float()
     return Cameras(torch.stack(views).float(), K.expand(plan.views, 3, 3).contiguous(), plan.width, plan.width)
-
-
-def _claim(folder: Path, plan: Plan) -> None:
-    text = json.dumps({"format": FORMAT, "plan": asdict(plan)}, indent=1) + "\n"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"out = {folder} cannot be a folder: {error.strerror}") from error
-    path = folder / "plan.json"
-    if not path.exists():
-        write(path, text)
-        return
-    if path.read_text() != text:
-        raise UserError(f"{folder} holds clips of another set-up{_difference(path, text)}: give another out, or remove the folder")
-
-
-def _difference(path: Path, text: str) -> str:
-    try:
-        old: dict[str, Any] = json.loads(path.read_text())["plan"]
-    except (ValueError, KeyError):
-        return ""
-    changed = [f"{key} {old.get(key)} there, {value} here" for key, value in json.loads(text)["plan"].items() if old.get(key) != value]
-    return f" ({'; '.join(changed)})"

@@ -20,6 +20,8 @@ from torch.nn import functional
 from neuido.errors import UserError
 
 FORMAT = "neuido-flow-vae/1"
+ENCODER_FORMAT = "neuido-encoder/1"
+"""Of `models.encoder`, whose files hold a VAE beside the projector."""
 CHANNELS = 16
 """Latent channels, as CogVideoX's."""
 
@@ -48,6 +50,17 @@ class Residual(nn.Module):
         return x + self.conv2(functional.silu(by_frame(self.norm2, h)))
 
 
+class Activation(nn.Module):
+    """SiLU of a normalised input: without the norm one bad step can leave all channels where SiLU is flat, and they stay there."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.norm = nn.GroupNorm(8, channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.silu(by_frame(self.norm, x))
+
+
 def by_frame(layer: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """A layer for images applied to each frame of (B, C, T, H, W)."""
     flat = x.transpose(1, 2).flatten(0, 1)
@@ -60,17 +73,18 @@ class FlowVAE(nn.Module):
     Args:
         width: Channels of the inner layers, a multiple of 8.
         latent_channels: Channels of the latent (CogVideoX: 16).
+        last_norm: Normalise before the last convolutions of encoder and decoder.
 
     Attributes:
         scale: Factor that brings latents to unit variance, as CogVideoX's `scaling_factor`; set by `normalise`.
         card: What the weights file says about their making.
     """
 
-    def __init__(self, width: int = 32, latent_channels: int = CHANNELS):
+    def __init__(self, width: int = 32, latent_channels: int = CHANNELS, last_norm: bool = True):
         super().__init__()
         if width < 8 or width % 8 or latent_channels < 1:
             raise UserError(f"width = {width} must be a multiple of 8, and latent_channels = {latent_channels} at least 1")
-        self.config = {"width": width, "latent_channels": latent_channels}
+        self.config = {"width": width, "latent_channels": latent_channels, "last_norm": last_norm}
         self.channels = latent_channels
         self.encoder = nn.Sequential(
             CausalConv3d(12, width),
@@ -79,6 +93,7 @@ class FlowVAE(nn.Module):
             Residual(2 * width),
             CausalConv3d(2 * width, 2 * width, stride=(2, 2, 2)),
             Residual(2 * width),
+            *([Activation(2 * width)] if last_norm else []),
             CausalConv3d(2 * width, 2 * latent_channels),
         )
         self.decoder = nn.ModuleList(
@@ -89,6 +104,7 @@ class FlowVAE(nn.Module):
                 Residual(2 * width),
                 CausalConv3d(2 * width, width),
                 Residual(width),
+                Activation(width) if last_norm else nn.SiLU(),
                 CausalConv3d(width, 12),
             ]
         )
@@ -108,7 +124,7 @@ class FlowVAE(nn.Module):
             raise UserError(f"a flow video must be (B, 3, T, H, W) with H and W multiples of 8, got {tuple(video.shape)}; change flow_size")
         squares = by_frame(lambda frame: functional.pixel_unshuffle(frame, 2), video)  # full size costs the most and tells little more
         mean, variance = self.encoder(squares).chunk(2, 1)
-        return mean, variance.clamp(-20, 10)
+        return mean, variance.clamp(-20, 2)
 
     def encode(self, video: Tensor) -> Tensor:
         """Mean latents times `scale`, (B, 16, T', H/8, W/8), of videos (B, 3, T, H, W) in [-1, 1]; T' = floor((T - 1) / 4) + 1."""
@@ -120,11 +136,11 @@ class FlowVAE(nn.Module):
 
     def reconstruct(self, latent: Tensor) -> Tensor:
         """`decode` before `scale`."""
-        first, before, middle, after, narrow, last, out = self.decoder
+        first, before, middle, after, narrow, last, active, out = self.decoder
         h = before(first(latent))
         h = after(middle(_longer(h)))
         h = last(narrow(_longer(h)))
-        return by_frame(lambda frame: functional.pixel_shuffle(frame, 2), out(functional.silu(h)))
+        return by_frame(lambda frame: functional.pixel_shuffle(frame, 2), out(active(h)))
 
     @torch.no_grad()
     def normalise(self, latents: Tensor) -> None:
@@ -139,12 +155,17 @@ class FlowVAE(nn.Module):
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Self:
-        """Read what `save` wrote.
+        """Read what `save` wrote, or the VAE inside an encoder's file.
 
         Raises:
-            UserError: No such file, or not one of this kind.
+            UserError: No such file, or not one of these kinds.
         """
-        config, tensors, card = read_weights(path, FORMAT, "vae")
+        config, tensors, card = read_weights(path, (FORMAT, ENCODER_FORMAT), "vae")
+        if "projector" in config:
+            if config["vae"] is None:
+                raise UserError(f"vae: {path} holds no VAE: its encoder uses {config['source']}")
+            config, card = config["vae"], {}
+            tensors = {name.removeprefix("vae."): t for name, t in tensors.items() if name.startswith("vae.")}
         vae = cls(**config)
         load_state(vae, tensors, path)
         vae.card = card
@@ -167,11 +188,11 @@ def write_weights(
     os.replace(hidden, path)
 
 
-def read_weights(path: str | os.PathLike, kind: str, option: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
+def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
     """Configuration, tensors and card of a file of `write_weights`.
 
     Raises:
-        UserError: No such file, or one of another format; it names `option`.
+        UserError: No such file, or one of a format that is not in `kinds`; it names `option`.
     """
     path = Path(path)
     if not path.is_file():
@@ -180,8 +201,8 @@ def read_weights(path: str | os.PathLike, kind: str, option: str) -> tuple[dict[
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}
-        if metadata.get("format") != kind:
-            raise UserError(f"{option}: {path} has format {metadata.get('format')!r}, not {kind!r}")
+        if metadata.get("format") not in kinds:
+            raise UserError(f"{option}: {path} has format {metadata.get('format')!r}, not {' or '.join(map(repr, kinds))}")
         return json.loads(metadata["config"]), tensors, json.loads(metadata["card"])
     except (SafetensorError, KeyError, json.JSONDecodeError) as error:
         raise UserError(f"{option}: {path} is no weights file of neuido: {error}") from error

@@ -1,12 +1,11 @@
 """Stage I: trunks, heads and one latent for each trajectory, learned from constitutive data (paper, "Dynamics Operator Pretraining")."""
 
-import math
 import sys
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor, nn
 from torchmetrics import MeanSquaredError, MetricCollection
@@ -15,6 +14,7 @@ from neuido.errors import UserError
 from neuido.losses import relative_errors
 from neuido.metrics import MedianRelativeError
 from neuido.models.operator import IntrinsicDynamicsOperator
+from neuido.models.training import figures_of, run_length
 from neuido.types import TrajectoryBatch
 
 RESIDUAL_FLOOR = 1e-5
@@ -175,22 +175,6 @@ class ConstitutiveMetrics(nn.Module):
         return self.stress, self.plastic, self.yielding, self.stress_by_family, self.plastic_by_family
 
 
-def run_length(trainer: Trainer) -> int:
-    """Optimiser steps of a whole run.
-
-    `trainer.estimated_stepping_batches` would do, but it sets up the loaders before Lightning restores their state, and a run
-    resumed in the middle of an epoch would then start that epoch anew.
-    """
-    bounds = [trainer.max_steps] if trainer.max_steps > 0 else []
-    if trainer.max_epochs is not None and trainer.max_epochs > 0:
-        batches, limit = len(trainer.datamodule.train_dataloader()), trainer.limit_train_batches
-        batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
-        bounds.append(trainer.max_epochs * math.ceil(batches / trainer.accumulate_grad_batches))
-    if not bounds:
-        raise UserError("trainer.max_epochs and trainer.max_steps are both unlimited: the cosine schedule needs an end")
-    return max(1, min(bounds))
-
-
 class PretrainModule(LightningModule):
     """Stage I.
 
@@ -302,8 +286,7 @@ class PretrainModule(LightningModule):
 
     def on_train_end(self) -> None:
         """Score the held-out instances and write the operator; both go to the logger and the file's card."""
-        figures = {k: float(v) for k, v in self.trainer.callback_metrics.items() if k.startswith("val/")}
-        figures |= {k: float(v) for k, v in self.score_instances().items()}
+        figures = figures_of(self) | {k: float(v) for k, v in self.score_instances().items()}
         self._publish(figures)
 
     @rank_zero_only

@@ -5,18 +5,17 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
 from neuido.data.films import FlowBatch
 from neuido.errors import UserError
 from neuido.models.flow import encode_flow
 from neuido.models.flow_vae import FlowVAE
-from neuido.models.pretrain import run_length
+from neuido.models.training import figures_of, publish, run_length
 
 
 class FlowVAEModule(LightningModule):
-    """Reconstruction of flow videos, with a weak pull of the latents to N(0, 1).
+    """Reconstruction of flow videos, with a weak pull of the latents to N(0, 1). The weights of the best validation are kept.
 
     Args:
         width: Of the VAE.
@@ -48,9 +47,10 @@ class FlowVAEModule(LightningModule):
         self.save_hyperparameters()
         self.vae = FlowVAE(width, latent_channels)
         self.latent_sum = torch.zeros(3, dtype=torch.float64)
+        self.best: dict[str, Any] = {}  # of the smallest validation error, so that one bad step late in a run costs little
 
     def configure_optimizers(self) -> dict[str, Any]:
-        optimizer = torch.optim.AdamW(self.parameters(), lr=self.hparams.lr, weight_decay=self.hparams.weight_decay)
+        optimizer = torch.optim.AdamW(self.parameters(), lr=self.hparams.lr, weight_decay=self.hparams.weight_decay, betas=(0.9, 0.99))
         total = run_length(self.trainer)
         first = min(100, max(1, total // 10))  # a full first step scatters the latents, and they do not come back
 
@@ -99,14 +99,20 @@ class FlowVAEModule(LightningModule):
         count, total, squares = self.latent_sum.tolist()
         self.vae.scale.fill_(max(squares / count - (total / count) ** 2, 1e-12) ** -0.5)
 
-    def on_train_end(self) -> None:
-        self._publish()
+    def on_validation_end(self) -> None:
+        figures = figures_of(self)
+        if figures and not figures["val/error"] >= self.best.get("figures", {}).get("val/error", math.inf):
+            weights = {name: t.detach().cpu().clone() for name, t in self.vae.state_dict().items()}
+            self.best = {"steps": self.global_step, "figures": figures, "weights": weights}
 
-    @rank_zero_only
-    def _publish(self) -> None:
-        figures = {k: float(v) for k, v in self.trainer.callback_metrics.items() if k.startswith("val/")}
-        for name, value in figures.items():
-            self.print(f"{name:40s} {value:.4g}")
-        if self.hparams.save_to is not None:
-            flow = {"flow_encoding": self.hparams.flow_encoding, "speed_scale": self.hparams.speed_scale}
-            self.vae.save(self.hparams.save_to, {"steps": self.global_step, "flow": flow, "figures": figures})
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["best"] = self.best
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.best = checkpoint.get("best", {})
+
+    def on_train_end(self) -> None:
+        best = self.best or {"steps": self.global_step, "figures": {}, "weights": self.vae.state_dict()}
+        self.vae.load_state_dict(best["weights"])
+        flow = {"flow_encoding": self.hparams.flow_encoding, "speed_scale": self.hparams.speed_scale}
+        publish(self, self.vae.save, {"steps": best["steps"], "flow": flow}, best["figures"])

@@ -51,7 +51,7 @@ def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
     Raises:
         UserError: No such file, or not one of this kind.
     """
-    config, tensors, _ = read_weights(path, FORMAT, "law")
+    config, tensors, _ = read_weights(path, (FORMAT,), "law")
     if config.get("trunk") not in LAWS:
         raise UserError(f"law: {path} has the trunk {config.get('trunk')!r}; one of {', '.join(LAWS)}")
     elastic, plastic = LAWS[config["trunk"]]

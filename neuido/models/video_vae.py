@@ -11,7 +11,7 @@ from neuido.errors import UserError
 from neuido.models.flow_vae import FlowVAE
 
 PREFIX = "cogvideox:"
-PRETRAINED = Path(__file__).parent / "weights" / "flow_vae.safetensors"
+PRETRAINED = Path(__file__).parent / "weights" / "stage2.safetensors"
 
 
 class VideoVAE(Protocol):

@@ -13,18 +13,17 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.utilities import rank_zero_only
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
+from neuido.data.families import laws
 from neuido.data.films import Clip, FilmDataModule
-from neuido.data.generate import laws
 from neuido.errors import UserError
 from neuido.models.branch import open_branch, small_strain_modulus
 from neuido.models.flow import Velocities
 from neuido.models.operator import IntrinsicDynamicsOperator
-from neuido.models.pretrain import run_length
+from neuido.models.training import publish, run_length
 
 STRAIN_FLOOR = 3e-4
 """Floor of a plastic correction's norm [-] in its relative error."""
@@ -203,15 +202,7 @@ class WarmupModule(LightningModule):
         self.log_dict(values, prog_bar=True, sync_dist=True)
 
     def on_train_end(self) -> None:
-        self._publish()
-
-    @rank_zero_only
-    def _publish(self) -> None:
-        figures = {k: float(v) for k, v in self.trainer.callback_metrics.items() if k.startswith("val/")}
-        for name, value in figures.items():
-            self.print(f"{name:40s} {value:.4g}")
-        if self.hparams.save_to is not None:
-            self.encoder.save(self.hparams.save_to, {"stage": "warm-up", "steps": self.global_step, "figures": figures})
+        publish(self, self.encoder.save, {"stage": "warm-up", "steps": self.global_step})
 
 
 def _rank_correlation(a: Tensor, b: Tensor) -> Tensor:

@@ -1,19 +1,19 @@
-"""What a finite-element rollout runs on: the meshes of some scenes in one set of arrays, and its loop of launches.
+"""What a finite-element rollout runs on: the meshes of some scenes in one set of arrays, and its frames.
 
 Order of an inner step as in the material point method: stress of F, nodal forces, motion and contact of the nodes, F_tr = (I + dt C) F,
 its plastic correction and the history.
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from neuido.physics import effect_kernels, effect_tables
-from neuido.physics.device import launch, real_of, torch_stream
+from neuido.physics import element_loop
 from neuido.physics.effect_tables import Tables
-from neuido.physics.law import ElasticLaw, PlasticLaw
+from neuido.physics.element_loop import Fields, Loop
+from neuido.physics.law import ElasticLaw, Law, PlasticLaw
 from neuido.physics.meshing import Mesh, follow, locate, steepest
 from neuido.types import Particles, ParticleState
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from neuido.physics.finite_elements import FiniteElements
 
 
+CAPACITY = 8
+"""Captured loops that an assembly keeps; each holds its memory."""
 DENSE = 3.0
 """Times the median density above which a particle's mass counts as attached to the body."""
 
@@ -117,6 +119,7 @@ class Assembly:
         self.first = torch.cat([counts.new_zeros(1), counts.cumsum(0)]).to(torch.int32).contiguous()
         own = slice(first, solver.particles.offsets[b])
         self.x0 = solver.state.x[own]
+        self.loops: dict[Hashable, Loop] = {}
         self.last: tuple[ParticleState, Tensor, Tensor, Tensor, Tensor] | None = None
         self.held = self._held(solver.held[own]).to(torch.uint8)
         self.particle_volume = solver.volume[own]
@@ -202,87 +205,70 @@ class Assembly:
         frames: ParticleState,
     ) -> None:
         """Fill the frames; launches alone but for the frames."""
-        k, device, alone = self.solver.kernels, self.solver.device, self.b - self.a < self.solver.scene_count
-        x, v, C, F = (t.clone(memory_format=torch.contiguous_format) for t in self.start(given.state))
-        v[self.held.bool()] = 0.0
-        mass = self.node_mass(given.mass)
+        count = every * inner
+        if plasticity is not None and (plasticity.identity or (given.tables is not None and given.tables.flow is not None)):
+            plasticity = None
+        x, v, C, F = self.start(given.state)
+        v = torch.where(self.held.bool()[:, None], 0.0, v)
+        fields = self._fields(given, count)
+        laws = [self._rows(law) for law in (elasticity, plasticity) if law is not None]
+        loop = self._loop(elasticity, plasticity, given.tables, fields, laws, count)
+        loop.begin((x, v, C, F), fields, laws)
+        self._frame(frames, 0, *loop.state)
+        for k in range(steps // every):
+            own = slice(k * count, (k + 1) * count)
+            loop.advance(given.pull[own] if len(given.pull) > 1 else None, None if given.growth is None else given.growth[own])
+            self._frame(frames, k + 1, *loop.state)
+        self.last = (ParticleState(*(t[-1].clone() for t in frames)), *(t.clone() for t in loop.state))
+
+    def _rows(self, law: Law) -> list[Tensor]:
+        """The tensors of a law, those of these scenes alone."""
+        tensors = [t.detach().to(self.solver.device, self.solver.dtype) for t in law.tensors()]
+        return [t if len(t) == 1 or not self._alone else t[self.a : self.b] for t in tensors]
+
+    @property
+    def _alone(self) -> bool:
+        return self.b - self.a < self.solver.scene_count
+
+    def _fields(self, given: Inputs, count: int) -> Fields:
+        """What the first of the intervals reads."""
         stiffness = None
         if given.stiffness is not None:
             index, weight = self.to_elements
-            stiffness = torch.einsum("ek,ek->e", weight, given.stiffness[index].log()).exp().contiguous()
-        tables, scene = given.tables, self.particles.scene
-        layout = effect_tables.Layout() if tables is None else tables.layout
-        flows = tables is not None and tables.flow is not None
-        if plasticity is not None and (plasticity.identity or flows):
-            plasticity = None
+            stiffness = torch.einsum("ek,ek->e", weight, given.stiffness[index].log()).exp()
+        tables = given.tables
+        return Fields(
+            self.node_mass(given.mass),
+            given.force,
+            given.friction,
+            given.dt,
+            given.pull[:count],
+            None if given.growth is None else given.growth[:count],
+            given.viscosity,
+            stiffness,
+            *((None,) * 3 if tables is None else (tables.material, tables.branches, tables.flow)),
+        )
 
-        def engine(law):
-            own = law.alone(self.a) if alone else law
-            tensors = [t.detach().to(device, self.solver.dtype) for t in law.tensors()]
-            rows = [t if len(t) == 1 or not alone else t[self.a : self.b] for t in tensors]
-            return own.engine([t.contiguous() for t in rows], self.particles)
-
-        effect = None if tables is None else effect_kernels.build(real_of(self.solver.dtype))
-        kinds = torch.tensor([] if tables is None else tables.kinds, dtype=torch.int32, device=device)
-        changes = plasticity is not None or flows
-        rates = changes or given.viscosity is not None or layout.width > 0
-        tau, trial, gradients = torch.empty_like(F), torch.empty_like(F), torch.empty_like(F)
-        force = x.new_empty(4 * len(F), 3)
-        history, history_next = F.new_zeros(len(F), layout.width), F.new_zeros(len(F), layout.width)
-        nodal = self.solver.smoothing == "nodal"
-        J, J_mean, p, at_node = (F.new_empty(len(F)) for _ in range(4)) if nodal else (None,) * 4
-        at_node = x.new_empty(len(x)) if nodal else None
-        smoothed = torch.empty_like(F) if nodal else F
-        table = self.solver.colliders
-        plane, kind = (t[self.a : self.b].contiguous() for t in (table.plane, table.kind))
-
-        def run(kernel, dim: int, *arguments) -> None:
-            launch(kernel, dim, arguments, device)
-
-        with torch_stream(device):
-            elastic = engine(elasticity)
-            plastic = None if plasticity is None else engine(plasticity)
-            run(k.reference, len(F), self.elements, x, gradients)
-            shape = None if changes else (gradients @ F).contiguous()
-            self._frame(frames, 0, x, v, C, F)
-            for n in range(steps * inner):
-                last = (n + 1) % (every * inner) == 0
-                growth = None if given.growth is None else given.growth[n]
-                pull = given.pull[n if len(given.pull) > 1 else 0]
-                if nodal:
-                    run(k.volume_change, len(F), F, J)
-                    run(k.node_mean, len(x), self.first, self.corner, self.volume, J, at_node)
-                    run(k.smooth, len(F), self.elements, at_node, F, J, J_mean, smoothed)
-                now = smoothed if nodal else F
-                elastic.forward(now, tau)
-                if tables is not None:
-                    run(effect.add_effect_stress, len(F), scene, stiffness, growth, tables.material, tables.branches, tables.spectral,
-                        layout.at_e_max, now, history, tau)  # fmt: skip
-                if given.viscosity is not None:
-                    run(k.add_viscous_stress, len(F), scene, given.viscosity, C, now, tau)
-                if nodal:
-                    run(k.pressure, len(F), tau, J_mean, p)
-                    run(k.node_mean, len(x), self.first, self.corner, self.volume, p, at_node)
-                    run(k.spread_pressure, len(F), self.elements, at_node, J, tau)
-                run(k.corner_forces, len(F), self.volume, gradients, tau, force)
-                run(k.move, len(x), self.first, self.corner, self.node_scene, self.held, mass, given.dt, pull, given.force, plane, kind,
-                    given.friction, force, x, v)  # fmt: skip
-                run(k.kinematics, len(F), self.elements, scene, given.dt, x, v, shape, rates or last, gradients, C, F,
-                    trial if changes else F)  # fmt: skip
-                if plastic is not None:
-                    plastic.forward(trial, F)
-                if (effect is not None and layout.width > 0) or flows:
-                    if tables.branches is not None:
-                        run(effect.relax, len(F), scene, given.dt, tables.branches, C, history, history_next)
-                    if flows:
-                        run(effect.flow, len(F), scene, given.dt, kinds, tables.flow, stiffness, growth, layout.at_alpha,
-                            layout.at_backstress, trial, C, history, F, history_next)  # fmt: skip
-                    if layout.e_max:
-                        run(effect.remember, len(F), F, layout.at_e_max, history, history_next)
-                    history, history_next = history_next, history
-                if last:
-                    self._frame(frames, (n + 1) // (every * inner), x, v, C, F)
-        self.last = (ParticleState(*(t[-1].clone() for t in frames)), x, v, C, F)
+    def _loop(
+        self,
+        elasticity: ElasticLaw,
+        plasticity: PlasticLaw | None,
+        tables: Tables | None,
+        fields: Fields,
+        laws: Sequence[Sequence[Tensor]],
+        count: int,
+    ) -> Loop:
+        """A loop for these launches; those that are captured are kept, the least recently used dropped first."""
+        if self._alone:
+            elasticity = elasticity.alone(self.a)
+            plasticity = None if plasticity is None else plasticity.alone(self.a)
+        own = element_loop.key(elasticity, plasticity, tables, fields, laws, count) if self.solver.graphs else None
+        loop = self.loops.pop(own, None) or Loop(self, elasticity, plasticity, tables, fields, laws, count, own is not None)
+        if own is not None:
+            while len(self.loops) >= CAPACITY:
+                self.loops.pop(next(iter(self.loops)))
+            self.loops[own] = loop
+        return loop
 
     def _frame(self, frames: ParticleState, n: int, x: Tensor, v: Tensor, C: Tensor, F: Tensor) -> None:
         for out, t in ((frames.x, x), (frames.v, v)):

@@ -8,6 +8,21 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from neuido.errors import UserError
+
+
+def choose_device(name: str) -> torch.device:
+    """The device for `auto` (cuda where there is one), `cpu` or `cuda`.
+
+    Raises:
+        UserError: Another name, or cuda where there is none.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise UserError(f"device must be auto, cpu or cuda, got {name!r}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("device cuda was asked for and there is none here: use device auto or cpu")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
 
 def start_warp() -> None:
     """Initialise Warp without its banner, and without its remark on a missing driver; safe to call again."""

@@ -37,7 +37,7 @@ def build(real: type) -> SimpleNamespace:
     locked = wp.constant(real(LOCKED))
     gap = wp.constant(real(GAP))
     shared = tools(real, name)
-    load, spread, deviator = shared.load, shared.spread, shared.deviator
+    load, spread, deviator, scale_of = shared.load, shared.spread, shared.deviator, shared.scale_of
 
     @func
     def volume_factor(F: mat33):
@@ -83,7 +83,27 @@ def build(real: type) -> SimpleNamespace:
         return tau
 
     @func
-    def scale_of(
+    def undamaged(
+        p: int,
+        s: int,
+        base: wp.array(dtype=mat33),
+        F: wp.array(dtype=mat33),
+        material: wp.array2d(dtype=real),
+        branches: wp.array3d(dtype=real),
+        spectral: bool,
+        history: wp.array2d(dtype=real),
+    ):
+        """The stress before `worn_scale`: that of the base law, extra(F) and the branches [Pa]."""
+        out = base[p]
+        if material:
+            out = out + extra_stress(F[p], material, s, spectral)
+        if branches:
+            for b in range(branches.shape[1]):
+                out = out + branches[s, b, 0] * load(history, p, 6 * b)
+        return out
+
+    @func
+    def worn_scale(
         p: int,
         s: int,
         stiffness: wp.array(dtype=real),
@@ -92,11 +112,8 @@ def build(real: type) -> SimpleNamespace:
         history: wp.array2d(dtype=real),
         at_e_max: int,
     ):
-        out = one
-        if stiffness:
-            out = out * stiffness[p]
-        if growth:
-            out = out * growth[s]
+        """`scale_of` times the factor of damage."""
+        out = scale_of(p, s, stiffness, growth)
         if at_e_max >= 0:
             out = out * wp.exp(-material[s, 7] * history[p, at_e_max])
         return out
@@ -117,13 +134,8 @@ def build(real: type) -> SimpleNamespace:
         """tau = scale (tau + extra(F) + sum of the branches)."""
         p = wp.tid()
         s = scene[p]
-        t = tau[p]
-        if material:
-            t = t + extra_stress(F[p], material, s, spectral)
-        if branches:
-            for b in range(branches.shape[1]):
-                t = t + branches[s, b, 0] * load(history, p, 6 * b)
-        tau[p] = scale_of(p, s, stiffness, growth, material, history, at_e_max) * t
+        t = undamaged(p, s, tau, F, material, branches, spectral, history)
+        tau[p] = worn_scale(p, s, stiffness, growth, material, history, at_e_max) * t
 
     @kernel
     def add_effect_stress_adjoint(
@@ -149,15 +161,10 @@ def build(real: type) -> SimpleNamespace:
         p = wp.tid()
         s = scene[p]
         A = a_tau[p]
-        scale = scale_of(p, s, stiffness, growth, material, history, at_e_max)
+        scale = worn_scale(p, s, stiffness, growth, material, history, at_e_max)
         G = (real(0.5) * scale) * (A + wp.transpose(A))
         if stiffness or growth or at_e_max >= 0:
-            t = base[p]
-            if material:
-                t = t + extra_stress(F[p], material, s, spectral)
-            if branches:
-                for b in range(branches.shape[1]):
-                    t = t + branches[s, b, 0] * load(history, p, 6 * b)
+            t = undamaged(p, s, base, F, material, branches, spectral, history)
             a_log = scale * wp.ddot(A, t)
             if stiffness:
                 a_stiffness[p] = a_stiffness[p] + a_log / stiffness[p]

@@ -210,61 +210,60 @@ def tables(
         raise UserError("maxwell_ratio and maxwell_time come together; one of them is missing")
     if (effects.fibre is None) != (effects.fibre_direction is None):
         raise UserError("fibre and fibre_direction come together; one of them is missing")
-    zero = like.new_zeros(count)
     if not effects.of_material:
-        return Tables(Layout(), None, False, None, None, (), zero)
-    mu = (
-        torch.as_tensor(shear_modulus(elasticity) if shear is None else shear, dtype=like.dtype, device=like.device)
-        .reshape(-1)
-        .expand(count)
+        return Tables(Layout(), None, False, None, None, (), like.new_zeros(count))
+    mu = torch.as_tensor(shear_modulus(elasticity) if shear is None else shear, dtype=like.dtype, device=like.device)
+    mu = mu.reshape(-1).expand(count)
+    branches = _branches(effects, count, like, mu)
+    flow, kinds = _flow(effects, elasticity, plasticity, count, like, mu)
+    damages = effects.softening is not None and (flow is None or bool((flow[:, 1] <= 0).any()))
+    material, stiff = _material(effects, count, like, mu, flow, damages)
+    if branches is not None:
+        stiff = stiff + 2 / 3 * branches[:, :, 0].sum(dim=1)
+    layout = Layout(
+        0 if branches is None else branches.shape[1],
+        flow is not None and (effects.hardening is not None or effects.softening is not None),
+        flow is not None and effects.kinematic_hardening is not None,
+        damages,
     )
+    return Tables(layout, material, effects.tension_compression is not None, branches, flow, kinds, stiff.detach())
 
-    def column(name: str) -> Tensor:
-        return effects.rows(name, count, like)[:, 0]
 
+def _branches(effects: Effects, count: int, like: Tensor, mu: Tensor) -> Tensor | None:
+    """`Tables.branches`."""
     weights, times = [], []
     if effects.maxwell_ratio is not None:
-        ratio, time = column("maxwell_ratio"), column("maxwell_time")
+        ratio, time = (effects.rows(name, count, like)[:, 0] for name in ("maxwell_ratio", "maxwell_time"))
         if bool(((time <= 0) & (ratio != 0)).any()):
             raise UserError(f"maxwell_time is {time.min().item():g} s; it must be positive")
         time = torch.where(time > 0, time, 1.0)  # of a branch that is not there
         weights.append(ratio[:, None])
         times.append(time[:, None])
     if effects.hysteresis is not None:
-        g, T = hysteresis_spectrum(column("hysteresis"))
+        g, T = hysteresis_spectrum(effects.rows("hysteresis", count, like)[:, 0])
         weights.append(g)
         times.append(T.expand_as(g))
-    branches = torch.stack([2 * mu[:, None] * torch.cat(weights, 1), torch.cat(times, 1)], dim=-1) if weights else None
+    return torch.stack([2 * mu[:, None] * torch.cat(weights, 1), torch.cat(times, 1)], dim=-1) if weights else None
 
-    flow, kinds = _flow(effects, elasticity, plasticity, count, like, mu)
+
+def _material(effects: Effects, count: int, like: Tensor, mu: Tensor, flow: Tensor | None, damages: bool) -> tuple[Tensor | None, Tensor]:
+    """`Tables.material`, and what it adds to the P-wave modulus [Pa], (S,)."""
+    names = ("strain_stiffening", "second_invariant", "tension_compression", "fibre")
+    zero = like.new_zeros(count)
+    if not damages and all(getattr(effects, name) is None for name in names):
+        return None, zero
     damage = zero
     if effects.softening is not None:
-        damage = column("softening")
+        damage = effects.rows("softening", count, like)[:, 0]
         if flow is not None:
             damage = torch.where(flow[:, 1] > 0, 0.0, damage)
-    has_damage = effects.softening is not None and (flow is None or bool((flow[:, 1] <= 0).any()))
-
-    names = ("strain_stiffening", "second_invariant", "tension_compression", "fibre")
-    material = None
-    stiff = zero
-    if has_damage or any(getattr(effects, name) is not None for name in names):
-        direction = like.new_zeros(count, 3)
-        if effects.fibre_direction is not None:
-            direction = effects.rows("fibre_direction", count, like)
-            size = direction.norm(dim=1, keepdim=True)
-            if bool((size <= 0).any()):
-                raise UserError("fibre_direction is zero; give a vector of any length")
-            direction = direction / size
-        k, c, r, f = (column(name) for name in names)
-        material = torch.cat([torch.stack([mu * k, mu * c, 2 * mu * r, f], dim=1), direction, damage[:, None], k[:, None]], dim=1)
-        stiff = 4 / 3 * mu * c + 2 * mu * r.clamp(min=0) + 2 * f
-    if branches is not None:
-        stiff = stiff + 2 / 3 * branches[:, :, 0].sum(dim=1)
-    alpha = flow is not None and (effects.hardening is not None or effects.softening is not None)
-    layout = Layout(
-        0 if branches is None else branches.shape[1],
-        alpha,
-        flow is not None and effects.kinematic_hardening is not None,
-        has_damage,
-    )
-    return Tables(layout, material, effects.tension_compression is not None, branches, flow, kinds, stiff.detach())
+    direction = like.new_zeros(count, 3)
+    if effects.fibre_direction is not None:
+        direction = effects.rows("fibre_direction", count, like)
+        size = direction.norm(dim=1, keepdim=True)
+        if bool((size <= 0).any()):
+            raise UserError("fibre_direction is zero; give a vector of any length")
+        direction = direction / size
+    k, c, r, f = (effects.rows(name, count, like)[:, 0] for name in names)
+    material = torch.cat([torch.stack([mu * k, mu * c, 2 * mu * r, f], dim=1), direction, damage[:, None], k[:, None]], dim=1)
+    return material, 4 / 3 * mu * c + 2 * mu * r.clamp(min=0) + 2 * f

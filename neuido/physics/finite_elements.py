@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics import effect_tables, element_kernels
+from neuido.physics import element_kernels, inputs
 from neuido.physics.assembly import Assembly, Inputs, Piece, piece_of
 from neuido.physics.device import real_of
 from neuido.physics.effects import Effects
@@ -39,6 +39,7 @@ class FiniteElements:
         device: Where it runs.
         dtype: `torch.float32` for work, `torch.float64` for checks.
         threads: On the CPU, run several scenes in as many threads as there are cores.
+        graphs: On CUDA, capture the launches between two frames once for each shape and replay them after.
         elements: About how many elements a body gets; see `meshing.mesh_body`.
         tetrahedra: A lattice cell is cut into 5 or 6.
         smoothing: `none`, or `nodal`: the volume change of an element is the mean of its nodes' means, against the locking of
@@ -65,6 +66,7 @@ class FiniteElements:
         device: str | torch.device = "cpu",
         dtype: torch.dtype = torch.float32,
         threads: bool = True,
+        graphs: bool = True,
         elements: int | None = None,
         tetrahedra: int = 5,
         smoothing: Literal["none", "nodal"] = "none",
@@ -76,6 +78,7 @@ class FiniteElements:
         self.scenes, self.device, self.dtype, self.smoothing = loaded.scenes, loaded.device, loaded.dtype, smoothing
         self.particles, self.state, self.mass, self.volume = loaded.particles, loaded.state, loaded.mass, loaded.volume
         self.dt, self.gravity, self.colliders = loaded.dt, loaded.gravity, loaded.colliders
+        self.graphs = graphs and self.device.type == "cuda"
         self.held = loaded.held.bool()
         self.kernels = element_kernels.build(real_of(dtype))
         bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
@@ -86,6 +89,7 @@ class FiniteElements:
         made: dict[tuple[int, ...], tuple[Mesh, Piece]] = {}
         pieces = []
         self.meshes: tuple[Mesh, ...] = ()
+        self.sizes: list[float] = []
         for s, body in enumerate(bodies):
             given = None if meshes is None else meshes[s]
             key = (id(body.x), id(body.volume), id(given))  # copies of one body share their mesh
@@ -95,6 +99,7 @@ class FiniteElements:
                 made[key] = (mesh, piece_of(mesh, x, volume, self.device, self.dtype))
             mesh, piece = made[key]
             self.meshes += (mesh,)
+            self.sizes.append(self.sizes[-1] if s and mesh is self.meshes[-2] else _size(mesh))
             pieces.append(piece)
         # on the CPU a scene is an assembly of its own, which a thread runs; on a GPU all scenes share their launches
         count = len(self.scenes)
@@ -117,29 +122,21 @@ class FiniteElements:
 
         Args:
             elasticity: The law, for its P-wave modulus.
-            viscosity: Shear and bulk viscosity [Pa s], (S, 2), or None; it acts with the velocity of half a step before.
+            viscosity: `Effects.viscosity` [Pa s], (S, 2), or None; it acts with the velocity of half a step before.
             mass: Particle masses [kg], (P,).
             stiffening: What effects add to each scene's modulus [Pa], and the largest factor on the sum, (S,) each.
 
         Raises:
             UserError: A modulus that is negative, or more than `MOST_INNER`.
         """
-        modulus = elasticity.modulus().detach().to(self.device, torch.float64).expand(self.scene_count)
-        if stiffening is not None:
-            modulus = (modulus + stiffening[0]) * stiffening[1]
-        rho = (self.mass if mass is None else mass.detach()).double() / self.volume.double()
+        bounds = inputs.waves(self, elasticity, mass, stiffening)
         out = []
         for assembly in self.assemblies:
             need = 1
             for s in range(assembly.a, assembly.b):
-                if not float(modulus[s]) >= 0.0:
-                    raise UserError(
-                        f"the law of scene {s} has a P-wave modulus of {float(modulus[s]):g} Pa at rest; it must not be negative"
-                    )
-                own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
-                density = float(rho[own].min())
+                modulus, density = bounds[s]
                 steep = float(assembly.pieces[s - assembly.a].steepest.max())
-                omega = 2.0 * math.sqrt(float(modulus[s]) / density * steep)
+                omega = 2.0 * math.sqrt(modulus / density * steep)
                 damping = 0.0
                 if viscosity is not None:
                     eta, zeta = viscosity.detach()[s].double().tolist()
@@ -193,47 +190,27 @@ class FiniteElements:
         Raises:
             UserError: Before the start, as `inner_steps`; afterwards a motion that is not finite.
         """
-        if steps < 1 or every < 1 or steps % every:
-            raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
+        inputs.check_frames(steps, every)
         with torch.no_grad():
-            return self._rollout(steps, elasticity, plasticity, state, effects or Effects(), gravity, friction, mass, every, inner)
+            given = inputs.prepare(
+                self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
+            )
+            return self._rollout(steps, elasticity, plasticity, given, every, inner)
 
     def _rollout(
         self,
         steps: int,
         elasticity: ElasticLaw,
         plasticity: PlasticLaw | None,
-        state: ParticleState | None,
-        effects: Effects,
-        gravity: Tensor | None,
-        friction: Tensor | None,
-        mass: Tensor | None,
+        given: inputs.RolloutInputs,
         every: int,
         inner: int | None,
     ) -> ParticleState:
-        count, like = self.scene_count, self.mass
-        state = self.state if state is None else ParticleState(*(t.detach().to(self.device, self.dtype) for t in state))
-        base = self.gravity if gravity is None else gravity.to(self.device, self.dtype).expand(count, 3)
-        force, viscosity = effects.force_table(count, like).contiguous(), effects.viscosity(count, like)
-        friction = self.colliders.friction if friction is None else friction.to(self.device, self.dtype)
-        if friction.shape != self.colliders.friction.shape:
-            raise UserError(f"friction has shape {tuple(friction.shape)}; it must be {tuple(self.colliders.friction.shape)}")
-        if effects.friction is not None:
-            friction = (friction + effects.rows("friction", count, like)).clamp(min=0.0)
-        mass = self.mass if mass is None else mass.to(self.device, self.dtype)
-        if effects.added_mass is not None:
-            mass = mass * (1 + effects.rows("added_mass", count, mass)[self.particles.scene.long(), 0])
-        tables = effect_tables.tables(effects, elasticity, plasticity, count, like) if effects.of_material else None
-        stiffness = None if effects.stiffness is None else effects.particle_stiffness(len(mass), mass)
-        stiffening = None
-        if tables is not None:
-            factor = torch.ones(count, dtype=torch.float64, device=self.device)
-            if stiffness is not None:
-                parts = zip(self.particles.offsets[:-1], self.particles.offsets[1:])
-                factor = torch.stack([stiffness[i:j].double().max() for i, j in parts])
-            growth = effects.growth(self.dt, steps)
-            stiffening = (tables.stiffening.double(), factor if growth is None else factor * growth.double().amax(dim=0))
-        inner_of = [inner] * count if inner is not None else self.inner_steps(elasticity, viscosity, mass, stiffening)
+        state, effects, tables, viscosity, stiffness = given.state, given.effects, given.tables, given.viscosity, given.stiffness
+        if inner is None:
+            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self.particles))
+        else:
+            inner_of = [inner] * self.scene_count
         frames = ParticleState(*(t.new_empty(steps // every + 1, *t.shape) for t in state))
 
         def one(assembly: Assembly) -> None:
@@ -242,19 +219,19 @@ class FiniteElements:
             scenes, own = slice(a, b), slice(self.particles.offsets[a], self.particles.offsets[b])
             dt = self.dt[scenes] / n
             growth = effects.growth(self.dt / n, steps * n)
-            inputs = Inputs(
+            part = Inputs(
                 ParticleState(*(t[own] for t in state)),
-                mass[own],
-                effects.accelerations(base, self.dt / n, steps * n)[:, scenes].contiguous(),
-                force[scenes].contiguous(),
-                friction[scenes].contiguous(),
+                given.mass[own],
+                effects.accelerations(given.gravity, self.dt / n, steps * n)[:, scenes].contiguous(),
+                given.force[scenes].contiguous(),
+                given.friction[scenes].contiguous(),
                 None if viscosity is None else viscosity[scenes].contiguous(),
                 None if tables is None else assembly.rows(tables),
                 None if stiffness is None else stiffness[own],
                 None if growth is None else growth[:, scenes].contiguous(),
                 dt.contiguous(),
             )
-            assembly.run(steps, every, n, elasticity, plasticity, inputs, ParticleState(*(t[:, own] for t in frames)))
+            assembly.run(steps, every, n, elasticity, plasticity, part, ParticleState(*(t[:, own] for t in frames)))
 
         if self.pool is None:
             for assembly in self.assemblies:
@@ -267,12 +244,18 @@ class FiniteElements:
 
     def _check(self, frames: ParticleState, steps: int, every: int, inner: list[int]) -> None:
         """Raise where a motion is not finite, or so fast that a point crosses an element in a step."""
-        for s, (i, j) in enumerate(zip(self.particles.offsets[:-1], self.particles.offsets[1:])):
-            dt = self.scenes[s].dt / inner[s]
-            corners = self.meshes[s].nodes[self.meshes[s].elements]
-            size = float((corners[:, 1:] - corners[:, :1]).norm(dim=2).max())
-            fine = torch.isfinite(frames.x[:, i:j]).all(dim=2) & (frames.v[:, i:j].norm(dim=2) * dt <= size)
-            if not bool(fine.all()):
-                frame = int((~fine.all(dim=1)).nonzero()[0])
-                raise UserError(f"the motion of scene {s} is not finite from step {max(frame - 1, 0) * every} of {steps} on; lower `dt` "
-                                f"(now {self.scenes[s].dt:g} s in {inner[s]} inner steps) or the stiffness")  # fmt: skip
+        dt = self.dt / torch.tensor(inner).to(self.dt)
+        limit = (torch.tensor(self.sizes).to(self.dt) / dt)[self.particles.scene.long()]
+        fine = torch.isfinite(frames.x).all(dim=2) & (frames.v.norm(dim=2) <= limit)
+        if bool(fine.all()):
+            return
+        frame, p = ((~fine).nonzero()[0]).tolist()
+        s = int(self.particles.scene[p])
+        raise UserError(f"the motion of scene {s} is not finite from step {max(frame - 1, 0) * every} of {steps} on; lower `dt` "
+                        f"(now {self.scenes[s].dt:g} s in {inner[s]} inner steps) or the stiffness")  # fmt: skip
+
+
+def _size(mesh: Mesh) -> float:
+    """The longest edge from an element's first corner [m]."""
+    corners = mesh.nodes[mesh.elements]
+    return float((corners[:, 1:] - corners[:, :1]).norm(dim=2).max())

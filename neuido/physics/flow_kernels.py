@@ -31,7 +31,7 @@ def build(real: type) -> SimpleNamespace:
     shared = tools(real, name)
     load, store, gather, spread, deviator = shared.load, shared.store, shared.gather, shared.spread, shared.deviator
     half_turn, rotation, add_spin_adjoint = shared.half_turn, shared.rotation, shared.add_spin_adjoint
-    mean_of, bound = shared.mean_of, shared.bound
+    mean_of, bound, scale_of = shared.mean_of, shared.bound, shared.scale_of
     zero = wp.constant(real(0.0))
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
@@ -40,15 +40,6 @@ def build(real: type) -> SimpleNamespace:
     gap = wp.constant(real(law_kernels.GAP))
     MISES = wp.constant(law_kernels.VON_MISES)
     CONE = wp.constant(law_kernels.DRUCKER_PRAGER)
-
-    @func
-    def scale_of(p: int, s: int, stiffness: wp.array(dtype=real), growth: wp.array(dtype=real)):
-        out = one
-        if stiffness:
-            out = out * stiffness[p]
-        if growth:
-            out = out * growth[s]
-        return out
 
     @func
     def may_flow(F: mat33, beta: mat33, two_mu: real, limit: real):

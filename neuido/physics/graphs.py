@@ -31,7 +31,7 @@ class KeptRollout:
 
     def forward(self, plan: "Plan", inputs: Sequence[Tensor]) -> int:
         """Run with new inputs; returns the serial number of this run."""
-        plan.forward(inputs, self.tape)
+        self._forward(plan, inputs)
         self.serial += 1
         return self.serial
 
@@ -41,6 +41,14 @@ class KeptRollout:
         """The adjoint of the run `serial` with these inputs."""
         if serial != self.serial:
             self.forward(plan, inputs)
+        return self._backward(plan, inputs, gradients, wanted)
+
+    def _forward(self, plan: "Plan", inputs: Sequence[Tensor]) -> None:
+        plan.forward(inputs, self.tape)
+
+    def _backward(
+        self, plan: "Plan", inputs: Sequence[Tensor], gradients: Sequence[Tensor | None], wanted: Sequence[bool]
+    ) -> list[Tensor | None]:
         return plan.backward(inputs, self.tape, gradients, wanted)
 
 
@@ -51,29 +59,25 @@ class CapturedRollout(KeptRollout):
         super().__init__(plan, keep_all)
         self.plan = plan
         self.inputs = [t.clone() for t in inputs]
-        self._backward: dict[tuple, tuple[torch.cuda.CUDAGraph, list, list]] = {}
+        self._adjoints: dict[tuple, tuple[torch.cuda.CUDAGraph, list, list]] = {}
         plan.forward(self.inputs, self.tape, steps=1)  # compiles and loads the kernels
         self.graph, _ = _capture(lambda: plan.forward(self.inputs, self.tape))
 
-    def forward(self, plan: "Plan", inputs: Sequence[Tensor]) -> int:
+    def _forward(self, plan: "Plan", inputs: Sequence[Tensor]) -> None:
         for own, given in zip(self.inputs, inputs, strict=True):
             own.copy_(given)
         self.graph.replay()
-        self.serial += 1
-        return self.serial
 
-    def backward(
-        self, plan: "Plan", inputs: Sequence[Tensor], serial: int, gradients: Sequence[Tensor | None], wanted: Sequence[bool]
+    def _backward(
+        self, plan: "Plan", inputs: Sequence[Tensor], gradients: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
-        if serial != self.serial:
-            self.forward(plan, inputs)
         key = (tuple(g is not None for g in gradients), tuple(wanted))
-        if key not in self._backward:
+        if key not in self._adjoints:
             own = [None if g is None else g.clone() for g in gradients]
             self.plan.backward(self.inputs, self.tape, own, wanted, steps=1)
             graph, out = _capture(lambda: self.plan.backward(self.inputs, self.tape, own, wanted))
-            self._backward[key] = (graph, own, out)
-        graph, own_gradients, out = self._backward[key]
+            self._adjoints[key] = (graph, own, out)
+        graph, own_gradients, out = self._adjoints[key]
         for own, given in zip(own_gradients, gradients):
             if given is not None:
                 own.copy_(given)

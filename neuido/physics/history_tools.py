@@ -1,4 +1,4 @@
-"""Warp functions that the kernels of the history share: symmetric matrices in six columns, the rotation of a step, strain sizes."""
+"""Warp functions that the kernels of the history share: symmetric matrices in six columns, the rotation of a step, sizes."""
 
 import functools
 from typing import Any, NamedTuple
@@ -30,6 +30,8 @@ class Tools(NamedTuple):
     """e -> its mean, three times"""
     bound: Any
     """F -> at least the norm of dev ln V"""
+    scale_of: Any
+    """(p, s, stiffness, growth) -> the factor of `stiffness` and `stiffness_change` on the elastic stress"""
 
 
 @functools.cache
@@ -122,4 +124,13 @@ def tools(real: type, module: str) -> Tools:
             out = half * wp.sqrt(wp.ddot(D, D)) / (one - r)
         return out
 
-    return Tools(load, store, gather, spread, deviator, half_turn, rotation, add_spin_adjoint, mean_of, bound)
+    @func
+    def scale_of(p: int, s: int, stiffness: wp.array(dtype=real), growth: wp.array(dtype=real)):
+        out = one
+        if stiffness:
+            out = out * stiffness[p]
+        if growth:
+            out = out * growth[s]
+        return out
+
+    return Tools(load, store, gather, spread, deviator, half_turn, rotation, add_spin_adjoint, mean_of, bound, scale_of)

@@ -23,6 +23,9 @@ LOCKED = 0.05
 GAP = 1e-6
 """Lower bound of sigma_i + sigma_j in a denominator; only an inverted F can come near it."""
 
+FLAT = 0.1
+"""det F below which a stretch is taken from the principal frame."""
+
 
 class LawKernels(NamedTuple):
     """The kernels for one scalar type. `kinds` (S,) int32, `params` (S, n); a particle of scene s reads row min(s, S - 1)."""
@@ -51,6 +54,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     vec = wp.types.vector(3, real)
     floor = wp.constant(real(FLOOR))
     gap = wp.constant(real(GAP))
+    flat = wp.constant(real(FLAT))
     zero = wp.constant(real(0.0))
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
@@ -58,7 +62,50 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     own = warp_linalg.functions(real, builtin_svd=builtin_svd)
     log1p, exp_slope, strain, volume_change, cofactor = own.log1p, own.exp_slope, own.strain, own.volume_change, own.cofactor
     frame, compose, bounded, hencky = own.frame, own.compose, own.bounded, own.hencky
-    inverse_stretch, log_difference = own.inverse_stretch, own.log_difference
+    inverse_stretch, log_difference, stretch = own.inverse_stretch, own.log_difference, own.stretch
+    slight, log_stretch, exp_excess = own.slight, own.log_stretch, own.exp_excess
+
+    @wp.func
+    def corotated_in_frame(Fp: mat, mu: real, lam: real):
+        U, d, _V = frame(Fp)
+        dJ = d[0] + d[1] + d[2] + d[0] * d[1] + d[0] * d[2] + d[1] * d[2] + d[0] * d[1] * d[2]
+        bulk = lam * (one + dJ) * dJ
+        k = two * mu
+        return compose(U, vec(k * (one + d[0]) * d[0] + bulk, k * (one + d[1]) * d[1] + bulk, k * (one + d[2]) * d[2] + bulk))
+
+    @wp.func
+    def corotated_by_stretch(Fp: mat, mu: real, lam: real):
+        """tau = 2 mu (V^2 - V) + lambda J (J - 1) I, without a frame: a fifth of the time."""
+        dJ = volume_change(Fp)
+        out = mat()
+        if one + dJ > flat:
+            E = strain(Fp)
+            out = (two * mu) * (E - stretch(E, dJ)) + (lam * (one + dJ) * dJ) * wp.identity(n=3, dtype=real)
+        else:
+            out = corotated_in_frame(Fp, mu, lam)
+        return out
+
+    @wp.func
+    def hencky_in_frame(Fp: mat, mu: real, lam: real):
+        U, d, _V = frame(Fp)
+        e = hencky(d)
+        bulk = lam * (e[0] + e[1] + e[2])
+        k = two * mu
+        return compose(U, vec(k * e[0] + bulk, k * e[1] + bulk, k * e[2] + bulk))
+
+    @wp.func
+    def hencky_by_series(Fp: mat, mu: real, lam: real):
+        """tau = 2 mu ln V + lambda ln(J) I, without a frame where the strain is slight."""
+        E = strain(Fp)
+        out = mat()
+        if wp.ddot(E, E) <= slight * slight:
+            out = (two * mu) * log_stretch(E) + (lam * log1p(volume_change(Fp))) * wp.identity(n=3, dtype=real)
+        else:
+            out = hencky_in_frame(Fp, mu, lam)
+        return out
+
+    corotated = corotated_in_frame if builtin_svd else corotated_by_stretch
+    logarithmic = hencky_in_frame if builtin_svd else hencky_by_series
 
     @wp.kernel(enable_backward=enable_backward, module="unique")
     def stress(
@@ -77,18 +124,10 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
         if kind == NEO_HOOKEAN:
             dJ = bounded(volume_change(Fp))
             tau[p] = mu * strain(Fp) + (lam * log1p(dJ)) * wp.identity(n=3, dtype=real)
+        elif kind == FIXED_COROTATED:
+            tau[p] = corotated(Fp, mu, lam)
         else:
-            U, d, _V = frame(Fp)
-            if kind == FIXED_COROTATED:
-                dJ = d[0] + d[1] + d[2] + d[0] * d[1] + d[0] * d[2] + d[1] * d[2] + d[0] * d[1] * d[2]
-                bulk = lam * (one + dJ) * dJ
-                k = two * mu
-                tau[p] = compose(U, vec(k * (one + d[0]) * d[0] + bulk, k * (one + d[1]) * d[1] + bulk, k * (one + d[2]) * d[2] + bulk))
-            else:
-                e = hencky(d)
-                bulk = lam * (e[0] + e[1] + e[2])
-                k = two * mu
-                tau[p] = compose(U, vec(k * e[0] + bulk, k * e[1] + bulk, k * e[2] + bulk))
+            tau[p] = logarithmic(Fp, mu, lam)
 
     @wp.kernel(enable_backward=False, module="unique")
     def stress_adjoint(
@@ -152,11 +191,8 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
                 wp.atomic_add(grad_params, s, 1, bulk)
 
     @wp.func
-    def flow(e: vec, kind: wp.int32, param: real):
-        """(state, trace, |dev e|, radius): state 0 is elastic, 1 a return to |dev e| = radius, 2 a return to the identity."""
-        trace = e[0] + e[1] + e[2]
-        m = trace / real(3.0)
-        q = wp.sqrt((e[0] - m) * (e[0] - m) + (e[1] - m) * (e[1] - m) + (e[2] - m) * (e[2] - m))
+    def limit(q: real, trace: real, kind: wp.int32, param: real):
+        """(state, radius) of |dev e| = q: state 0 is elastic, 1 a return to |dev e| = radius, 2 a return to the identity."""
         radius = param
         if kind == DRUCKER_PRAGER:
             radius = -param * trace
@@ -165,7 +201,61 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
             state = wp.int32(1)
         if kind == DRUCKER_PRAGER and trace > zero:
             state = wp.int32(2)
+        return state, radius
+
+    @wp.func
+    def flow(e: vec, kind: wp.int32, param: real):
+        """(state, trace, |dev e|, radius), as `limit`."""
+        trace = e[0] + e[1] + e[2]
+        m = trace / real(3.0)
+        q = wp.sqrt((e[0] - m) * (e[0] - m) + (e[1] - m) * (e[1] - m) + (e[2] - m) * (e[2] - m))
+        state, radius = limit(q, trace, kind, param)
         return state, trace, q, radius
+
+    @wp.func
+    def return_in_frame(Fp: mat, kind: wp.int32, param: real):
+        U, d, V = frame(Fp)
+        e = hencky(d)
+        state, trace, q, radius = flow(e, kind, param)
+        out = Fp
+        if state > 0:
+            # z - sigma, so that F moves by the plastic increment alone and does not pick up the rounding of U and V.
+            c0 = -d[0]
+            c1 = -d[1]
+            c2 = -d[2]
+            if state == 1:
+                m = trace / real(3.0)
+                shrink = radius / q - one
+                x = shrink * (e[0] - m)
+                c0 = wp.exp(e[0]) * x * exp_slope(x) + wp.max(floor - one - d[0], zero)
+                x = shrink * (e[1] - m)
+                c1 = wp.exp(e[1]) * x * exp_slope(x) + wp.max(floor - one - d[1], zero)
+                x = shrink * (e[2] - m)
+                c2 = wp.exp(e[2]) * x * exp_slope(x) + wp.max(floor - one - d[2], zero)
+            out = Fp + U * wp.diag(vec(c0, c1, c2)) * wp.transpose(V)
+        return out
+
+    @wp.func
+    def return_by_series(Fp: mat, kind: wp.int32, param: real):
+        """The same without a frame where the strain is slight: F + (exp(X) - 1) F with X the plastic increment of -ln V."""
+        E = strain(Fp)
+        out = Fp
+        if wp.ddot(E, E) <= slight * slight:
+            L = log_stretch(E)
+            dJ = volume_change(Fp)
+            trace = log1p(dJ)
+            D = L - (trace / real(3.0)) * wp.identity(n=3, dtype=real)
+            q = wp.sqrt(wp.ddot(D, D))
+            state, radius = limit(q, trace, kind, param)
+            if state == 1:
+                out = Fp + exp_excess((radius / q - one) * D) * Fp
+            if state == 2:
+                out = Fp + exp_excess(-L) * Fp
+        else:
+            out = return_in_frame(Fp, kind, param)
+        return out
+
+    returned = return_in_frame if builtin_svd else return_by_series
 
     @wp.kernel(enable_backward=enable_backward, module="unique")
     def correct(
@@ -178,30 +268,10 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
         p = wp.tid()
         s = wp.min(scene[p], params.shape[0] - 1)
         kind = kinds[s]
-        Fp = F[p]
         if kind == IDENTITY:
-            corrected[p] = Fp
+            corrected[p] = F[p]
         else:
-            U, d, V = frame(Fp)
-            e = hencky(d)
-            state, trace, q, radius = flow(e, kind, params[s, 0])
-            if state == 0:
-                corrected[p] = Fp
-            else:
-                # z - sigma, so that F moves by the plastic increment alone and does not pick up the rounding of U and V.
-                c0 = -d[0]
-                c1 = -d[1]
-                c2 = -d[2]
-                if state == 1:
-                    m = trace / real(3.0)
-                    shrink = radius / q - one
-                    x = shrink * (e[0] - m)
-                    c0 = wp.exp(e[0]) * x * exp_slope(x) + wp.max(floor - one - d[0], zero)
-                    x = shrink * (e[1] - m)
-                    c1 = wp.exp(e[1]) * x * exp_slope(x) + wp.max(floor - one - d[1], zero)
-                    x = shrink * (e[2] - m)
-                    c2 = wp.exp(e[2]) * x * exp_slope(x) + wp.max(floor - one - d[2], zero)
-                corrected[p] = Fp + U * wp.diag(vec(c0, c1, c2)) * wp.transpose(V)
+            corrected[p] = returned(F[p], kind, params[s, 0])
 
     @wp.kernel(enable_backward=False, module="unique")
     def correct_adjoint(

@@ -342,7 +342,7 @@ def locate(mesh: Mesh, points: Tensor, *, near: int = 24, chunk: int = 1024) -> 
     return torch.cat(found), torch.cat(weights)
 
 
-def follow(x: Tensor, places: Tensor, *, near: int = 16, degree: int = 1, chunk: int = 1024) -> tuple[Tensor, Tensor]:
+def follow(x: Tensor, places: Tensor, *, near: int = 16, degree: int = 1, falloff: float = 3.0, chunk: int = 1024) -> tuple[Tensor, Tensor]:
     """Particles (n, k) and weights (n, k) for each place; their sums take a field from the particles there.
 
     Args:
@@ -350,6 +350,7 @@ def follow(x: Tensor, places: Tensor, *, near: int = 16, degree: int = 1, chunk:
         places: [m], (n, 3).
         near: Particles k that take part, at most.
         degree: 1 reproduces every affine field (moving least squares); 0 is a positive mean.
+        falloff: Weights fall as exp(-falloff (d / s)^2) with the distance d, s that of the last of the k.
         chunk: Places at a time.
     """
     k = min(near, len(x))
@@ -357,7 +358,7 @@ def follow(x: Tensor, places: Tensor, *, near: int = 16, degree: int = 1, chunk:
     for part in places.split(chunk):
         distance, index = torch.cdist(part, x).topk(k, largest=False)
         scale = distance[:, -1:].clamp(min=1e-12)
-        kernel = torch.exp(-3.0 * (distance / scale) ** 2)
+        kernel = torch.exp(-falloff * (distance / scale) ** 2)
         if degree == 0:
             out.append((index, kernel / kernel.sum(dim=1, keepdim=True)))
             continue

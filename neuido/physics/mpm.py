@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics import effect_tables, kernels
+from neuido.physics import inputs, kernels
 from neuido.physics.autograd import run
 from neuido.physics.colliders import clamp_table, collider_table, inside_box
 from neuido.physics.device import real_of
@@ -223,23 +223,18 @@ class Simulator:
 
         Args:
             elasticity: Its modulus is that of the wave.
-            viscosity: Shear and bulk [Pa s], (S, 2).
+            viscosity: `Effects.viscosity` [Pa s], (S, 2).
             mass: [kg], (P,).
             stiffer: What effects add to the modulus [Pa] and their largest factor on it, (S,) each.
 
         Raises:
-            UserError: dt c / dx above `COURANT_LIMIT`, too viscous for an explicit step, or a body faster than a cell a step.
+            UserError: A negative modulus, dt c / dx above `COURANT_LIMIT`, too viscous for an explicit step, or a body faster than a cell
+                a step.
         """
-        modulus = elasticity.modulus().detach().to(self.device, torch.float64).expand(self.scene_count)
-        if stiffer is not None:
-            modulus = (modulus + stiffer[0]) * stiffer[1]
-        rho = (self.mass if mass is None else mass.detach()).double() / self.volume.double()
-        for s, scene in enumerate(self.scenes):
+        for s, (modulus, density) in enumerate(inputs.waves(self, elasticity, mass, stiffer)):
+            scene = self.scenes[s]
             own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
-            density = float(rho[own].min())
-            if not float(modulus[s]) >= 0.0:
-                raise UserError(f"the law of scene {s} has a P-wave modulus of {float(modulus[s]):g} Pa at rest; it must not be negative")
-            wave = (float(modulus[s]) / density) ** 0.5
+            wave = (modulus / density) ** 0.5
             limit = COURANT_LIMIT * scene.dx / max(wave, 1e-30)
             if scene.dt > limit:
                 raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit:.3g} s of a wave of {wave:.4g} m/s on cells of "
@@ -248,8 +243,9 @@ class Simulator:
                 eta, zeta = viscosity.detach()[s].double().tolist()
                 limit = COURANT_LIMIT * scene.dx**2 * density / max(2.0 * (4.0 / 3.0 * eta + zeta), 1e-30)
                 if scene.dt > limit:
-                    raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit:.3g} s of a viscosity of {eta:g}, "
-                                    f"{zeta:g} Pa s; lower `dt` or the viscosity")  # fmt: skip
+                    bulk = float((viscosity[s, 1] - 2.0 / 3.0 * viscosity[s, 0]).detach())  # in the type in which it was added
+                    raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit:.3g} s of a shear viscosity of "
+                                    f"{eta:.3g} and a bulk viscosity of {bulk:.3g} Pa s; lower `dt` or the viscosity")  # fmt: skip
             speed = float(self.state.v[own].norm(dim=1).max())
             if speed * scene.dt >= scene.dx:
                 raise UserError(f"the body of scene {s} starts with {speed:.4g} m/s and crosses a cell of {scene.dx:.4g} m in a step of "
@@ -295,53 +291,25 @@ class Simulator:
         Raises:
             UserError: Before the start: an unstable step. Afterwards: a particle lost, too fast, or not finite.
         """
-        if steps < 1 or every < 1 or steps % every:
-            raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
+        inputs.check_frames(steps, every)
         if segment is not None and (segment < 1 or steps % segment or segment % every):
             raise UserError(f"segment is {segment}; it must divide steps ({steps}) and be a multiple of every ({every})")
-        state = self.state if state is None else ParticleState(*(t.to(self.device, self.dtype).contiguous() for t in state))
-        effects = Effects() if effects is None else effects
-        base = self.gravity if gravity is None else gravity.to(self.device, self.dtype).expand(self.scene_count, 3)
-        pull = effects.accelerations(base, self.dt, steps).contiguous()
-        force = effects.force_table(self.scene_count, self.mass).contiguous()
-        viscosity = effects.viscosity(self.scene_count, self.mass)
-        friction = self.colliders.friction if friction is None else friction.to(self.device, self.dtype).contiguous()
-        if effects.friction is not None:
-            friction = (friction + effects.rows("friction", self.scene_count, self.mass)).clamp(min=0.0)
-        if friction.shape != self.colliders.friction.shape:
-            raise UserError(f"friction has shape {tuple(friction.shape)}; it must be {tuple(self.colliders.friction.shape)}")
-        mass = self.mass if mass is None else mass.to(self.device, self.dtype).contiguous()
-        if effects.added_mass is not None:
-            mass = mass * (1 + effects.rows("added_mass", self.scene_count, mass)[self.particles.scene.long(), 0])
-        empty = mass.new_empty(0)
-        tables, stiffness, growth = None, empty, None
-        if effects.of_material:
-            tables = effect_tables.tables(effects, elasticity, plasticity, self.scene_count, self.mass)
-            if effects.stiffness is not None:
-                stiffness = effects.particle_stiffness(len(mass), mass)
-            growth = effects.growth(self.dt, steps)
+        given = inputs.prepare(
+            self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
+        )
+        pull = given.effects.accelerations(given.gravity, self.dt, steps).contiguous()
         if check:
-            stiffer = None if tables is None else self._stiffening(tables.stiffening, stiffness, growth)
-            self.check_step(elasticity, viscosity, mass, stiffer)
+            self.check_step(elasticity, given.viscosity, given.mass, given.stiffening(self.particles))
+        tables, mass = given.tables, given.mass
         plan = Plan(self, elasticity, plasticity, steps, every, tables)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
         history = mass.new_zeros(len(mass), plan.layout.width)
-        start = [t[self.order] for t in (*state, history, mass)]
-        optional = [viscosity, stiffness[self.order] if len(stiffness) else None, growth]
+        start = [t[self.order] for t in (*given.state, history, mass)]
+        optional = [given.viscosity, None if given.stiffness is None else given.stiffness[self.order], given.growth]
         optional += [None] * 3 if tables is None else [tables.material, tables.branches, tables.flow]
-        optional = [empty if t is None else t.contiguous() for t in optional]
-        frames = run(plan, (*start, pull, force, friction.contiguous(), *optional, *law_tensors), segment)
+        optional = [mass.new_empty(0) if t is None else t.contiguous() for t in optional]
+        frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment)
         return ParticleState(*(t[:, self.inverse] for t in frames[:4]))
-
-    def _stiffening(self, added: Tensor, stiffness: Tensor, growth: Tensor | None) -> tuple[Tensor, Tensor]:
-        """What the effects add to each scene's P-wave modulus [Pa], and the largest factor on the sum."""
-        factor = torch.ones(self.scene_count, dtype=torch.float64, device=self.device)
-        if len(stiffness):
-            parts = zip(self.particles.offsets[:-1], self.particles.offsets[1:])
-            factor = torch.stack([stiffness[i:j].detach().double().max() for i, j in parts])
-        if growth is not None:
-            factor = factor * growth.detach().double().amax(dim=0)
-        return added.double(), factor
 
 
 def _short(t: Tensor) -> list[float]:

@@ -298,16 +298,10 @@ class Plan:
             for n in reversed(range(self.steps if steps is None else steps)):
                 if (n + 1) % self.every == 0:
                     _add(now, gradients, (n + 1) // self.every)
-                x, v, C, F, history = (t[n] for t in tape.states)
+                x, v, C, F, history = state = tuple(t[n] for t in tape.states)
                 v_next, C_next, F_next = tape.v[n + 1], tape.C[n + 1], tape.F[n + 1]
                 material, a_material = self.material(inputs, n), self.material((*inputs[:STATES], *a_fixed), n)
-                tau = scratch if tape.tau is None else tape.tau[n]
-                if tape.tau is None:
-                    self.stress(elastic, F, C, history, viscosity, material, tau)
-                grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid")) if tape.grid is None else tape.grid[n]
-                velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
-                if tape.velocity is None:
-                    self.on_grid(grid, at_step(pull, n), force, friction, velocity)
+                tau, grid, velocity = self.remade(inputs, tape, n, state, elastic, material, scratch)
                 a_x, a_v, a_C, a_F, a_history = then
                 a_out = now[3]
                 trial = None
@@ -340,6 +334,29 @@ class Plan:
             _add(now, gradients, 0)
             of_laws = [*elastic.gradients(), *(() if plastic is None else plastic.gradients())]
         return [*now, *a_fixed, *of_laws]
+
+    def remade(
+        self,
+        inputs: Sequence[Tensor],
+        tape: Tape,
+        n: int,
+        state: Sequence[Tensor],
+        elastic: Engine,
+        material: Material | None,
+        scratch: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Stress, grid and nodal velocities of substep n, from the tape, or made again from the state before it."""
+        sim = self.simulator
+        mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
+        x, v, C, F, history = state
+        tau = scratch if tape.tau is None else tape.tau[n]
+        if tape.tau is None:
+            self.stress(elastic, F, C, history, viscosity, material, tau)
+        grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid")) if tape.grid is None else tape.grid[n]
+        velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
+        if tape.velocity is None:
+            self.on_grid(grid, at_step(pull, n), force, friction, velocity)
+        return tau, grid, velocity
 
     def remember_adjoint(
         self,

@@ -43,6 +43,14 @@ class Functions(NamedTuple):
     """(x, y) -> (ln(1 + y) - ln(1 + x)) / (y - x) of the bounded logarithm"""
     bounded: Any
     """max(x, FLOOR - 1), NaN kept"""
+    stretch: Any
+    """(F F^T - I, det F - 1) -> V - I of the left stretch V, exactly symmetric; for det F > 0"""
+    slight: Any
+    """Largest norm of F F^T - I for `log_stretch`."""
+    log_stretch: Any
+    """F F^T - I -> ln V, exactly symmetric, by a series for slight strains"""
+    exp_excess: Any
+    """symmetric X -> exp(X) - I by a series, |X| at most `slight`"""
 
 
 @functools.cache
@@ -57,9 +65,13 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
     small_strain = wp.constant(real(0.5))
     # Square of the relative size at which an off-diagonal strain counts as zero.
     converged = wp.constant(real(1e-14 if real is wp.float32 else 1e-33))
+    # Square of the relative size of a Newton step whose successor is below the rounding.
+    halved = wp.constant(real(1e-8 if real is wp.float32 else 1e-17))
+    slight = wp.constant(real(0.1 if real is wp.float32 else 2e-3))
     zero = wp.constant(real(0.0))
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
+    two = wp.constant(real(2.0))
     floor = wp.constant(real(FLOOR))
 
     @wp.func
@@ -258,6 +270,47 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         return vec(log1p(bounded(excess[0])), log1p(bounded(excess[1])), log1p(bounded(excess[2])))
 
     @wp.func
+    def stretch(E: mat, dJ: real):
+        # Newton on the trace p of V - I: with its second and third invariants q and r, tr E = 2 p + p^2 - 2 q, det V = 1 + p + q + r, and
+        # g(p) = 0 is the second invariant of E. From above, where it starts, Newton falls to the largest root; g' = 2 det(tr(V) I - V).
+        e1 = wp.trace(E)
+        size = wp.ddot(E, E)
+        e2 = half * (e1 * e1 - size)
+        p = real(3.0) * e1 / (wp.sqrt(real(9.0) + real(3.0) * e1) + real(3.0))
+        q = real(0.0)
+        r = real(0.0)
+        D = real(8.0)
+        move = one
+        n = wp.int32(0)
+        while n < 12 and move * move > halved * size:
+            q = p + half * (p * p - e1)
+            r = dJ - p - q
+            D = (real(3.0) + p) * (real(3.0) + two * p + q) - one - dJ
+            move = half * (q * (real(4.0) + two * p + q) - two * r * (real(3.0) + p) - e2) / D
+            p -= move
+            n += 1
+        q = p + half * (p * p - e1)
+        r = dJ - p - q
+        D = (real(3.0) + p) * (real(3.0) + two * p + q) - one - dJ
+        # Cayley and Hamilton (Hoger and Carlson, Q. Appl. Math. 42, 1984), less I
+        return (((two + p) * (two + p) - q) / D) * E - (one / D) * (E * E) + ((real(4.0) + p) * r / D) * wp.identity(n=3, dtype=real)
+
+    @wp.func
+    def log_stretch(E: mat):
+        Z = E * wp.inverse(E + two * wp.identity(n=3, dtype=real))  # ln V = artanh Z
+        W = Z * Z
+        L = Z + Z * (W * (wp.identity(n=3, dtype=real) / real(3.0) + W / real(5.0)))
+        return half * (L + wp.transpose(L))
+
+    @wp.func
+    def exp_excess(X: mat):
+        eye = wp.identity(n=3, dtype=real)
+        out = eye + X / real(5.0)
+        out = eye + X * out / real(4.0)
+        out = eye + X * out / real(3.0)
+        return X * (eye + X * out / two)
+
+    @wp.func
     def inverse_stretch(excess: vec):
         """The derivative of `hencky`."""
         result = vec(zero, zero, zero)
@@ -294,4 +347,8 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         inverse_stretch,
         log_difference,
         bounded,
+        stretch,
+        slight,
+        log_stretch,
+        exp_excess,
     )

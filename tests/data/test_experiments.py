@@ -15,6 +15,7 @@ from neuido.physics.laws import material
 from neuido.physics.mpm import Simulator
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
 from tests.data import samples
+from tests.data.refused import assert_refused
 
 S = samples.Sample()
 
@@ -133,7 +134,7 @@ def test_scene_to_dict():
         ("density: 1000.0", "density: heavy", "model.density must be a finite number"),
         ("free: [young, yield_stress]", "free: [young, friction_angle]", "model.free has 'friction_angle'"),
         ("free: [young, yield_stress]", "free: young", "model.free must be a list"),
-        ("free: [young, yield_stress]", "free: [young, young]", "names a parameter twice"),
+        ("free: [young, yield_stress]", "free: [young, young]", "names a figure twice"),
         ("role: fit", "role: train", r"recordings\[0\] \(drop\).role = 'train'"),
         ("noise: 0.0005", "noise: -1", r"recordings\[0\] \(drop\).noise must be at least 0"),
         ("noise: 0.0005", "nois: 1", r"unknown key 'nois' in recordings\[0\]"),
@@ -155,12 +156,7 @@ def test_scene_to_dict():
     ],
 )
 def test_malformed_yaml(folder, old, new, message):
-    file = folder / "experiment.yaml"
-    assert file.read_text().count(old) >= 1
-    file.write_text(file.read_text().replace(old, new, 1))
-    with pytest.raises(UserError, match=message) as caught:
-        read_experiment(folder)
-    assert "\n" not in str(caught.value) and "experiment.yaml" in str(caught.value)
+    assert_refused(read_experiment, folder / "experiment.yaml", old, new, message)
 
 
 def wrong(key: str, change):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.data import generate, storage
+from neuido.data import families, generate, storage
 from neuido.data.simulate import FAMILIES, simulate
 from neuido.errors import UserError
 
@@ -65,13 +65,13 @@ def test_parameters_depend_on_seed_family_and_number_alone():
     assert len(shared) == 15
     assert all(one[name] == other[name] for name in shared)
     moved = {i.name: i.parameters for i in generate.plan(setup(seed=1))}
-    assert all((moved[name] == one[name]) == (name in generate.PARAMETERS or name == "jelly") for name in one)
+    assert all((moved[name] == one[name]) == (name in families.PARAMETERS or name == "jelly") for name in one)
 
 
 @pytest.mark.parametrize("name", ["jelly", "plasticine-001", "sand-002", "elastic-004"])
 def test_targets_are_the_laws_of_the_stored_inputs(folder, name):
     entry = next(e for e in index(folder)["trajectories"] if e["name"] == name)
-    elastic, plastic = generate.laws(entry["family"], [entry["parameters"]])
+    elastic, plastic = families.laws(entry["family"], [entry["parameters"]])
     trial, corrected, stress = torch.from_numpy(np.load(folder / f"{name}.npy")).view(-1, 3, 3, 3).unbind(1)
     if entry["family"] == "elastic":
         assert torch.equal(corrected, trial)

@@ -4,6 +4,7 @@ import pytest
 from neuido.data.material_tests import read_material_tests
 from neuido.errors import UserError
 from neuido.physics.laws import material
+from tests.data.refused import assert_refused
 
 YAML = """format: neuido-material-test/1
 name: rubber
@@ -106,14 +107,9 @@ def test_adjoining_rows_are_one_specimen(folder):
     ],
 )
 def test_malformed(folder, old, new, message):
-    file = folder / "test.yaml"
     if new == "time: b":
         (folder / "sheet.csv").write_text(SHEET.replace("0.2,0.1,4", "0.2,0.01,4"))
-    assert old in YAML
-    file.write_text(YAML.replace(old, new, 1))
-    with pytest.raises(UserError, match=message) as caught:
-        read_material_tests(folder)
-    assert "\n" not in str(caught.value) and "test.yaml" in str(caught.value)
+    assert_refused(read_material_tests, folder / "test.yaml", old, new, message)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ import pytest
 
 from neuido.data.tracks import read_tracks
 from neuido.errors import UserError
+from tests.data.refused import assert_refused
 
 YAML = """format: neuido-track/1
 name: balls
@@ -85,11 +86,7 @@ def test_read(folder):
     ],
 )
 def test_malformed(folder, old, new, message):
-    assert old in YAML
-    (folder / "track.yaml").write_text(YAML.replace(old, new, 1))
-    with pytest.raises(UserError, match=message) as caught:
-        read_tracks(folder)
-    assert "\n" not in str(caught.value) and "track.yaml" in str(caught.value)
+    assert_refused(read_tracks, folder / "track.yaml", old, new, message)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from neuido.data.synthetic import JELLY
 from neuido.data.visual import Motion, Placing, Setting, read_motion, read_setting, read_truth, write_motion, write_setting
 from neuido.errors import UserError
 from neuido.types import AttachedMass, Box, Plane, Scene, Walls
+from tests.data.refused import assert_refused
 
 
 def test_motion_round_trip(tmp_path):
@@ -43,12 +44,7 @@ def test_setting_round_trip(tmp_path):
 def test_setting_errors(tmp_path, old, new, words):
     path = tmp_path / "scene.yaml"
     write_setting(Setting("mine", Scene(), 1000.0, JELLY, Placing(0.5, up="z")), path)
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
-    with pytest.raises(UserError, match=words) as error:
-        read_setting(path)
-    assert str(path) in str(error.value)
+    assert_refused(read_setting, path, old, new, words)
 
 
 @pytest.mark.parametrize(

@@ -34,9 +34,19 @@ def body(velocity: tuple[float, float, float], spin: float, height: float, side:
 
 
 def experiment(
-    folder: Path, effects: dict[str, float], *, noise: float = 4e-4, frames: int = 16, seed: int = 1, side: int = 5
+    folder: Path,
+    effects: dict[str, float],
+    *,
+    noise: float = 4e-4,
+    frames: int = 16,
+    seed: int = 1,
+    side: int = 5,
+    laws: tuple | None = None,
 ) -> Experiment:
-    """Write an experiment: a block thrown on a floor twice, the second time held out, with effects that are not declared."""
+    """Write an experiment: a block thrown on a floor twice, the second time held out, with effects that are not declared.
+
+    `laws`: what moves it, in place of `MODEL`'s.
+    """
     scene = Scene(cells=14, dt=1e-3, colliders=(Plane((0.0, 0.1, 0.0), (0.0, 1.0, 0.0), "separate", 0.2),))
     rng = np.random.default_rng(seed)
     recordings = []
@@ -46,9 +56,8 @@ def experiment(
     ):
         simulator = Simulator(scene, b, density=1000.0)
         with torch.no_grad():
-            out = simulator.rollout(
-                10 * (frames - 1), *material(MODEL["elasticity"], MODEL["plasticity"]), every=10, effects=Effects.of(effects)
-            )
+            pair = material(MODEL["elasticity"], MODEL["plasticity"]) if laws is None else laws
+            out = simulator.rollout(10 * (frames - 1), *pair, every=10, effects=Effects.of(effects))
         pick = torch.from_numpy(rng.permutation(len(b.x))[:60].copy())
         x = out.x[:, pick] + noise * torch.from_numpy(rng.standard_normal((frames, 60, 3))).float()
         x[frames // 2, :3] = torch.nan
@@ -76,7 +85,7 @@ def filmed(
 ) -> Experiment:
     """Write the block of `experiment` as silhouettes from some views, a throw and one held out; `particles`: with x0, v0 and volume."""
     scene = Scene(cells=14, dt=1e-3, colliders=(Plane((0.0, 0.1, 0.0), (0.0, 1.0, 0.0), "separate", 0.2),))
-    cameras = orbit(views, radius=2.4, elevations=(12.0, 24.0), target=(0.5, 0.35, 0.5), width=width, height=width, angle=32.0)
+    cameras = orbit(views, radius=2.4, elevations=(12.0, 50.0), target=(0.5, 0.35, 0.5), width=width, height=width, angle=32.0)
     recordings = []
     for name, role, b in (
         ("throw", "fit", body((0.9, 0.6, 0.2), 5.0, 0.42, side)),

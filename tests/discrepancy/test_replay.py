@@ -9,8 +9,9 @@ import yaml
 
 from neuido.cli import main
 from neuido.data.experiments import read_experiment
+from neuido.discrepancy.believed import ready
 from neuido.discrepancy.body import SEGMENT, _segment, body_problem
-from neuido.discrepancy.declared import ready
+from neuido.discrepancy.resume import CachedProblem
 from neuido.errors import UserError
 from neuido.physics.laws import FixedCorotated
 from neuido.physics.mpm import Simulator
@@ -134,8 +135,21 @@ def test_long_recordings_run_in_pieces(folder, monkeypatch):
     monkeypatch.setattr(Simulator, "rollout", watched)
     problem.predict([{}], 0)
     assert asked == [(90, 30)]
-    (kept,) = problem.simulator(0, 0, 1).cache._kept.values()
+    (simulator,) = problem._simulators.values()
+    (kept,) = simulator.cache._kept.values()
     assert len(kept.tape.x) == 10
+
+
+def test_long_recordings_are_stored_and_told_of_in_small_calls(folder, tmp_path, monkeypatch):
+    problem = body_problem(read_experiment(folder))
+    points = [{"young": 6e4 + 100 * i} for i in range(6)]
+    for effort, calls in ((1e3, [6]), (1e9, [4, 2])):
+        ticks: list[int] = []
+        monkeypatch.setattr(type(problem), "effort", lambda self, recording, setting=0, effort=effort: effort)
+        cached = CachedProblem(problem, tmp_path / f"{effort:g}", tick=ticks.append)
+        rows = cached.predict(points, 0)
+        assert ticks == calls
+        np.testing.assert_array_equal(rows, problem.predict(points, 0))
 
 
 @pytest.mark.gpu

@@ -8,8 +8,8 @@ import pytest
 import torch
 from lightning.pytorch import Trainer, seed_everything
 
+from neuido.data.families import laws
 from neuido.data.films import FilmDataModule, read_clip
-from neuido.data.generate import laws
 from neuido.errors import UserError
 from neuido.models.encoder import DynamicsEncoder
 from neuido.models.film import film
@@ -48,6 +48,18 @@ def test_clips(folder):
     assert window.flow.shape == (16, 8, 32, 32, 2)
 
 
+def test_shards_make_the_same_clips(folder, tmp_path):
+    for shard in (1, 0):
+        assert not (tmp_path / "a" / "index.json").exists()
+        film(str(tmp_path / "a"), **{**TINY, "count": 3}, shard=shard, shards=2)
+    for number in range(3):
+        with np.load(folder / f"clip-{number:05d}.npz") as whole, np.load(tmp_path / "a" / f"clip-{number:05d}.npz") as part:
+            assert np.array_equal(whole["flow"], part["flow"])
+    assert len(json.loads((tmp_path / "a" / "index.json").read_text())["clips"]) == 3
+    with pytest.raises(UserError, match="shard = 2"):
+        film(str(tmp_path / "a"), **{**TINY, "count": 3}, shard=2, shards=2)
+
+
 def test_a_body_falls(folder):
     flow = read_clip(folder / "clip-00000.npz").flow.float()
     moving = flow[:, 0][flow[:, 0].norm(dim=-1) > 0.2]
@@ -80,7 +92,8 @@ def test_vae_training_learns(folder, tmp_path):
     after = trainer(tmp_path).validate(module, data, verbose=False)[0]
     assert after["val/error"] < 0.8 * before["val/error"]
     vae = FlowVAE.load(tmp_path / "vae.safetensors")
-    assert vae.card["steps"] == 40 and vae.scale != 1
+    assert vae.card["steps"] in (10, 20, 30, 40) and vae.scale != 1  # of the best validation
+    assert vae.card["figures"]["val/error"] == pytest.approx(after["val/error"], rel=1e-4)
 
 
 def test_warm_up_learns_and_touches_the_projector_alone(folder, tmp_path):
@@ -91,12 +104,12 @@ def test_warm_up_learns_and_touches_the_projector_alone(folder, tmp_path):
     module = WarmupModule(**options, save_to=str(tmp_path / "encoder.safetensors"))
     frozen = {name: p.clone() for name, p in module.named_parameters() if "projector" not in name}
     data = FilmDataModule(str(folder), batch_size=6, frames=0, held_out=0.2)
-    fit = trainer(tmp_path, max_steps=60, check_val_every_n_epoch=100)
+    fit = trainer(tmp_path, max_steps=100, check_val_every_n_epoch=100)
     losses = []
     step = module.training_step
     module.training_step = lambda *a: losses.append(step(*a)) or losses[-1]
     fit.fit(module, data)
-    assert torch.stack(losses[-5:]).mean() < 0.6 * losses[0]
+    assert torch.stack(losses[-10:]).mean() < 0.6 * losses[0]
     assert frozen and all(torch.equal(p, dict(module.named_parameters())[name]) for name, p in frozen.items())
     assert DynamicsEncoder.load(tmp_path / "encoder.safetensors").card["stage"] == "warm-up"
 

@@ -36,7 +36,7 @@ def test_it_learns():
     video = torch.stack([a * ramp[:, None] * ramp for a in torch.linspace(0.2, 1, 4)])[:, None, None].expand(4, 3, 5, 16, 16)
     optimizer = torch.optim.AdamW(vae.parameters(), lr=2e-3)
     first = (vae.reconstruct(vae.posterior(video)[0]) - video).square().mean().item()
-    for _ in range(60):
+    for _ in range(90):
         error = (vae.reconstruct(vae.posterior(video)[0]) - video).square().mean()
         optimizer.zero_grad()
         error.backward()

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuido.data.generate import PUBLISHED, laws
+from neuido.data.families import PUBLISHED, laws
 from neuido.models.operator import PRETRAINED, IntrinsicDynamicsOperator
 from neuido.models.pretrain import PretrainModule
 

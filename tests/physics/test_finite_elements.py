@@ -1,11 +1,13 @@
 """The finite elements against closed forms, a slow twin in torch, and what they must share with the material point method."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from neuido.errors import UserError
+from neuido.physics import element_loop
 from neuido.physics.assembly import Assembly
 from neuido.physics.constitutive import Constitutive
 from neuido.physics.effects import Effects
@@ -231,6 +233,56 @@ def test_parameter_sets_in_one_call_equal_single_ones():
     together = sim.rollout(50, FixedCorotated(young, 0.3), effects=effects, every=25)
     for a, b in zip(out, together):
         assert torch.allclose(a, b, rtol=0, atol=1e-9 * float(a.abs().max()))
+
+
+REPLAYED = {
+    "elastic": ((FixedCorotated, None), {}),
+    "pulled": ((FixedCorotated, None), {"time_force": ((3.0, 0.0, 0.0), (-4.0, 1.0, 0.0)), "stiffness_change": 5.0}),
+    "yielding": ((FixedCorotated, Identity()), {"yield_inverse": 1 / 1.5e3, "hardening": 2e3, "kinematic_hardening": 5e3}),
+    "branches": ((NeoHookean, VonMises(3e3, 4e4, 0.3)), {"maxwell_ratio": 0.5, "maxwell_time": 0.01, "viscosity_shear": 5.0}),
+}
+
+
+def replayed(name: str, device: str, graphs: bool, every: int, dtype: torch.dtype) -> list[ParticleState]:
+    """Two rollouts of two scenes by one solver, the second with another stiffness, time force and start."""
+    (law, plastic), given = REPLAYED[name]
+    scene = Scene(dt=5e-4, walls=None, colliders=(Plane((0.0, 0.1, 0.0), (0.1, 1.0, 0.0)),))
+    body = block((0.3, 0.1, 0.3), (0.5, 0.3, 0.5), (4, 4, 4), (0.4, -3.0, 0.0), (3.0, 0.0, 2.0))
+    sim = FiniteElements([scene] * 2, [body] * 2, density=1000.0, device=device, dtype=dtype, elements=320, graphs=graphs)
+    if device == "cpu":  # as on a GPU, where the scenes share their launches
+        sim.assemblies, sim.pool, sim.graphs = [Assembly(sim, [a.pieces[0] for a in sim.assemblies], 0, 2)], None, graphs
+    out = []
+    for factor in (1.0, 1.4):
+        effects = dict(given)
+        if "time_force" in effects:
+            effects |= {"time_force": factor * torch.tensor(effects["time_force"]), "time_force_interval": 0.03}
+        state = sim.state._replace(v=factor * sim.state.v)
+        young = factor * torch.tensor([4e4, 5e4], dtype=torch.float64)
+        out.append(sim.rollout(60, law(young, 0.3), plastic, state=state, effects=Effects(**effects), inner=1, every=every))
+    return out
+
+
+@pytest.mark.parametrize("name", REPLAYED)
+@pytest.mark.parametrize("every", [10, 15])
+def test_a_kept_loop_is_a_fresh_one(name, every, monkeypatch):
+    """What a graph replays finds all that it reads in the loop's own memory; the graph is a stand-in, which launches anew."""
+    monkeypatch.setattr(element_loop, "_capture", lambda launches: (SimpleNamespace(replay=launches), None))
+    kept = replayed(name, "cpu", True, every, torch.float64)
+    for a, b in zip(kept, replayed(name, "cpu", False, every, torch.float64)):
+        for got, want in zip(a, b):
+            assert torch.equal(got, want)
+    assert float((kept[0].x - kept[1].x).abs().max()) > 1e-3
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", REPLAYED)
+@pytest.mark.parametrize("every", [10, 15])
+def test_a_graph_is_the_eager_loop(name, every):
+    """Nodes gather their forces, so that no sum depends on an order: the graph's motion is the eager one's, bit for bit."""
+    graph = replayed(name, "cuda", True, every, torch.float32)
+    for a, b in zip(graph, replayed(name, "cuda", False, every, torch.float32)):
+        for got, want in zip(a, b):
+            assert torch.equal(got, want)
 
 
 def test_a_motion_in_pieces_is_the_whole_motion():

@@ -251,6 +251,28 @@ def test_kernel_equals_twin(name, dtype, forward, backward):
     assert error.quantile(0.9 if dtype == torch.float32 else 1.0) <= backward
 
 
+FLAT = with_stretches([[3.0, 1.0, j / 3.0] for j in (0.099, 0.0999999, 0.1000001, 0.12)] + [[4.0, 4.0, 0.01], [0.5, 0.5, 0.5]])
+SLIGHT = torch.cat([generic(60, size, seed=5) for size in (2e-4, 5e-4, 1e-3)])  # |F F^T - I| from 5e-4 to 6e-3
+
+
+@pytest.mark.parametrize(
+    ("law", "F"),
+    [
+        (elastic("fixed_corotated"), FLAT),
+        (elastic("fixed_corotated"), SLIGHT),
+        (elastic("sigma"), SLIGHT),
+        (VonMises(1e-3 * YOUNG, YOUNG, POISSON), SLIGHT),
+        (DruckerPrager(25.0, YOUNG, POISSON), SLIGHT),
+    ],
+)
+def test_kernels_without_a_frame_join_those_with_one(law, F):
+    """On both sides of where the stretch (J of 0.1) and the series (strains of 2e-3) give over to the principal frame."""
+    expected = law(F)
+    scale = (expected - F if isinstance(law, laws.PlasticLaw) else expected).abs().max()
+    assert float(scale) > 0
+    assert float((engine(law, F) - expected).abs().max()) < 1e-9 * float(scale)
+
+
 @pytest.mark.parametrize("name", ELASTIC)
 @pytest.mark.parametrize("strain", [1e-5, 1e-3, 1e-1])
 def test_float32_stress_keeps_the_digits_of_small_strains(name, strain):

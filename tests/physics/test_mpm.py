@@ -80,8 +80,8 @@ def test_rollout_gradient_equals_finite_differences():
     gradients = torch.autograd.grad(p.loss(p.sim.rollout, 6, 2)[0], p.leaves())
     for name, t, gradient in zip(NAMES, p.leaves(), gradients, strict=True):
         direction = torch.randn(t.shape, generator=torch.Generator().manual_seed(9), dtype=t.dtype).to(t.device)
-        # relative steps; the loss is piecewise smooth and this one stays on its piece
-        h = 1e-5 * float(t.detach().norm() / direction.norm())
+        # relative steps; the loss is piecewise smooth in x and F, and a short step stays on its piece; elsewhere a long one rounds off less
+        h = (1e-5 if name in "xF" else 1e-4) * float(t.detach().norm() / direction.norm())
         with torch.no_grad():
             values = []
             for shift in (-2, -1, 1, 2):
@@ -294,7 +294,8 @@ def test_float32_follows_float64():
         (dict(steps=10, every=3), "multiple of every"),
         (dict(steps=12, every=2, segment=5), "segment is 5"),
         (dict(effects=Effects(drag_linear=-1.0)), "drag_linear is -1"),
-        (dict(effects=Effects(viscosity_shear=1e5)), "viscosity"),
+        (dict(effects=Effects(viscosity_shear=1e5)), r"a shear viscosity of 1e\+05 and a bulk viscosity of 0 Pa s"),
+        (dict(effects=Effects(viscosity_shear=300.0, viscosity_bulk=1e5)), r"a shear viscosity of 300 and a bulk viscosity of 1e\+05 Pa s"),
         (dict(scene=Scene(walls=None), body=block((0.4, 0.0, 0.4), (0.6, 0.2, 0.6), (4, 4, 4), velocity=(0.0, -9.0, 0.0)), steps=100),
          "left the domain"),
         (dict(body=Body(torch.tensor([[0.5, float("nan"), 0.5]]), torch.zeros(1, 3), torch.ones(1))), "NaN"),

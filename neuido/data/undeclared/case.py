@@ -11,7 +11,6 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from neuido.data.generate import _device
 from neuido.data.scenes import read_yaml
 from neuido.data.storage import publish_folder, write
 from neuido.data.undeclared import Case
@@ -20,6 +19,7 @@ from neuido.data.undeclared.curves import curve_case
 from neuido.data.undeclared.effects import KINDS, OUTSIDE
 from neuido.data.undeclared.sizing import LEAST, MOST, Again
 from neuido.errors import UserError
+from neuido.physics.device import choose_device
 
 TRIES = 12
 """Draws before a seed is given up."""
@@ -38,7 +38,7 @@ def make(seed: int, out: str | Path, *, case: Case, device: str, progress: bool)
             return key
         raise UserError(f"out = {folder} exists and is not the case of seed {seed} with these options: give another folder")
     maker = body_case if case.measured == "body" else curve_case
-    chosen = str(_device(device))
+    chosen = str(choose_device(device))
     with tqdm(desc=folder.name, unit=" simulations", disable=not progress) as bar:
         for attempt in range(TRIES):
             rng = np.random.default_rng([int(seed), attempt])

@@ -1,8 +1,9 @@
 """Material tests and tracks with an undeclared effect: curves, beside the moving bodies of `case`."""
 
 import csv
+import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from neuido.physics.effects import Effects
 from neuido.physics.laws import material
 from neuido.physics.material_point import Specimen, stress_along
 from neuido.physics.point_mass import Forces, fly
+from neuido.types import Vector
 
 Sizes = Mapping[str, tuple[Mapping[str, float], str, float, float]]
 TEST_KINDS = ("viscosity_shear", "maxwell", "hysteresis", "strain_stiffening", "second_invariant", "tension_compression", "yield",
@@ -95,20 +97,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
     plain = stresses({})
     noise = 3e-3 * max(float(np.abs(one).max()) for one in plain)
     flow = plasticity.get("yield_stress", young)
-    sizes: Sizes = {
-        "viscosity_shear": ({"eta": 0.01 * young * PERIOD}, "eta", 0.01, 30),
-        "maxwell": ({"ratio": 0.3, "time": PERIOD * 10 ** rng.uniform(-1.3, 0.0)}, "ratio", 0.05, 8),
-        "hysteresis": ({"eta": 0.15}, "eta", 0.1, 4),
-        "strain_stiffening": ({"k": 0.3}, "k", 0.05, 8),
-        "second_invariant": ({"c": 0.3}, "c", 0.05, 8),
-        "tension_compression": ({"r": 0.3}, "r", 0.05, 6),
-        "yield": ({"inverse": 6.0 / young}, "inverse", 0.2, 6),
-        "hardening": ({"h": 0.05 * young}, "h", 0.02, 10),
-        "kinematic_hardening": ({"h": 0.05 * young}, "h", 0.02, 10),
-        "rate_yield": ({"eta": 0.1 * flow * PERIOD}, "eta", 0.02, 30),
-        "softening": ({"s": 0.5}, "s", 0.05, 6),
-        "stiffness_change": ({"rate": -0.1 if rng.random() < 0.5 else 0.1}, "rate", 0.05, 3),
-    }
+    sizes = _test_sizes(rng, young, flow)
     drawn = _effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms(stresses(values)[0] - plain[0]))
     true = stresses(drawn.values) if drawn else plain
     believed = float(f"{young * (rng.uniform(0.65, 0.85) if rng.random() < 0.5 else rng.uniform(1.2, 1.5)):.3g}")
@@ -134,18 +123,36 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
         "plasticity": {k: start.get(k, v) for k, v in plasticity.items()},
         "free": free,
     }
+    return functools.partial(_write_tests, name, model, tests), truth
 
-    def write_folder(folder: Path) -> None:
-        entries = []
-        for title, mode, role, rows in tests:
-            _write_csv(folder / f"{title}.csv", ("time_s", "stretch", "stress_pa"), rows)
-            columns = {"time": "time_s", "stretch": "stretch", "nominal_stress": "stress_pa"}
-            entries.append({"name": title, "file": f"{title}.csv", "mode": mode, "columns": columns, "role": role})
-        content = {"format": "neuido-material-test/1", "name": name, "model": model, "tests": entries}
-        (folder / "test.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-        read_material_tests(folder)
 
-    return write_folder, truth
+def _test_sizes(rng: np.random.Generator, young: float, flow: float) -> Sizes:
+    """Of each effect: values to start from, the parameters that are sized, their least and their most."""
+    return {
+        "viscosity_shear": ({"eta": 0.01 * young * PERIOD}, "eta", 0.01, 30),
+        "maxwell": ({"ratio": 0.3, "time": PERIOD * 10 ** rng.uniform(-1.3, 0.0)}, "ratio", 0.05, 8),
+        "hysteresis": ({"eta": 0.15}, "eta", 0.1, 4),
+        "strain_stiffening": ({"k": 0.3}, "k", 0.05, 8),
+        "second_invariant": ({"c": 0.3}, "c", 0.05, 8),
+        "tension_compression": ({"r": 0.3}, "r", 0.05, 6),
+        "yield": ({"inverse": 6.0 / young}, "inverse", 0.2, 6),
+        "hardening": ({"h": 0.05 * young}, "h", 0.02, 10),
+        "kinematic_hardening": ({"h": 0.05 * young}, "h", 0.02, 10),
+        "rate_yield": ({"eta": 0.1 * flow * PERIOD}, "eta", 0.02, 30),
+        "softening": ({"s": 0.5}, "s", 0.05, 6),
+        "stiffness_change": ({"rate": -0.1 if rng.random() < 0.5 else 0.1}, "rate", 0.05, 3),
+    }
+
+
+def _write_tests(name: str, model: Mapping[str, Any], tests: Sequence[tuple[str, str, str, np.ndarray]], folder: Path) -> None:
+    entries = []
+    for title, mode, role, rows in tests:
+        _write_csv(folder / f"{title}.csv", ("time_s", "stretch", "stress_pa"), rows)
+        columns = {"time": "time_s", "stretch": "stretch", "nominal_stress": "stress_pa"}
+        entries.append({"name": title, "file": f"{title}.csv", "mode": mode, "columns": columns, "role": role})
+    content = {"format": "neuido-material-test/1", "name": name, "model": model, "tests": entries}
+    (folder / "test.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    read_material_tests(folder)
 
 
 def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance: Callable[[int], Any]):
@@ -173,19 +180,7 @@ def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance
         return fly(t, start, velocity, np.zeros(count), Forces(**acting), step=2e-3)
 
     plain = paths({})
-    level = np.array([1.0, 0.2, 1.0]) * rng.normal(size=3)
-    level /= np.linalg.norm(level)
-    turn = rng.normal(size=3)
-    turn /= np.linalg.norm(turn)
-    place = np.array([0.0, 1.5, 0.0]) + rng.uniform(-1.0, 1.0, 3)
-    sizes: Sizes = {
-        "gravity": ({"g": -0.6 if rng.random() < 0.5 else 0.6}, "g", 0.05, 6),
-        "uniform_acceleration": (dict(zip("xyz", level)), "x y z", 0.05, 3),
-        "drag_linear": ({"k": 0.2}, "k", 0.02, 10),
-        "drag_quadratic": ({"k": 0.05}, "k", 0.02, 10),
-        "magnus": (dict(zip("xyz", 0.3 * turn)), "x y z", 0.05, 8),
-        "position_force": ({"k": 1.0, **dict(zip("xyz", place))}, "k", 0.05, 8),
-    }
+    sizes = _track_sizes(rng)
     drawn = _effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms((paths(values) - plain)[:2]))
     true = paths(drawn.values) if drawn else plain
     roles, names = ["fit", "fit", "held_out", "held_out"], [f"throw-{i + 1}" for i in range(count)]
@@ -197,21 +192,39 @@ def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance
         "recordings": _rows(list(true), list(plain), noise, roles, names, "m") if drawn else [],
     }
     seen = true + noise * rng.normal(size=true.shape)
+    rows = [(title, role, np.concatenate([t[:, None], x], axis=1)) for title, role, x in zip(names, roles, seen)]
+    return functools.partial(_write_tracks, name, gravity, noise, rows), truth
 
-    def write_folder(folder: Path) -> None:
-        entries = []
-        for title, role, x in zip(names, roles, seen):
-            _write_csv(folder / f"{title}.csv", ("t_s", "x_m", "y_m", "z_m"), np.concatenate([t[:, None], x], axis=1))
-            columns = {"t": "t_s", "x": "x_m", "y": "y_m", "z": "z_m"}
-            entries.append({"name": title, "body": "ball", "file": f"{title}.csv", "columns": columns, "noise": noise, "role": role})
-        content = {
-            "format": "neuido-track/1", "name": name, "model": {"gravity": list(gravity), "effects": {}, "free": []},
-            "nuisances": {"release_time": 0.002, "length_scale": 0.002, "time_base": 0.001}, "bodies": {"ball": {}}, "recordings": entries,
-        }  # fmt: skip
-        (folder / "track.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-        read_tracks(folder)
 
-    return write_folder, truth
+def _track_sizes(rng: np.random.Generator) -> Sizes:
+    """As `_test_sizes`."""
+    level = np.array([1.0, 0.2, 1.0]) * rng.normal(size=3)
+    level /= np.linalg.norm(level)
+    turn = rng.normal(size=3)
+    turn /= np.linalg.norm(turn)
+    place = np.array([0.0, 1.5, 0.0]) + rng.uniform(-1.0, 1.0, 3)
+    return {
+        "gravity": ({"g": -0.6 if rng.random() < 0.5 else 0.6}, "g", 0.05, 6),
+        "uniform_acceleration": (dict(zip("xyz", level)), "x y z", 0.05, 3),
+        "drag_linear": ({"k": 0.2}, "k", 0.02, 10),
+        "drag_quadratic": ({"k": 0.05}, "k", 0.02, 10),
+        "magnus": (dict(zip("xyz", 0.3 * turn)), "x y z", 0.05, 8),
+        "position_force": ({"k": 1.0, **dict(zip("xyz", place))}, "k", 0.05, 8),
+    }
+
+
+def _write_tracks(name: str, gravity: Vector, noise: float, tracks: Sequence[tuple[str, str, np.ndarray]], folder: Path) -> None:
+    entries = []
+    for title, role, rows in tracks:
+        _write_csv(folder / f"{title}.csv", ("t_s", "x_m", "y_m", "z_m"), rows)
+        columns = {"t": "t_s", "x": "x_m", "y": "y_m", "z": "z_m"}
+        entries.append({"name": title, "body": "ball", "file": f"{title}.csv", "columns": columns, "noise": noise, "role": role})
+    content = {
+        "format": "neuido-track/1", "name": name, "model": {"gravity": list(gravity), "effects": {}, "free": []},
+        "nuisances": {"release_time": 0.002, "length_scale": 0.002, "time_base": 0.001}, "bodies": {"ball": {}}, "recordings": entries,
+    }  # fmt: skip
+    (folder / "track.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    read_tracks(folder)
 
 
 def _write_csv(path: Path, titles: tuple[str, ...], rows: np.ndarray) -> None:

@@ -92,35 +92,22 @@ def move(
         UserError: A step above the stability limit, a particle lost.
     """
     scene = replace(scene, cells=solver.cells, dt=solver.dt)
-    args = [scene] * len(bodies), list(bodies)
-    if solver.name == "elements":
-        elements = round(solver.density * len(bodies[0].x))
-        simulator = FiniteElements(*args, density=law["density"], device=device, elements=elements, tetrahedra=solver.tetrahedra)
-    else:
-        simulator = Simulator(*args, density=law["density"], device=device)
+    simulator = _simulator(solver, scene, bodies, law["density"], device)
     every = round(interval / scene.dt)
     frames = math.ceil(seconds / interval - 1e-6)
     elasticity, plasticity = material(law["elasticity"], law["plasticity"])
-    x, mass = simulator.state.x, None
-    known = {name: value for name, value in values.items() if not name.startswith(OWN)}
-    own = {name.partition(".")[0]: {} for name in values if name.startswith(OWN)}
-    for name, value in values.items():
-        if name.startswith(OWN):
-            own[name.partition(".")[0]][name.partition(".")[2]] = value
-    effects = _effects(known, x, simulator.particles.scene)
-    if "density_gradient" in own:
-        mass = _graded(simulator, own.pop("density_gradient"))
-    lift = None
-    if "moving_floor" in own:
-        lift = own.pop("moving_floor")
+    known, own = _sorted(values)
+    effects = Effects.of(known, x=simulator.state.x, scene=simulator.particles.scene)
+    slope, lift = own.pop("density_gradient", None), own.pop("moving_floor", None)
+    mass = None if slope is None else _graded(simulator, slope)
+    if lift is not None:
         effects = effects._replace(**_shaken(lift, frames * every, scene.dt))
     with torch.no_grad():
         if own:
             out = _split(simulator, elasticity, plasticity, effects, own, frames, every)
         else:
             out = simulator.rollout(frames * every, elasticity, plasticity, every=every, effects=effects, mass=mass)
-    count = len(bodies)
-    place, velocity = (t.double().cpu().numpy().reshape(frames + 1, count, -1, 3).swapaxes(0, 1) for t in (out.x, out.v))
+    place, velocity = (t.double().cpu().numpy().reshape(frames + 1, len(bodies), -1, 3).swapaxes(0, 1) for t in (out.x, out.v))
     if lift is not None:  # back from the frame of the floor
         t = np.arange(frames + 1) * interval
         w = 2 * math.pi * lift["frequency"]
@@ -133,8 +120,25 @@ def move(
 OWN = ("dry_drag.", "moving_floor.", "delayed_spring.", "swelling.", "magnet.", "density_gradient.", "spin_decay.")
 
 
-def _effects(values: Mapping[str, float], x: Tensor, scene: Tensor) -> Effects:
-    return Effects.of(values, x=x, scene=scene)
+def _simulator(solver: Solver, scene: Scene, bodies: Sequence[Body], density: float, device: str) -> Simulator | FiniteElements:
+    scenes = [scene] * len(bodies)
+    if solver.name != "elements":
+        return Simulator(scenes, bodies, density=density, device=device)
+    elements = round(solver.density * len(bodies[0].x))
+    return FiniteElements(scenes, bodies, density=density, device=device, elements=elements, tetrahedra=solver.tetrahedra)
+
+
+def _sorted(values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+    """The effects of the library by flat names, and those outside it by name and parameter."""
+    known: dict[str, float] = {}
+    own: dict[str, dict[str, float]] = {}
+    for name, value in values.items():
+        if name.startswith(OWN):
+            effect, _, parameter = name.partition(".")
+            own.setdefault(effect, {})[parameter] = value
+        else:
+            known[name] = value
+    return known, own
 
 
 def _graded(simulator: Simulator | FiniteElements, slope: Mapping[str, float]) -> Tensor:

@@ -1,0 +1,91 @@
+"""Predictions kept by point, so that no step of a diagnosis runs what another one ran, and a count of what each step ran."""
+
+import time
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from neuido.discrepancy.problem import Point, Problem, Recording
+
+LIMIT = 500_000_000
+"""Bytes of the predictions that are kept; the one that was used longest ago goes first."""
+
+
+@dataclass
+class Work:
+    """What one step of a diagnosis asked for."""
+
+    simulations: int = 0
+    """Points times recordings that were run."""
+    reused: int = 0
+    """Those that were there already."""
+    effort: float = 0.0
+    """`Problem.effort` of the runs: particle-substeps of a body."""
+    seconds: float = 0.0
+
+
+class Memo:
+    """The predictions of a problem, each computed once while there is room for it.
+
+    Args:
+        problem: What predicts.
+        limit: Bytes that are kept.
+
+    Attributes:
+        work: What each step ran, by its name; see `during`.
+    """
+
+    def __init__(self, problem: Problem, *, limit: int = LIMIT) -> None:
+        self.problem, self.limit = problem, limit
+        self.work: dict[str, Work] = {}
+        self._step = "other"
+        self._kept: OrderedDict[tuple, np.ndarray] = OrderedDict()
+        self._size = 0
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        return self.problem.recordings
+
+    @property
+    def simulations(self) -> int:
+        """Points times recordings that were run so far."""
+        return sum(w.simulations for w in self.work.values())
+
+    @contextmanager
+    def during(self, step: str) -> Iterator[None]:
+        """Runs count for this step while it is open, unless an outer one is open already."""
+        before = self._step
+        self._step = step if before == "other" else before
+        try:
+            yield
+        finally:
+            self._step = before
+
+    def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
+        """As `Problem.predict`."""
+        keys = [(recording, setting, tuple(sorted(point.items()))) for point in points]
+        found = {key: self._kept[key] for key in keys if key in self._kept}
+        missing = {key: point for key, point in zip(keys, points, strict=True) if key not in found}
+        work = self.work.setdefault(self._step, Work())
+        work.reused += len(points) - len(missing)
+        if missing:
+            begun = time.monotonic()
+            rows = self.problem.predict(list(missing.values()), recording, setting)
+            work.seconds += time.monotonic() - begun
+            work.simulations += len(missing)
+            work.effort += len(missing) * self.problem.effort(recording, setting)
+            found |= dict(zip(missing, rows, strict=True))
+        for key in dict.fromkeys(keys):
+            self._keep(key, found[key])
+        return np.stack([found[key] for key in keys]) if keys else np.empty((0, len(self.recordings[recording].y)))
+
+    def _keep(self, key: tuple, row: np.ndarray) -> None:
+        if key not in self._kept:
+            self._kept[key] = row.copy()  # not a view that keeps its whole batch alive
+            self._size += row.nbytes
+        self._kept.move_to_end(key)
+        while self._size > self.limit and len(self._kept) > 1:
+            self._size -= self._kept.popitem(last=False)[1].nbytes

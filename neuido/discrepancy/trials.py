@@ -1,0 +1,65 @@
+"""What the steps of a diagnosis leave: the declared model fitted, candidates fitted in full, and what one step of the growth found."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from neuido.discrepancy.fit import Fit
+from neuido.discrepancy.floors import Floor
+from neuido.discrepancy.problem import Candidate, Point
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """The declared model, fitted."""
+
+    fit: Fit
+    floor: Floor
+    errors: np.ndarray
+    """Mean squares of each part."""
+
+
+@dataclass(eq=False)
+class Trial:
+    """One candidate fitted in full."""
+
+    candidate: Candidate
+    fit: Fit
+    errors: np.ndarray
+    """Mean squares of each part."""
+    gain: float
+    reason: str = ""
+    """Why it is rejected; empty: it is not."""
+
+    @property
+    def score(self) -> float:
+        """Mean logarithm of its errors: lower is better."""
+        return float(np.mean(np.log(np.maximum(self.errors, 1e-300))))
+
+
+@dataclass(eq=False)
+class Round:
+    """One step of the growth."""
+
+    base: Point
+    errors: np.ndarray
+    trials: list[Trial]
+    chosen: Trial | None
+    members: list[Trial]
+    p_value: float
+    floor: Floor
+    cosines: dict[str, float] = field(default_factory=dict)
+    null: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+
+def unphysical(c: Candidate, point: Point) -> str:
+    """Why a fitted candidate cannot be: at the edge of its range, or zero; empty where it can."""
+    for p in c.size_parameters:
+        value = point[p.name]
+        for bound in (p.lower, p.upper):
+            zero = abs(bound) < 1e-12
+            if (zero and abs(value) < 1e-3 * p.scale and len(c.size_parameters) == 1 and not p.log) or (
+                not zero and abs(value - bound) < 1e-6 * abs(bound)
+            ):
+                return f"{p.name} ends at {value:.3g} {p.unit}, the edge of its physical range" if not zero else "its size fits as zero"
+    return ""

@@ -1,0 +1,89 @@
+"""Predictions are computed once, and counted; fits that have lost stop, and the one that wins is not disturbed."""
+
+import numpy as np
+import pytest
+
+from neuido.discrepancy.fit import Race, levenberg_marquardt, run
+from neuido.discrepancy.memo import Memo
+from neuido.discrepancy.problem import Parameter, Problem, Recording
+
+T = np.linspace(0.0, 1.0, 40)
+
+
+class Lines(Problem):
+    """y = a t + b t^2 with a record of every point that was run."""
+
+    def __init__(self, together: bool = True) -> None:
+        y = 2.0 * T + 3.0 * T**2
+        parameters = tuple(Parameter(name, "1", 0.5, 1.0, -9.0, 9.0) for name in "ab")
+        super().__init__("lines", "rmse", "1", parameters, (), (), (Recording("r", "fit", y, 0.1, np.zeros(40, int), T),), settings=2)
+        self.ran: list[tuple] = []
+
+    def predict(self, points, recording, setting=0):
+        self.ran += [(recording, setting, tuple(sorted(p.items()))) for p in points]
+        return np.stack([p.get("a", 0.5) * T + p.get("b", 0.5) * np.sin(2 * T) ** setting * T**2 for p in points])
+
+
+def test_a_point_is_run_once_for_each_setting():
+    problem = Lines()
+    memo = Memo(problem)
+    one, two = {"a": 1.0, "b": 2.0}, {"b": 3.0, "a": 1.0}
+    with memo.during("first"):
+        rows = memo.predict([one, two, one], 0)
+    assert np.array_equal(rows[0], rows[2])
+    with memo.during("second"):
+        again = memo.predict([dict(reversed(two.items())), {"a": 5.0}], 0)
+        other = memo.predict([one], 0, 1)
+    assert np.array_equal(again[0], rows[1])
+    assert not np.array_equal(other[0], rows[0])
+    assert len(problem.ran) == len(set(problem.ran)) == memo.simulations == 4
+    assert (memo.work["first"].simulations, memo.work["first"].reused) == (2, 1)
+    assert (memo.work["second"].simulations, memo.work["second"].reused) == (2, 1)
+    assert memo.work["second"].effort == 2 * len(T)
+    assert memo.predict([], 0).shape == (0, len(T))
+
+
+def test_the_memory_is_bounded_and_an_answer_is_no_view():
+    problem = Lines()
+    memo = Memo(problem, limit=2 * T.nbytes)
+    for a in (1.0, 2.0, 1.0, 3.0, 1.0, 2.0):  # 2 goes when 3 comes: 1 was asked for since
+        memo.predict([{"a": a}], 0)[0][:] = np.nan
+    assert [dict(key)["a"] for _, _, key in problem.ran] == [1.0, 2.0, 3.0, 2.0]
+    assert all(np.isfinite(memo.predict([{"a": a}], 0)).all() for a in (1.0, 2.0))
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_both_ways_to_try_dampings_end_alike(together):
+    problem = Lines()
+    (fit,) = run(problem, [levenberg_marquardt(problem.declared, {}, together=together)], lambda r, n: r / 0.1, [0])
+    assert fit.converged
+    assert fit.point["a"] == pytest.approx(2.0, abs=1e-3)
+    assert fit.point["b"] == pytest.approx(3.0, abs=1e-3)
+    assert len(problem.ran) == fit.evaluations
+
+
+def test_the_boldest_damping_alone_is_cheaper():
+    counts = []
+    for together in (True, False):
+        problem = Lines()
+        run(problem, [levenberg_marquardt(problem.declared, {}, together=together)], lambda r, n: r / 0.1, [0])
+        counts.append(len(problem.ran))
+    assert counts[1] < counts[0]
+
+
+def test_a_fit_that_cannot_catch_up_stops_and_the_others_do_not():
+    def fits(race):
+        problem = Lines()
+        held = [problem.declared[0]], {"b": 9.0}  # its best is far above that of both parameters
+        requests = [levenberg_marquardt(problem.declared, {}, race=race), levenberg_marquardt(*held, race=race, tolerance=0.0)]
+        return run(problem, requests, lambda r, n: r / 0.1 + 1e-3, [0])
+
+    free, raced = fits(None), fits(Race())
+    assert raced[0].point == free[0].point
+    assert raced[1].evaluations <= free[1].evaluations
+    assert Race(1.0).lost([100.0, 50.0, 49.0], 9)
+    assert Race(1.0).lost([100.0, 50.0, 50.0, 50.0], 9)
+    assert not Race(1.0).lost([100.0, 50.0, 50.0], 9)  # the next step is less bold
+    assert not Race(1.0).lost([100.0, 50.0, 20.0], 9)  # at this pace it ends below
+    assert not Race(1.0).lost([100.0, 90.0], 10)  # one iteration says little
+    assert not Race().lost([100.0, 99.0, 98.0], 9)  # nobody is ahead
