@@ -26,6 +26,7 @@ import torch
 
 from neuido.data.scenes import load_scene
 from neuido.data.shapes import ball
+from neuido.physics.invariants import InvariantElastic, InvariantPlastic
 from neuido.physics.laws import FixedCorotated, NeoHookean
 from neuido.physics.mpm import Simulator
 from neuido.physics.networks import ObjectiveElastic, ObjectivePlastic
@@ -113,7 +114,7 @@ def network_flops(weights: tuple, gradient: bool) -> int:
     A backward pass adds the layers again (recomputed: reading activations back would take longer), the same for the gradient
     of the input, and the last layer once more for the gradient of its weights.
     """
-    first, second, last = (2 * weights[i].shape[-2] * weights[i].shape[-1] for i in (0, 2, 4))
+    first, second, last = (2 * W.shape[-2] * W.shape[-1] for W in weights if W.ndim == 3)
     layers = first + second + last
     return 3 * layers + last if gradient else layers
 
@@ -165,10 +166,18 @@ def neural(count: int, device: torch.device) -> tuple:
     return elastic, plastic, leaves + more
 
 
-def scene_case(names: list[str], steps: int) -> Callable:
+def invariant(count: int, device: torch.device) -> tuple:
+    """Networks of NCLaw's shapes with small random weights, all of them leaves, as LoRA on every layer reaches them."""
+    g = torch.Generator().manual_seed(0)
+    shapes = ((64, 13, 0.3), (64, 64, 0.1), (9, 64, 1.0), (64, 13, 0.3), (64, 64, 0.1), (9, 64, 0.1))
+    leaves = [(scale * torch.randn(1, m, n, generator=g)).to(device).requires_grad_() for m, n, scale in shapes]
+    return InvariantElastic(*leaves[:3]), InvariantPlastic(*leaves[3:]), leaves
+
+
+def scene_case(names: list[str], steps: int, laws: Callable = neural) -> Callable:
     def make(device: torch.device, data: Path | None):
         sim = Simulator(*bodies(names, data), device=device)
-        return sim, neural(len(names), device), steps
+        return sim, laws(len(names), device), steps
 
     return make
 
@@ -191,6 +200,9 @@ CASES = [
     Case("bouncy-ball, neural law, forward + backward", scene_case(["bouncy-ball"], 400), True, 50e-3, "s", NEUMA["both"], plain=100),
     Case("six scenes at once, neural law, forward", scene_case(list(SIX), 400), False),
     Case("six scenes at once, neural law, forward + backward", scene_case(list(SIX), 400), True, 3.5, "x one scene"),
+    Case("NCLaw's networks, bouncy-ball, forward", scene_case(["bouncy-ball"], 400, invariant), False, 0.1, "s", NEUMA["forward"]),
+    Case("NCLaw's networks, bouncy-ball, forward + backward", scene_case(["bouncy-ball"], 400, invariant), True, 0.3, "s", NEUMA["both"]),
+    Case("NCLaw's networks, bouncy-ball, forward + backward", scene_case(["bouncy-ball"], 10, invariant), True, devices=("cpu",)),
     Case("1M particles, 70^3, fixed corotated, forward", block_case(100, 70, 100, FixedCorotated), False, 2e9, "p-s/s"),
     Case("bouncy-ball, neural law, forward", scene_case(["bouncy-ball"], 10), False, devices=("cpu",), plain=3),
     Case("bouncy-ball, neural law, forward + backward", scene_case(["bouncy-ball"], 10), True, devices=("cpu",), plain=3),

@@ -9,19 +9,20 @@ Whatever the user can mend ends in one line on stderr and exit status 2. `NEUIDO
 
 import importlib
 import inspect
-import logging
+import itertools
+import json
 import os
-import re
 import signal
 import sys
-import warnings
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_origin
 
 import neuido
+from neuido.chatter import quiet_lightning
 from neuido.errors import UserError, one_line
+from neuido.sweep import own_folder, redirect
 
 if TYPE_CHECKING:
     from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -30,6 +31,9 @@ LIGHT = {  # name: (module, function, one line for the list); the module must im
     "simulate": ("neuido.simulate", "simulate", "Generate the trajectories of Stage I, or filmed scenes."),
     "reconstruct": ("neuido.reconstruct", "reconstruct", "Gaussians and particles of a filmed body's first frame."),
     "diagnose": ("neuido.discrepancy.command", "diagnose", "Find the effect that a model lacks, from measured motion."),
+    "sweep": ("neuido.sweep", "sweep", "Run a wandb sweep file without a server, offline, into one CSV."),
+    "report": ("neuido.report", "report", "One page of several runs: tables, curves, videos side by side."),
+    "latents": ("neuido.latents", "latents", "How the latents of Stage I lie, and what lies between two of them."),
     "demo": ("neuido.demo", "demo", "Learn laws from bodies and from video, and find an effect that a model lacks."),
     "film": ("neuido.models.film", "film", "Film simulated bodies of many materials, for the video encoder."),
     "doctor": ("neuido.doctor", "doctor", "Print versions and devices, and run a small rollout on each device."),
@@ -43,6 +47,7 @@ HEAVY = {
 
 MODULES = (  # so that their class names resolve without a path
     *(f"neuido.models.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt", "adapter")),
+    *(f"neuido.models.{name}" for name in ("baselines", "springs", "symbolic")),
     *(f"neuido.data.{name}" for name in ("trajectories", "films", "visual_module")),
     "neuido.discrepancy.diagnosed",
 )
@@ -89,15 +94,19 @@ def _run_light(name: str, args: list[str]) -> int:
 
     module, function, _ = LIGHT[name]
     component = getattr(importlib.import_module(module), function)
-    if args and not args[0].startswith("-"):  # the first parameter may stand alone
-        args = [f"--{next(iter(inspect.signature(component).parameters))}", *args]
+    first = next(iter(inspect.signature(component).parameters.values()))
+    alone = list(itertools.takewhile(lambda word: not word.startswith("-"), args))  # the first parameter may stand alone
+    if alone and get_origin(first.annotation) is list:
+        args = [f"--{first.name}", json.dumps(alone), *args[len(alone) :]]
+    elif alone:
+        args = [f"--{first.name}", *args]
     status = auto_cli(component, args=args, as_positional=False, prog=f"neuido {name}", exit_on_error=False)
     return status if isinstance(status, int) else 0
 
 
 def run_lightning(args: list[str]) -> "LightningCLI":
     """Run a command of the trainer; the model, the data module and the trainer are attributes of what it returns."""
-    _quiet_lightning()
+    quiet_lightning()
     from lightning.pytorch import LightningDataModule, LightningModule
     from lightning.pytorch.cli import LightningCLI, SaveConfigCallback
 
@@ -117,6 +126,8 @@ def run_lightning(args: list[str]) -> "LightningCLI":
             options = self.config[self.subcommand]
             if options.get("weights_only") is None:
                 options["weights_only"] = True
+            if folder := own_folder(os.environ):
+                redirect(options, folder)
 
     class BesideTheLog(SaveConfigCallback):
         def setup(self, trainer, pl_module, stage):  # without a log it would write into the current folder, and refuse to a second time
@@ -179,16 +190,3 @@ def _help() -> str:
 def _fail(line: str, status: int) -> None:
     print(f"neuido: {line}", file=sys.stderr)
     sys.exit(status)
-
-
-def _quiet_lightning() -> None:
-    """Drop lightning's advertisements and the warnings about its own code."""
-    logging.getLogger("lightning.fabric.utilities.seed").setLevel(logging.WARNING)  # config.yaml states the seed
-    chatter = re.compile(r".*Tip: |TPU available|GPU available: False")
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda record: not chatter.match(record.getMessage()))
-    warnings.filterwarnings("ignore", message=r".*LightningCLI's args parameter is intended")  # sys.argv is passed on as it is
-    warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).* is deprecated")
-    warnings.filterwarnings("ignore", message=r".*tensorboardX.* has been removed")
-    warnings.filterwarnings("ignore", message=r".*does not have many workers")  # the data sets are memory maps
-    warnings.filterwarnings("ignore", message=r".*but have no `validation_step`")  # adaptation scores before and after each scene
-    warnings.filterwarnings("ignore", message=r".*in eval mode at the start of training")  # what is frozen is meant to be

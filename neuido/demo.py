@@ -1,14 +1,12 @@
 """The `demo` command: laws learned from simulated bodies, a law read from video, one closed loop, and a page that shows them."""
 
-import base64
-import html
 import os
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuido.errors import UserError
+from neuido.page import escaped, page, picture, table
 
 if TYPE_CHECKING:
     from neuido.demo_laws import LawsResult
@@ -16,10 +14,6 @@ if TYPE_CHECKING:
     from neuido.demo_video import Adapted, VideoResult
 
 PARTS = ("laws", "video", "loop")
-STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:1120px;margin:2em auto;padding:0 1em}
-h1{font-size:1.5em}h2{font-size:1.2em;margin-top:2em;border-bottom:1px solid #ddd}img{max-width:100%}
-table{border-collapse:collapse;margin:.6em 0}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #eee}
-td.n{text-align:right;font-variant-numeric:tabular-nums}.note{color:#666;font-size:.9em}"""
 
 
 def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "laws,video,loop") -> None:
@@ -58,9 +52,9 @@ def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "
             sections.append(f'{body}<p class="note">{spent:.0f} s.</p>')
     finally:
         torch.set_num_threads(threads)
-    page = folder / "report.html"
-    _write(page, "\n".join(sections))
-    print(f"report: {page}")
+    target = folder / "report.html"
+    _write(target, "\n".join(sections))
+    print(f"report: {target}")
 
 
 def _laws(folder: Path, settings: str) -> str:
@@ -88,7 +82,7 @@ def laws_section(result: "LawsResult") -> str:
         "Trained on a thrown cube, tried on a falling ball: relative errors of the stress and of the plastic correction, held out "
         "(a material that does not flow has no plastic error), and the distance of matched particles from the motion under the true law."
     )
-    return f"<h2>Stage I: laws from simulated bodies</h2><p>{text}</p>{_table(head, result.rows)}{_picture(result.picture)}"
+    return f"<h2>Stage I: laws from simulated bodies</h2><p>{text}</p>{table(head, result.rows, digits=3)}{picture(result.picture)}"
 
 
 def video_section(result: "VideoResult") -> str:
@@ -107,8 +101,8 @@ def video_section(result: "VideoResult") -> str:
         else "Scores are those of views that were held out."
     )
     few = "" if result.adapted is None else adapted_section(result.adapted)
-    shown = "".join(f"<h3>{_text(s.name)}: recorded above, predicted below</h3>{_picture(s.picture)}" for s in result.scenes)
-    return f"<h2>Stage II: a law from video, in one pass</h2><p>{text}</p>{_table(head, rows)}{shown}{few}"
+    shown = "".join(f"<h3>{escaped(s.name)}: recorded above, predicted below</h3>{picture(s.picture)}" for s in result.scenes)
+    return f"<h2>Stage II: a law from video, in one pass</h2><p>{text}</p>{table(head, rows, digits=3)}{shown}{few}"
 
 
 def adapted_section(result: "Adapted") -> str:
@@ -116,8 +110,8 @@ def adapted_section(result: "Adapted") -> str:
     rows = [(name, scores.get("psnr", ""), scores.get("cd", ""), scores.get("rmse", "")) for name, scores in
             (("zero-shot", result.before), (f"after {result.steps} steps, {result.seconds:.0f} s", result.after))]  # fmt: skip
     text = "LoRA on both trunks and the latent, fitted to the training views of the scene that Stage II has not seen; scores of the others."
-    table = _table(("", "PSNR [dB]", "CD [1e-4]", "particle RMSE [m]"), rows)
-    return f"<h3>{_text(result.name)}: adapted to its images</h3><p>{text}</p>{table}{_picture(result.picture)}"
+    compared = table(("", "PSNR [dB]", "CD [1e-4]", "particle RMSE [m]"), rows, digits=3)
+    return f"<h3>{escaped(result.name)}: adapted to its images</h3><p>{text}</p>{compared}{picture(result.picture)}"
 
 
 def loop_section(result: "LoopResult", folder: Path) -> str:
@@ -134,37 +128,16 @@ def loop_section(result: "LoopResult", folder: Path) -> str:
     ]
     if result.again:
         rows.append(("answer once the effect is in the model", result.again))
-    link = html.escape(Path(os.path.relpath(result.report, folder)).as_posix())
+    link = escaped(Path(os.path.relpath(result.report, folder)).as_posix())
     text = (
         "A block is thrown twice; its declared model lacks an effect. The residual of the best fit (arrows, at each point) is "
         f'traced to it. <a href="{link}">The whole diagnosis</a>.'
     )
     head = "<h2>The closed loop: what does the model lack?</h2>"
-    return f"{head}<p>{text}</p>{_table(('', ''), rows)}{_picture(result.picture)}"
+    return f"{head}<p>{text}</p>{table(('', ''), rows, digits=3)}{picture(result.picture)}"
 
 
 def _write(path: Path, body: str) -> None:
     from neuido.data.storage import write
 
-    head = f'<meta charset="utf-8"><title>neuido demo</title><style>{STYLE}</style>'
-    write(path, f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n<h1>neuido demo</h1>\n{body}\n</body></html>\n')
-
-
-def _picture(path: Path) -> str:
-    data = base64.b64encode(path.read_bytes()).decode()
-    return f'<p><img alt="{_text(path.stem)}" src="data:image/png;base64,{data}"></p>'
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    def cell(value: Any) -> str:
-        if isinstance(value, float):
-            return f'<td class="n">{value:.3g}</td>' if value == value else "<td></td>"  # a NaN: there is none
-        return f"<td>{_text(value)}</td>"
-
-    lines = ["<tr>" + "".join(f"<th>{_text(h)}</th>" for h in head) + "</tr>"] if any(head) else []
-    lines += ["<tr>" + "".join(cell(v) for v in row) + "</tr>" for row in rows]
-    return "<table>" + "\n".join(lines) + "</table>"
-
-
-def _text(value: Any) -> str:
-    return html.escape(str(value))
+    write(path, page("neuido demo", f"<h1>neuido demo</h1>\n{body}"))

@@ -144,7 +144,7 @@ def _optimise(batch: "MultiViewBatch", around: "Setting", target: Path, device: 
     from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
     from lightning.pytorch.loggers import CSVLogger
 
-    from neuido.cli import _quiet_lightning
+    from neuido.chatter import quiet_lightning
     from neuido.models.reconstruct import ReconstructModule
 
     class Views(LightningDataModule):
@@ -155,7 +155,7 @@ def _optimise(batch: "MultiViewBatch", around: "Setting", target: Path, device: 
         def train_dataloader(self) -> range:
             return range(steps)
 
-    _quiet_lightning()
+    quiet_lightning()
     warnings.filterwarnings("ignore", message=r"Checkpoint directory .* exists and is not empty")  # it is the folder of the results
     warnings.filterwarnings("ignore", message=r".*your dataloader is not resumable")  # a step's views follow from its number
     steps = options["steps"]

@@ -16,6 +16,7 @@ from neuido.data.scenes import VARIABLE, data_root
 from neuido.data.visual import VisualScene, load_visual
 from neuido.data.visual_known import load_known
 from neuido.errors import UserError
+from neuido.types import MultiViewBatch
 
 KEYS = {"reconstruction": ("reconstruction", "recording", "views"), "particles": ("recording", "views", "dt", "crop")}
 """What a scene's mapping takes beside `path`, by where its body comes from (`body`)."""
@@ -78,6 +79,30 @@ class OneByOne(Resumable[VisualScene]):
         return [self.scenes[epoch]] * (self.steps - start) if epoch < len(self.scenes) else []
 
 
+def train_on(batch: MultiViewBatch, views: int | list[int]) -> MultiViewBatch:
+    """The batch without the views that training is not to see; those that are held out stay.
+
+    Args:
+        batch: Images of V views.
+        views: How many training views, taken evenly, or their numbers among those that are not held out.
+
+    Raises:
+        UserError: More views than there are, or a number that is none of theirs.
+    """
+    there = (~batch.held_out).nonzero()[:, 0].tolist()
+    if isinstance(views, int):
+        if not 0 < views <= len(there):
+            raise UserError(f"data.training_views = {views}: {batch.name} has {len(there)} views that are not held out")
+        chosen = torch.linspace(0, len(there) * (1 - 1 / views), views).round().long().tolist()
+    else:
+        chosen = sorted(set(views))
+        if not chosen or not all(0 <= view < len(there) for view in chosen):
+            raise UserError(f"data.training_views = {views}: {batch.name} has the training views 0 to {len(there) - 1}")
+    kept = sorted([*(there[i] for i in chosen), *batch.held_out.nonzero()[:, 0].tolist()])
+    cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats[kept], Ks=batch.cameras.Ks[kept])
+    return batch._replace(images=batch.images[kept], masks=batch.masks[kept], cameras=cameras, held_out=batch.held_out[kept])
+
+
 class VisualDataModule(LightningDataModule):
     """Scenes of `neuido simulate` or of one's own, each with what `neuido reconstruct` made of it (`data.visual`).
 
@@ -93,6 +118,7 @@ class VisualDataModule(LightningDataModule):
         frame_count: Number of frames; none: all.
         width: Width of the images [px]; none: as recorded.
         background: `white` or `black`, where a mask is known.
+        training_views: How many of the views that are not held out training sees, taken evenly, or their numbers; none: all.
         seed: Seed of the order of the scenes, which is another one in each epoch.
     """
 
@@ -107,13 +133,14 @@ class VisualDataModule(LightningDataModule):
         frame_count: int | None = None,
         width: int | None = None,
         background: str = "white",
+        training_views: int | list[int] | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
         if not scenes:
             raise UserError("data.scenes is empty: name at least one folder")
         self.given, self.given_unseen, self.seed = list(scenes), list(unseen or []), seed
-        self.root, self.reconstructions = root, reconstructions
+        self.root, self.reconstructions, self.training_views = root, reconstructions, training_views
         self.options: dict[str, Any] = {"frame_step": frame_step, "frame_count": frame_count, "width": width, "background": background}
         self.steps_in_a_row: int | None = None
         """Set by a model that fits one scene after the other: how many steps each takes, and an epoch is then one scene."""
@@ -121,12 +148,12 @@ class VisualDataModule(LightningDataModule):
     @cached_property
     def scenes(self) -> list[VisualScene]:
         """The scenes that training sees."""
-        return [self._open(given, f"data.scenes[{i}]") for i, given in enumerate(self.given)]
+        return self._all(self.given, "data.scenes")
 
     @cached_property
     def unseen(self) -> list[VisualScene]:
         """The scenes that it does not see."""
-        return [self._open(given, f"data.unseen[{i}]") for i, given in enumerate(self.given_unseen)]
+        return self._all(self.given_unseen, "data.unseen")
 
     @property
     def unseen_names(self) -> list[str]:
@@ -165,6 +192,12 @@ class VisualDataModule(LightningDataModule):
     def transfer_batch_to_device(self, batch: VisualScene, device: torch.device, dataloader_idx: int) -> VisualScene:
         """Not here: the model brings a scene to the device once, and keeps it there."""
         return batch
+
+    def _all(self, given: list[str | dict[str, Any]], where: str) -> list[VisualScene]:
+        scenes = [self._open(each, f"{where}[{i}]") for i, each in enumerate(given)]
+        if self.training_views is None:
+            return scenes
+        return [scene._replace(batch=train_on(scene.batch, self.training_views)) for scene in scenes]
 
     def _find(self, path: Path) -> Path:
         own = Path(self.root or ".") / path

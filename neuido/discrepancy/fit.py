@@ -16,8 +16,11 @@ KEPT_PROMISE = 0.7
 """Share of the gain that the linear model promises at which a step is taken without trying other dampings."""
 NOTHING = 2e-4
 """Relative gain, as the linear model promises it, that is not worth a run."""
-BEHIND = 4.0
+BEHIND = 2.5
 """A fit that would end above so many times the lowest cost of a race, at the pace of its last step, is given up."""
+
+BEST_PACE = 0.6
+"""Lowest ratio of costs, of an iteration to the one before, that a fit is trusted to keep up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +84,7 @@ class Race:
             return False
         failed = costs[-1] == costs[-2]  # one step that fails says only that it was too bold
         pace = (costs[-1] / max(costs[-3], 1e-300)) ** 0.5 if failed else costs[-1] / costs[-2]
-        return costs[-1] * pace**left > BEHIND * self.best
+        return costs[-1] * max(pace, BEST_PACE) ** left > BEHIND * self.best
 
 
 def levenberg_marquardt(

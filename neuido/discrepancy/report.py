@@ -1,6 +1,5 @@
 """The report of a diagnosis: one self-contained HTML page. Without matplotlib it has the tables and the player of the motion alone."""
 
-import html
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -12,17 +11,16 @@ from neuido.discrepancy import report_figures as draw
 from neuido.discrepancy import report_silhouettes as pictures
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.rounds import ALPHA
+from neuido.page import escaped, table
+from neuido.page import page as html_page
 
 if TYPE_CHECKING:
     from neuido.discrepancy.answer import Details
 
-STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:1120px;margin:2em auto;padding:0 1em}
-h1{font-size:1.5em}h2{font-size:1.15em;margin-top:1.8em;border-bottom:1px solid #ddd}
-table{border-collapse:collapse;margin:.6em 0}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #eee;font-size:.93em}
-td.n{text-align:right;font-variant-numeric:tabular-nums}
+STYLE = """h2{font-size:1.15em}
 .answer{font-size:1.2em;padding:.6em 1em;background:#f3f6f9;border-left:4px solid #1f77b4}
-svg{max-width:100%;height:auto}canvas{border:1px solid #ddd;background:#fff;touch-action:none;max-width:100%}
-.player label{margin-right:.8em}.b{color:#c0392b}.a{color:#1f77b4}.note{color:#666;font-size:.9em}"""
+canvas{border:1px solid #ddd;background:#fff;touch-action:none;max-width:100%}
+.player label{margin-right:.8em}.b{color:#c0392b}.a{color:#1f77b4}"""
 WEAK = "The missing force by the weak residual, which differentiates no measured position; grey: what noise alone makes of it."
 NOTHING = "<p>The residual is noise alone: no effect was fitted.</p>"
 SENTENCES = {
@@ -43,25 +41,23 @@ def page(details: "Sequence[Details]", diagnoses: Sequence[Diagnosis], *, kind: 
         kind: `experiment`, `material test` or `track`.
     """
     name = diagnoses[0].problem.name if len(diagnoses) == 1 else diagnoses[0].problem.name.rpartition(": ")[0]
-    parts = [f"<h1>Diagnosis of the {_text(kind)} {_text(name)}</h1>"]
+    parts = [f"<h1>Diagnosis of the {escaped(kind)} {escaped(name)}</h1>"]
     for made, d in zip(details, diagnoses, strict=True):
         if len(diagnoses) > 1:
-            parts.append(f"<h1>{_text(made.content.get('body', d.problem.name))}</h1>")
+            parts.append(f"<h1>{escaped(made.content.get('body', d.problem.name))}</h1>")
         parts += _one(made, d)
     seconds = sum(made.content["seconds"] for made in details)
     device, version = details[0].content["device"], details[0].content["version"]
     simulations = sum(d.evaluations for d in diagnoses)
-    parts.append(f'<p class="note">neuido {_text(version)}, {seconds:.0f} s on {_text(device)}, {simulations} simulations.</p>')
-    head = f'<meta charset="utf-8"><title>{_text(name)}</title><style>{STYLE}</style>'
-    body = "\n".join(part for part in parts if part)
-    return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
+    parts.append(f'<p class="note">neuido {escaped(version)}, {seconds:.0f} s on {escaped(device)}, {simulations} simulations.</p>')
+    return html_page(name, "\n".join(part for part in parts if part), style=STYLE)
 
 
 def _one(made: "Details", d: Diagnosis) -> list[str]:
     c = made.content
     names = " and ".join(" or ".join(e["class"]) for e in c["effects"])
     bodies = {name: arrays for name, arrays in made.motion.items() if "positions" in arrays}
-    out = [f'<p class="answer">{_text(SENTENCES[c["answer"]].format(names=names or "it"))}</p>', _effects(c), _errors(c)]
+    out = [f'<p class="answer">{escaped(SENTENCES[c["answer"]].format(names=names or "it"))}</p>', _effects(c), _errors(c)]
     if bodies:
         out += [
             "<h2>Motion before and after</h2>",
@@ -76,17 +72,16 @@ def _one(made: "Details", d: Diagnosis) -> list[str]:
             draw.stage_curves(made.stages),
         ]
         out.append(f'<p class="note">{WEAK}</p>')
-        for name, p in c["places"].items():
+        for place, p in c["places"].items():
             at = ", ".join(f"{v:.3g}" for v in p["from_centre"])
-            out.append(
-                f"<p>{_text(name)}: the missing force is largest at ({at}) m from the centre, {p['over_median']:.1f} times the median.</p>"
-            )
+            where = f"{place}: the missing force is largest at ({at}) m from the centre, {p['over_median']:.1f} times the median."
+            out.append(f"<p>{escaped(where)}</p>")
     elif made.silhouettes:
         out += pictures.section(made.silhouettes)
     else:
         out += ["<h2>Data before and after</h2>", draw.data_curves(made.motion, d.problem.unit)]
     out += _ranking(d)
-    out += ["<h2>Rejected</h2>", _table(("effect", "reason"), [(r["name"], r["reason"]) for r in c["rejected"]])]
+    out += ["<h2>Rejected</h2>", table(("effect", "reason"), [(r["name"], r["reason"]) for r in c["rejected"]])]
     out += ["<h2>Fitted figures</h2>", _figures(c)]
     share = made.ceilings["after"]
     fit, held = (100 * min(max(value, 0.0), 1.0) for value in (share.fit, share.held_out))
@@ -94,10 +89,10 @@ def _one(made: "Details", d: Diagnosis) -> list[str]:
     out.append(
         f"<p>A small network explains {fit:.0f} % of what remains beside noise where it was fitted{there}: the ceiling of any effect.</p>"
     )
-    out += ["<h2>Next experiment</h2>", f"<p>{_text(next_experiment.summary(c['next_experiment']))}</p>"]
+    out += ["<h2>Next experiment</h2>", f"<p>{escaped(next_experiment.summary(c['next_experiment']))}</p>"]
     if c["next_experiment"]:
         out.append(
-            _table(("other changes", "expected log odds"), [(o["change"], o["expected_log_odds"]) for o in c["next_experiment"]["others"]])
+            table(("other changes", "expected log odds"), [(o["change"], o["expected_log_odds"]) for o in c["next_experiment"]["others"]])
         )
     return out
 
@@ -112,7 +107,7 @@ def _effects(c: dict[str, Any]) -> str:
             else:
                 low, high = p["interval90"]
                 rows.append((e["name"], key, p["value"], p["unit"], f"{low:.4g} to {high:.4g}", f"{e['p_value']:.3g}", e["where"]))
-    return _table(("effect", "parameter", "value", "unit", "90 % interval", "p (family-wise)", "where"), rows) if rows else ""
+    return table(("effect", "parameter", "value", "unit", "90 % interval", "p (family-wise)", "where"), rows) if rows else ""
 
 
 def _errors(c: dict[str, Any]) -> str:
@@ -124,7 +119,7 @@ def _errors(c: dict[str, Any]) -> str:
         if e["before"][name] is not None:
             rows.append((label, e["before"][name], e["after"][name], e["before"][name] / max(e["after"][name], 1e-300)))
     floors = f"Floors: noise {e['noise_floor']:.3g} {e['unit']}, discretisation {e['discretisation_floor']:.3g} {e['unit']}."
-    return f"<h2>Error [{_text(e['unit'])}]</h2>" + _table(("recording", "before", "after", "ratio"), rows) + f"<p>{_text(floors)}</p>"
+    return f"<h2>Error [{escaped(e['unit'])}]</h2>" + table(("recording", "before", "after", "ratio"), rows) + f"<p>{escaped(floors)}</p>"
 
 
 def _ratio(e: dict[str, Any], name: str) -> float:
@@ -136,7 +131,7 @@ def _stages(made: "Details") -> str:
     for recording, series in made.stages.items():
         for s in series:
             rows.append((recording, s.name, s.unit, s.size(s.before), s.size(s.after), s.size(s.noise), math.sqrt(s.excess(s.before))))
-    return _table(("recording", "stage", "unit", "missing before", "missing after", "noise", "before, in noise"), rows)
+    return table(("recording", "stage", "unit", "missing before", "missing after", "noise", "before, in noise"), rows)
 
 
 def _ranking(d: Diagnosis) -> list[str]:
@@ -155,7 +150,7 @@ def _ranking(d: Diagnosis) -> list[str]:
             verdict = t.reason or ("chosen" if t is r.chosen else "not told from it" if id(t) in kept else "")
             cosine = r.cosines.get(t.candidate.key)
             rows.append((t.candidate.key, figures, f"{math.exp(t.gain):.2f}", "" if cosine is None else f"{cosine:.2f}", verdict))
-        out.append(_table(("effect", "parameters", "error ratio", "cosine to the best", "verdict"), rows))
+        out.append(table(("effect", "parameters", "error ratio", "cosine to the best", "verdict"), rows))
         chance = f"chance brings {math.exp(threshold):.2f} at 95 %, from {len(r.null)} draws"
         out.append(f'<p class="note">p = {r.p_value:.3g}, family-wise over all candidates; {chance}.</p>' if trials else NOTHING)
     return out
@@ -175,22 +170,4 @@ def _figures(c: dict[str, Any]) -> str:
                 "{:.4g} to {:.4g}".format(*a["interval90"]),
             )
         )
-    return _table(("figure", "unit", "before", "90 % interval", "after", "90 % interval"), rows) if rows else "<p>None was free.</p>"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    if not rows:
-        return "<p>None.</p>"
-
-    def cell(value: Any) -> str:
-        if isinstance(value, float | int) and not isinstance(value, bool):
-            return f'<td class="n">{value:.4g}</td>'
-        return f"<td>{_text(value)}</td>"
-
-    lines = ["<tr>" + "".join(f"<th>{_text(h)}</th>" for h in head) + "</tr>"]
-    lines += ["<tr>" + "".join(cell(v) for v in row) + "</tr>" for row in rows]
-    return "<table>" + "\n".join(lines) + "</table>"
-
-
-def _text(value: Any) -> str:
-    return html.escape(str(value))
+    return table(("figure", "unit", "before", "90 % interval", "after", "90 % interval"), rows) if rows else "<p>None was free.</p>"

@@ -1,39 +1,16 @@
 """The figures of a diagnosis' report: inline SVG by matplotlib, and a small player of the motion drawn by the page itself."""
 
 import base64
-import io
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from neuido.discrepancy.residual import Series
+from neuido.page import figure, small, svg
 
 INK, BEFORE, AFTER = "#333333", "#c0392b", "#1f77b4"
 MOST_POINTS, MOST_FRAMES = 250, 60
-
-
-def figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, np.ndarray] | None:
-    """A figure without a window and its axes (rows, columns), or None where matplotlib is not installed."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        return None
-    made = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(made)
-    return made, made.subplots(rows, columns, squeeze=False)
-
-
-def svg(made: Any) -> str:
-    """A figure as an inline element."""
-    import matplotlib
-
-    stream = io.StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "neuido"}):
-        made.savefig(stream, format="svg", metadata={"Date": None})
-    return stream.getvalue().partition("<svg")[1] + stream.getvalue().partition("<svg")[2]
 
 
 def stage_curves(stages: Mapping[str, Sequence[Series]]) -> str:
@@ -57,7 +34,7 @@ def stage_curves(stages: Mapping[str, Sequence[Series]]) -> str:
             ax.fill_between(s.times, s.noise, color=INK, alpha=0.2, lw=0)
             ax.set_title(f"{recording}: {name} [{s.unit}]", fontsize=8)
             ax.set_ylim(bottom=0.0)
-            _small(ax)
+            small(ax)
             ax.set_xlabel("t [s]", fontsize=7)
     return svg(made)
 
@@ -79,7 +56,7 @@ def error_curves(motion: Mapping[str, Mapping[str, np.ndarray]], noise: float, d
         ax.set_xlabel("t [s]", fontsize=8)
         ax.set_ylabel("RMS distance [mm]", fontsize=8)
         ax.set_ylim(bottom=0.0)
-        _small(ax)
+        small(ax)
     axes[0][0].legend(fontsize=7, frameon=False)
     return svg(made)
 
@@ -103,7 +80,7 @@ def residual_maps(motion: Mapping[str, Mapping[str, np.ndarray]]) -> str:
             shown = ax.scatter(place[:, a], place[:, b], c=sizes[when], s=6, cmap="inferno_r", vmin=0.0, vmax=top, linewidths=0)
             ax.set_aspect("equal")
             ax.set_title(f"{name}, {when}, along {'zx'[i % 2]}", fontsize=8)
-            _small(ax)
+            small(ax)
         made.colorbar(shown, ax=list(row), shrink=0.8).set_label("mm", fontsize=7)
     return svg(made)
 
@@ -125,7 +102,7 @@ def data_curves(motion: Mapping[str, Mapping[str, np.ndarray]], unit: str) -> st
         axes[0, column].set_title(name, fontsize=8)
         axes[1, column].axhline(0.0, color=INK, lw=0.6)
         for ax in axes[:, column]:
-            _small(ax)
+            small(ax)
     axes[0, 0].set_ylabel(f"data [{unit}]", fontsize=8)
     axes[1, 0].set_ylabel(f"residual [{unit}]", fontsize=8)
     return svg(made)
@@ -146,14 +123,8 @@ def ranking(trials: Sequence[tuple[str, float, bool]], floor: float) -> str:
     ax.axvline(np.exp(floor), color=BEFORE, lw=1, ls="--")
     ax.set_xscale("log")
     ax.set_xlabel("error before over error after (fitted or held out, the smaller); dashed: 95 % of what chance brings", fontsize=7)
-    _small(ax)
+    small(ax)
     return svg(made)
-
-
-def _small(ax: Any) -> None:
-    ax.tick_params(labelsize=7)
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
 
 
 def player(motion: Mapping[str, Mapping[str, np.ndarray]]) -> str:

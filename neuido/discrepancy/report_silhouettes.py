@@ -1,14 +1,13 @@
 """Silhouettes in the report: outlines before and after over the measured mask, and how well they agree."""
 
-import base64
 from collections.abc import Mapping
-from html import escape
 from typing import Any
 
 import cv2
 import numpy as np
 
 from neuido.discrepancy.silhouettes import distances
+from neuido.page import escaped, png, table
 
 BEFORE, AFTER = (192, 57, 43), (31, 119, 180)
 """Red and blue of the report, RGB."""
@@ -27,23 +26,21 @@ def section(drawn: Mapping[str, Mapping[str, Any]]) -> list[str]:
     for name, own in drawn.items():
         chosen = sorted({round(i) for i in np.linspace(0, len(own["times"]) - 1, FRAMES)})
         times = ", ".join(f"{own['times'][t]:.3g}" for t in chosen)
-        out.append(f'<p>{escape(name)} at {times} s: measured (grey), <span class="b">before</span>, <span class="a">after</span>.</p>')
+        out.append(f'<p>{escaped(name)} at {times} s: measured (grey), <span class="b">before</span>, <span class="a">after</span>.</p>')
         rows = [np.concatenate([_overlay(own, t, v) for t in chosen], axis=1) for v in range(own["masks"].shape[1])]
-        out.append(_png(np.concatenate(rows)))
+        _, data = cv2.imencode(".png", cv2.cvtColor(np.concatenate(rows), cv2.COLOR_RGB2BGR))
+        out.append(png(data.tobytes(), f"silhouettes of {name}"))
     return out
 
 
 def _table(drawn: Mapping[str, Mapping[str, Any]]) -> str:
-    head = ("recording", "frames", "", "overlap (IoU)", "outline [px]", "outline [mm]", "PSNR [dB]")
     rows = [
-        f"<tr><td>{escape(name)}</td><td>{role.replace('_', ' ')}</td><td>{when}</td>"
-        f'<td class="n">{s["iou"]:.3f}</td><td class="n">{s["outline_px"]:.3g}</td><td class="n">{s["outline_mm"]:.3g}</td>'
-        f'<td class="n">{s["psnr"]:.3g}</td></tr>'
+        (name, role.replace("_", " "), when, *(own["scores"][when][role][key] for key in ("iou", "outline_px", "outline_mm", "psnr")))
         for name, own in drawn.items()
         for role in own["scores"]["before"]
-        for when, s in ((when, own["scores"][when][role]) for when in ("before", "after"))
+        for when in ("before", "after")
     ]
-    return "<table><tr>" + "".join(f"<th>{h}</th>" for h in head) + "</tr>" + "\n".join(rows) + "</table>"
+    return table(("recording", "frames", "", "overlap (IoU)", "outline [px]", "outline [mm]", "PSNR [dB]"), rows, digits=3)
 
 
 def _overlay(own: Mapping[str, Any], t: int, v: int) -> np.ndarray:
@@ -57,8 +54,3 @@ def _overlay(own: Mapping[str, Any], t: int, v: int) -> np.ndarray:
         image = cv2.drawContours(image, found, -1, colour, 1)
     image[:, -1] = 230
     return image
-
-
-def _png(image: np.ndarray) -> str:
-    _, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    return f'<img alt="silhouettes" style="max-width:100%" src="data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}">'

@@ -37,6 +37,8 @@ ROUGH = 0.02
 """Relative gain that ends the fit before the floors are known."""
 MANY = 5
 """Parameters above which a candidate is fitted after the others."""
+LEADERS = 4
+"""Candidates that are fitted before the others."""
 POLISHED = 3
 """Candidates whose fits are refined from further starts."""
 
@@ -316,12 +318,16 @@ class Inference:
     ) -> dict[str, tuple[Candidate, Fit]]:
         """The best fit of each candidate; fits that cannot catch up with the best one stop.
 
-        Where every point costs, candidates of many parameters come last, when it is known what they must reach.
+        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last.
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
         race = Race()
-        few, many = ([(c, begin) for c, begin in starts if (len(c.parameters) > MANY) == most] for most in (False, True))
-        for own in [starts] if self.problem.together else [few, many]:
+        small = [c.key for c, _ in starts if len(c.parameters) <= MANY]
+        first = list(dict.fromkeys(small))[:LEADERS]
+        waves: list[list[tuple[Candidate, Point]]] = [[], [], []]
+        for c, begin in starts:
+            waves[0 if self.problem.together or c.key in first else 1 if c.key in small else 2].append((c, begin))
+        for own in waves:
             fits = self.fits([self.request((*free, *c.parameters), begin, race=race) for c, begin in own], floor)
             for (c, _), fit in zip(own, fits, strict=True):
                 if c.key not in best or fit.cost < best[c.key][1].cost:

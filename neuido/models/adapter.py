@@ -97,7 +97,7 @@ class LowRankAdaptation(Method):
                 known = ", ".join(["encoder", "mean", *sorted(set(self.operator.latent_families)), *self.operator.latent_names[:3]])
                 raise UserError(f"model.method.start = {self.start!r}: one of {known}, ..., or a law file (.safetensors)")
             return self.operator.latent(self.start)
-        _, tensors, _ = read_weights(self.start, LAW_FORMAT, "model.method.start")
+        _, tensors, _ = read_weights(self.start, (LAW_FORMAT,), "model.method.start")
         if "z" not in tensors or tensors["z"].shape != (self.operator.latent_dim,):
             raise UserError(f"model.method.start = {self.start} holds no latent of {self.operator.latent_dim} numbers")
         return tensors["z"]

@@ -1,5 +1,7 @@
 """The frozen operator and the encoder that is trained, as the modules of warm-up and Stage II begin with them."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -45,20 +47,30 @@ def small_strain_modulus(operator: IntrinsicDynamicsOperator, z: Tensor, strain:
     return (tau[:, 0] - tau[:, 1]) / (2 * strain)
 
 
-def implausibility(operator: IntrinsicDynamicsOperator, z: Tensor, samples: int = 48) -> Tensor:
-    """How far the elastic law of z (d,) is from one that a rollout survives, at strains up to 0.4; zero for all laws of Stage I's kind.
+def implausibility(operator: IntrinsicDynamicsOperator, z: Tensor) -> Tensor:
+    """`implausible_stress` of the elastic law of z (d,); zero for all laws of Stage I's kind."""
+    modulus = small_strain_modulus(operator, z[None])[0]
+    return implausible_stress(lambda F: operator.elastic(z[None], F[None])[0], modulus)
+
+
+def implausible_stress(stress: Callable[[Tensor], Tensor], modulus: Tensor, samples: int = 48) -> Tensor:
+    """How far an elastic law is from one that a rollout survives, at strains up to 0.4.
 
     A stress that points against its strain, or one more than three times the small-strain modulus times the strain, makes a body explode
     in some later contact, and images say so too late.
+
+    Args:
+        stress: F (n, 3, 3) -> tau (n, 3, 3) [Pa], differentiable in the law's parameters.
+        modulus: P-wave modulus [Pa], ().
+        samples: Deformation gradients, a third each of small, middle and large strains.
     """
     generator = torch.Generator().manual_seed(0)
     spread = torch.tensor([0.03, 0.1, 0.2]).repeat_interleave(samples // 3)[:, None, None]
-    F = (torch.eye(3) + spread * torch.randn(3 * (samples // 3), 3, 3, generator=generator)).to(z)
+    F = (torch.eye(3) + spread * torch.randn(3 * (samples // 3), 3, 3, generator=generator)).to(modulus)
     F = F[torch.linalg.det(F) > 0.2]
-    tau = operator.elastic(z[None], F[None])[0]
+    tau = stress(F)
     l, A, _ = hencky_strain(F)
-    strain = A + l[:, None, None] / 3 * torch.eye(3).to(z)
+    strain = A + l[:, None, None] / 3 * torch.eye(3).to(modulus)
     work = (tau * strain).sum((1, 2)) / (tau.flatten(1).norm(dim=1) * strain.flatten(1).norm(dim=1) + 1e-6)
-    modulus = small_strain_modulus(operator, z[None])[0].clamp(min=1e3)
-    stiff = tau.flatten(1).norm(dim=1) / (3 * modulus * strain.flatten(1).norm(dim=1))
+    stiff = tau.flatten(1).norm(dim=1) / (3 * modulus.clamp(min=1e3) * strain.flatten(1).norm(dim=1))
     return (0.1 - work).relu().mean() + stiff.clamp(min=1).log().square().mean()

@@ -7,12 +7,12 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from neuido.data.tables import folder_of as folder_of
 from neuido.data.visual import VisualScene
 from neuido.errors import UserError
 from neuido.models.encoder import DynamicsEncoder
@@ -274,9 +274,3 @@ def track(rest: Tensor, points: Tensor, x: Tensor, nearest: int = 8) -> Tensor:
     index = torch.as_tensor(index).reshape(len(points), -1).to(x.device)
     moved = sum((x - rest)[:, index[:, j]] * weight[:, j, None] for j in range(index.shape[1]))
     return points.to(x) + moved
-
-
-def folder_of(out: str | os.PathLike, name: str) -> Path:
-    """The folder of a scene's results, under a name that stays inside `out`."""
-    clean = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).lstrip(".") or "scene"
-    return Path(out) / clean

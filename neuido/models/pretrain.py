@@ -188,6 +188,8 @@ class PretrainModule(LightningModule):
         basis_dim: Number of basis functions D (the paper does not say).
         hidden_dim: Width of the trunks (the paper does not say).
         head_dim: Width of the heads (the paper does not say).
+        latent_std: Standard deviation of the latents at the start (paper: 1). What the laws do not feel of it stays in them for good; with
+            0.1 their families lie apart in the space of the latents itself (`neuido latents`).
         lr: Learning rate of trunks and heads; AdamW with a cosine to zero over the run (paper).
         latent_lr_factor: The latents learn with this many times `lr`.
         weight_decay: Of trunks and heads.
@@ -209,6 +211,7 @@ class PretrainModule(LightningModule):
         basis_dim: int = 64,
         hidden_dim: int = 64,
         head_dim: int = 128,
+        latent_std: float = 1.0,
         lr: float = 3e-3,
         latent_lr_factor: float = 10.0,
         weight_decay: float = 1e-4,
@@ -222,7 +225,12 @@ class PretrainModule(LightningModule):
         compile: bool = False,
     ):
         super().__init__()
-        for name, value in (("trajectory_count", trajectory_count), ("lr", lr), ("relative_epsilon", relative_epsilon)):
+        for name, value in (
+            ("trajectory_count", trajectory_count),
+            ("latent_std", latent_std),
+            ("lr", lr),
+            ("relative_epsilon", relative_epsilon),
+        ):
             if value <= 0:
                 raise UserError(f"model.{name} = {value}: it must be positive")
         if plastic_target not in ("residual", "full"):
@@ -230,7 +238,7 @@ class PretrainModule(LightningModule):
         self.save_hyperparameters()
         sizes = {"trunk": trunk, "latent_dim": latent_dim, "basis_dim": basis_dim, "hidden_dim": hidden_dim, "head_dim": head_dim}
         self.operator = IntrinsicDynamicsOperator(**sizes)  # type: ignore[arg-type]
-        self.latents = nn.Parameter(torch.randn(trajectory_count, latent_dim))  # paper: N(0, 1)
+        self.latents = nn.Parameter(latent_std * torch.randn(trajectory_count, latent_dim))
         if init_from is not None:
             self._start_from(init_from)
         if compile:

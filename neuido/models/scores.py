@@ -1,16 +1,14 @@
 """Scores of a predicted motion, frame by frame: Chamfer distance with its floor, matched RMSE, and images on views that were held out."""
 
-import csv
 import math
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from neuido.data.tables import write_rows as write_rows
 from neuido.metrics import chamfer_distance, resampling_floor
 from neuido.models.flow import window
 from neuido.models.lpips import LPIPS, Absent
@@ -112,17 +110,3 @@ def later(particles: Sequence[dict[str, Any]], pictures: Sequence[dict[str, Any]
     """`mean_of` the frames from `first` on, of the rows of particles and of images."""
     parts = [mean_of([row for row in rows if row["frame"] >= first], names) for rows in (particles, pictures)]
     return parts[0] | parts[1]
-
-
-def write_rows(path: str | os.PathLike, rows: Sequence[dict[str, Any]]) -> None:
-    """Write rows as CSV, all at once; a value that a row lacks is empty."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    hidden = path.with_name(f".{path.name}.tmp")
-    with hidden.open("w", newline="") as file:
-        writer = csv.DictWriter(file, names, restval="")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
-    os.replace(hidden, path)

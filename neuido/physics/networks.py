@@ -22,6 +22,7 @@ from neuido.errors import UserError
 from neuido.physics import device, fused, network_kernels
 from neuido.physics.device import real_of, torch_stream
 from neuido.physics.law import ElasticLaw, Engine, PlasticLaw
+from neuido.physics.layers import linear, linear_adjoint
 from neuido.physics.network_kernels import COARSE, DELTA, FINE, LINEAR, LODE
 from neuido.types import Particles
 
@@ -136,33 +137,6 @@ class _Workspace:
 _workspace = functools.lru_cache(maxsize=8)(_Workspace)
 
 
-def _linear(x: Tensor, W: Tensor, b: Tensor, offsets: Sequence[int], out: Tensor) -> None:
-    """out = x W^T + b with the weights of each particle's scene."""
-    if W.shape[0] == 1 and b.shape[0] == 1:
-        torch.addmm(b[0], x, W[0].T, out=out)
-        return
-    for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])):
-        torch.addmm(b[min(s, len(b) - 1)], x[i:j], W[min(s, len(W) - 1)].T, out=out[i:j])
-
-
-def _linear_adjoint(
-    x: Tensor, W: Tensor, gy: Tensor, offsets: Sequence[int], ones: Tensor, gx: Tensor | None, gW: Tensor | None, gb: Tensor | None
-) -> None:
-    """Writes gx; adds to gW and gb. Any of them may be None: not wanted."""
-    single = gy.shape[0]
-    for target, parameter in ((gx, W), (gW, gW), (gb, gb)):
-        if target is None:
-            continue
-        shared = parameter.shape[0] == 1
-        for s, (i, j) in enumerate(((0, single),) if shared else zip(offsets[:-1], offsets[1:])):
-            if target is gx:
-                torch.mm(gy[i:j], W[s], out=gx[i:j])
-            elif target is gW:
-                gW[s].addmm_(gy[i:j].T, x[i:j])
-            else:
-                gb[s].addmv_(gy[i:j].T, ones[i:j])
-
-
 class _Network:
     """What the four laws share; not a law by itself.
 
@@ -216,11 +190,11 @@ class _Network:
         offsets = self._offsets(F, particles)
         w = self._buffers(F, W1.shape[-2])
         self._features(F, w.x)
-        _linear(w.x, W1, b1, offsets, w.z1)
+        linear(w.x, W1, b1, offsets, w.z1)
         torch._C._nn.silu(w.z1, out=w.h1)
-        _linear(w.h1, W2, b2, offsets, w.z2)
+        linear(w.h1, W2, b2, offsets, w.z2)
         torch._C._nn.silu(w.z2, out=w.h2)
-        _linear(w.h2, W3, b3, offsets, w.y)
+        linear(w.h2, W3, b3, offsets, w.y)
         return w
 
     def _backpropagate(
@@ -230,11 +204,11 @@ class _Network:
         W1, _, W2, _, W3, _ = (t.detach() for t in tensors)
         gW1, gb1, gW2, gb2, gW3, gb3 = grads
         offsets = self._offsets(F, particles)
-        _linear_adjoint(w.h2, W3, w.gy, offsets, w.ones, w.g2, gW3, gb3)
+        linear_adjoint(w.h2, W3, w.gy, offsets, w.ones, w.g2, gW3, gb3)
         torch.ops.aten.silu_backward.grad_input(w.g2, w.z2, grad_input=w.g2)
-        _linear_adjoint(w.h1, W2, w.g2, offsets, w.ones, w.g1, gW2, gb2)
+        linear_adjoint(w.h1, W2, w.g2, offsets, w.ones, w.g1, gW2, gb2)
         torch.ops.aten.silu_backward.grad_input(w.g1, w.z1, grad_input=w.g1)
-        _linear_adjoint(w.x, W1, w.g1, offsets, w.ones, w.gx, gW1, gb1)
+        linear_adjoint(w.x, W1, w.g1, offsets, w.ones, w.gx, gW1, gb1)
 
     @staticmethod
     def _offsets(F: Tensor, particles: Particles | None) -> Sequence[int]:

@@ -1,9 +1,11 @@
 """Scenes take turns: each once an epoch, shared between processes, and on from where a run stopped."""
 
 import pytest
+import torch
 
-from neuido.data.visual_module import Turns, VisualDataModule
+from neuido.data.visual_module import Turns, VisualDataModule, train_on
 from neuido.errors import UserError
+from neuido.types import Cameras, MultiViewBatch
 
 NAMES = list("abcde")
 
@@ -50,3 +52,31 @@ def test_what_is_missing_is_named(tmp_path):
         VisualDataModule(["one"], root=str(tmp_path)).setup("fit")
     with pytest.raises(UserError, match="colour"):
         VisualDataModule([{"path": "one", "colour": "red"}], root=str(tmp_path)).setup("fit")
+
+
+def filmed(views: int, held_out: tuple[int, ...]) -> MultiViewBatch:
+    """A batch whose images and cameras are the numbers of their views."""
+    numbers = torch.arange(views, dtype=torch.float32)
+    cameras = Cameras(numbers[:, None, None] * torch.ones(4, 4), numbers[:, None, None] * torch.ones(3, 3), 2, 2)
+    images = numbers[:, None, None, None, None] * torch.ones(3, 2, 2, 3)
+    held = torch.tensor([v in held_out for v in range(views)])
+    return MultiViewBatch(0, "one", images, images[..., 0], cameras, torch.arange(3.0).double(), held, torch.ones(3))
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [(1, [0, 3, 9]), (4, [0, 2, 3, 6, 9, 10]), (10, list(range(12))), ([1, 9], [1, 3, 9, 11]), ([9, 1, 9], [1, 3, 9, 11])],
+)
+def test_training_on_some_of_the_views(given, kept):
+    """Held-out views 3 and 9 stay whatever is chosen; the numbers are those of the others."""
+    batch = train_on(filmed(12, (3, 9)), given)
+    assert batch.images[:, 0, 0, 0, 0].tolist() == kept
+    for part in (batch.masks[:, 0, 0, 0], batch.cameras.viewmats[:, 0, 0], batch.cameras.Ks[:, 0, 0]):
+        assert part.tolist() == kept
+    assert batch.held_out.nonzero()[:, 0].tolist() == [kept.index(3), kept.index(9)]
+
+
+@pytest.mark.parametrize("given", [0, 3, -1, [], [2], [-1]])
+def test_views_that_there_are_not(given):
+    with pytest.raises(UserError, match="training_views"):
+        train_on(filmed(3, (1,)), given)

@@ -85,5 +85,6 @@ def test_a_fit_that_cannot_catch_up_stops_and_the_others_do_not():
     assert Race(1.0).lost([100.0, 50.0, 50.0, 50.0], 9)
     assert not Race(1.0).lost([100.0, 50.0, 50.0], 9)  # the next step is less bold
     assert not Race(1.0).lost([100.0, 50.0, 20.0], 9)  # at this pace it ends below
+    assert Race(1.0).lost([1e6, 1e5, 1e4], 9)  # no fit keeps this pace up
     assert not Race(1.0).lost([100.0, 90.0], 10)  # one iteration says little
     assert not Race().lost([100.0, 99.0, 98.0], 9)  # nobody is ahead

@@ -188,3 +188,14 @@ def order(folder):
     data = TrajectoryDataModule(str(folder), batch_size=120)
     data.setup()
     return data.order
+
+
+def test_latents_start_as_far_apart_as_asked():
+    torch.manual_seed(0)
+    wide = PretrainModule(40, **SMALL).latents.detach()
+    torch.manual_seed(0)
+    near = PretrainModule(40, **SMALL, latent_std=0.1).latents.detach()
+    assert wide.std() == pytest.approx(1.0, abs=0.1)  # paper
+    assert torch.allclose(near, 0.1 * wide)
+    with pytest.raises(UserError, match="latent_std = 0"):
+        PretrainModule(40, latent_std=0.0)

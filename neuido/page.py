@@ -1,0 +1,155 @@
+"""Self-contained HTML pages: text, tables, inline figures, pictures and videos. Without matplotlib there are no figures."""
+
+import base64
+import html
+import io
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:1120px;margin:2em auto;padding:0 1em}
+h1{font-size:1.5em}h2{font-size:1.2em;margin-top:2em;border-bottom:1px solid #ddd}img,svg{max-width:100%;height:auto}
+table{border-collapse:collapse;margin:.6em 0}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #eee;font-size:.93em}
+td.n{text-align:right;font-variant-numeric:tabular-nums}.best{font-weight:bold}.note{color:#666;font-size:.9em}
+figure{display:inline-block;margin:.3em;vertical-align:top}figcaption{font-size:.85em}video{max-width:520px}"""
+
+
+class Best(NamedTuple):
+    """A cell of a table in bold."""
+
+    value: Any
+
+
+def page(title: str, body: str, *, style: str = "") -> str:
+    """A whole page.
+
+    Args:
+        title: Of the window.
+        body: HTML.
+        style: CSS after `STYLE`.
+    """
+    head = f'<meta charset="utf-8"><title>{escaped(title)}</title><style>{STYLE}{style}</style>'
+    return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
+
+
+def escaped(value: Any) -> str:
+    """A value as HTML text."""
+    return html.escape(str(value))
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, digits: int = 4) -> str:
+    """A table; numbers stand to the right with so many digits, NaN and None are empty, a `Best` is bold."""
+    if not rows:
+        return "<p>None.</p>"
+
+    def cell(value: Any) -> str:
+        bold = " best" if isinstance(value, Best) else ""
+        value = value.value if isinstance(value, Best) else value
+        if value is None or (isinstance(value, float) and math.isnan(value)):
+            return "<td></td>"
+        if isinstance(value, float | int) and not isinstance(value, bool):
+            return f'<td class="n{bold}">{value:.{digits}g}</td>'
+        return f'<td class="t{bold}">{escaped(value)}</td>' if bold else f"<td>{escaped(value)}</td>"
+
+    lines = ["<tr>" + "".join(f"<th>{escaped(h)}</th>" for h in head) + "</tr>"] if any(head) else []
+    lines += ["<tr>" + "".join(cell(v) for v in row) + "</tr>" for row in rows]
+    return "<table>" + "\n".join(lines) + "</table>"
+
+
+def picture(path: Path) -> str:
+    """A PNG file."""
+    return png(path.read_bytes(), path.stem)
+
+
+def png(data: bytes, name: str) -> str:
+    """A picture from the bytes of a PNG file."""
+    return f'<p><img alt="{escaped(name)}" src="data:image/png;base64,{base64.b64encode(data).decode()}"></p>'
+
+
+def video(path: Path, caption: str, *, width: int = 520) -> str | None:
+    """A video file in the page, as WebM: browsers do not play the MPEG-4 that OpenCV writes; none where it cannot be read.
+
+    Args:
+        path: The file.
+        caption: Below it.
+        width: Largest width [px].
+    """
+    data = webm(path, width)
+    if data is None:
+        return None
+    source = f"data:video/webm;base64,{base64.b64encode(data).decode()}"
+    return f'<figure><video controls loop muted playsinline src="{source}"></video><figcaption>{escaped(caption)}</figcaption></figure>'
+
+
+def webm(path: Path, width: int) -> bytes | None:
+    """A video as WebM with VP9, at most so many pixels wide; none where OpenCV cannot read or write it."""
+    import cv2
+
+    source = cv2.VideoCapture(str(path))
+    size = [int(source.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+    if not source.isOpened() or min(size) < 2:
+        return None
+    scale = min(1.0, width / size[0])
+    smaller = tuple(max(2, round(scale * n) // 2 * 2) for n in size)  # the codec wants even sides
+    handle, name = tempfile.mkstemp(suffix=".webm")
+    os.close(handle)
+    try:
+        with _quiet():
+            sink = cv2.VideoWriter(name, cv2.VideoWriter_fourcc(*"VP90"), source.get(cv2.CAP_PROP_FPS) or 20.0, smaller)
+            if not sink.isOpened():
+                return None
+            while (read := source.read())[0]:
+                sink.write(cv2.resize(read[1], smaller, interpolation=cv2.INTER_AREA))
+            sink.release()
+        return Path(name).read_bytes() or None
+    finally:
+        source.release()
+        Path(name).unlink()
+
+
+class _quiet:
+    """Without what FFmpeg writes to stderr about a tag that WebM has no use for."""
+
+    def __enter__(self) -> None:
+        import sys
+
+        sys.stderr.flush()
+        self.kept, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        os.dup2(sink, 2)
+        os.close(sink)
+
+    def __exit__(self, *details: object) -> None:
+        os.dup2(self.kept, 2)
+        os.close(self.kept)
+
+
+def figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any] | None:
+    """A figure without a window and its axes (rows, columns), or None where matplotlib is not installed."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        return None
+    made = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(made)
+    return made, made.subplots(rows, columns, squeeze=False)
+
+
+def svg(made: Any) -> str:
+    """A figure as an inline element."""
+    import matplotlib
+
+    stream = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "neuido"}):
+        made.savefig(stream, format="svg", metadata={"Date": None})
+    return stream.getvalue().partition("<svg")[1] + stream.getvalue().partition("<svg")[2]
+
+
+def small(ax: Any) -> None:
+    """Small ticks, and no frame above and to the right."""
+    ax.tick_params(labelsize=7)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
