@@ -60,27 +60,23 @@ class Turns(Resumable[VisualScene]):
         return -(-len(self.scenes) // self.ranks)
 
     def batches(self, epoch: int, start: int) -> Iterable[VisualScene]:
-        return (self.scenes[i] for i in self._order(epoch)[start:])
-
-    def _order(self, epoch: int) -> list[int]:
-        """Which scenes this process gets in an epoch."""
         count = len(self.scenes)
         order = np.random.default_rng([self.seed, epoch]).permutation(count).tolist()
-        return [order[(k * self.ranks + self.rank) % count] for k in range(len(self))]
+        return (self.scenes[order[(k * self.ranks + self.rank) % count]] for k in range(start, len(self)))
 
 
-class OneByOne(Turns):
+class OneByOne(Resumable[VisualScene]):
     """Each scene for so many steps: an epoch is one scene, in the order given."""
 
     def __init__(self, scenes: Sequence[VisualScene], *, steps: int) -> None:
-        super().__init__(scenes)
-        self.steps = steps
+        super().__init__({"scenes": len(scenes), "steps": steps})
+        self.scenes, self.steps = list(scenes), steps
 
     def __len__(self) -> int:
         return self.steps
 
-    def _order(self, epoch: int) -> list[int]:
-        return [epoch] * self.steps if epoch < len(self.scenes) else []
+    def batches(self, epoch: int, start: int) -> Iterable[VisualScene]:
+        return [self.scenes[epoch]] * (self.steps - start) if epoch < len(self.scenes) else []
 
 
 def train_on(batch: MultiViewBatch, views: int | list[int]) -> MultiViewBatch:
@@ -172,7 +168,7 @@ class VisualDataModule(LightningDataModule):
             if bool(scene.batch.held_out.all()):
                 raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} are held out")
 
-    def train_dataloader(self) -> Turns:
+    def train_dataloader(self) -> Turns | OneByOne:
         if self.steps_in_a_row is not None:
             return OneByOne(self.scenes, steps=self.steps_in_a_row)
         return Turns(self.scenes, seed=self.seed, **self._share())

@@ -33,8 +33,7 @@ class AdaptModule(FilmedModule):
     Args:
         method: What is fitted (`models.methods`).
         steps: Optimiser steps of each scene; none: the method's own number (ours: 100, the paper's).
-        training_views: Training views that fitting sees, the first ones; 0: all.
-        views_per_step: Of these, views in a step, drawn anew for each; 0: all.
+        views_per_step: Training views in a step, drawn anew for each; 0: all.
         encoder_views: Training views that the encoder sees; 0: all.
         fit_frames: Frames that fitting sees, the first ones; 0: all. Scores then have the rest apart, as `later_...`.
         curriculum: Shares of these frames that are rolled out, one after the other, for equal parts of `curriculum_share` of the steps.
@@ -63,7 +62,6 @@ class AdaptModule(FilmedModule):
         self,
         method: Method,
         steps: int | None = None,
-        training_views: int = 0,
         views_per_step: int = 2,
         encoder_views: int = 0,
         fit_frames: int = 0,
@@ -89,7 +87,7 @@ class AdaptModule(FilmedModule):
     ):
         super().__init__()
         counts = {"steps": steps or 0, "fit_frames": fit_frames, "velocity_steps": velocity_steps, "segment": segment}
-        counts |= {"training_views": training_views, "views_per_step": views_per_step, "encoder_views": encoder_views}
+        counts |= {"views_per_step": views_per_step, "encoder_views": encoder_views}
         weights = {"image_weight": image_weight, "silhouette_weight": silhouette_weight, "velocity_lr": velocity_lr}
         filmed.check_options(counts, weights, curriculum, curriculum_share)
         if image_weight + silhouette_weight == 0:
@@ -142,12 +140,11 @@ class AdaptModule(FilmedModule):
 
     def _training_views(self, prepared: Prepared) -> list[int]:
         """The views that are trained on."""
-        seen = prepared.training[: self.hparams.training_views or None]
         if self.hparams.stop_on != "view":
-            return seen
-        if len(seen) < 2:
+            return prepared.training
+        if len(prepared.training) < 2:
             raise UserError(f"model.stop_on = view: {prepared.source.name} has one training view, and none would be left; use loss or none")
-        return seen[:-1]
+        return prepared.training[:-1]
 
     def _frames(self, prepared: Prepared) -> int:
         """Frames that fitting sees."""
@@ -271,8 +268,7 @@ class AdaptModule(FilmedModule):
         motion = self._try(prepared, fit)
         if motion is None:
             return
-        trained = self._training_views(prepared)
-        views = [prepared.training[len(trained)]] if self.hparams.stop_on == "view" else trained
+        views = prepared.training[-1:] if self.hparams.stop_on == "view" else prepared.training
         value = float(self._weighted(*filmed.image_losses(prepared, motion, views)))
         self._log({"train/looked": value})
         progress.see(value, fit, self.hparams.patience)
