@@ -18,7 +18,8 @@ NOTHING = 2e-4
 """Relative gain, as the linear model promises it, that is not worth a run."""
 BEHIND = 2.5
 """A fit that would end above so many times the lowest cost of a race, at the pace of its last step, is given up."""
-
+TRAILING = 5.0
+"""What a fit multiplies its tolerance by while it is more than a tenth above the lowest cost of a race."""
 BEST_PACE = 0.6
 """Lowest ratio of costs, of an iteration to the one before, that a fit is trusted to keep up."""
 
@@ -145,7 +146,8 @@ def levenberg_marquardt(
         if ends[best] < cost:
             q, r, cost = tried[best], found[best], ends[best]
             damping = max(damping * DAMPINGS[best], 1e-6)
-            converged = gain < tolerance and moved < 0.5
+            behind = race is not None and cost > 1.1 * race.best
+            converged = gain < tolerance * (TRAILING if behind else 1.0) and moved < 0.5
         else:
             converged = damping > 1e3 or np.abs(tried[0] - q).max() < 1e-3
             damping *= 30.0
