@@ -10,17 +10,10 @@ import torch
 import neuido
 from neuido import cli
 from neuido.cli import main
+from tests.command import run
 
 ROOT = Path(neuido.__file__).parents[1]
 STAGE1 = str(neuido.configs_root() / "stage1.yaml")
-
-
-def run(capsys, *args: str) -> tuple[int, str, str]:
-    """Run the command in this process: status, stdout, stderr."""
-    with pytest.raises(SystemExit) as stop:
-        main(list(args))
-    out, err = capsys.readouterr()
-    return stop.value.code, out, err
 
 
 def assert_one_line(capsys, args: list[str], *words: str) -> None:

@@ -163,9 +163,9 @@ class BodyProblem(Problem):
     # Forward runs.
 
     def _predict(self, points: Sequence[Point], groups: Sequence[list[int]], recording: int, setting: int, out: np.ndarray) -> None:
-        """Fill the rows of groups of points that move alike."""
+        """Fill the rows of groups of points that move alike; NaN where a simulation is impossible."""
         try:
-            x, v = self._roll([points[g[0]] for g in groups], recording, setting)
+            moved = self._simulate([points[g[0]] for g in groups], recording, setting)
         except UserError:
             if len(groups) > 1:
                 for g in groups:
@@ -173,8 +173,16 @@ class BodyProblem(Problem):
             else:
                 out[groups[0]] = np.nan
             return
+        self._fill(points, groups, recording, moved, out)
+
+    def _simulate(self, points: Sequence[Point], recording: int, setting: int) -> Any:
+        """One motion a point, as `_fill` takes them."""
+        return self._roll(points, recording, setting)
+
+    def _fill(self, points: Sequence[Point], groups: Sequence[list[int]], recording: int, moved: Any, out: np.ndarray) -> None:
+        """The rows of each group, from its motion."""
         seen = self.measured[recording].seen.numpy()
-        for g, xs, vs in zip(groups, x, v, strict=True):
+        for g, xs, vs in zip(groups, *moved, strict=True):
             for i in g:
                 out[i] = self._as_seen(points[i], recording, xs, vs)[1:][seen[1:]].reshape(-1)
 

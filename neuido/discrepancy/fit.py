@@ -48,10 +48,6 @@ class Covariance:
         factor = 1.0 - self.sigma / np.sqrt(self.sigma**2 + self.spread**2)
         return (r - self.directions @ (factor[:, None] * inside if r.ndim == 2 else factor * inside)) / self.sigma
 
-    def log_determinant(self) -> float:
-        """ln det of the covariance over sigma^2."""
-        return float(np.sum(np.log1p((self.spread / self.sigma) ** 2)))
-
 
 @dataclass(frozen=True, eq=False)
 class Fit:

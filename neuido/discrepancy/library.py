@@ -248,8 +248,3 @@ def _with_waves(made: Effects, waves: Mapping[str, torch.Tensor], duration: floa
         share = (at - left)[None, :, None]
         knots = knots + (1 - share) * own[:, left] + share * own[:, left + 1]
     return made._replace(time_force=knots, time_force_interval=duration / (count - 1))
-
-
-def active_effects(point: Mapping[str, float]) -> frozenset[str]:
-    """The effects that are present in a point."""
-    return frozenset(name.split(".")[0] for name, value in point.items() if "." in name and value)

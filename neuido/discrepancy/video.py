@@ -144,16 +144,10 @@ class VideoProblem(BodyProblem):
 
     # Forward runs.
 
-    def _predict(self, points: Sequence[Point], groups: Sequence[list[int]], recording: int, setting: int, out: np.ndarray) -> None:
-        try:
-            moved = self._move([points[g[0]] for g in groups], recording, setting)
-        except UserError:
-            if len(groups) > 1:
-                for g in groups:
-                    self._predict(points, [g], recording, setting, out)
-            else:
-                out[groups[0]] = np.nan
-            return
+    def _simulate(self, points: Sequence[Point], recording: int, setting: int) -> Any:
+        return self._move(points, recording, setting)
+
+    def _fill(self, points: Sequence[Point], groups: Sequence[list[int]], recording: int, moved: Any, out: np.ndarray) -> None:
         f = self.footage[recording]
         for s, g in enumerate(groups):
             motion = _alone(moved, s)

@@ -14,7 +14,7 @@ from neuido.errors import UserError
 from neuido.physics import device, invariant_kernels, linalg
 from neuido.physics.device import real_of, torch_stream
 from neuido.physics.invariant_kernels import EPSILON, FEATURES, TIE
-from neuido.physics.law import ElasticLaw, Engine, Law, PlasticLaw
+from neuido.physics.law import ElasticLaw, Engine, EngineLaw, PlasticLaw
 from neuido.physics.layers import linear, linear_adjoint
 from neuido.types import Particles
 
@@ -72,7 +72,7 @@ class InvariantEngine(Engine):
         linear_adjoint(self.buffer[x], self.tensors[i], grad, self.particles.offsets, None, self.adjoints[x], self.grads[i], None)
 
 
-class _Invariant(Law):
+class _Invariant(EngineLaw):
     """What the elastic and the plastic network share; not a law by itself.
 
     Args:
@@ -104,23 +104,6 @@ class _Invariant(Law):
 
     def key(self, tensors: Sequence[Tensor]) -> Hashable:
         return type(self).__name__, self.scale
-
-    def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
-        InvariantEngine(self, tensors, particles).forward(F, out)
-
-    def adjoint(
-        self,
-        tensors: Sequence[Tensor],
-        F: Tensor,
-        grad_out: Tensor,
-        grad_F: Tensor,
-        grad_tensors: Sequence[Tensor | None],
-        particles: Particles,
-    ) -> None:
-        engine = InvariantEngine(self, tensors, particles)
-        engine.start_adjoint([False] * len(tensors))
-        engine.grads = list(grad_tensors)
-        engine.adjoint(F, grad_out, grad_F)
 
     def _network(self, F: Tensor, s: int) -> Tensor:
         """R X of scene s in plain torch, (..., 3, 3)."""

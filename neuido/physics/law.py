@@ -82,6 +82,30 @@ class Engine:
         return self.grads
 
 
+class EngineLaw(Law):
+    """A law whose `engine` does all its work; a call outside a rollout makes one for itself."""
+
+    def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
+        raise NotImplementedError
+
+    def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
+        self.engine(tensors, particles).forward(F, out)
+
+    def adjoint(
+        self,
+        tensors: Sequence[Tensor],
+        F: Tensor,
+        grad_out: Tensor,
+        grad_F: Tensor,
+        grad_tensors: Sequence[Tensor | None],
+        particles: Particles,
+    ) -> None:
+        engine = self.engine(tensors, particles)
+        engine.start_adjoint([False] * len(tensors))
+        engine.grads = list(grad_tensors)
+        engine.adjoint(F, grad_out, grad_F)
+
+
 class ElasticLaw(Law):
     """F -> Kirchhoff stress tau [Pa]."""
 

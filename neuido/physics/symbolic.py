@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics import networks
-from neuido.physics.law import ElasticLaw, Engine, Law, PlasticLaw
+from neuido.physics.law import ElasticLaw, Engine, EngineLaw, PlasticLaw
 from neuido.physics.layers import linear, linear_adjoint
 from neuido.physics.network_kernels import LINEAR, STRESS_COEFFICIENTS, YIELD_COEFFICIENTS
 from neuido.types import Particles
@@ -70,7 +70,7 @@ class SymbolicEngine(Engine):
         networks.launch(adjoint, F, F, self.c, scale, grad_out, self.gx, grad_F)
 
 
-class _Symbolic(Law):
+class _Symbolic(EngineLaw):
     elastic: bool
     outputs: int
     columns: int
@@ -91,22 +91,6 @@ class _Symbolic(Law):
 
     def key(self, tensors: Sequence[Tensor]) -> Hashable:
         return type(self).__name__
-
-    def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
-        SymbolicEngine(self, tensors, particles).forward(F, out)
-
-    def adjoint(
-        self,
-        tensors: Sequence[Tensor],
-        F: Tensor,
-        grad_out: Tensor,
-        grad_F: Tensor,
-        grad_tensors: Sequence[Tensor | None],
-        particles: Particles,
-    ) -> None:
-        engine = SymbolicEngine(self, tensors, particles)
-        engine.grads = list(grad_tensors)
-        engine.adjoint(F, grad_out, grad_F)
 
     def _at(self, F: Tensor, particles: Particles | None) -> Tensor:
         """The coefficients of each F in plain torch, (..., outputs)."""

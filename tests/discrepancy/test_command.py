@@ -15,6 +15,7 @@ import yaml
 
 import neuido
 from neuido.cli import main
+from tests import command
 from tests.discrepancy import made
 
 ROOT = Path(neuido.__file__).parents[1]
@@ -22,10 +23,7 @@ DRAGS = ["--effects", "drag_linear,drag_quadratic,gravity", "--progress", "false
 
 
 def run(capsys, *args) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as stop:
-        main(["diagnose", *map(str, args)])
-    out, err = capsys.readouterr()
-    return stop.value.code, out, err
+    return command.run(capsys, "diagnose", *args)
 
 
 @pytest.fixture(scope="module")

@@ -8,24 +8,17 @@ import pytest
 import torch
 import yaml
 
-from neuido.cli import main
 from neuido.data.experiments import read_experiment
 from neuido.discrepancy.believed import classical, laws_of, ready, scaled, with_law
 from neuido.discrepancy.body import body_problem
 from neuido.models.operator import IntrinsicDynamicsOperator
 from neuido.models.results import load_law, save_law
 from neuido.physics.mpm import Simulator
+from tests.command import run
 from tests.discrepancy import made
 
 DRAG = {"drag_linear.k": 3.0}
 FACTOR = 0.7
-
-
-def run(capsys, *args) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in args])
-    out, err = capsys.readouterr()
-    return stop.value.code, out, err
 
 
 @pytest.fixture(scope="module")

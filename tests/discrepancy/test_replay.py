@@ -7,7 +7,6 @@ import pytest
 import torch
 import yaml
 
-from neuido.cli import main
 from neuido.data.experiments import read_experiment
 from neuido.discrepancy.believed import ready
 from neuido.discrepancy.body import SEGMENT, _segment, body_problem
@@ -15,16 +14,10 @@ from neuido.discrepancy.resume import CachedProblem
 from neuido.errors import UserError
 from neuido.physics.laws import FixedCorotated
 from neuido.physics.mpm import Simulator
+from tests.command import run
 from tests.discrepancy import made
 
 EFFECTS = {"drag_linear.k": 3.0}
-
-
-def run(capsys, *args) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in args])
-    out, err = capsys.readouterr()
-    return stop.value.code, out, err
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ import pytest
 import torch
 import yaml
 
-from neuido.cli import main
 from neuido.data.experiments import read_experiment
 from neuido.data.synthetic import dress
 from neuido.discrepancy import silhouettes
@@ -21,16 +20,14 @@ from neuido.discrepancy.silhouettes import View
 from neuido.discrepancy.video import VideoProblem, video_problem
 from neuido.models.gaussians import harmonics_of, save_ply
 from neuido.types import Gaussians, ParticleState
+from tests import command
 from tests.discrepancy import made
 
 EFFECTS = {"drag_linear.k": 4.0}
 
 
 def run(capsys, *args) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as stop:
-        main(["diagnose", *[str(a) for a in args]])
-    out, err = capsys.readouterr()
-    return stop.value.code, out, err
+    return command.run(capsys, "diagnose", *args)
 
 
 def disc(x: float, y: float, radius: float, size: int = 64) -> np.ndarray:
