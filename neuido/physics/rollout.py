@@ -6,6 +6,7 @@ the laws, last substep first. `autograd.py` makes one `torch.autograd.Function` 
 """
 
 import copy
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -173,20 +174,23 @@ class Plan:
         now = tuple(frame[0] for frame in tape.states)
         spare = [tuple(torch.empty_like(t) for t in now) for _ in range(2)] if stride > 1 else []
         scratch, other = torch.empty_like(now[3]), torch.empty_like(now[3])
+        copies = sim.device.type == "cpu"
         tape.status.zero_()
         with torch_stream(sim.device):
             elastic, plastic = self.engines(inputs)
             for n in range(self.steps if steps is None else steps):
-                kept = (n + 1) % stride == 0
-                then = tuple(frame[(n + 1) // stride] for frame in tape.states) if kept else spare[n % 2]
+                frame = tuple(frames[(n + 1) // stride] for frames in tape.states) if (n + 1) % stride == 0 else None
+                # on the CPU a frame is a copy: launches whose tensors always lie in the same places need no packing
+                then = spare[n % 2] if frame is None or (spare and copies) else frame
                 x, v, C, F, history = now
                 tau = scratch if tape.tau is None else tape.tau[n]
                 trial = other if tape.trial is None else tape.trial[n]
                 material = self.material(inputs, n)
                 self.stress(elastic, F, C, history, viscosity, material, tau)
-                grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid") if tape.grid is None else tape.grid[n])
+                reach = self.reach(x) if tape.grid is None else slice(0, sim.node_count)
+                grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid") if tape.grid is None else tape.grid[n], reach)
                 velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
-                self.on_grid(grid, at_step(pull, n), force, friction, velocity)
+                self.on_grid(grid, at_step(pull, n), force, friction, velocity, reach)
                 self.launch(sim.kernels.grid_to_particles, len(x),
                             [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
                              trial if self.corrects else then[3], n, tape.status], self.block)  # fmt: skip
@@ -194,6 +198,9 @@ class Plan:
                     plastic.forward(trial, then[3])
                 if material is not None:
                     self.remember(material, trial, then[2], history, then[3], then[4])
+                if frame is not None and then is not frame:
+                    for kept, t in zip(frame, then):
+                        kept.copy_(t)
                 now = then
 
     def stress(
@@ -224,17 +231,33 @@ class Plan:
         if self.layout.e_max:
             self.launch(k.remember, len(F), [F, self.layout.at_e_max, history, history_next])
 
-    def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> Tensor:
+    def reach(self, x: Tensor) -> slice:
+        """The nodes that particles at x touch, as a range: on the CPU the planes between the first and the last one, with one to spare."""
         sim = self.simulator
-        arguments = [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau, grid.zero_()]
+        if sim.device.type != "cpu" or sim.scene_count > 1:
+            return slice(0, sim.node_count)
+        low, high = (float(t) for t in torch.aminmax(x[:, 0]))
+        if not math.isfinite(high - low):
+            return slice(0, sim.node_count)
+        planes, plane = sim.grid_shape[1], sim.node_count // sim.grid_shape[1]
+        first, last = (min(max(int((at - sim.edge) / sim.scenes[0].dx - 0.5), 0), planes - 3) for at in (low, high))
+        return slice(max(first - 1, 0) * plane, min(last + 4, planes) * plane)
+
+    def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor, reach: slice | None = None) -> Tensor:
+        """Momentum and mass of the nodes; of those beyond `reach` nothing is written."""
+        sim = self.simulator
+        (grid if reach is None else grid[reach]).zero_()
+        arguments = [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau, grid]
         self.launch(sim.kernels.particles_to_grid, len(x), arguments, self.block)
         return grid
 
-    def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor, velocity: Tensor) -> None:
+    def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor, velocity: Tensor, reach: slice | None = None) -> None:
         sim = self.simulator
-        self.launch(sim.kernels.update_grid, sim.node_count // sim.chunk, [*self.grid_inputs(pull, force, friction), grid, velocity])
+        own = slice(0, sim.node_count) if reach is None else reach
+        inputs = [*self.grid_inputs(pull, force, friction, sim.node_index[own]), grid[own], velocity[own]]
+        self.launch(sim.kernels.update_grid, (own.stop - own.start) // sim.chunk, inputs)
 
-    def grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor) -> list:
+    def grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor, index: Tensor | None = None) -> list:
         sim = self.simulator
         table = sim.colliders
         return [
@@ -248,7 +271,7 @@ class Plan:
             friction,
             sim.clamp_lower,
             sim.clamp_upper,
-            sim.node_index,
+            sim.node_index if index is None else index,
             sim.chunk,
         ]
 
