@@ -165,7 +165,7 @@ def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial],
     squares = inference.mean_squares([before, base.point], floor)
     errors = {when: _by_recording(inference, row) for when, row in zip(("before", "after"), squares, strict=True)}
     after = intervals(inference, base, floor, squares[1])
-    start = Fit(before, tuple(p.name for p in inference.problem.declared), 0.0, np.empty((0, 0)), np.empty(0), 0, True)
+    start = Fit(before, tuple(p.name for p in inference.problem.declared), 0.0, np.empty(0), 0, True)
     declared = intervals(inference, start, first.floor, squares[0]) if inference.problem.declared else {}
     scale = inference.problem.error(np.ones(1), 0)
     floors = {

@@ -57,8 +57,6 @@ class Fit:
     names: tuple[str, ...]
     cost: float
     """Sum of squares of the whitened residuals, priors included."""
-    jacobian: np.ndarray
-    """Of the whitened residuals by the fit's coordinates at the end, (n, p)."""
     residual: np.ndarray
     """Whitened, (n,), priors included."""
     evaluations: int
@@ -93,8 +91,12 @@ def levenberg_marquardt(
     damping: float = 1e-2,
     together: bool = True,
     race: Race | None = None,
+    slopes: np.ndarray | None = None,
 ) -> Request:
     """One fit as a generator: it yields the points that it wants and receives their whitened residuals (None: not runnable).
+
+    Where every point costs, the slopes of one step serve the next one, corrected by what it did (Broyden 1965); they are measured anew when
+    a step keeps less than `KEPT_PROMISE` of what they promise, and before a fit ends.
 
     Args:
         parameters: What moves.
@@ -102,8 +104,9 @@ def levenberg_marquardt(
         iterations: At most.
         tolerance: Relative gain of an iteration that ends the fit.
         damping: Of the first step.
-        together: Ask for all dampings of a step at once, where a launch of several points costs as one; else for the boldest one first.
+        together: Ask for all dampings and slopes of a step at once, where a launch of several points costs as one; else for few.
         race: The fits that it is compared with.
+        slopes: About the derivatives of the whitened residuals by the coordinates at the start, (n, p); without the priors' rows.
     """
     names = tuple(p.name for p in parameters)
     fixed = {k: v for k, v in start.items() if k not in names}
@@ -121,37 +124,61 @@ def levenberg_marquardt(
 
     (r,) = yield from ask([q])
     cost = np.inf if r is None else float(r @ r)
-    J, converged, costs = np.empty((0 if r is None else len(r), 0)), r is not None, [cost]
-    for n in range(iterations if r is not None and names else 0):
+    converged, costs, n = r is not None, [cost], 0
+    J, fresh = None if slopes is None or together or r is None else _with_prior_rows(slopes, parameters), False
+    while n < iterations and r is not None and names:
         converged = False
-        steps = np.where(q + STEP > high, -STEP, STEP)
-        columns = yield from ask([q + np.eye(len(q))[i] * steps[i] for i in range(len(q))])
-        J = np.stack([np.zeros_like(r) if c is None else (c - r) / s for c, s in zip(columns, steps, strict=True)], axis=1)
+        if J is None:
+            steps = np.where(q + STEP > high, -STEP, STEP)
+            columns = yield from ask([q + np.eye(len(q))[i] * steps[i] for i in range(len(q))])
+            J = np.stack([np.zeros_like(r) if c is None else (c - r) / s for c, s in zip(columns, steps, strict=True)], axis=1)
+            fresh = True
         A, g = J.T @ J, J.T @ r
         tried = [np.clip(q + move, low, high) for move in _moves(A, g, damping)]
         promise = [-float((t - q) @ (2 * g + A @ (t - q))) for t in tried]
         if max(promise) < NOTHING * cost and np.abs(tried[0] - q).max() < 0.5:
-            converged = True
-            break
+            if fresh:
+                converged = True
+                break
+            J = None
+            continue
         found = yield from ask(tried if together else tried[:1])
-        if not together and (found[0] is None or cost - float(found[0] @ found[0]) < KEPT_PROMISE * promise[0]):
+        kept = together or (found[0] is not None and cost - float(found[0] @ found[0]) >= KEPT_PROMISE * promise[0])
+        if not kept and fresh:
             found += yield from ask(tried[1:])
         ends = [np.inf if f is None else float(f @ f) for f in found]
         best = int(np.argmin(ends))
+        if ends[best] >= cost and not fresh:
+            J = None
+            continue
+        n += 1
         gain, moved = (cost - ends[best]) / cost if cost > 0 else 0.0, np.abs(tried[best] - q).max()
         if ends[best] < cost:
+            move, change = tried[best] - q, found[best] - r
             q, r, cost = tried[best], found[best], ends[best]
             damping = max(damping * DAMPINGS[best], 1e-6)
             behind = race is not None and cost > 1.1 * race.best
-            converged = gain < tolerance * (TRAILING if behind else 1.0) and moved < 0.5
+            small = gain < tolerance * (TRAILING if behind else 1.0) and moved < 0.5
+            converged = small and (fresh or behind)
+            if together or (small and not converged) or not (kept or fresh):
+                J = None
+            else:
+                J = J + np.outer(change - J @ move, move) / max(float(move @ move), 1e-300)
+            fresh = False
         else:
             converged = damping > 1e3 or np.abs(tried[0] - q).max() < 1e-3
             damping *= 30.0
         costs.append(cost)
-        if converged or (race is not None and race.lost(costs, iterations - n - 1)):
+        if converged or (race is not None and race.lost(costs, iterations - n)):
             break
     point = fixed | {p.name: p.physical(v) for p, v in zip(parameters, q, strict=True)}
-    return Fit(point, names, cost, J, r, count, converged)
+    return Fit(point, names, cost, r, count, converged)
+
+
+def _with_prior_rows(slopes: np.ndarray, parameters: Sequence[Parameter]) -> np.ndarray:
+    """Slopes with the rows that `_with_priors` adds to the residual."""
+    rows = [np.eye(len(parameters))[i] / p.prior for i, p in enumerate(parameters) if p.prior is not None]
+    return np.concatenate([slopes, rows]) if rows else slopes
 
 
 def _moves(A: np.ndarray, g: np.ndarray, damping: float) -> list[np.ndarray]:

@@ -267,11 +267,11 @@ class Inference:
         for stays, c, i, begin in ranked:
             if c.key not in chosen and (len(chosen) < self.keep or stays < 2.0 * ranked[0][0]):
                 chosen[c.key] = i
-                starts.append((c, begin))
+                starts.append((c, begin, self._first_slopes(c, i, free, slopes, columns, floor)))
                 if not c.linear:
-                    starts.append((c, begin | {p.name: p.value for p in self.problem.declared}))
+                    starts.append((c, begin | {p.name: p.value for p in self.problem.declared}, None))
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
-                starts.append((c, begin))
+                starts.append((c, begin, None))
         self.tell(f"fitting {', '.join(chosen)}")
         best = self.contest(free, starts, floor)
         best |= self.polish(free, best, base, floor)
@@ -313,8 +313,28 @@ class Inference:
         share = min(max(over / math.log(1.5), 0.0), 1.0)  # from the floor itself to half as much again
         return GAIN_IN_FLOOR + share * (LEAST_GAIN - GAIN_IN_FLOOR)
 
+    def _first_slopes(
+        self,
+        c: Candidate,
+        start: int,
+        free: Sequence[Parameter],
+        slopes: Mapping[int, np.ndarray],
+        columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
+        floor: Floor,
+    ) -> np.ndarray | None:
+        """What the screening says of the slopes of a candidate's fit; none where it probed only sizes, or they do not act in proportion."""
+        if not c.linear or c.size_parameters != c.parameters or any(p.log for p in c.parameters):
+            return None
+        whiten, coordinates = floor.whitener(self.parts), [p.coordinate(c.starts[start][p.name]) for p in c.parameters]
+        parts = []
+        for n in dict.fromkeys(p.recording for p in self.parts if p.fitted):
+            both = (*slopes[n].T, *(columns[c.key, start][n] / coordinates).T)
+            parts.append(np.stack([whiten(column, n) for column in both], axis=1))
+        J = np.concatenate(parts)
+        return J if np.isfinite(J).all() else None
+
     def contest(
-        self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point]], floor: Floor
+        self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], floor: Floor
     ) -> dict[str, tuple[Candidate, Fit]]:
         """The best fit of each candidate; fits that cannot catch up with the best one stop.
 
@@ -322,14 +342,15 @@ class Inference:
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
         race = Race()
-        small = [c.key for c, _ in starts if len(c.parameters) <= MANY]
+        small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
         first = list(dict.fromkeys(small))[:LEADERS]
-        waves: list[list[tuple[Candidate, Point]]] = [[], [], []]
-        for c, begin in starts:
-            waves[0 if self.problem.together or c.key in first else 1 if c.key in small else 2].append((c, begin))
+        waves: list[list[tuple[Candidate, Point, np.ndarray | None]]] = [[], [], []]
+        for entry in starts:
+            key = entry[0].key
+            waves[0 if self.problem.together or key in first else 1 if key in small else 2].append(entry)
         for own in waves:
-            fits = self.fits([self.request((*free, *c.parameters), begin, race=race) for c, begin in own], floor)
-            for (c, _), fit in zip(own, fits, strict=True):
+            fits = self.fits([self.request((*free, *c.parameters), begin, race=race, slopes=J) for c, begin, J in own], floor)
+            for (c, *_), fit in zip(own, fits, strict=True):
                 if c.key not in best or fit.cost < best[c.key][1].cost:
                     best[c.key] = (c, fit)
         return best

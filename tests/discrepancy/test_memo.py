@@ -71,6 +71,48 @@ def test_the_boldest_damping_alone_is_cheaper():
     assert counts[1] < counts[0]
 
 
+class Decays(Problem):
+    """y = sum_k exp(-a_k t) / (k + 1), nonlinear in six parameters."""
+
+    def __init__(self) -> None:
+        self.true = np.array([0.5, 1.5, 3.0, 5.0, 8.0, 12.0])
+        parameters = tuple(Parameter(f"a{k}", "1", 1.1 * v, 0.3, 0.0, 40.0) for k, v in enumerate(self.true))
+        record = Recording("r", "fit", self.motion(self.true), 0.1, np.zeros(40, int), T)
+        super().__init__("decays", "rmse", "1", parameters, (), (), (record,))
+
+    @staticmethod
+    def motion(a):
+        return np.sum(np.exp(-np.outer(T, a)) / np.arange(1, 7), axis=1)
+
+    def predict(self, points, recording, setting=0):
+        return np.stack([self.motion([p.get(q.name, q.value) for q in self.declared]) for p in points])
+
+
+def test_slopes_of_one_step_serve_the_next():
+    problem = Decays()
+
+    def fit(**options):
+        return run(problem, [levenberg_marquardt(problem.declared, {}, **options)], lambda r, n: r / 1e-6, [0])[0]
+
+    anew, kept = fit(together=True, iterations=40), fit(together=False, iterations=40)
+    assert kept.cost < 1e-4 * fit(iterations=1).cost
+    assert kept.cost < 3.0 * anew.cost + 1.0
+    assert kept.evaluations < 0.6 * anew.evaluations
+
+
+def test_slopes_that_are_given_save_a_round_and_wrong_ones_are_measured_anew():
+    problem = Lines()
+    right = np.stack([T, T**2], axis=1) / 0.1
+    costs = {}
+    for name, slopes in {"none": None, "right": right, "wrong": right[:, ::-1], "opposite": -right}.items():
+        (fit,) = run(problem, [levenberg_marquardt(problem.declared, {}, together=False, slopes=slopes)], lambda r, n: r / 0.1, [0])
+        assert fit.converged
+        assert fit.point["a"] == pytest.approx(2.0, abs=1e-3), name
+        assert fit.point["b"] == pytest.approx(3.0, abs=1e-3), name
+        costs[name] = fit.evaluations
+    assert costs["right"] < costs["none"]
+
+
 def test_a_fit_that_cannot_catch_up_stops_and_the_others_do_not():
     def fits(race):
         problem = Lines()
