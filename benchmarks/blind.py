@@ -126,10 +126,22 @@ def _with_one_recording(folder: Path, target: Path) -> Path:
 def in_parallel(work, tasks: list[tuple], workers: int) -> Iterator[tuple[tuple, Any]]:
     """(task, result) as they finish, in processes of their own."""
     os.environ["OMP_NUM_THREADS"] = "1"
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    cores = context.SimpleQueue()
+    available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    for n in range(workers):  # workers whose threads share all cores would be in each other's way
+        cores.put(available[n::workers] or available)
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_keep_to, initargs=(cores,)) as pool:
         waiting = {pool.submit(work, *task): task for task in tasks}
         for done in as_completed(waiting):
             yield waiting[done], done.result()
+
+
+def _keep_to(cores) -> None:
+    """Run this process on the next share of the cores."""
+    share = cores.get()
+    if share:
+        os.sched_setaffinity(0, share)
 
 
 def record(path: Path, row: dict[str, Any]) -> None:
