@@ -97,12 +97,12 @@ def make(
     own = range(shard, plan.count, shards)
     missing = [i for i in own if not complete(folder / f"{names[i]}.npz")]
     size = batch or (16 if chosen.type == "cuda" else 1)
-    kinds = list(plan.families)
+    kinds, workers = list(plan.families), max(1, (os.cpu_count() or 1) // shards)
     with tqdm(total=len(own), initial=len(own) - len(missing), unit="clip", disable=not progress) as bar:
         for k in range(len(kinds)):
             wanted = [i for i in missing if i % len(kinds) == k]
             for start in range(0, len(wanted), size):
-                with ThreadPoolExecutor(os.cpu_count() if size > 1 else 1) as pool:
+                with ThreadPoolExecutor(workers if size > 1 else 1) as pool:
                     group = list(pool.map(lambda i: draw(plan, i), wanted[start : start + size]))
                     shots = shoot(plan, group, chosen)
                     list(pool.map(lambda pair: _finish(plan, folder, *pair), zip(group, shots)))

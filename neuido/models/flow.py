@@ -27,6 +27,8 @@ PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 ENCODINGS = ("velocity", "wheel")
+cv2.setNumThreads(1)  # videos run side by side: threads within an image would be in each other's way
+
 SECTORS = (15, 6, 4, 11, 13, 6)
 """Steps of the Middlebury colour wheel from red to yellow, green, cyan, blue, magenta and back (Baker et al. 2011)."""
 
@@ -55,7 +57,7 @@ def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None 
     videos = images.detach().flatten(0, -5) if images.ndim > 4 else images.detach()[None]
 
     def video(frames: Tensor) -> np.ndarray:
-        grey = [(255 * (frame @ weights)).round().clamp(0, 255).to(torch.uint8).cpu().numpy() for frame in frames]
+        grey = (255 * (frames @ weights)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
         search = cv2.DISOpticalFlow_create(PRESETS[preset])
         return np.stack([search.calc(a, b, None) for a, b in zip(grey, grey[1:])])
 
