@@ -207,13 +207,13 @@ class AlignModule(FilmedModule):
         self._rows.append(summary)
 
     def score_baselines(self, prepared: Prepared) -> dict[str, float]:
-        """CD of Stage I's mean latent, of random ones of its prior N(0, 1), and of its own at random (medians over those that run)."""
+        """CD of Stage I's mean latent, of random ones (`random_latents`), and of its own at random (medians over those that run)."""
         generator = torch.Generator().manual_seed(0)
         latents, count = self.operator.latents, self.hparams.baselines
-        prior = torch.randn(count, self.operator.latent_dim, generator=generator)
+        drawn = self.operator.random_latents(count, generator)
         picked = latents[torch.randperm(len(latents), generator=generator)[:count]]
         out: dict[str, float] = {}
-        for name, candidates in (("mean", latents.mean(0)[None]), ("random", prior), ("trained", picked)):
+        for name, candidates in (("mean", latents.mean(0)[None]), ("random", drawn), ("trained", picked)):
             values = []
             for z in candidates.to(self.device):
                 try:

@@ -345,19 +345,19 @@ class RandomLatent(_Latent):
 
     Args:
         operator: File of the operator, or `pretrained`.
-        of: `prior`: N(0, 1), which Stage I's latents started from; `trained`: one of Stage I's at random.
+        of: `normal`: of the mean and deviation of Stage I's latents; `trained`: one of Stage I's at random.
         seed: Which.
     """
 
     steps = 0
 
-    def __init__(self, operator: str = "pretrained", of: Literal["prior", "trained"] = "prior", seed: int = 0):
+    def __init__(self, operator: str = "pretrained", of: Literal["normal", "trained"] = "normal", seed: int = 0):
         super().__init__(operator)
         self.of, self.seed = of, seed
 
     def build(self, scene: Prepared) -> None:
         generator, latents = torch.Generator().manual_seed(self.seed), self.operator.latents
-        z = torch.randn(self.operator.latent_dim, generator=generator)
+        z = self.operator.random_latents(1, generator)[0]
         if self.of == "trained":
             z = latents[int(torch.randint(len(latents), (), generator=generator))].clone()
         self.register_buffer("z", z)

@@ -137,6 +137,11 @@ class IntrinsicDynamicsOperator(nn.Module):
             raise UserError(f"no latent is named {name!r}; there are {', '.join(self.latent_names) or 'none'}")
         return self.latents[self.latent_names.index(name)].to(self.elastic_trunk.fc1.weight)
 
+    def random_latents(self, count: int, generator: torch.Generator) -> Tensor:
+        """Latents (count, d) from a normal distribution with the mean and, component by component, the deviation of the trained ones."""
+        mean, deviation = self.latents.mean(0), self.latents.std(0)
+        return mean + deviation * torch.randn(count, self.latent_dim, generator=generator).to(mean)
+
     def coefficients(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """lambda^E and lambda^P, (S, D) each, of z (S, d)."""
         return self.elastic_head(z), self.plastic_head(z)
