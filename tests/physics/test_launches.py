@@ -1,4 +1,4 @@
-"""Launches on the CPU keep their packed arguments: scalars, places and shapes may change from call to call, and threads may share a kernel."""
+"""Launches on the CPU keep their packed arguments: scalars, places and shapes may change, and threads may share a kernel."""
 
 from concurrent.futures import ThreadPoolExecutor
 
