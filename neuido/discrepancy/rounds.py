@@ -264,8 +264,10 @@ class Inference:
         ranked, columns = self.screen(base.point, candidates, floor, slopes)
         chosen: dict[str, int] = {}
         starts = []
+        # what many parameters could fit says little of how near the others are
+        near = 2.0 * min((stays for stays, c, *_ in ranked if len(c.parameters) <= MANY), default=0.0)
         for stays, c, i, begin in ranked:
-            if c.key not in chosen and (len(chosen) < self.keep or stays < 2.0 * ranked[0][0]):
+            if c.key not in chosen and (len(chosen) < self.keep or stays < near):
                 chosen[c.key] = i
                 starts.append((c, begin, self._first_slopes(c, i, free, slopes, columns, floor)))
                 if not c.linear:

@@ -192,6 +192,7 @@ class PretrainModule(LightningModule):
             0.1 their families lie apart in the space of the latents itself (`neuido latents`).
         lr: Learning rate of trunks and heads; AdamW with a cosine to zero over the run (paper).
         latent_lr_factor: The latents learn with this many times `lr`.
+        latent_decay: Weight decay of the latents. Adam moves them at random wherever the laws do not feel them, and this draws that back.
         weight_decay: Of trunks and heads.
         relative_epsilon: Floor of the relative loss, as a fraction of the trajectory's RMS (design: about 1 %).
         plastic_target: `residual`: relative error of F_hat - F_tr; `full`: of F_hat, the paper to the letter.
@@ -214,6 +215,7 @@ class PretrainModule(LightningModule):
         latent_std: float = 1.0,
         lr: float = 3e-3,
         latent_lr_factor: float = 10.0,
+        latent_decay: float = 0.0,
         weight_decay: float = 1e-4,
         relative_epsilon: float = 0.01,
         plastic_target: Literal["residual", "full"] = "residual",
@@ -233,6 +235,8 @@ class PretrainModule(LightningModule):
         ):
             if value <= 0:
                 raise UserError(f"model.{name} = {value}: it must be positive")
+        if latent_decay < 0:
+            raise UserError(f"model.latent_decay = {latent_decay}: it must not be negative")
         if plastic_target not in ("residual", "full"):
             raise UserError(f"model.plastic_target = {plastic_target!r}: choose residual or full")
         self.save_hyperparameters()
@@ -274,7 +278,7 @@ class PretrainModule(LightningModule):
     def configure_optimizers(self) -> dict[str, Any]:
         groups = [
             {"params": list(self.operator.parameters()), "weight_decay": self.hparams.weight_decay},
-            {"params": [self.latents], "lr": self.hparams.lr * self.hparams.latent_lr_factor, "weight_decay": 0.0},
+            {"params": [self.latents], "lr": self.hparams.lr * self.hparams.latent_lr_factor, "weight_decay": self.hparams.latent_decay},
         ]
         optimizer = torch.optim.AdamW(groups, lr=self.hparams.lr, fused=self.latents.is_cuda)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, run_length(self.trainer))

@@ -199,3 +199,18 @@ def test_latents_start_as_far_apart_as_asked():
     assert torch.allclose(near, 0.1 * wide)
     with pytest.raises(UserError, match="latent_std = 0"):
         PretrainModule(40, latent_std=0.0)
+
+
+def test_decay_draws_back_what_the_laws_do_not_feel():
+    """A latent without any gradient shrinks by lr decay a step, and the weights are left to their own decay."""
+    model = PretrainModule(40, **SMALL, lr=1e-2, latent_lr_factor=10.0, latent_decay=0.5)
+    model.trainer = Trainer(max_steps=100, accelerator="cpu", logger=False, enable_checkpointing=False)
+    optimizer = model.configure_optimizers()["optimizer"]
+    before = model.latents.detach().clone()
+    for p in model.parameters():
+        p.grad = torch.zeros_like(p)
+    optimizer.step()
+    assert torch.allclose(model.latents.detach(), (1 - 0.1 * 0.5) * before)
+    assert optimizer.param_groups[0]["weight_decay"] == 1e-4
+    with pytest.raises(UserError, match="latent_decay = -1"):
+        PretrainModule(40, latent_decay=-1.0)
