@@ -15,7 +15,8 @@ from statistics import mean
 STAGE2 = ("cd", "floor", "rmse", "psnr", "ssim", "crop_psnr", "crop_ssim", "seconds")
 METHODS = ("cd", "rmse", "psnr", "ssim", "crop_psnr", "steps", "seconds", "peak_memory_gb")
 SCALES = {"rmse": 1e3}
-DIGITS = {"cd": 3, "floor": 3, "rmse": 3, "psnr": 3, "ssim": 3, "crop_psnr": 3, "crop_ssim": 3, "steps": 4, "seconds": 2, "peak_memory_gb": 2}
+DIGITS = {"steps": 4, "seconds": 2, "peak_memory_gb": 2}
+"""Where three would be too many or too few."""
 
 
 def read(files: Iterable[Path]) -> list[dict[str, str]]:
@@ -43,24 +44,27 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def stage2(files: Sequence[Path], before: Sequence[Path]) -> str:
     """Zero-shot laws, a row a scene, the means of each file, and the unseen scenes beside latents that know nothing of them."""
     earlier = {row["scene"]: row for row in read(before)}
+
+    def figures(rows: Sequence[dict[str, str]]) -> list[str]:
+        return [shown(rows, key, 1e3 if key == "seconds" else 1.0) for key in STAGE2]
+
     head = ["scene", "CD", "floor", "RMSE [1e-3]", "PSNR", "SSIM", "PSNR, crop", "SSIM, crop", "ms", "CD before Stage II"]
     out, unseen = [], []
     for file in files:
         rows = read([file])
         for row in rows:
             name = row["scene"] + (", unseen" if row.get("unseen") == "1" else "")
-            figures = [shown([row], key, 1e3 if key == "seconds" else 1.0) for key in STAGE2]
-            out.append([name, *figures, shown([earlier[row["scene"]]], "cd") if row["scene"] in earlier else ""])
+            out.append([name, *figures([row]), shown([earlier[row["scene"]]], "cd") if row["scene"] in earlier else ""])
         seen = [row for row in rows if row.get("unseen") != "1"]
-        out.append([f"**{len(seen)} training scenes of {file.stem}, mean**", *(shown(seen, k, 1e3 if k == "seconds" else 1.0) for k in STAGE2), ""])
+        out.append([f"**{len(seen)} training scenes of {file.stem}, mean**", *figures(seen), ""])
         unseen += [row for row in rows if row.get("unseen") == "1"]
     text = table(head, out)
     if unseen:
         own = []
         for row in unseen:
             ratio = float(row["cd_random"]) / float(row["cd"])
-            figures = [shown([row], key) for key in ("cd", "cd_mean", "cd_random", "cd_trained")]
-            own.append([row["scene"], *figures, f"{ratio:.1f}", f"{float(row['modulus']):.3g}"])
+            rivals = [shown([row], key) for key in ("cd", "cd_mean", "cd_random", "cd_trained")]
+            own.append([row["scene"], *rivals, f"{ratio:.1f}", f"{float(row['modulus']):.3g}"])
         text += "\n\n" + table(["scene", "CD", "mean latent", "random", "of Stage I", "random / ours", "modulus found [Pa]"], own)
     return text
 
@@ -80,7 +84,8 @@ def methods(file: Path) -> str:
         share = f"{mean(float(row['cd']) for row in good) / mean(float(row['floor']) for row in good):.3g}" if good else ""
         out.append([run, stage, f"{len(good)}/{len(own)}", figures[0], share, *figures[1:]])
         found = {row["scene"]: row for row in own}
-        by_scene.append([run, stage, *(shown([found[s]], "cd") + " / " + shown([found[s]], "psnr") if found[s].get("cd") else "fails" for s in scenes)])
+        both = [f"{shown([found[s]], 'cd')} / {shown([found[s]], 'psnr')}" if found[s].get("cd") else "fails" for s in scenes]
+        by_scene.append([run, stage, *both])
     return table(head, out) + "\n\nCD / PSNR:\n\n" + table(["run", "stage", *scenes], by_scene)
 
 

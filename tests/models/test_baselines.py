@@ -183,7 +183,9 @@ def test_a_method_is_fitted_scored_and_read_back(tmp_path, weights, name):
     assert float(tested["cd"]) == pytest.approx(float(after["cd"]), rel=1e-4)
 
 
-@pytest.mark.parametrize("build", [lambda w: NCLaw(w), lambda w: MeanLatent(), lambda w: RandomLatent(), lambda w: RandomLatent(of="trained")])
+@pytest.mark.parametrize(
+    "build", [lambda w: NCLaw(w), lambda w: MeanLatent(), lambda w: RandomLatent(), lambda w: RandomLatent(of="trained")]
+)
 def test_what_learns_nothing_is_scored(tmp_path, weights, build):
     trainer(tmp_path).fit(module(tmp_path, build(weights)), TinyScenes(str(tmp_path), youngs=(5e4,)))
     (row,) = rows_of(tmp_path / "out" / "scores.csv")
