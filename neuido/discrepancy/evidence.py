@@ -79,7 +79,7 @@ def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool]) -> float
     """Logarithm of the ratio of errors, before over after: the smaller of those of the fitted and of the held-out recordings."""
     fitted = np.array(fitted)
     groups = [g for g in (fitted, ~fitted) if g.any()]
-    return min(0.5 * float(np.log(max(before[g].mean(), 1e-300) / max(after[g].mean(), 1e-300))) for g in groups)
+    return min(0.5 * float(np.diff(np.log(np.clip([after[g].mean(), before[g].mean()], 1e-300, 1e300)))[0]) for g in groups)
 
 
 class _Part:

@@ -103,7 +103,7 @@ class _Command:
         self.kept = [value for value in arguments if not isinstance(value, Tensor)]  # what the key knows by its address
 
 
-MOST_COMMANDS = 4_000
+MOST_COMMANDS = 12_000
 _making = threading.Lock()
 _layouts: dict[wp.Kernel, type[ctypes.Structure]] = {}
 _commands: dict[tuple, _Command] = {}
