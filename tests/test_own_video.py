@@ -88,7 +88,8 @@ def test_from_images_to_a_law_in_three_commands(video, tmp_path, monkeypatch):
     clouds = [PlyData.read(str(folder / "particles" / f"{k:03d}.ply"))["vertex"] for k in range(13)]
     assert len(clouds[0]) == figures["particles"]
     centre = torch.tensor(np.array([[float(cloud[axis].mean()) for axis in "xyz"] for cloud in clouds]), dtype=torch.float32)
-    assert (centre - truth.mean(1)).norm(dim=1).max() < 0.03  # m; it falls by 0.12 m and rises by 0.17 m
+    # m; it falls by 0.12 m and rises by 0.17 m, in frames of 18 ms where the encoder knows those of 5 ms at most
+    assert (centre - truth.mean(1)).norm(dim=1).max() < 0.04
     assert cv2.VideoCapture(str(folder / "prediction.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 13
     (row,) = csv.DictReader((tmp_path / "out" / "scores.csv").open())
     assert "cd" not in row and float(row["psnr"]) > 22  # no truth, no distance; images of the view that was held out

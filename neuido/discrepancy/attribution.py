@@ -78,7 +78,8 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     else:
         firsts: list[Round] = []
         for inference, start in zip(tried, starts, strict=True):
-            firsts.append(inference.round(start.fit, start.floor, []))
+            leaders = firsts[0].leaders if firsts and firsts[0].chosen else None
+            firsts.append(inference.round(start.fit, start.floor, [], leaders))
             if firsts[-1].trials and inference.is_noise(firsts[-1].trials[0].errors):
                 break
         # another method must do clearly better before it takes the place of the suggested one

@@ -37,6 +37,10 @@ ROUGH = 0.02
 """Relative gain that ends the fit before the floors are known."""
 MANY = 5
 """Parameters above which a candidate is fitted after the others."""
+HOPELESS = 0.75
+"""Share of the misfit that a candidate beyond the first few may leave, as the screening predicts it, and still get a fit."""
+OWN = 3
+"""Candidates that the screening of a second solver may add to those that led with the first one."""
 LEADERS = 4
 """Candidates that are fitted before the others."""
 POLISHED = 3
@@ -252,8 +256,15 @@ class Inference:
 
     # One round.
 
-    def round(self, base: Fit, floor: Floor, found: Sequence[Trial]) -> Round:
-        """Look for one more effect beside those that were found."""
+    def round(self, base: Fit, floor: Floor, found: Sequence[Trial], leaders: Sequence[str] | None = None) -> Round:
+        """Look for one more effect beside those that were found.
+
+        Args:
+            base: Where the model stands.
+            floor: Noise and discretisation there.
+            found: The effects so far.
+            leaders: Keys of the candidates that led with another solver, where it named one: they and the first of the screening get a fit.
+        """
         taken = {t.candidate.name for t in found}
         extra = tuple(p for t in found for p in t.candidate.parameters)
         candidates = [c for c in self.problem.candidates if c.name not in taken]
@@ -265,9 +276,11 @@ class Inference:
         chosen: dict[str, int] = {}
         starts = []
         # what many parameters could fit says little of how near the others are
-        near = 2.0 * min((stays for stays, c, *_ in ranked if len(c.parameters) <= MANY), default=0.0)
+        near = min(2.0 * min((stays for stays, c, *_ in ranked if len(c.parameters) <= MANY), default=0.0), HOPELESS)
+        keep = self.keep if leaders is None else min(self.keep, OWN)
         for stays, c, i, begin in ranked:
-            if c.key not in chosen and (len(chosen) < self.keep or stays < near):
+            led = leaders is not None and c.key in leaders
+            if c.key not in chosen and (len(chosen) < keep or led or (leaders is None and stays < near)):
                 chosen[c.key] = i
                 starts.append((c, begin, self._first_slopes(c, i, free, slopes, columns, floor)))
                 if not c.linear:

@@ -8,6 +8,9 @@ from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.problem import Candidate, Point
 
+LED = 5
+"""Candidates of the best scores that lead a round."""
+
 
 @dataclass(frozen=True, eq=False)
 class Start:
@@ -50,6 +53,12 @@ class Round:
     floor: Floor
     cosines: dict[str, float] = field(default_factory=dict)
     null: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def leaders(self) -> list[str]:
+        """Keys of the candidates that the chosen one could be mistaken for, and of the next best."""
+        ahead = [*self.members, *(t for t in self.trials if not t.reason), *self.trials[:LED]]
+        return list(dict.fromkeys(t.candidate.key for t in ahead))
 
 
 def unphysical(c: Candidate, point: Point) -> str:

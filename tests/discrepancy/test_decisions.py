@@ -38,8 +38,8 @@ class SmallestError(Inference):
     def is_noise(self, errors: np.ndarray) -> bool:
         return False
 
-    def round(self, base, floor, found) -> Round:
-        result = super().round(base, floor, found)
+    def round(self, base, floor, found, leaders=None) -> Round:
+        result = super().round(base, floor, found, leaders)
         result.chosen = min(result.trials, key=lambda t: t.fit.cost, default=None)
         result.members = [result.chosen] if result.chosen else []
         return result
