@@ -71,7 +71,16 @@ def test_from_images_to_a_law_in_three_commands(video, tmp_path, monkeypatch):
     placing = ["--scale", str(SCALE), "--shift", str(list(SHIFT)), "--up", "z", "--velocity", "[0.0, -1.8, 0.3]"]
     small = ["--steps", "150", "--start", "500", "--gaussians", "900", "--particles", "900", "--resolution", "48", "--device", "cpu"]
     neuido("reconstruct", str(video), *placing, *small, "--progress", "false")
-    scene = ["--config", "predict", "--data.root", str(video.parent), "--data.scenes", "[my-video]"]
+    scene = [
+        "--config",
+        "predict",
+        "--model.init_from",
+        "pretrained-small",
+        "--data.root",
+        str(video.parent),
+        "--data.scenes",
+        "[my-video]",
+    ]
     quiet = ["--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.out", str(tmp_path / "out")]
     neuido("predict", *scene, *quiet)
     neuido("test", *scene, *quiet)
@@ -88,8 +97,7 @@ def test_from_images_to_a_law_in_three_commands(video, tmp_path, monkeypatch):
     clouds = [PlyData.read(str(folder / "particles" / f"{k:03d}.ply"))["vertex"] for k in range(13)]
     assert len(clouds[0]) == figures["particles"]
     centre = torch.tensor(np.array([[float(cloud[axis].mean()) for axis in "xyz"] for cloud in clouds]), dtype=torch.float32)
-    # m; it falls by 0.12 m and rises by 0.17 m, in frames of 18 ms where the encoder knows those of 5 ms at most
-    assert (centre - truth.mean(1)).norm(dim=1).max() < 0.04
+    assert (centre - truth.mean(1)).norm(dim=1).max() < 0.03  # m; it falls by 0.12 m and rises by 0.17 m
     assert cv2.VideoCapture(str(folder / "prediction.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 13
     (row,) = csv.DictReader((tmp_path / "out" / "scores.csv").open())
     assert "cd" not in row and float(row["psnr"]) > 22  # no truth, no distance; images of the view that was held out

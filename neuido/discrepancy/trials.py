@@ -57,8 +57,7 @@ class Round:
     @property
     def leaders(self) -> list[str]:
         """Keys of the candidates that the chosen one could be mistaken for, and of the next best."""
-        ahead = [*self.members, *(t for t in self.trials if not t.reason), *self.trials[:LED]]
-        return list(dict.fromkeys(t.candidate.key for t in ahead))
+        return list(dict.fromkeys(t.candidate.key for t in (*self.members, *self.trials[:LED])))
 
 
 def unphysical(c: Candidate, point: Point) -> str:

@@ -74,10 +74,14 @@ def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.devic
         if dim:
             _launch_again(kernel, dim, arguments, device)
         return
-    inputs = [
+    wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), block_dim=block)
+
+
+def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:
+    """What Warp takes for the arguments of a kernel."""
+    return [
         _array(value, arg.type.dtype) if isinstance(value, Tensor) else value for value, arg in zip(arguments, kernel.adj.args, strict=True)
     ]
-    wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), block_dim=block)
 
 
 class _Command:
@@ -89,11 +93,7 @@ class _Command:
     __slots__ = ("arguments", "bounds", "forward", "kept", "module")
 
     def __init__(self, kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
-        inputs = [
-            _array(value, arg.type.dtype) if isinstance(value, Tensor) else value
-            for value, arg in zip(arguments, kernel.adj.args, strict=True)
-        ]
-        recorded = wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), record_cmd=True)
+        recorded = wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), record_cmd=True)
         layout = _layouts.get(kernel)
         if layout is None:
             fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, recorded.params[1:], strict=True)]
@@ -104,6 +104,7 @@ class _Command:
 
 
 MOST_COMMANDS = 12_000
+"""Packed launches that are kept: those of a thousand substeps with their adjoints."""
 _making = threading.Lock()
 _layouts: dict[wp.Kernel, type[ctypes.Structure]] = {}
 _commands: dict[tuple, _Command] = {}

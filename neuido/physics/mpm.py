@@ -134,7 +134,6 @@ class Simulator:
         self.dx = column([s.dx for s in self.scenes])
         self.dt = column([s.dt for s in self.scenes])
         self.origin = column([[l - kernels.PAD * s.dx for l in s.lower] for s in self.scenes])
-        self.edge = self.scenes[0].lower[0] - kernels.PAD * self.scenes[0].dx
         self.gravity = column([list(s.gravity) for s in self.scenes])
         self.colliders = collider_table(self.scenes, self.dtype, self.device)
         self.clamp_lower, self.clamp_upper = clamp_table(self.scenes, self.dtype, self.device)

@@ -187,7 +187,7 @@ class Plan:
                 trial = other if tape.trial is None else tape.trial[n]
                 material = self.material(inputs, n)
                 self.stress(elastic, F, C, history, viscosity, material, tau)
-                reach = self.reach(x) if tape.grid is None else slice(0, sim.node_count)
+                reach = self.reach(x) if tape.grid is None else slice(None)
                 grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid") if tape.grid is None else tape.grid[n], reach)
                 velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
                 self.on_grid(grid, at_step(pull, n), force, friction, velocity, reach)
@@ -235,29 +235,30 @@ class Plan:
         """The nodes that particles at x touch, as a range: on the CPU the planes between the first and the last one, with one to spare."""
         sim = self.simulator
         if sim.device.type != "cpu" or sim.scene_count > 1:
-            return slice(0, sim.node_count)
+            return slice(None)
         low, high = (float(t) for t in torch.aminmax(x[:, 0]))
         if not math.isfinite(high - low):
-            return slice(0, sim.node_count)
+            return slice(None)
         planes, plane = sim.grid_shape[1], sim.node_count // sim.grid_shape[1]
-        first, last = (min(max(int((at - sim.edge) / sim.scenes[0].dx - 0.5), 0), planes - 3) for at in (low, high))
+        dx = sim.scenes[0].dx
+        edge = sim.scenes[0].lower[0] - kernels.PAD * dx
+        first, last = (min(max(int((at - edge) / dx - 0.5), 0), planes - 3) for at in (low, high))
         return slice(max(first - 1, 0) * plane, min(last + 4, planes) * plane)
 
-    def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor, reach: slice | None = None) -> Tensor:
+    def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor, reach: slice = slice(None)) -> Tensor:
         """Momentum and mass of the nodes; of those beyond `reach` nothing is written."""
         sim = self.simulator
-        (grid if reach is None else grid[reach]).zero_()
+        grid[reach].zero_()
         arguments = [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau, grid]
         self.launch(sim.kernels.particles_to_grid, len(x), arguments, self.block)
         return grid
 
-    def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor, velocity: Tensor, reach: slice | None = None) -> None:
+    def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor, velocity: Tensor, reach: slice = slice(None)) -> None:
         sim = self.simulator
-        own = slice(0, sim.node_count) if reach is None else reach
-        inputs = [*self.grid_inputs(pull, force, friction, sim.node_index[own]), grid[own], velocity[own]]
-        self.launch(sim.kernels.update_grid, (own.stop - own.start) // sim.chunk, inputs)
+        inputs = [*self.grid_inputs(pull, force, friction, reach), grid[reach], velocity[reach]]
+        self.launch(sim.kernels.update_grid, len(grid[reach]) // sim.chunk, inputs)
 
-    def grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor, index: Tensor | None = None) -> list:
+    def grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor, reach: slice = slice(None)) -> list:
         sim = self.simulator
         table = sim.colliders
         return [
@@ -271,7 +272,7 @@ class Plan:
             friction,
             sim.clamp_lower,
             sim.clamp_upper,
-            sim.node_index if index is None else index,
+            sim.node_index[reach],
             sim.chunk,
         ]
 

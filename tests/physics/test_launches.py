@@ -82,7 +82,7 @@ def test_planes_beyond_the_body_do_not_matter(monkeypatch, dtype):
     from neuido.physics.rollout import Plan
 
     few = frames()
-    monkeypatch.setattr(Plan, "reach", lambda self, x: slice(0, self.simulator.node_count))
+    monkeypatch.setattr(Plan, "reach", lambda self, x: slice(None))
     for a, b in zip(few, frames(), strict=True):
         assert torch.equal(a, b)
     assert float(few.x[..., 0].max()) > 0.7  # it went half through the domain
