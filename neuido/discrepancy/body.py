@@ -26,7 +26,7 @@ from neuido.physics import effect_kernels, law_kernels
 from neuido.physics.device import real_of
 from neuido.physics.effect_library import KNOTS
 from neuido.physics.finite_elements import FiniteElements
-from neuido.physics.meshing import follow
+from neuido.physics.meshing import Mesh, follow, mesh_body
 from neuido.physics.mpm import Simulator
 from neuido.physics.threads import _one_thread_each, pool
 from neuido.types import ParticleState
@@ -49,8 +49,8 @@ INSTRUMENTS = ("release_time", "time_base", "length_scale")
 NEIGHBOURS = 12
 SEGMENT = 2000
 """Substeps that are launched as one piece where launches are captured or a tape is kept."""
-KEPT = 24
-"""Simulators that are kept: of each recording, setting, and number of parameter sets or thread."""
+KEPT = {"cpu": 24, "cuda": 96}
+"""Simulators that are kept: of each recording, setting, and number of parameter sets or thread. On a GPU each holds its captured launches."""
 WINDOWS = 6
 """In time, of the patterns of an unknown discretisation error."""
 
@@ -84,6 +84,7 @@ class BodyProblem(Problem):
     tracked: bool = True
     """Whether the data are positions of points."""
     _simulators: dict[Any, Simulator] = field(default_factory=dict, repr=False)
+    _meshes: dict[int, Mesh] = field(default_factory=dict, repr=False)
     _maps: dict[int, Any] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
 
@@ -246,12 +247,22 @@ class BodyProblem(Problem):
             if found is None:
                 r, s = self.measured[recording], SETTINGS[setting]
                 scene = replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)
-                kind = FiniteElements if s.solver == "finite_elements" else Simulator
-                found = kind([scene] * count, [r.body] * count, density=self.experiment.model["density"], device=self.device)
-                while len(self._simulators) >= KEPT:
+                scenes, bodies, density = [scene] * count, [r.body] * count, self.experiment.model["density"]
+                if s.solver == "finite_elements":
+                    found = FiniteElements(scenes, bodies, density=density, device=self.device, meshes=self._mesh(recording))
+                else:
+                    found = Simulator(scenes, bodies, density=density, device=self.device)
+                while len(self._simulators) >= KEPT[torch.device(self.device).type]:
                     self._simulators.pop(next(iter(self._simulators)))
             self._simulators[key] = found  # the last one used is the last one to go
         return found
+
+    def _mesh(self, recording: int) -> Mesh:
+        """The body of a recording as finite elements have it; seconds of work, so that all simulators share it."""
+        if recording not in self._meshes:
+            body = self.measured[recording].body
+            self._meshes[recording] = mesh_body(body.x, body.volume)
+        return self._meshes[recording]
 
     def _start(self, simulator: Simulator, points: Sequence[Point], recording: int) -> ParticleState:
         """The start with the velocities and spins of each point."""
