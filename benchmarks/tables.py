@@ -69,6 +69,13 @@ def stage2(files: Sequence[Path], before: Sequence[Path]) -> str:
     return text
 
 
+def both(row: dict[str, str] | None) -> str:
+    """CD and PSNR of a row; what kept it from having them."""
+    if row is None:
+        return "not run"
+    return f"{shown([row], 'cd')} / {shown([row], 'psnr')}" if row.get("cd") else "fails"
+
+
 def methods(file: Path) -> str:
     """A row a run and stage: means over the scenes that ran; then CD by scene."""
     rows = read([file])
@@ -82,10 +89,9 @@ def methods(file: Path) -> str:
         good = [row for row in own if row.get("cd")]
         figures = [shown(good, key) for key in METHODS]
         share = f"{mean(float(row['cd']) for row in good) / mean(float(row['floor']) for row in good):.3g}" if good else ""
-        out.append([run, stage, f"{len(good)}/{len(own)}", figures[0], share, *figures[1:]])
+        out.append([run, stage, f"{len(good)}/{len(scenes)}", figures[0], share, *figures[1:]])
         found = {row["scene"]: row for row in own}
-        both = [f"{shown([found[s]], 'cd')} / {shown([found[s]], 'psnr')}" if found[s].get("cd") else "fails" for s in scenes]
-        by_scene.append([run, stage, *both])
+        by_scene.append([run, stage, *(both(found.get(s)) for s in scenes)])
     return table(head, out) + "\n\nCD / PSNR:\n\n" + table(["run", "stage", *scenes], by_scene)
 
 

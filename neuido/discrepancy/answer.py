@@ -152,6 +152,9 @@ def rejected(d: Diagnosis) -> list[dict[str, str]]:
             name = t.candidate.name
             if name not in kept and name not in reasons and t.reason:
                 reasons[name] = t.reason
+        for name in (key.partition(":")[0] for key in r.needless):
+            if name not in kept:
+                reasons.setdefault(name, "an effect of fewer parameters leaves nothing but noise")
     for c in d.problem.candidates:
         if c.name not in kept and c.name not in reasons:
             reasons[c.name] = behind if any(r.trials for r in d.rounds) else "nothing but noise is left without it"
@@ -301,6 +304,7 @@ def _round(d: Diagnosis, r: Round) -> dict[str, Any]:
         "mean_squares": list(r.errors),
         "noise": [r.floor.noise[p.recording] for p in d.parts],
         "discretisation": [float(np.sqrt(np.mean(r.floor.spread[p.recording][p.rows] ** 2))) for p in d.parts],
+        "floors": list(r.floors),
         "p_value": r.p_value,
         "chosen": r.chosen.candidate.key if r.chosen else None,
         "members": [t.candidate.key for t in r.members],

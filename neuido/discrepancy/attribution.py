@@ -13,12 +13,28 @@ from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import ALPHA, LEAST_GAIN, Inference, Round, Start, Tell, Trial
 
-__all__ = ["ALPHA", "MOST", "UNEXPLAINED", "Diagnosis", "Floor", "Inference", "Part", "Round", "Start", "Trial", "diagnose", "split"]
+__all__ = [
+    "ALPHA",
+    "MOST",
+    "UNEXPLAINED",
+    "UNEXPLAINED_EXACT",
+    "Diagnosis",
+    "Floor",
+    "Inference",
+    "Part",
+    "Round",
+    "Start",
+    "Trial",
+    "diagnose",
+    "split",
+]
 
 MOST = 3
 """Effects that a growth may add."""
-UNEXPLAINED = 3.0
-"""Times the floor: a residual above it that no effect explains is called unknown."""
+UNEXPLAINED = 2.0
+"""Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
+UNEXPLAINED_EXACT = 3.0
+"""The same where nothing is discretised: the noise that a folder states is an estimate."""
 
 
 @dataclass(eq=False)
@@ -74,7 +90,8 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     rounds: list[Round] = []
     if at_noise:
         chosen = min(at_noise, key=lambda i: float(np.mean(starts[i].errors)))
-        rounds = [Round(starts[chosen].fit.point, starts[chosen].errors, [], None, [], 1.0, starts[chosen].floor)]
+        start = starts[chosen]
+        rounds = [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, start.errors)]
     else:
         firsts: list[Round] = []
         for inference, start in zip(tried, starts, strict=True):
@@ -155,11 +172,11 @@ def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial],
     first = rounds[0]
     kept = {t.candidate.key for t in found}
     steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
-    over = np.sqrt(first.errors / inference.floors(first.floor))
+    over, limit = np.sqrt(first.errors / first.floors), UNEXPLAINED if inference.problem.settings > 1 else UNEXPLAINED_EXACT
     if found:
         classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
         answer = "class" if max(classes) > 1 else "effect"
-    elif float(np.exp(np.mean(np.log(np.maximum(over, 1e-150))))) > UNEXPLAINED:
+    elif float(np.exp(np.mean(np.log(np.maximum(over, 1e-150))))) > limit:
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"

@@ -47,10 +47,10 @@ NUISANCES = (  # name, unit, prior standard deviation; of the frame interval, of
 )
 INSTRUMENTS = ("release_time", "time_base", "length_scale")
 NEIGHBOURS = 12
-SEGMENT = 2000
-"""Substeps that are launched as one piece where launches are captured or a tape is kept."""
+SEGMENT = 200
+"""Substeps of the piece that a GPU captures; a rollout replays it. A longer one takes longer to capture than to run."""
 KEPT = {"cpu": 24, "cuda": 96}
-"""Simulators that are kept: of each recording, setting, and number of parameter sets or thread. On a GPU each holds its captured launches."""
+"""Simulators that are kept: of each recording, setting, and number of parameter sets or thread. On a GPU they hold captured launches."""
 WINDOWS = 6
 """In time, of the patterns of an unknown discretisation error."""
 
@@ -110,6 +110,11 @@ class BodyProblem(Problem):
     @property
     def together(self) -> bool:
         return self.device != "cpu"
+
+    def refinements(self, setting: int) -> list[int]:
+        others = super().refinements(setting)
+        alike = [s for s in others if SETTINGS[s].solver == SETTINGS[setting].solver]
+        return alike if len(alike) > 1 else others
 
     def effort(self, recording: int, setting: int = 0) -> float:
         """Particle-substeps; inner steps of the finite elements count as one."""

@@ -58,7 +58,7 @@ class Fit:
     cost: float
     """Sum of squares of the whitened residuals, priors included."""
     residual: np.ndarray
-    """Whitened, (n,), priors included."""
+    """Whitened, (n,), priors included; empty where the model runs nowhere."""
     evaluations: int
     converged: bool
 
@@ -172,7 +172,7 @@ def levenberg_marquardt(
         if converged or (race is not None and race.lost(costs, iterations - n)):
             break
     point = fixed | {p.name: p.physical(v) for p, v in zip(parameters, q, strict=True)}
-    return Fit(point, names, cost, r, count, converged)
+    return Fit(point, names, cost, np.empty(0) if r is None else r, count, converged)
 
 
 def _with_prior_rows(slopes: np.ndarray, parameters: Sequence[Parameter]) -> np.ndarray:
@@ -205,6 +205,7 @@ def run(
     *,
     setting: int = 0,
     tick: Callable[[int], None] | None = None,
+    data: Sequence[Mapping[int, np.ndarray]] | None = None,
 ) -> list[Fit]:
     """Run several fits side by side: what they ask for at one time goes into one call of `predict` for each recording.
 
@@ -215,6 +216,7 @@ def run(
         recordings: Numbers of the recordings that are fitted.
         setting: Setting of the discretisation.
         tick: Called with the number of points of each round.
+        data: What each fit is to meet, by recording; the recordings themselves where absent.
     """
     results: list[Fit | None] = [None] * len(requests)
     wanted: dict[int, list[Point]] = {}
@@ -222,7 +224,8 @@ def run(
         wanted[i] = next(request)
     while wanted:
         points = [p for asked in wanted.values() for p in asked]
-        answers = residuals(problem, points, whiten, recordings, setting)
+        own = None if data is None else [data[i] for i, asked in wanted.items() for _ in asked]
+        answers = residuals(problem, points, whiten, recordings, setting, own)
         if tick is not None:
             tick(len(points))
         at, after = 0, {}
@@ -243,15 +246,15 @@ def residuals(
     whiten: Callable[[np.ndarray, int], np.ndarray],
     recordings: Sequence[int],
     setting: int = 0,
+    data: Sequence[Mapping[int, np.ndarray]] | None = None,
 ) -> list[np.ndarray | None]:
-    """Whitened residuals of each point over the recordings, joined; None where one of them cannot run."""
+    """Whitened residuals of each point over the recordings (or over data of its own), joined; None where one of them cannot run."""
     parts: list[list[np.ndarray]] = [[] for _ in points]
     good = [True] * len(points)
     for n in recordings:
-        y = problem.recordings[n].y
         for i, row in enumerate(problem.predict(points, n, setting)):
             if np.isfinite(row).all():
-                parts[i].append(whiten(row - y, n))
+                parts[i].append(whiten(row - (problem.recordings[n].y if data is None else data[i][n]), n))
             else:
                 good[i] = False
     return [np.concatenate(part) if ok else None for part, ok in zip(parts, good, strict=True)]

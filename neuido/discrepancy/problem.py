@@ -128,6 +128,10 @@ class Problem:
         """A residual (n,) as one figure in `unit`."""
         return float(np.sqrt(np.mean(residual**2)))
 
+    def refinements(self, setting: int) -> list[int]:
+        """The other settings that tell the error of one: of its own method where there are two of them, else all."""
+        return [s for s in range(self.settings) if s != setting]
+
     def setting_name(self, setting: int) -> str:
         """What a setting is, for the report."""
         return "suggested" if setting == 0 else f"setting {setting}"

@@ -35,8 +35,13 @@ NOISE_ALONE = 1.8
 """Mean squares up to so many times that of the noise are noise."""
 ROUGH = 0.02
 """Relative gain that ends the fit before the floors are known."""
+SMALL = 2
+"""Parameters up to which a candidate gets a fit in the first round whatever its place in the screening: a direction says little of what a
+yield stress or a lossy floor does once it acts."""
+VAIN = 0.98
+"""Share of the misfit that even such a candidate may leave, as the screening predicts it, if small sizes of it act in proportion."""
 MANY = 5
-"""Parameters above which a candidate is fitted after the others."""
+"""Parameters above which a candidate is fitted after the others, and not at all where one of those leaves noise alone."""
 HOPELESS = 0.75
 """Share of the misfit that a candidate beyond the first few may leave, as the screening predicts it, and still get a fit."""
 OWN = 3
@@ -55,7 +60,7 @@ class Inference:
     Args:
         problem: What to diagnose.
         setting: Setting of the discretisation that predicts; the others tell its error.
-        keep: Candidates that get a full fit, at the least.
+        keep: Candidates that get a full fit by their place in the screening, at the least; in the first round all small ones do beside.
         draws: Of the bootstrap.
         seed: Of the draws.
         tell: Called with a line of progress.
@@ -278,9 +283,12 @@ class Inference:
         # what many parameters could fit says little of how near the others are
         near = min(2.0 * min((stays for stays, c, *_ in ranked if len(c.parameters) <= MANY), default=0.0), HOPELESS)
         keep = self.keep if leaders is None else min(self.keep, OWN)
+        first = leaders is None and not found
         for stays, c, i, begin in ranked:
             led = leaders is not None and c.key in leaders
-            if c.key not in chosen and (len(chosen) < keep or led or (leaders is None and stays < near)):
+            small = first and len(c.parameters) <= SMALL and (stays < VAIN or not c.linear)
+            if c.key not in chosen and (keep > 0 or led or small or (leaders is None and stays < near)):
+                keep -= not small
                 chosen[c.key] = i
                 starts.append((c, begin, self._first_slopes(c, i, free, slopes, columns, floor)))
                 if not c.linear:
@@ -302,13 +310,16 @@ class Inference:
         good = [t for t in trials if not t.reason]
         top = min(good, key=lambda t: t.score + PARSIMONY * len(t.candidate.size_parameters)) if good else None
         p = float((1 + np.sum(null >= top.gain)) / (1 + len(null))) if top else 1.0
-        result = Round(base.point, errors, trials, None, [], p, floor, null=null)
+        floors = self.floors(base.point, free, floor)
+        result = Round(
+            base.point, errors, trials, None, [], p, floor, floors, null=null, needless=[key for key in chosen if key not in best]
+        )
         if top is None:
             return result
         for t in trials:
             if t.candidate.key in model.keys and top.candidate.key in model.keys:
                 result.cosines[t.candidate.key] = model.cosine(t.candidate.key, top.candidate.key)
-        if p <= ALPHA and top.gain > self.least_gain(errors, floor):
+        if p <= ALPHA and top.gain > self.least_gain(errors, result.floors):
             result.chosen = top
             result.members = [t for t in good if self._is_rival(t, top)]
         for t in trials:
@@ -316,15 +327,34 @@ class Inference:
                 t.reason = self._why(t, top, result)
         return result
 
-    def floors(self, floor: Floor) -> np.ndarray:
-        """Noise and discretisation together as mean squares of the parts."""
-        return np.array([np.mean(1.0 / floor.weight[p.recording][p.rows] ** 2) for p in self.parts])
+    def floors(self, point: Point, free: Sequence[Parameter], floor: Floor) -> np.ndarray:
+        """Noise, and what a refit leaves of the discretisation error, together as mean squares of the parts.
 
-    def least_gain(self, errors: np.ndarray, floor: Floor) -> float:
-        """The gain that an effect must bring, from the size of the residual over the floor."""
+        The motions under the other settings of the same method are fitted as if they had been measured: most of what a grid or a step does
+        a stiffness can do as well, so that their differences as they are would hide effects several times larger than what matters.
+        """
+        least = np.array([floor.noise[p.recording] ** 2 for p in self.parts])
+        everywhere = list(floor.noise)
+        with self.memo.during("discretisation"):
+            made = [{n: self.memo.predict([point], n, s)[0] for n in everywhere} for s in self.problem.refinements(self.setting)]
+            made = [y for y in made if all(np.isfinite(row).all() for row in y.values())]
+            if not made:
+                return least
+            rows = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
+            requests = [self.request(free, point, iterations=8, tolerance=ROUGH) for _ in made]
+            fits = run(self.memo, requests, floor.whitener(self.parts), rows, setting=self.setting, data=made)
+            seen = {n: self.memo.predict([fit.point for fit in fits], n, self.setting) for n in everywhere}
+        left = [
+            [np.mean(floor.settle(row - y[p.recording], p)[p.rows] ** 2) for row, y in zip(seen[p.recording], made, strict=True)]
+            for p in self.parts
+        ]
+        return least + np.nanmean(left, axis=1)
+
+    def least_gain(self, errors: np.ndarray, floors: np.ndarray) -> float:
+        """The gain that an effect must bring, from the size of the residual over the floor; mean squares of the parts."""
         if self.problem.settings == 1:  # nothing is discretised: only chance is to be beaten
             return LEAST_GAIN_EXACT
-        over = 0.5 * float(np.mean(np.log(errors / self.floors(floor))))
+        over = 0.5 * float(np.mean(np.log(errors / floors)))
         share = min(max(over / math.log(1.5), 0.0), 1.0)  # from the floor itself to half as much again
         return GAIN_IN_FLOOR + share * (LEAST_GAIN - GAIN_IN_FLOOR)
 
@@ -353,7 +383,7 @@ class Inference:
     ) -> dict[str, tuple[Candidate, Fit]]:
         """The best fit of each candidate; fits that cannot catch up with the best one stop.
 
-        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last.
+        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all.
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
         race = Race()
@@ -364,6 +394,10 @@ class Inference:
             key = entry[0].key
             waves[0 if self.problem.together or key in first else 1 if key in small else 2].append(entry)
         for own in waves:
+            if own is waves[2] and best:
+                least = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
+                if self.is_noise(self.mean_squares([least.point], floor)[0]):
+                    break
             fits = self.fits([self.request((*free, *c.parameters), begin, race=race, slopes=J) for c, begin, J in own], floor)
             for (c, *_), fit in zip(own, fits, strict=True):
                 if c.key not in best or fit.cost < best[c.key][1].cost:
@@ -401,7 +435,7 @@ class Inference:
 
     def _why(self, t: Trial, top: Trial, result: Round) -> str:
         if result.chosen is None:
-            at_least = max(float(np.quantile(result.null, 1 - ALPHA)), self.least_gain(result.errors, result.floor))
+            at_least = max(float(np.quantile(result.null, 1 - ALPHA)), self.least_gain(result.errors, result.floors))
             return f"lowers the error {math.exp(t.gain):.2f}-fold; with nuisances and discretisation it takes {math.exp(at_least):.2f}-fold"
         return f"leaves {math.exp(0.5 * (t.score - top.score)):.1f} times the error of {top.candidate.name}"
 

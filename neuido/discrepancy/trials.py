@@ -51,8 +51,12 @@ class Round:
     members: list[Trial]
     p_value: float
     floor: Floor
+    floors: np.ndarray
+    """What noise and discretisation would leave after a refit, mean squares of each part."""
     cosines: dict[str, float] = field(default_factory=dict)
     null: np.ndarray = field(default_factory=lambda: np.empty(0))
+    needless: list[str] = field(default_factory=list)
+    """Keys of candidates of many parameters that were not fitted, since one of few leaves noise alone."""
 
     @property
     def leaders(self) -> list[str]:

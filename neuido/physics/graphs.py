@@ -86,18 +86,26 @@ class CapturedRollout(KeptRollout):
 
 
 def _capture(launches: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
-    """A graph of the launches, and what they returned. No garbage collection meanwhile: freeing another graph would break it."""
+    """A graph of the launches, and what they returned.
+
+    No garbage collection meanwhile, for freeing another graph would break it; and none before, as `torch.cuda.graph` has it: that takes
+    longer than to capture a hundred substeps.
+    """
+    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
     torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
     collecting = gc.isenabled()
-    gc.collect()
     gc.disable()
     try:
-        with torch.cuda.graph(graph):
-            out = launches()
+        with torch.cuda.stream(stream):
+            graph.capture_begin()
+            try:
+                out = launches()
+            finally:
+                graph.capture_end()
     finally:
         if collecting:
             gc.enable()
+    torch.cuda.current_stream().wait_stream(stream)
     return graph, out
 
 

@@ -26,7 +26,7 @@ def diagnosis(problem, points: dict[str, dict[str, float]]) -> Diagnosis:
         fit = Fit(point, tuple(point), 1.0, np.empty(0), 1, True)
         trials.append(Trial(c, fit, np.ones(2), 1.0))
     floor = Floor({}, {}, {}, {})
-    step = Round({}, np.ones(2), trials, trials[0], trials, 0.005, floor)
+    step = Round({}, np.ones(2), trials, trials[0], trials, 0.005, floor, np.ones(2))
     point = trials[0].fit.point
     return Diagnosis(problem, "class", [step], {}, point, floors.split(problem), {}, {}, {}, {}, 0, {})
 

@@ -1,0 +1,110 @@
+"""Which candidates a round fits, and which floor it weighs their gain against."""
+
+import numpy as np
+import pytest
+
+from neuido.discrepancy import rounds
+from neuido.discrepancy.answer import rejected, trace
+from neuido.discrepancy.attribution import diagnose
+from neuido.discrepancy.fit import levenberg_marquardt, run
+from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
+from neuido.discrepancy.rounds import GAIN_IN_FLOOR, LEAST_GAIN, Inference
+
+T = np.linspace(0.0, 1.0, 120)
+NOISE = 0.01
+
+
+class Line(Problem):
+    """y = a t, and what a candidate adds: a clip at `1 / inverse` (nothing near zero says where it will act), waves, a bend.
+
+    Setting 1 has another slope, which `a` makes good, and a wiggle, which nothing does.
+    """
+
+    def __init__(self, y, *, waves: int = 3, together: bool = False) -> None:
+        def bent(name, lower=-5.0, **options):
+            return Candidate(name, (Parameter(f"{name}.c", "1", 0.0, 0.3, lower, 5.0),), ({f"{name}.c": 0.3},), "flight", **options)
+
+        clip = Parameter("clip.inverse", "1", 0.0, 0.3, 1e-3, 10.0, log=True)
+        candidates = [bent("square"), bent("cube")]
+        for n in range(waves):
+            sizes = tuple(Parameter(f"wave{n}.c{k}", "1", 0.0, 0.1, -5.0, 5.0) for k in range(8))
+            candidates.append(Candidate(f"wave{n}", sizes, ({p.name: 0.1 for p in sizes},), "flight"))
+        starts = {"clip.inverse": 0.05}, {"clip.inverse": 0.5}  # nothing is clipped at the first
+        candidates.append(Candidate("clip", (clip,), starts, "rest", sizes=("clip.inverse",), linear=False))
+        rng = np.random.default_rng(0)
+        recordings = tuple(
+            Recording(name, role, y(T) + NOISE * rng.normal(size=len(T)), NOISE, np.zeros(len(T), int), T)
+            for name, role in (("one", "fit"), ("two", "held_out"))
+        )
+        declared = (Parameter("a", "1", 1.0, 0.3, -20.0, 20.0),)
+        super().__init__("line", "rmse", "1", declared, (), tuple(candidates), recordings, settings=2)
+        self.__dict__["_together"] = together
+
+    @property
+    def together(self):
+        return self._together
+
+    def predict(self, points, recording, setting=0):
+        out = []
+        for p in points:
+            y = (p.get("a", 1.0) + 2.0 * setting) * T + 0.02 * setting * np.sin(40 * T)
+            for n in range(3):
+                y = y + sum(p.get(f"wave{n}.c{k}", 0.0) * np.sin((k + 1 + 0.3 * n) * T) for k in range(8))
+            y = y + p.get("square.c", 0.0) * T**2 + p.get("cube.c", 0.0) * T**3
+            out.append(np.minimum(y, 1.0 / p["clip.inverse"]) if p.get("clip.inverse") else y)
+        return np.stack(out)
+
+
+def clipped(t):
+    return np.minimum(3.0 * t, 1.6)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_small_candidate_that_the_screening_passes_over_is_fitted(together, monkeypatch):
+    found = diagnose(Line(clipped, together=together), keep=1)
+    assert [t.candidate.name for t in found.effects] == ["clip"]
+    assert 1.0 / found.after["clip.inverse"] == pytest.approx(1.6, abs=0.02)
+    monkeypatch.setattr(rounds, "SMALL", 0)
+    assert "clip" not in [t.candidate.name for t in diagnose(Line(clipped, together=together), keep=1).rounds[0].trials]
+
+
+def test_many_parameters_are_not_fitted_where_one_leaves_noise_alone():
+    found = diagnose(Line(clipped), keep=6)
+    asked, fitted = set(found.rounds[0].needless), {t.candidate.key for t in found.rounds[0].trials}
+    assert asked and asked <= {"wave0", "wave1", "wave2"}
+    assert not asked & fitted
+    reasons = {r["name"]: r["reason"] for r in rejected(found)}
+    assert all("fewer parameters" in reasons[name] for name in asked)
+    # where none does, they are
+    other = diagnose(Line(lambda t: t + 0.3 * np.sin(9 * t)), keep=6)
+    assert not other.rounds[0].needless
+    assert any(t.candidate.key.startswith("wave") for t in other.rounds[0].trials)
+
+
+def test_the_floor_is_what_a_refit_leaves():
+    inference = Inference(Line(lambda t: 3.0 * t))
+    start = inference.start()
+    as_they_are = np.sqrt(np.mean(start.floor.spread[0] ** 2))
+    assert as_they_are > 1.0  # a slope of 2
+    floors = inference.floors(start.fit.point, inference.problem.declared, start.floor)
+    assert floors == pytest.approx(NOISE**2 + 0.02**2 / 2, rel=0.2)
+    # and the gain that it takes goes by that
+    small, large = (inference.least_gain(k * floors, floors) for k in (0.5, 4.0))
+    assert (small, large) == (GAIN_IN_FLOOR, LEAST_GAIN)
+
+
+def test_a_fit_that_runs_nowhere_ends_without_a_residual():
+    class Broken(Line):
+        def predict(self, points, recording, setting=0):
+            rows = super().predict(points, recording, setting)
+            rows[[p.get("clip.inverse", 0.0) > 0 for p in points]] = np.nan
+            return rows
+
+    problem = Broken(lambda t: 3.0 * t + 2.0 * t**2)
+    clip = problem.candidates[-1]
+    (fit,) = run(problem, [levenberg_marquardt((*problem.declared, *clip.parameters), clip.starts[0])], lambda r, n: r / NOISE, [0])
+    assert fit.cost == np.inf
+    assert len(fit.residual) == 0
+    found = diagnose(problem)
+    assert [t.candidate.name for t in found.effects] == ["square"]
+    assert all(t["name"] != "clip" or t["data"] == 0 for t in trace(found)["rounds"][0]["trials"])
