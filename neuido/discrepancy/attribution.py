@@ -18,6 +18,7 @@ __all__ = [
     "MOST",
     "UNEXPLAINED",
     "UNEXPLAINED_EXACT",
+    "WITHIN",
     "Diagnosis",
     "Floor",
     "Inference",
@@ -26,6 +27,7 @@ __all__ = [
     "Start",
     "Trial",
     "diagnose",
+    "over",
     "split",
 ]
 
@@ -35,6 +37,8 @@ UNEXPLAINED = 2.0
 """Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
 UNEXPLAINED_EXACT = 3.0
 """The same where nothing is discretised: the noise that a folder states is an estimate."""
+WITHIN = 0.5
+"""Share of that floor within which a residual that no effect explains is no reason to look again with another method."""
 
 
 @dataclass(eq=False)
@@ -99,6 +103,8 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
             firsts.append(inference.round(start.fit, start.floor, [], leaders))
             if firsts[-1].trials and inference.is_noise(firsts[-1].trials[0].errors):
                 break
+            if firsts[-1].chosen is None and over(firsts[-1]) < WITHIN:
+                break
         # another method must do clearly better before it takes the place of the suggested one
         best = [min([t.score for t in r.trials if not t.reason or t in r.members] + [_score(r.errors)]) for r in firsts]
         chosen = min(range(len(firsts)), key=lambda i: best[i] + (0.0 if i == 0 else math.log(1.2)))
@@ -118,6 +124,11 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         rounds.append(inference.round(base, floor, found))
     base, found = drop(inference, base, floor, found)
     return conclude(inference, start.fit.point, base, found, rounds, floor)
+
+
+def over(r: Round) -> float:
+    """How far the residual of a round's base is above its floors: a ratio of errors, the geometric mean over the parts."""
+    return float(np.exp(0.5 * np.mean(np.log(np.maximum(r.errors, 1e-300) / r.floors))))
 
 
 def _score(errors: np.ndarray) -> float:
@@ -172,11 +183,11 @@ def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial],
     first = rounds[0]
     kept = {t.candidate.key for t in found}
     steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
-    over, limit = np.sqrt(first.errors / first.floors), UNEXPLAINED if inference.problem.settings > 1 else UNEXPLAINED_EXACT
+    limit = UNEXPLAINED if inference.problem.settings > 1 else UNEXPLAINED_EXACT
     if found:
         classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
         answer = "class" if max(classes) > 1 else "effect"
-    elif float(np.exp(np.mean(np.log(np.maximum(over, 1e-150))))) > limit:
+    elif over(first) > limit:
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"

@@ -5,7 +5,7 @@ import pytest
 
 from neuido.discrepancy import rounds
 from neuido.discrepancy.answer import rejected, trace
-from neuido.discrepancy.attribution import diagnose
+from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, over
 from neuido.discrepancy.fit import levenberg_marquardt, run
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import GAIN_IN_FLOOR, LEAST_GAIN, Inference
@@ -20,7 +20,7 @@ class Line(Problem):
     Setting 1 has another slope, which `a` makes good, and a wiggle, which nothing does.
     """
 
-    def __init__(self, y, *, waves: int = 3, together: bool = False) -> None:
+    def __init__(self, y, *, wiggle: float = 0.02, solvers: tuple[int, ...] = (0,), waves: int = 3, together: bool = False) -> None:
         def bent(name, lower=-5.0, **options):
             return Candidate(name, (Parameter(f"{name}.c", "1", 0.0, 0.3, lower, 5.0),), ({f"{name}.c": 0.3},), "flight", **options)
 
@@ -37,8 +37,8 @@ class Line(Problem):
             for name, role in (("one", "fit"), ("two", "held_out"))
         )
         declared = (Parameter("a", "1", 1.0, 0.3, -20.0, 20.0),)
-        super().__init__("line", "rmse", "1", declared, (), tuple(candidates), recordings, settings=2)
-        self.__dict__["_together"] = together
+        super().__init__("line", "rmse", "1", declared, (), tuple(candidates), recordings, settings=2, solvers=solvers)
+        self.__dict__ |= {"_together": together, "_wiggle": wiggle}
 
     @property
     def together(self):
@@ -47,7 +47,7 @@ class Line(Problem):
     def predict(self, points, recording, setting=0):
         out = []
         for p in points:
-            y = (p.get("a", 1.0) + 2.0 * setting) * T + 0.02 * setting * np.sin(40 * T)
+            y = (p.get("a", 1.0) + 2.0 * setting) * T + self._wiggle * setting * np.sin(40 * T)
             for n in range(3):
                 y = y + sum(p.get(f"wave{n}.c{k}", 0.0) * np.sin((k + 1 + 0.3 * n) * T) for k in range(8))
             y = y + p.get("square.c", 0.0) * T**2 + p.get("cube.c", 0.0) * T**3
@@ -108,3 +108,19 @@ def test_a_fit_that_runs_nowhere_ends_without_a_residual():
     found = diagnose(problem)
     assert [t.candidate.name for t in found.effects] == ["square"]
     assert all(t["name"] != "clip" or t["data"] == 0 for t in trace(found)["rounds"][0]["trials"])
+
+
+def test_what_lies_within_the_floor_is_not_asked_of_another_method():
+    def fitted(y):
+        lines = []
+        found = diagnose(Line(y, wiggle=0.1, solvers=(0, 1)), tell=lines.append)
+        return found, sum(line.startswith("fitting ") for line in lines)
+
+    found, rounds_of_fits = fitted(lambda t: 3.0 * t + 0.025 * np.sin(33 * t))
+    assert found.answer == "none"
+    assert over(found.rounds[0]) < WITHIN
+    assert rounds_of_fits == 1
+    found, rounds_of_fits = fitted(lambda t: 3.0 * t + 0.3 * np.sin(33 * t))
+    assert found.answer == "unknown"
+    assert over(found.rounds[0]) > UNEXPLAINED
+    assert rounds_of_fits == 2
