@@ -149,7 +149,11 @@ def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> t
 
 
 def intervals(inference: Inference, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
-    """90 % intervals: noise, and the part of the discretisation error that the residual leaves room for, through the fit."""
+    """90 % intervals: noise, and the part of the discretisation error that the residuals leave room for, through the fit.
+
+    The room is that of the part whose residual is largest beside its discretisation: where a fit has taken the error of the solver into its
+    parameters, only what was held out shows it.
+    """
     parts = [p for p in inference.parts if p.fitted]
     parameters = [inference.problem.parameter(name) for name in fit.names]
     slopes = inference.slopes(parameters, fit.point, [p.recording for p in parts], step=0.1)
@@ -158,15 +162,17 @@ def intervals(inference: Inference, fit: Fit, floor: Floor, errors: np.ndarray) 
     gain = np.linalg.pinv(J)
     covariance = np.zeros((len(parameters), len(parameters)))
     at = 0
-    for p, square in zip(parts, errors[np.array(inference.fitted)], strict=True):
+    shares = [
+        max(float(square) - floor.noise[p.recording] ** 2, 0.0) / max(float(np.mean(floor.spread[p.recording][p.rows] ** 2)), 1e-300)
+        for p, square in zip(inference.parts, errors, strict=True)
+    ]
+    room = min(max(shares), 1.0)
+    for p in parts:
         n, w = p.recording, floor.weight[p.recording][p.rows]
         own = gain[:, at : at + len(w)]
         at += len(w)
         covariance += floor.noise[n] ** 2 * (own * w**2) @ own.T
-        room = max(float(square) - floor.noise[n] ** 2, 0.0) / max(float(np.mean(floor.spread[n][p.rows] ** 2)), 1e-300)
-        shifts = [
-            own @ (inference.weighted(floor.differences[n], p, floor) * math.sqrt(min(room, 1.0) / max(floor.differences[n].shape[1], 1)))
-        ]
+        shifts = [own @ (inference.weighted(floor.differences[n], p, floor) * math.sqrt(room / max(floor.differences[n].shape[1], 1)))]
         if n in nuisances:
             shifts.append(own @ inference.weighted(nuisances[n], p, floor) * math.sqrt(min(room + 0.05, 1.0)))
         for shift in shifts:

@@ -5,7 +5,7 @@ import pytest
 
 from neuido.discrepancy import rounds
 from neuido.discrepancy.answer import rejected, trace
-from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, over
+from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, intervals, over
 from neuido.discrepancy.fit import levenberg_marquardt, run
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import GAIN_IN_FLOOR, LEAST_GAIN, Inference
@@ -124,3 +124,17 @@ def test_what_lies_within_the_floor_is_not_asked_of_another_method():
     assert found.answer == "unknown"
     assert over(found.rounds[0]) > UNEXPLAINED
     assert rounds_of_fits == 2
+
+
+def test_an_interval_leaves_room_for_what_only_the_held_out_recording_shows():
+    inference = Inference(Line(lambda t: 3.0 * t))
+    start = inference.start()
+
+    def width(fitted, held_out):
+        low, high = intervals(inference, start.fit, start.floor, np.array([fitted, held_out]) ** 2 + NOISE**2)["a"]
+        return high - low
+
+    assert width(0.0, 0.0) < 0.05
+    # the settings differ by a slope of 2: a fit may be off by as much
+    assert width(0.0, 2.0) == pytest.approx(2 * 1.645 * 2.0, rel=0.05)
+    assert width(0.0, 0.02) == pytest.approx(width(0.02, 0.0))
