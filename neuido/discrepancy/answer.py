@@ -146,6 +146,7 @@ def rejected(d: Diagnosis) -> list[dict[str, str]]:
     """Every candidate that is neither an effect nor in the class of one, with the reason of the round that weighed it best."""
     kept = {t.candidate.name for r in d.rounds for t in (r.members if r.chosen is not None else [])}
     reasons: dict[str, str] = {}
+    near = "what is left without it is noise, or so near to it that no effect could lower it enough"
     behind = "its direction in the data stays behind those of the effects that were fitted in full"
     for r in d.rounds:
         for t in r.trials:
@@ -157,7 +158,7 @@ def rejected(d: Diagnosis) -> list[dict[str, str]]:
                 reasons.setdefault(name, "an effect of fewer parameters leaves nothing but noise")
     for c in d.problem.candidates:
         if c.name not in kept and c.name not in reasons:
-            reasons[c.name] = behind if any(r.trials for r in d.rounds) else "nothing but noise is left without it"
+            reasons[c.name] = behind if any(r.trials for r in d.rounds) else near
     out = [{"name": name, "reason": reason} for name, reason in reasons.items()]
     return out + [{"name": name, "reason": reason} for name, reason in d.problem.labels.get("excluded", {}).items()]
 

@@ -86,16 +86,19 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     starts: list[Start] = []
     for n in problem.solvers:
         inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo)
-        if starts and (tried[-1].is_noise(starts[-1].errors) or not inference.runs(starts[0].fit.point)):
+        if starts and (tried[-1].is_settled(starts[-1].errors) or not inference.runs(starts[0].fit.point)):
             continue
         tried.append(inference)
         starts.append(inference.start(starts[0].fit.point if starts else None))
-    at_noise = [i for i, start in enumerate(starts) if tried[i].is_noise(start.errors)]
+    settled = [i for i, start in enumerate(starts) if tried[i].is_settled(start.errors)]
     rounds: list[Round] = []
-    if at_noise:
-        chosen = min(at_noise, key=lambda i: float(np.mean(starts[i].errors)))
+    if settled:
+        chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
         start = starts[chosen]
-        rounds = [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, start.errors)]
+        floors = start.errors
+        if not tried[chosen].is_noise(start.errors):
+            floors = tried[chosen].floors(start.fit.point, problem.declared, start.floor)
+        rounds = [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]
     else:
         firsts: list[Round] = []
         for inference, start in zip(tried, starts, strict=True):
@@ -118,8 +121,8 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         step = rounds[-1].chosen
         found.append(step)
         base = step.fit
-        if len(found) == most or inference.is_noise(step.errors):
-            break  # nothing is left but noise
+        if len(found) == most or inference.is_settled(step.errors):
+            break
         floor = inference.floor(base.point)
         rounds.append(inference.round(base, floor, found))
     base, found = drop(inference, base, floor, found)

@@ -180,6 +180,13 @@ class Inference:
         """Whether nothing but noise is left in any part."""
         return bool(np.all(errors < NOISE_ALONE * np.array([self.noise_of(p.recording) ** 2 for p in self.parts])))
 
+    def is_settled(self, errors: np.ndarray) -> bool:
+        """Whether no effect could be named any more: nothing is left but noise, or too little above it for any gain to be enough."""
+        if self.is_noise(errors) or self.problem.settings == 1:
+            return self.is_noise(errors)
+        noise = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
+        return evidence.gain(errors, noise, self.fitted) < LEAST_GAIN
+
     # Screening.
 
     def columns(

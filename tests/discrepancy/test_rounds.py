@@ -138,3 +138,14 @@ def test_an_interval_leaves_room_for_what_only_the_held_out_recording_shows():
     # the settings differ by a slope of 2: a fit may be off by as much
     assert width(0.0, 2.0) == pytest.approx(2 * 1.645 * 2.0, rel=0.05)
     assert width(0.0, 0.02) == pytest.approx(width(0.02, 0.0))
+
+
+def test_what_is_too_near_to_the_noise_for_any_gain_is_not_screened():
+    lines = []
+    found = diagnose(Line(lambda t: 3.0 * t + 0.015 * np.sin(33 * t)), tell=lines.append)
+    assert found.answer == "none"
+    assert not any(line.startswith(("fitting ", "directions ")) for line in lines)
+    inference = Inference(Line(lambda t: 3.0 * t))
+    assert inference.is_settled(np.array([2.5, 100.0]) * NOISE**2)  # the gain is the smaller one of the two
+    assert not inference.is_noise(np.array([2.5, 100.0]) * NOISE**2)
+    assert not inference.is_settled(np.array([4.0, 4.0]) * NOISE**2)
