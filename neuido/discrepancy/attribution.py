@@ -95,7 +95,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     if settled:
         chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
         start = starts[chosen]
-        floors = start.errors
+        floors = np.array([tried[chosen].noise_of(p.recording) ** 2 for p in tried[chosen].parts])
         if not tried[chosen].is_noise(start.errors):
             floors = tried[chosen].floors(start.fit.point, problem.declared, start.floor)
         rounds = [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]

@@ -67,10 +67,10 @@ Request = Generator[list[Point], list[np.ndarray | None], Fit]
 
 
 class Race:
-    """Fits that are compared with each other; one that cannot catch up any more, or not come below a limit, stops."""
+    """Fits that are compared with each other; one that cannot catch up any more stops."""
 
-    def __init__(self, best: float = np.inf, limit: float = np.inf) -> None:
-        self.best, self.limit = best, limit
+    def __init__(self, best: float = np.inf) -> None:
+        self.best = best
 
     def lost(self, costs: Sequence[float], left: int) -> bool:
         """Whether a fit with these costs, one an iteration, has lost with so many iterations left."""
@@ -79,7 +79,7 @@ class Race:
             return False
         failed = costs[-1] == costs[-2]  # one step that fails says only that it was too bold
         pace = (costs[-1] / max(costs[-3], 1e-300)) ** 0.5 if failed else costs[-1] / costs[-2]
-        return costs[-1] * max(pace, BEST_PACE) ** left > min(BEHIND * self.best, self.limit)
+        return costs[-1] * max(pace, BEST_PACE) ** left > BEHIND * self.best
 
 
 def levenberg_marquardt(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.fit import Fit, Race, Request, levenberg_marquardt, residuals, run
+from neuido.discrepancy.fit import Fit, Race, Request, levenberg_marquardt, run
 from neuido.discrepancy.floors import Floor, Part, over_time, split
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
@@ -46,8 +46,6 @@ HOPELESS = 0.75
 """Share of the misfit that a candidate beyond the first few may leave, as the screening predicts it, and still get a fit."""
 OWN = 3
 """Candidates that the screening of a second solver may add to those that led with the first one."""
-VAGUE = 1.3
-"""Times the cost that an effect must come below to be named: a fit that would end above that is given up."""
 LEADERS = 4
 """Candidates that are fitted before the others."""
 POLISHED = 3
@@ -305,7 +303,7 @@ class Inference:
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
                 starts.append((c, begin, None))
         self.tell(f"fitting {', '.join(chosen)}")
-        best = self.contest(free, starts, base, floor)
+        best = self.contest(free, starts, floor)
         best |= self.polish(free, best, base, floor)
         squares = self.mean_squares([fit.point for _, fit in best.values()], floor)
         trials = []
@@ -388,17 +386,14 @@ class Inference:
         return J if np.isfinite(J).all() else None
 
     def contest(
-        self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], base: Fit, floor: Floor
+        self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], floor: Floor
     ) -> dict[str, tuple[Candidate, Fit]]:
-        """The best fit of each candidate; fits that cannot catch up with the best one, or gain enough to be named, stop.
+        """The best fit of each candidate; fits that cannot catch up with the best one stop.
 
         Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all.
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
-        least = LEAST_GAIN if self.problem.settings > 1 else LEAST_GAIN_EXACT
-        rows = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
-        (now,) = residuals(self.memo, [base.point], floor.whitener(self.parts), rows, self.setting)
-        race = Race(limit=VAGUE * math.exp(-2.0 * least) * (np.inf if now is None else float(now @ now)))
+        race = Race()
         small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
         first = list(dict.fromkeys(small))[:LEADERS]
         waves: list[list[tuple[Candidate, Point, np.ndarray | None]]] = [[], [], []]
@@ -407,8 +402,8 @@ class Inference:
             waves[0 if self.problem.together or key in first else 1 if key in small else 2].append(entry)
         for own in waves:
             if own is waves[2] and best:
-                nearest = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
-                if self.is_noise(self.mean_squares([nearest.point], floor)[0]):
+                least = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
+                if self.is_noise(self.mean_squares([least.point], floor)[0]):
                     break
             fits = self.fits([self.request((*free, *c.parameters), begin, race=race, slopes=J) for c, begin, J in own], floor)
             for (c, *_), fit in zip(own, fits, strict=True):

@@ -38,6 +38,8 @@ class SmallestError(Inference):
     def is_noise(self, errors: np.ndarray) -> bool:
         return False
 
+    is_settled = is_noise
+
     def round(self, base, floor, found, leaders=None) -> Round:
         result = super().round(base, floor, found, leaders)
         result.chosen = min(result.trials, key=lambda t: t.fit.cost, default=None)

@@ -116,7 +116,7 @@ def test_long_recordings_run_in_pieces(folder, monkeypatch):
         assert steps % piece == 0
         assert piece % every == 0
         assert piece == every or piece <= SEGMENT
-    assert _segment(32_000, 400) == 2000
+    assert _segment(32_000, 10) == 200
     monkeypatch.setattr("neuido.discrepancy.body.SEGMENT", 30)
     problem = body_problem(read_experiment(folder))
     asked, rollout = [], Simulator.rollout
