@@ -39,6 +39,7 @@ from neuido.errors import UserError
 
 RERUN = ("single-recording", "no-discretisation")
 SOLVERS = ("same", "finer", "elements")
+ATTEMPTS = 16
 PAIRS = (
     "drag_linear+yield", "uniform_acceleration+viscosity_shear", "friction+stiffness_gradient", "gravity+strain_stiffening",
     "magnus+softening", "drag_quadratic+hardening", "restitution+fibre", "friction+viscosity_shear", "position_force+yield",
@@ -71,7 +72,7 @@ def plan(cases: int, curves: int, seed: int, *, particles: int = 0, seconds: flo
 
 def make_one(name: str, seed: int, case: Case, folder: str, device: str) -> str:
     """One case; a seed that gives none is followed by others."""
-    for attempt in range(4):
+    for attempt in range(ATTEMPTS):
         out = Path(folder) / name
         try:
             make_undeclared(seed + 100_000 * attempt, str(out), case=case, device=device, progress=False)

@@ -27,7 +27,6 @@ __all__ = [
     "Start",
     "Trial",
     "diagnose",
-    "over",
     "split",
 ]
 
@@ -95,7 +94,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     if settled:
         chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
         start = starts[chosen]
-        floors = np.array([tried[chosen].noise_of(p.recording) ** 2 for p in tried[chosen].parts])
+        floors = tried[chosen].noise_squares
         if not tried[chosen].is_noise(start.errors):
             floors = tried[chosen].floors(start.fit.point, problem.declared, start.floor)
         rounds = [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]
@@ -106,7 +105,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
             firsts.append(inference.round(start.fit, start.floor, [], leaders))
             if firsts[-1].trials and inference.is_noise(firsts[-1].trials[0].errors):
                 break
-            if firsts[-1].chosen is None and over(firsts[-1]) < WITHIN:
+            if firsts[-1].chosen is None and firsts[-1].over < WITHIN:
                 break
         # another method must do clearly better before it takes the place of the suggested one
         best = [min([t.score for t in r.trials if not t.reason or t in r.members] + [_score(r.errors)]) for r in firsts]
@@ -127,11 +126,6 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         rounds.append(inference.round(base, floor, found))
     base, found = drop(inference, base, floor, found)
     return conclude(inference, start.fit.point, base, found, rounds, floor)
-
-
-def over(r: Round) -> float:
-    """How far the residual of a round's base is above its floors: a ratio of errors, the geometric mean over the parts."""
-    return float(np.exp(0.5 * np.mean(np.log(np.maximum(r.errors, 1e-300) / r.floors))))
 
 
 def _score(errors: np.ndarray) -> float:
@@ -164,12 +158,12 @@ def intervals(inference: Inference, fit: Fit, floor: Floor, errors: np.ndarray) 
     J = np.concatenate([inference.weighted(slopes[p.recording], p, floor) for p in parts])
     gain = np.linalg.pinv(J)
     covariance = np.zeros((len(parameters), len(parameters)))
-    at = 0
     shares = [
         max(float(square) - floor.noise[p.recording] ** 2, 0.0) / max(float(np.mean(floor.spread[p.recording][p.rows] ** 2)), 1e-300)
         for p, square in zip(inference.parts, errors, strict=True)
     ]
     room = min(max(shares), 1.0)
+    at = 0
     for p in parts:
         n, w = p.recording, floor.weight[p.recording][p.rows]
         own = gain[:, at : at + len(w)]
@@ -196,7 +190,7 @@ def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial],
     if found:
         classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
         answer = "class" if max(classes) > 1 else "effect"
-    elif over(first) > limit:
+    elif first.over > limit:
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"

@@ -112,6 +112,7 @@ class BodyProblem(Problem):
         return self.device != "cpu"
 
     def refinements(self, setting: int) -> list[int]:
+        """The others of its own method where there are two of them, else all others."""
         others = super().refinements(setting)
         alike = [s for s in others if SETTINGS[s].solver == SETTINGS[setting].solver]
         return alike if len(alike) > 1 else others

@@ -21,7 +21,7 @@ class Columns:
     nuisances: np.ndarray
     """Times their prior standard deviations."""
     discretisation: np.ndarray
-    """Differences of settings after the declared parameters' refit."""
+    """Differences of the settings at the base."""
     smooth: np.ndarray
     """Patterns of an unknown part of it, times its size."""
     candidates: Mapping[str, np.ndarray]

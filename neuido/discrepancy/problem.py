@@ -129,7 +129,7 @@ class Problem:
         return float(np.sqrt(np.mean(residual**2)))
 
     def refinements(self, setting: int) -> list[int]:
-        """The other settings that tell the error of one: of its own method where there are two of them, else all."""
+        """The other settings that tell the error of one."""
         return [s for s in range(self.settings) if s != setting]
 
     def setting_name(self, setting: int) -> str:

@@ -17,7 +17,7 @@ from neuido.discrepancy.fit import Fit, Race, Request, levenberg_marquardt, run
 from neuido.discrepancy.floors import Floor, Part, over_time, split
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
-from neuido.discrepancy.trials import Round, Start, Trial, unphysical
+from neuido.discrepancy.trials import Round, Start, Trial, times_over, unphysical
 
 ALPHA = 0.05
 """Family-wise level of a named effect."""
@@ -83,17 +83,23 @@ class Inference:
         self.memo = memo or Memo(problem)
         self.parts = split(problem)
         self.fitted = [p.fitted for p in self.parts]
+        self.fitted_recordings = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
+        self.noise_squares = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
+        """Mean squares of the noise of each part."""
 
     # Fits.
 
-    def fits(self, requests: Sequence, floor: Floor) -> list[Fit]:
-        rows = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
+    def fits(
+        self, requests: Sequence, floor: Floor, *, to: Sequence[Mapping[int, np.ndarray]] | None = None, step: str = "fits"
+    ) -> list[Fit]:
+        """Run fits side by side, to the data or each to motions in their place; their work counts as that of `step`."""
 
         def tick(count: int) -> None:
             self.tell(f"{self.memo.simulations} simulations")
 
-        with self.memo.during("fits"):
-            return run(self.memo, requests, floor.whitener(self.parts), rows, setting=self.setting, tick=tick)
+        with self.memo.during(step):
+            whiten, rows = floor.whitener(self.parts), self.fitted_recordings
+            return run(self.memo, requests, whiten, rows, setting=self.setting, data=to, tick=tick)
 
     def mean_squares(self, points: Sequence[Point], floor: Floor) -> list[np.ndarray]:
         """Of each part, at several points, the nuisances at their most probable values."""
@@ -176,14 +182,12 @@ class Inference:
 
     def is_noise(self, errors: np.ndarray) -> bool:
         """Whether nothing but noise is left in any part."""
-        return bool(np.all(errors < NOISE_ALONE * np.array([self.noise_of(p.recording) ** 2 for p in self.parts])))
+        return bool(np.all(errors < NOISE_ALONE * self.noise_squares))
 
     def is_settled(self, errors: np.ndarray) -> bool:
         """Whether no effect could be named any more: nothing is left but noise, or too little above it for any gain to be enough."""
-        if self.is_noise(errors) or self.problem.settings == 1:
-            return self.is_noise(errors)
-        noise = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
-        return evidence.gain(errors, noise, self.fitted) < LEAST_GAIN
+        hopeless = self.problem.settings > 1 and evidence.gain(errors, self.noise_squares, self.fitted) < LEAST_GAIN
+        return hopeless or self.is_noise(errors)
 
     # Screening.
 
@@ -340,29 +344,27 @@ class Inference:
         The motions under the other settings of the same method are fitted as if they had been measured: most of what a grid or a step does
         a stiffness can do as well, so that their differences as they are would hide effects several times larger than what matters.
         """
-        least = np.array([floor.noise[p.recording] ** 2 for p in self.parts])
         everywhere = list(floor.noise)
         with self.memo.during("discretisation"):
             made = [{n: self.memo.predict([point], n, s)[0] for n in everywhere} for s in self.problem.refinements(self.setting)]
-            made = [y for y in made if all(np.isfinite(row).all() for row in y.values())]
-            if not made:
-                return least
-            rows = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
-            requests = [self.request(free, point, iterations=8, tolerance=ROUGH) for _ in made]
-            fits = run(self.memo, requests, floor.whitener(self.parts), rows, setting=self.setting, data=made)
+        made = [y for y in made if all(np.isfinite(row).all() for row in y.values())]
+        if not made:
+            return self.noise_squares
+        requests = [self.request(free, point, iterations=8, tolerance=ROUGH) for _ in made]
+        fits = self.fits(requests, floor, to=made, step="discretisation")
+        with self.memo.during("discretisation"):
             seen = {n: self.memo.predict([fit.point for fit in fits], n, self.setting) for n in everywhere}
         left = [
             [np.mean(floor.settle(row - y[p.recording], p)[p.rows] ** 2) for row, y in zip(seen[p.recording], made, strict=True)]
             for p in self.parts
         ]
-        return least + np.nanmean(left, axis=1)
+        return self.noise_squares + np.nanmean(left, axis=1)
 
     def least_gain(self, errors: np.ndarray, floors: np.ndarray) -> float:
         """The gain that an effect must bring, from the size of the residual over the floor; mean squares of the parts."""
         if self.problem.settings == 1:  # nothing is discretised: only chance is to be beaten
             return LEAST_GAIN_EXACT
-        over = 0.5 * float(np.mean(np.log(errors / floors)))
-        share = min(max(over / math.log(1.5), 0.0), 1.0)  # from the floor itself to half as much again
+        share = min(max(math.log(times_over(errors, floors)) / math.log(1.5), 0.0), 1.0)  # from the floor itself to half as much again
         return GAIN_IN_FLOOR + share * (LEAST_GAIN - GAIN_IN_FLOOR)
 
     def _first_slopes(
@@ -402,8 +404,8 @@ class Inference:
             waves[0 if self.problem.together or key in first else 1 if key in small else 2].append(entry)
         for own in waves:
             if own is waves[2] and best:
-                least = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
-                if self.is_noise(self.mean_squares([least.point], floor)[0]):
+                leading = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
+                if self.is_noise(self.mean_squares([leading.point], floor)[0]):
                     break
             fits = self.fits([self.request((*free, *c.parameters), begin, race=race, slopes=J) for c, begin, J in own], floor)
             for (c, *_), fit in zip(own, fits, strict=True):

@@ -59,9 +59,19 @@ class Round:
     """Keys of candidates of many parameters that were not fitted, since one of few leaves noise alone."""
 
     @property
+    def over(self) -> float:
+        """How far the residual of its base is above its floors: a ratio of errors."""
+        return times_over(self.errors, self.floors)
+
+    @property
     def leaders(self) -> list[str]:
         """Keys of the candidates that the chosen one could be mistaken for, and of the next best."""
         return list(dict.fromkeys(t.candidate.key for t in (*self.members, *self.trials[:LED])))
+
+
+def times_over(errors: np.ndarray, floors: np.ndarray) -> float:
+    """Ratio of errors, both given as mean squares of the parts: the geometric mean over these."""
+    return float(np.exp(0.5 * np.mean(np.log(np.maximum(errors, 1e-300) / floors))))
 
 
 def unphysical(c: Candidate, point: Point) -> str:

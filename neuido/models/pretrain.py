@@ -193,6 +193,7 @@ class PretrainModule(LightningModule):
         lr: Learning rate of trunks and heads; AdamW with a cosine to zero over the run (paper).
         latent_lr_factor: The latents learn with this many times `lr`.
         latent_decay: Weight decay of the latents. Adam moves them at random wherever the laws do not feel them, and this draws that back.
+        latent_decay_to: What that draws them to: `zero`, or the mean of their `family`, a prior that materials of a family are near each other.
         weight_decay: Of trunks and heads.
         relative_epsilon: Floor of the relative loss, as a fraction of the trajectory's RMS (design: about 1 %).
         plastic_target: `residual`: relative error of F_hat - F_tr; `full`: of F_hat, the paper to the letter.
@@ -216,6 +217,7 @@ class PretrainModule(LightningModule):
         lr: float = 3e-3,
         latent_lr_factor: float = 10.0,
         latent_decay: float = 0.0,
+        latent_decay_to: Literal["zero", "family"] = "zero",
         weight_decay: float = 1e-4,
         relative_epsilon: float = 0.01,
         plastic_target: Literal["residual", "full"] = "residual",
@@ -237,6 +239,8 @@ class PretrainModule(LightningModule):
                 raise UserError(f"model.{name} = {value}: it must be positive")
         if latent_decay < 0:
             raise UserError(f"model.latent_decay = {latent_decay}: it must not be negative")
+        if latent_decay_to not in ("zero", "family"):
+            raise UserError(f"model.latent_decay_to = {latent_decay_to!r}: choose zero or family")
         if plastic_target not in ("residual", "full"):
             raise UserError(f"model.plastic_target = {plastic_target!r}: choose residual or full")
         self.save_hyperparameters()
@@ -250,6 +254,7 @@ class PretrainModule(LightningModule):
                 each.hidden = torch.compile(each.hidden)  # type: ignore[method-assign]
         self.register_buffer("stress_epsilon", torch.ones(trajectory_count))
         self.register_buffer("residual_epsilon", torch.full((trajectory_count,), RESIDUAL_FLOOR))
+        self.register_buffer("family_mean", torch.eye(trajectory_count), persistent=False)
         self.metrics: ConstitutiveMetrics | None = None
         self.families: list[str] = []
 
@@ -270,19 +275,29 @@ class PretrainModule(LightningModule):
             raise UserError(f"model.trajectory_count = {count}, and the data have {data.trajectory_count} trajectories")
         self.stress_epsilon.copy_(self.hparams.relative_epsilon * data.stress_rms)
         self.residual_epsilon.copy_(self._residual_epsilon(data.residual_rms))
+        alike = torch.tensor([[a == b for b in data.families] for a in data.families], dtype=torch.float32, device=self.device)
+        self.family_mean = alike / alike.sum(1, keepdim=True)
         self.metrics = ConstitutiveMetrics("test/" if stage == "test" else "val/", data.families)
 
     def _residual_epsilon(self, rms: Tensor) -> Tensor:
         return self.hparams.relative_epsilon * rms + RESIDUAL_FLOOR
 
     def configure_optimizers(self) -> dict[str, Any]:
+        decay = self.hparams.latent_decay if self.hparams.latent_decay_to == "zero" else 0.0
         groups = [
             {"params": list(self.operator.parameters()), "weight_decay": self.hparams.weight_decay},
-            {"params": [self.latents], "lr": self.hparams.lr * self.hparams.latent_lr_factor, "weight_decay": self.hparams.latent_decay},
+            {"params": [self.latents], "lr": self.hparams.lr * self.hparams.latent_lr_factor, "weight_decay": decay},
         ]
         optimizer = torch.optim.AdamW(groups, lr=self.hparams.lr, fused=self.latents.is_cuda)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, run_length(self.trainer))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
+        super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        if self.hparams.latent_decay_to == "family":
+            rate = optimizer.param_groups[-1]["lr"] * self.hparams.latent_decay  # decoupled, as AdamW's
+            with torch.no_grad():
+                self.latents.lerp_(self.family_mean @ self.latents, rate)
 
     def training_step(self, batch: TrajectoryBatch, batch_idx: int) -> Tensor:
         answers = self._answer(batch)

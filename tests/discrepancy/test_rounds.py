@@ -5,13 +5,14 @@ import pytest
 
 from neuido.discrepancy import rounds
 from neuido.discrepancy.answer import rejected, trace
-from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, intervals, over
+from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, intervals
 from neuido.discrepancy.fit import levenberg_marquardt, run
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import GAIN_IN_FLOOR, LEAST_GAIN, Inference
 
 T = np.linspace(0.0, 1.0, 120)
 NOISE = 0.01
+WAVES = 3
 
 
 class Line(Problem):
@@ -20,13 +21,13 @@ class Line(Problem):
     Setting 1 has another slope, which `a` makes good, and a wiggle, which nothing does.
     """
 
-    def __init__(self, y, *, wiggle: float = 0.02, solvers: tuple[int, ...] = (0,), waves: int = 3, together: bool = False) -> None:
-        def bent(name, lower=-5.0, **options):
-            return Candidate(name, (Parameter(f"{name}.c", "1", 0.0, 0.3, lower, 5.0),), ({f"{name}.c": 0.3},), "flight", **options)
+    def __init__(self, y, *, wiggle: float = 0.02, solvers: tuple[int, ...] = (0,), together: bool = False) -> None:
+        def bent(name):
+            return Candidate(name, (Parameter(f"{name}.c", "1", 0.0, 0.3, -5.0, 5.0),), ({f"{name}.c": 0.3},), "flight")
 
         clip = Parameter("clip.inverse", "1", 0.0, 0.3, 1e-3, 10.0, log=True)
         candidates = [bent("square"), bent("cube")]
-        for n in range(waves):
+        for n in range(WAVES):
             sizes = tuple(Parameter(f"wave{n}.c{k}", "1", 0.0, 0.1, -5.0, 5.0) for k in range(8))
             candidates.append(Candidate(f"wave{n}", sizes, ({p.name: 0.1 for p in sizes},), "flight"))
         starts = {"clip.inverse": 0.05}, {"clip.inverse": 0.5}  # nothing is clipped at the first
@@ -48,7 +49,7 @@ class Line(Problem):
         out = []
         for p in points:
             y = (p.get("a", 1.0) + 2.0 * setting) * T + self._wiggle * setting * np.sin(40 * T)
-            for n in range(3):
+            for n in range(WAVES):
                 y = y + sum(p.get(f"wave{n}.c{k}", 0.0) * np.sin((k + 1 + 0.3 * n) * T) for k in range(8))
             y = y + p.get("square.c", 0.0) * T**2 + p.get("cube.c", 0.0) * T**3
             out.append(np.minimum(y, 1.0 / p["clip.inverse"]) if p.get("clip.inverse") else y)
@@ -118,11 +119,11 @@ def test_what_lies_within_the_floor_is_not_asked_of_another_method():
 
     found, rounds_of_fits = fitted(lambda t: 3.0 * t + 0.025 * np.sin(33 * t))
     assert found.answer == "none"
-    assert over(found.rounds[0]) < WITHIN
+    assert found.rounds[0].over < WITHIN
     assert rounds_of_fits == 1
     found, rounds_of_fits = fitted(lambda t: 3.0 * t + 0.3 * np.sin(33 * t))
     assert found.answer == "unknown"
-    assert over(found.rounds[0]) > UNEXPLAINED
+    assert found.rounds[0].over > UNEXPLAINED
     assert rounds_of_fits == 2
 
 

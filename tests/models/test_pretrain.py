@@ -214,3 +214,31 @@ def test_decay_draws_back_what_the_laws_do_not_feel():
     assert optimizer.param_groups[0]["weight_decay"] == 1e-4
     with pytest.raises(UserError, match="latent_decay = -1"):
         PretrainModule(40, latent_decay=-1.0)
+
+
+def test_decay_to_the_family_gathers_each_about_its_own_mean(folder, tmp_path):
+    """Weights and latents that learn at no rate but that of the decay: distances within a family shrink, its mean stays."""
+
+    class Still(PretrainModule):
+        def training_step(self, batch, batch_idx):
+            return 0.0 * (super().training_step(batch, batch_idx) + self.latents.sum())
+
+    def run(to):
+        seed_everything(0)
+        data = TrajectoryDataModule(str(folder), batch_size=300)
+        model = Still(6, **SMALL, instance_steps=0, lr=1e-2, latent_decay=5.0, latent_decay_to=to)
+        before = model.latents.detach().clone()
+        trainer(tmp_path, max_steps=3, limit_val_batches=0).fit(model, data)
+        return data.families, before, model.latents.detach()
+
+    families, before, after = run("family")
+    for family in set(families):
+        rows = [i for i, name in enumerate(families) if name == family]
+        mean = before[rows].mean(0)
+        assert torch.allclose(after[rows].mean(0), mean, atol=1e-6)
+        shrunk = (after[rows] - mean).norm() / (before[rows] - mean).norm()
+        assert 0.05 < shrunk < 0.7
+    _, before, after = run("zero")
+    assert torch.allclose(after / before, (after / before)[0, 0].expand_as(after), rtol=1e-4)
+    with pytest.raises(UserError, match="latent_decay_to = 'mean': choose zero or family"):
+        PretrainModule(40, latent_decay_to="mean")
