@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
-from neuido.discrepancy.rounds import ALPHA, LEAST_GAIN, Inference, Round, Start, Tell, Trial
+from neuido.discrepancy.rounds import ALPHA, CLASS_RATIO, LEAST_GAIN, WITHIN, Inference, Round, Start, Tell, Trial
+from neuido.discrepancy.trials import score, unphysical
 
 __all__ = [
     "ALPHA",
@@ -36,8 +37,10 @@ UNEXPLAINED = 2.0
 """Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
 UNEXPLAINED_EXACT = 3.0
 """The same where nothing is discretised: the noise that a folder states is an estimate."""
-WITHIN = 0.5
-"""Share of that floor within which a residual that no effect explains is no reason to look again with another method."""
+FIRST_OF_TWO = math.log(1.2)
+"""Gain of an effect that is tried with a second one, where none gains enough alone."""
+LOOKED_AHEAD = 2
+"""Effects that are."""
 
 
 @dataclass(eq=False)
@@ -85,10 +88,12 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     starts: list[Start] = []
     for n in problem.solvers:
         inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo)
-        if starts and (tried[-1].is_settled(starts[-1].errors) or not inference.runs(starts[0].fit.point)):
+        if starts and tried[-1].is_settled(starts[-1].errors):
             continue
-        tried.append(inference)
-        starts.append(inference.start(starts[0].fit.point if starts else None))
+        start = inference.start(starts[0].fit.point if starts else None)
+        if start is not None:
+            tried.append(inference)
+            starts.append(start)
     settled = [i for i, start in enumerate(starts) if tried[i].is_settled(start.errors)]
     rounds: list[Round] = []
     if settled:
@@ -108,14 +113,16 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
             if firsts[-1].chosen is None and firsts[-1].over < WITHIN:
                 break
         # another method must do clearly better before it takes the place of the suggested one
-        best = [min([t.score for t in r.trials if not t.reason or t in r.members] + [_score(r.errors)]) for r in firsts]
+        best = [min([t.score for t in r.trials if not t.reason or t in r.members] + [score(r.errors)]) for r in firsts]
         chosen = min(range(len(firsts)), key=lambda i: best[i] + (0.0 if i == 0 else math.log(1.2)))
         rounds = [firsts[chosen]]
     inference, start = tried[chosen], starts[chosen]
     if len(tried) > 1:
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
+    if rounds[0].chosen is None and rounds[0].over > _limit(problem):
+        rounds = look_ahead(inference, rounds[0])
     base, floor = start.fit, start.floor
-    found: list[Trial] = []
+    found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
         found.append(step)
@@ -125,11 +132,57 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         floor = inference.floor(base.point)
         rounds.append(inference.round(base, floor, found))
     base, found = drop(inference, base, floor, found)
+    if len(found) > 1:
+        base, found = narrow(inference, base, floor, found, rounds)
     return conclude(inference, start.fit.point, base, found, rounds, floor)
 
 
-def _score(errors: np.ndarray) -> float:
-    return float(np.mean(np.log(np.maximum(errors, 1e-300))))
+def _limit(problem: Problem) -> float:
+    return UNEXPLAINED if problem.settings > 1 else UNEXPLAINED_EXACT
+
+
+def look_ahead(inference: Inference, first: Round) -> list[Round]:
+    """Where no single effect gains enough: the one of the best few beside which another does, and the round that found that one.
+
+    Two effects may each be worth little without the other: a body that slides and dissipates is as badly fitted by friction alone.
+    """
+    chance = max(float(np.quantile(first.null, 1 - ALPHA)) if len(first.null) else 0.0, FIRST_OF_TWO)
+    good = [t for t in first.trials if t.gain > chance and not unphysical(t.candidate, t.fit.point)]
+    for t in good[:LOOKED_AHEAD]:
+        second = inference.round(t.fit, inference.floor(t.fit.point), [t])
+        if second.chosen is not None and evidence.gain(first.errors, second.chosen.errors, inference.fitted) > 2.0 * LEAST_GAIN:
+            t.reason = ""
+            members = [other for other in good if inference.is_rival(other, t)]
+            for other in members:
+                other.reason = ""
+            return [replace(first, chosen=t, members=members), second]
+    return [first]
+
+
+def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:
+    """Weigh each class of effects again beside all others that were found: the best one of each stays, with those near it."""
+    for r in rounds:
+        if r.chosen not in found or len(r.members) == 1:
+            continue
+        rest = [t for t in found if t is not r.chosen]
+        beside = tuple(p for t in rest for p in t.candidate.parameters)
+        own = {p.name for p in r.chosen.candidate.parameters}
+        without = {k: v for k, v in base.point.items() if k not in own}
+        members, requests = [t for t in r.members if t.candidate.name not in {o.candidate.name for o in rest}], []
+        for t in members:
+            start = base.point if t is r.chosen else without | {p.name: t.fit.point[p.name] for p in t.candidate.parameters}
+            requests.append(inference.request((*inference.problem.declared, *beside, *t.candidate.parameters), start))
+        fits = inference.fits(requests, floor)
+        squares = inference.mean_squares([fit.point for fit in fits], floor)
+        weighed = [replace(t, fit=fit, errors=square) for t, fit, square in zip(members, fits, squares, strict=True)]
+        at = min(range(len(weighed)), key=lambda i: weighed[i].penalised)
+        for t, new in zip(members, weighed, strict=True):
+            above = new.score - weighed[at].score
+            if new is not weighed[at] and above > 2.0 * math.log(CLASS_RATIO):
+                t.reason = f"beside {' and '.join(o.candidate.name for o in rest)} it leaves {math.exp(0.5 * above):.1f} times the error"
+        found[found.index(r.chosen)] = members[at]
+        base, r.chosen, r.members = fits[at], members[at], [t for t in members if not t.reason]
+    return base, found
 
 
 def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:
@@ -186,11 +239,10 @@ def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial],
     first = rounds[0]
     kept = {t.candidate.key for t in found}
     steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
-    limit = UNEXPLAINED if inference.problem.settings > 1 else UNEXPLAINED_EXACT
     if found:
         classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
         answer = "class" if max(classes) > 1 else "effect"
-    elif first.over > limit:
+    elif first.over > _limit(inference.problem):
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"

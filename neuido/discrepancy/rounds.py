@@ -23,8 +23,6 @@ ALPHA = 0.05
 """Family-wise level of a named effect."""
 CLASS_RATIO = 1.4
 """Candidates whose errors are within this factor of the best one's are not told from it."""
-PARSIMONY = 0.02
-"""What a further parameter must lower the mean logarithm of the errors' squares by."""
 LEAST_GAIN = math.log(1.7)
 """Smaller gains are no reason to name anything: other solvers differ by as much in ways that no setting of one solver shows."""
 LEAST_GAIN_EXACT = math.log(1.15)
@@ -48,6 +46,10 @@ OWN = 3
 """Candidates that the screening of a second solver may add to those that led with the first one."""
 LEADERS = 4
 """Candidates that are fitted before the others."""
+FAR = 6.0
+"""Times the size that a candidate is screened at, for a fit from elsewhere."""
+WITHIN = 0.5
+"""Share of the floor within which a residual that no effect explains is no reason to look further."""
 POLISHED = 3
 """Candidates whose fits are refined from further starts."""
 
@@ -168,16 +170,21 @@ class Inference:
                 out += [dict(point) | {p.name: min(max(value * f, p.lower), p.upper)} for f in (0.5, 2.0)]
         return out
 
-    def start(self, near: Point | None = None) -> "Start":
-        """The base fit, with what noise and discretisation do to it; from about the declared values, or from them and from `near`."""
+    def start(self, near: Point | None = None) -> Start | None:
+        """The base fit, with what noise and discretisation do to it; from about the declared values, or from them and from `near`.
+
+        None: given `near`, the fit ends where not every recording can be predicted.
+        """
         # the first fit only says where the floor is to be found
         fit = self.base([{}, near] if near else self.starts({}), self.noise(), iterations=6, tolerance=ROUGH)
+        if near is not None and not self.runs(fit.point):
+            return None
         floor = self.floor(fit.point)
         fit = self.base([fit.point], floor)
         return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
 
     def runs(self, point: Point) -> bool:
-        """Whether every recording can be predicted there: finite elements tangle where sand flows."""
+        """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""
         return all(bool(np.isfinite(self.memo.predict([point], p.recording, self.setting)).all()) for p in self.parts)
 
     def is_noise(self, errors: np.ndarray) -> bool:
@@ -309,30 +316,36 @@ class Inference:
         self.tell(f"fitting {', '.join(chosen)}")
         best = self.contest(free, starts, floor)
         best |= self.polish(free, best, base, floor)
-        squares = self.mean_squares([fit.point for _, fit in best.values()], floor)
+        model = self._linear(base.point, floor, slopes, columns, chosen, everywhere, candidates)
+        empty = Round(base.point, errors, [], None, [], 1.0, floor, self.floors(base.point, free, floor), null=model.null(self.draws))
+        result = self.judge(empty, best, model, list(chosen))
+        if first and result.chosen is None and result.over > WITHIN:
+            best |= self.elsewhere(best, {key: c.starts[i] for c in candidates for key, i in chosen.items() if c.key == key}, floor)
+            result = self.judge(empty, best, model, list(chosen))
+        return result
+
+    def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel, asked: Sequence[str]) -> Round:
+        """A round with the trials that fits make, and what is chosen of them; `asked` are the keys that were to be fitted."""
+        errors = empty.errors
+        squares = self.mean_squares([fit.point for _, fit in best.values()], empty.floor)
         trials = []
         for (c, fit), square in zip(best.values(), squares, strict=True):
             trial = Trial(c, fit, square, evidence.gain(errors, square, self.fitted))
             trial.reason = unphysical(c, fit.point)
             trials.append(trial)
         trials.sort(key=lambda t: t.score)
-        model = self._linear(base.point, floor, slopes, columns, chosen, everywhere, candidates)
-        null = model.null(self.draws)
         good = [t for t in trials if not t.reason]
-        top = min(good, key=lambda t: t.score + PARSIMONY * len(t.candidate.size_parameters)) if good else None
-        p = float((1 + np.sum(null >= top.gain)) / (1 + len(null))) if top else 1.0
-        floors = self.floors(base.point, free, floor)
-        result = Round(
-            base.point, errors, trials, None, [], p, floor, floors, null=null, needless=[key for key in chosen if key not in best]
-        )
+        top = min(good, key=lambda t: t.penalised) if good else None
+        p = float((1 + np.sum(empty.null >= top.gain)) / (1 + len(empty.null))) if top else 1.0
+        result = replace(empty, trials=trials, p_value=p, cosines={}, needless=[key for key in asked if key not in best])
         if top is None:
             return result
         for t in trials:
             if t.candidate.key in model.keys and top.candidate.key in model.keys:
                 result.cosines[t.candidate.key] = model.cosine(t.candidate.key, top.candidate.key)
-        if p <= ALPHA and top.gain > self.least_gain(errors, result.floors):
+        if p <= ALPHA and top.gain > self.least_gain(errors, result.floors, top.errors):
             result.chosen = top
-            result.members = [t for t in good if self._is_rival(t, top)]
+            result.members = [t for t in good if self.is_rival(t, top)]
         for t in trials:
             if not t.reason and t not in result.members:
                 t.reason = self._why(t, top, result)
@@ -360,10 +373,12 @@ class Inference:
         ]
         return self.noise_squares + np.nanmean(left, axis=1)
 
-    def least_gain(self, errors: np.ndarray, floors: np.ndarray) -> float:
-        """The gain that an effect must bring, from the size of the residual over the floor; mean squares of the parts."""
+    def least_gain(self, errors: np.ndarray, floors: np.ndarray, left: np.ndarray) -> float:
+        """The gain that an effect must bring, from the residual over the floor and what it leaves, all as mean squares of the parts."""
         if self.problem.settings == 1:  # nothing is discretised: only chance is to be beaten
             return LEAST_GAIN_EXACT
+        if self.is_noise(left):  # whatever the floor, no error of the discretisation is in there
+            return LEAST_GAIN
         share = min(max(math.log(times_over(errors, floors)) / math.log(1.5), 0.0), 1.0)  # from the floor itself to half as much again
         return GAIN_IN_FLOOR + share * (LEAST_GAIN - GAIN_IN_FLOOR)
 
@@ -435,7 +450,24 @@ class Inference:
                 out[c.key] = (c, fit)
         return out
 
-    def _is_rival(self, t: Trial, top: Trial) -> bool:
+    def elsewhere(
+        self, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of one size once more, from the declared values and a larger size: the slope at zero may have led into a side valley."""
+        requests, of, race = [], [], Race(min(fit.cost for _, fit in best.values()))
+        for key, (c, fit) in best.items():
+            if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
+                continue
+            (p,) = c.size_parameters
+            size = math.copysign(FAR * abs(starts[key][p.name]), fit.point[p.name])
+            begin = dict(fit.point) | {d.name: d.value for d in self.problem.declared} | {p.name: min(max(size, p.lower), p.upper)}
+            requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
+            of.append(c)
+        self.tell(f"again from elsewhere: {', '.join(c.key for c in of)}")
+        fits = zip(of, self.fits(requests, floor), strict=True)
+        return {c.key: (c, fit) for c, fit in fits if fit.cost < best[c.key][1].cost}
+
+    def is_rival(self, t: Trial, top: Trial) -> bool:
         """Whether the data cannot tell `t` from the best one: about its errors, a gain of its own, and not by many more parameters."""
         more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
         if more >= 3 and t.score > top.score - 0.1:
@@ -444,7 +476,7 @@ class Inference:
 
     def _why(self, t: Trial, top: Trial, result: Round) -> str:
         if result.chosen is None:
-            at_least = max(float(np.quantile(result.null, 1 - ALPHA)), self.least_gain(result.errors, result.floors))
+            at_least = max(float(np.quantile(result.null, 1 - ALPHA)), self.least_gain(result.errors, result.floors, t.errors))
             return f"lowers the error {math.exp(t.gain):.2f}-fold; with nuisances and discretisation it takes {math.exp(at_least):.2f}-fold"
         return f"leaves {math.exp(0.5 * (t.score - top.score)):.1f} times the error of {top.candidate.name}"
 

@@ -1,5 +1,6 @@
 """What the steps of a diagnosis leave: the declared model fitted, candidates fitted in full, and what one step of the growth found."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,6 +9,8 @@ from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.problem import Candidate, Point
 
+PARSIMONY = 0.04
+"""What a further parameter must lower the mean logarithm of the errors' squares by."""
 LED = 5
 """Candidates of the best scores that lead a round."""
 
@@ -36,8 +39,13 @@ class Trial:
 
     @property
     def score(self) -> float:
-        """Mean logarithm of its errors: lower is better."""
-        return float(np.mean(np.log(np.maximum(self.errors, 1e-300))))
+        """Of its errors: lower is better."""
+        return score(self.errors)
+
+    @property
+    def penalised(self) -> float:
+        """The score, made worse for each parameter."""
+        return self.score + PARSIMONY * len(self.candidate.size_parameters)
 
 
 @dataclass(eq=False)
@@ -69,9 +77,14 @@ class Round:
         return list(dict.fromkeys(t.candidate.key for t in (*self.members, *self.trials[:LED])))
 
 
+def score(errors: np.ndarray) -> float:
+    """Mean logarithm of the mean squares of the parts."""
+    return float(np.mean(np.log(np.maximum(errors, 1e-300))))
+
+
 def times_over(errors: np.ndarray, floors: np.ndarray) -> float:
     """Ratio of errors, both given as mean squares of the parts: the geometric mean over these."""
-    return float(np.exp(0.5 * np.mean(np.log(np.maximum(errors, 1e-300) / floors))))
+    return math.exp(0.5 * (score(errors) - score(floors)))
 
 
 def unphysical(c: Candidate, point: Point) -> str:

@@ -193,7 +193,7 @@ class PretrainModule(LightningModule):
         lr: Learning rate of trunks and heads; AdamW with a cosine to zero over the run (paper).
         latent_lr_factor: The latents learn with this many times `lr`.
         latent_decay: Weight decay of the latents. Adam moves them at random wherever the laws do not feel them, and this draws that back.
-        latent_decay_to: What that draws them to: `zero`, or the mean of their `family`, a prior that materials of a family are near each other.
+        latent_decay_to: What that draws them to: `zero`, or the mean of their `family`.
         weight_decay: Of trunks and heads.
         relative_epsilon: Floor of the relative loss, as a fraction of the trajectory's RMS (design: about 1 %).
         plastic_target: `residual`: relative error of F_hat - F_tr; `full`: of F_hat, the paper to the letter.

@@ -90,7 +90,7 @@ def test_the_floor_is_what_a_refit_leaves():
     floors = inference.floors(start.fit.point, inference.problem.declared, start.floor)
     assert floors == pytest.approx(NOISE**2 + 0.02**2 / 2, rel=0.2)
     # and the gain that it takes goes by that
-    small, large = (inference.least_gain(k * floors, floors) for k in (0.5, 4.0))
+    small, large = (inference.least_gain(k * floors, floors, floors) for k in (0.5, 4.0))
     assert (small, large) == (GAIN_IN_FLOOR, LEAST_GAIN)
 
 
@@ -150,3 +150,84 @@ def test_what_is_too_near_to_the_noise_for_any_gain_is_not_screened():
     assert inference.is_settled(np.array([2.5, 100.0]) * NOISE**2)  # the gain is the smaller one of the two
     assert not inference.is_noise(np.array([2.5, 100.0]) * NOISE**2)
     assert not inference.is_settled(np.array([4.0, 4.0]) * NOISE**2)
+
+
+class Tones(Line):
+    """Line with tones: `low`, `high`, and `chord`, which is both and something that no other has."""
+
+    def __init__(self, y, *names):
+        super().__init__(y, wiggle=0.0)
+        own = [Candidate(n, (Parameter(f"{n}.c", "1", 0.0, 0.1, -5.0, 5.0),), ({f"{n}.c": 0.1},), "flight") for n in names]
+        self.__dict__["candidates"] = (*self.candidates, *own)
+
+    def predict(self, points, recording, setting=0):
+        low, high, other = (np.sin(w * T) for w in (40, 62, 87))
+        shapes = {"low": low, "high": high, "chord": low + 0.2 * high + 0.6 * other}
+        rows = super().predict(points, recording)
+        return rows + np.stack([sum(p.get(f"{name}.c", 0.0) * shape for name, shape in shapes.items()) for p in points])
+
+
+def test_two_effects_of_which_none_gains_enough_alone():
+    def both(t):
+        return 3.0 * t + 0.3 * np.sin(40 * t) + 0.3 * np.sin(62 * t)
+
+    found = diagnose(Tones(both, "low", "high"))
+    assert sorted(t.candidate.name for t in found.effects) == ["high", "low"]
+    assert found.errors["after"]["two"] == pytest.approx(NOISE, rel=0.3)
+    first = found.rounds[0]
+    assert first.chosen.gain < LEAST_GAIN  # 1.4-fold
+    # a residual that no pair explains stays unknown
+    lost = diagnose(Tones(lambda t: both(t) + 0.6 * np.sin(110 * t) + 0.6 * np.sin(150 * t), "low", "high"))
+    assert lost.answer == "unknown"
+
+
+def test_a_class_is_weighed_again_beside_what_was_found_later():
+    found = diagnose(Tones(lambda t: 3.0 * t + 0.5 * np.sin(40 * t) + 0.25 * np.sin(62 * t), "low", "high", "chord"))
+    assert sorted(t.candidate.name for t in found.effects) == ["high", "low"]
+    assert all(len(r.members) == 1 for r in found.rounds if r.chosen)
+    reasons = {r["name"]: r["reason"] for r in rejected(found)}
+    assert reasons["chord"].startswith("beside high it leaves")
+
+
+def test_what_leaves_noise_alone_need_not_pass_the_floor():
+    inference = Inference(Line(lambda t: 3.0 * t))
+    errors, floors, noise = np.full(2, 9.0) * NOISE**2, np.full(2, 36.0) * NOISE**2, np.full(2, NOISE**2)
+    assert inference.least_gain(errors, floors, 1.2 * noise) == LEAST_GAIN
+    assert inference.least_gain(errors, floors, 3.0 * noise) == GAIN_IN_FLOOR
+
+
+def test_a_method_that_fails_at_one_point_is_tried_all_the_same():
+    class Tangled(Line):
+        """Setting 1 runs nowhere near the slope of the other one's fit."""
+
+        def predict(self, points, recording, setting=0):
+            rows = super().predict(points, recording, setting)
+            rows[[setting == 1 and p.get("a", 1.0) > 4.9 for p in points]] = np.nan
+            return rows
+
+    problem = Tangled(lambda t: 5.0 * t + 0.1 * np.sin(40 * t), wiggle=0.1, solvers=(0, 1))
+    found = diagnose(problem)
+    assert found.setting == 1
+    assert found.answer == "none"
+    assert found.after["a"] == pytest.approx(3.0, abs=0.01)
+
+
+def test_a_size_behind_a_ridge_is_found_from_elsewhere(monkeypatch):
+    class Ridge(Line):
+        """`step` acts as c (c - 1/2): small sizes do the opposite of large ones."""
+
+        def __init__(self, y):
+            super().__init__(y)
+            own = Candidate("step", (Parameter("step.c", "1", 0.0, 0.1, 0.0, 5.0),), ({"step.c": 0.1},), "flight")
+            self.__dict__["candidates"] = (*self.candidates, own)
+
+        def predict(self, points, recording, setting=0):
+            rows = super().predict(points, recording, setting)
+            return rows + np.stack([(p.get("step.c", 0.0) * (p.get("step.c", 0.0) - 0.5)) * np.sin(50 * T) for p in points])
+
+    problem = Ridge(lambda t: 3.0 * t + 3.0 * np.sin(50 * t))
+    found = diagnose(problem, keep=12)
+    assert [t.candidate.name for t in found.effects] == ["step"]
+    assert found.after["step.c"] == pytest.approx(2.0, abs=0.02)
+    monkeypatch.setattr(rounds, "FAR", 1.0)
+    assert diagnose(problem, keep=12).answer == "unknown"
