@@ -37,10 +37,8 @@ UNEXPLAINED = 2.0
 """Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
 UNEXPLAINED_EXACT = 3.0
 """The same where nothing is discretised: the noise that a folder states is an estimate."""
-FIRST_OF_TWO = math.log(1.2)
-"""Gain of an effect that is tried with a second one, where none gains enough alone."""
 LOOKED_AHEAD = 2
-"""Effects that are."""
+"""Effects that are tried with a second one, where none gains enough alone."""
 
 
 @dataclass(eq=False)
@@ -119,7 +117,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     inference, start = tried[chosen], starts[chosen]
     if len(tried) > 1:
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
-    if rounds[0].chosen is None and rounds[0].over > _limit(problem):
+    if rounds[0].chosen is None and rounds[0].trials:
         rounds = look_ahead(inference, rounds[0])
     base, floor = start.fit, start.floor
     found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
@@ -146,9 +144,10 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
 
     Two effects may each be worth little without the other: a body that slides and dissipates is as badly fitted by friction alone.
     """
-    chance = max(float(np.quantile(first.null, 1 - ALPHA)) if len(first.null) else 0.0, FIRST_OF_TWO)
-    good = [t for t in first.trials if t.gain > chance and not unphysical(t.candidate, t.fit.point)]
-    for t in good[:LOOKED_AHEAD]:
+    good = [t for t in first.trials if t.gain > inference.by_chance(first) and not unphysical(t.candidate, t.fit.point)]
+    if first.over < _limit(inference.problem):  # it may all be the discretisation
+        good = [t for t in good if t.gain > LEAST_GAIN]
+    for t in sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]:
         second = inference.round(t.fit, inference.floor(t.fit.point), [t])
         if second.chosen is not None and evidence.gain(first.errors, second.chosen.errors, inference.fitted) > 2.0 * LEAST_GAIN:
             t.reason = ""

@@ -105,7 +105,7 @@ def levenberg_marquardt(
         tolerance: Relative gain of an iteration that ends the fit.
         damping: Of the first step.
         together: Ask for all dampings and slopes of a step at once, where a launch of several points costs as one; else for few.
-        race: The fits that it is compared with; where every point costs, a fit that trails gives up earlier.
+        race: The fits that it is compared with.
         slopes: About the derivatives of the whitened residuals by the coordinates at the start, (n, p); without the priors' rows.
     """
     names = tuple(p.name for p in parameters)
@@ -157,7 +157,7 @@ def levenberg_marquardt(
             move, change = tried[best] - q, found[best] - r
             q, r, cost = tried[best], found[best], ends[best]
             damping = max(damping * DAMPINGS[best], 1e-6)
-            behind = race is not None and cost > 1.1 * race.best and not together  # few more points of a launch cost little
+            behind = race is not None and cost > 1.1 * race.best
             small = gain < tolerance * (TRAILING if behind else 1.0) and moved < 0.5
             converged = small and (fresh or behind)
             if together or (small and not converged) or not (kept or fresh):

@@ -46,6 +46,8 @@ OWN = 3
 """Candidates that the screening of a second solver may add to those that led with the first one."""
 LEADERS = 4
 """Candidates that are fitted before the others."""
+SOME_GAIN = math.log(1.2)
+"""Smaller gains are no reason to look further."""
 FAR = 6.0
 """Times the size that a candidate is screened at, for a fit from elsewhere."""
 WITHIN = 0.5
@@ -319,7 +321,7 @@ class Inference:
         model = self._linear(base.point, floor, slopes, columns, chosen, everywhere, candidates)
         empty = Round(base.point, errors, [], None, [], 1.0, floor, self.floors(base.point, free, floor), null=model.null(self.draws))
         result = self.judge(empty, best, model, list(chosen))
-        if first and result.chosen is None and result.over > WITHIN:
+        if first and result.chosen is None and result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials):
             best |= self.elsewhere(best, {key: c.starts[i] for c in candidates for key, i in chosen.items() if c.key == key}, floor)
             result = self.judge(empty, best, model, list(chosen))
         return result
@@ -449,6 +451,10 @@ class Inference:
             if fit.cost < least:
                 out[c.key] = (c, fit)
         return out
+
+    def by_chance(self, r: Round) -> float:
+        """Gain up to which an effect is not worth another look, be it alone or with a second one."""
+        return max(float(np.quantile(r.null, 1 - ALPHA)) if len(r.null) else 0.0, SOME_GAIN)
 
     def elsewhere(
         self, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
