@@ -148,7 +148,8 @@ def place(x: np.ndarray, t: np.ndarray, predicted: np.ndarray, *, sigma: float) 
         sigma: Noise of a coordinate [m].
     """
     shape = hats(predicted[0])
-    shape = shape[shape.sum(axis=1) > 1.0]  # those with hardly a point are noise
+    points = shape.sum(axis=1)
+    shape = shape[points > min(1.0, 0.5 * float(points.max()))]  # those with hardly a point are noise
     fields = np.einsum("kn,ac->kanc", shape, np.eye(3)).reshape(-1, *predicted.shape[1:])
     total = np.zeros(len(shape))
     for bump in windows(t):

@@ -17,7 +17,7 @@ from neuido.models.conditions import read_conditions, run_condition
 from neuido.models.filmed import FIGURES, FilmedModule, plainly
 from neuido.models.methods import CARD, Method, scalars
 from neuido.models.pipeline import Laws, Prepared, folder_of, prepare, roll_surely
-from neuido.models.progress import Progress, restore, snapshot
+from neuido.models.progress import Progress, restore
 from neuido.models.scene_fit import EffectSource, SceneFit
 from neuido.types import ParticleState
 
@@ -202,20 +202,19 @@ class AdaptModule(FilmedModule):
         return self._weighted(loss, silhouette) + regular
 
     def _roll_or_undo(self, prepared: Prepared, fit: SceneFit, frames: int) -> ParticleState | None:
-        """The motion; where it fails that of the last parameters that ran, to which the fit returns with half the rates; or none."""
+        """The motion; where it fails that of parameters that ran, to which the fit returns with half the rates; or none."""
         name = prepared.source.name
         progress = self._progress[name]
         for _ in range(2):
             try:
                 motion = fit.roll(prepared, frames, segment=self.hparams.segment)
-                progress.good = snapshot(fit)
+                progress.ran(fit)
                 return motion
             except UserError as error:  # a law that cannot run has no image
                 print(f"{name}: {error}", file=sys.stderr)
                 self._log({"train/failed": 1.0})
-            if not restore(fit, progress.good):
+            if not progress.undo(fit):
                 return None
-            progress.damping *= 0.5
         return None
 
     def _weighted(self, loss: Tensor, silhouette: Tensor) -> Tensor:
@@ -229,12 +228,15 @@ class AdaptModule(FilmedModule):
         return filmed.frames_at((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """A step whose gradient is not finite is left out."""
+        """A step whose gradient is not finite is left out, and undone as one whose law does not run."""
         gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
         if gradients and not bool(torch.stack([g.isfinite().all() for g in gradients]).all()):
             self._log({"train/not_finite": 1.0})
             for g in gradients:
                 g.zero_()
+            if self._current is not None:
+                name = self._current[0]
+                self._progress[name].undo(self.fit_of(name))
 
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
         name, prepared = self._current  # type: ignore[misc]
@@ -290,7 +292,7 @@ class AdaptModule(FilmedModule):
             return
         if not restore(fit, progress.best) and self._try(prepared, fit) is None:  # the last step's law was never run
             restore(fit, progress.good)
-        progress.best, progress.good = {}, {}
+        progress.best, progress.good, progress.first = {}, {}, {}
         fit.save(folder_of(self.hparams.out, name) / "fit")
         self._score_fit("after")
         self._current = None

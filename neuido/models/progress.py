@@ -8,6 +8,10 @@ from torch import Tensor, nn
 
 LEAST = 0.01
 """The share by which a loss must fall to count as lower."""
+RECENT = 5
+"""Steps after a failure within which another one says that the last parameters that ran are themselves at the edge."""
+RECOVERY = 2.0**0.1
+"""Factor on the rates of each step that runs, up to their own."""
 
 
 @dataclass
@@ -24,7 +28,9 @@ class Progress:
     """Of Warp's pool, since the process began."""
     done: bool = False
     damping: float = 1.0
-    """Factor on the rates; it is halved when a step has led to a law that does not run."""
+    """Factor on the rates; it is halved when a step has led to a law that does not run, and comes back in ten that do."""
+    failed_at: int = -RECENT - 1
+    """Step of the last failure."""
     lowest: float = float("inf")
     lowest_at: int = 0
     over: bool = False
@@ -33,6 +39,22 @@ class Progress:
     """The parameters of the lowest loss."""
     good: dict[str, Tensor] = field(default_factory=dict)
     """The last parameters that ran."""
+    first: dict[str, Tensor] = field(default_factory=dict)
+    """The first ones that did."""
+
+    def ran(self, fit: nn.Module) -> None:
+        """The parameters have run."""
+        self.good = snapshot(fit)
+        self.first = self.first or self.good
+        self.damping = min(1.0, self.damping * RECOVERY)
+
+    def undo(self, fit: nn.Module) -> bool:
+        """Go back to the last parameters that ran, and halfway to the first ones where those lead nowhere; whether there were any."""
+        if self.steps - self.failed_at <= RECENT:
+            self.good = {name: torch.lerp(value, self.first[name], 0.5) for name, value in self.good.items()}
+        self.failed_at = self.steps
+        self.damping *= 0.5
+        return restore(fit, self.good)
 
     def see(self, value: float, fit: nn.Module, patience: int) -> None:
         """Take the loss of a fit; `over` becomes true after `patience` steps without a lower one."""

@@ -148,3 +148,12 @@ def test_place_finds_the_corner_that_is_pushed():
     assert excess > 3
     signs = np.sign(where - X.mean(axis=0))
     np.testing.assert_array_equal(signs, [1, 1, -1])
+
+
+def test_place_of_few_points():
+    few = np.linspace(0, len(X) - 1, 6).astype(int)
+    before = falling(np.array([0.0, -9.8, 0.0]))[:, few]
+    x = before + np.linspace(0.0, 0.1, 6)[:, None] * 0.5 * T[:, None, None] ** 2
+    where, excess = residual.place(x, T, before, sigma=1e-4)
+    assert np.isfinite(where).all()
+    assert excess >= 1.0

@@ -22,7 +22,7 @@ from neuido.models.filmed import image_losses
 from neuido.models.methods import Method
 from neuido.models.operator import IntrinsicDynamicsOperator
 from neuido.models.pipeline import prepare
-from neuido.models.progress import Progress
+from neuido.models.progress import RECOVERY, Progress
 from neuido.models.scene_fit import EffectSource, SceneFit
 from neuido.physics.effects import Effects
 from tests.models.visual_samples import TinyScenes, tiny_scene
@@ -176,9 +176,37 @@ def test_a_step_into_a_law_that_cannot_run_is_undone(tmp_path, capsys):
     model.optimizer_step = thrown
     trainer(tmp_path).fit(model, TinyScenes(str(tmp_path), youngs=(5e4,)))
     assert "tiny-0:" in capsys.readouterr().err
-    assert model._progress["tiny-0"].damping == 0.5
+    assert model._progress["tiny-0"].damping == 0.5 * RECOVERY**2
     after = rows_of(tmp_path / "out" / "scores.csv")[-1]
     assert after["stage"] == "after" and float(after["psnr"]) > 20
+
+
+def test_parameters_at_the_edge_of_what_runs_are_left():
+    """The last ones that ran help nobody whose next step fails again: halfway back to the first ones, and the rates recover."""
+    fit, progress = torch.nn.Linear(1, 1, bias=False), Progress()
+
+    def put(value, runs):
+        fit.weight.data.fill_(value)
+        if runs:
+            progress.ran(fit)
+        else:
+            assert progress.undo(fit)
+        progress.steps += 1
+        return float(fit.weight.detach())
+
+    assert not progress.undo(fit)  # nothing has run yet
+    progress = Progress()
+    put(0.0, True)
+    put(1.0, True)
+    assert put(1.01, False) == 1.0
+    put(1.0, True)
+    assert put(1.001, False) == 0.5
+    assert put(0.6, False) == 0.25
+    assert progress.damping == pytest.approx(0.125 * RECOVERY)
+    for _ in range(40):
+        put(0.9, True)
+    assert progress.damping == 1.0
+    assert put(1.0, False) == pytest.approx(0.9)
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path):
