@@ -1,7 +1,7 @@
 """From a residual to a name: grow the model by one effect at a time, drop what became needless, and say how sure the answer is."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +37,8 @@ UNEXPLAINED = 2.0
 """Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
 UNEXPLAINED_EXACT = 3.0
 """The same where nothing is discretised: the noise that a folder states is an estimate."""
+WORSE = 1.5
+"""Times the error of the better method at which the other one is not asked any more, where that found nothing."""
 LOOKED_AHEAD = 2
 """Effects that are tried with a second one, where none gains enough alone."""
 
@@ -92,47 +94,58 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         if start is not None:
             tried.append(inference)
             starts.append(start)
-    settled = [i for i, start in enumerate(starts) if tried[i].is_settled(start.errors)]
-    rounds: list[Round] = []
-    if settled:
-        chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
-        start = starts[chosen]
-        floors = tried[chosen].noise_squares
-        if not tried[chosen].is_noise(start.errors):
-            floors = tried[chosen].floors(start.fit.point, problem.declared, start.floor)
-        rounds = [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]
-    else:
-        firsts: list[Round] = []
-        for inference, start in zip(tried, starts, strict=True):
-            leaders = firsts[0].leaders if firsts and firsts[0].chosen else None
-            firsts.append(inference.round(start.fit, start.floor, [], leaders))
-            if firsts[-1].trials and inference.is_noise(firsts[-1].trials[0].errors):
-                break
-            if firsts[-1].chosen is None and firsts[-1].over < WITHIN:
-                break
-        # another method must do clearly better before it takes the place of the suggested one
-        best = [min([t.score for t in r.trials if not t.reason or t in r.members] + [score(r.errors)]) for r in firsts]
-        chosen = min(range(len(firsts)), key=lambda i: best[i] + (0.0 if i == 0 else math.log(1.2)))
-        rounds = [firsts[chosen]]
+    chosen, first = first_round(tried, starts)
     inference, start = tried[chosen], starts[chosen]
     if len(tried) > 1:
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
-    if rounds[0].chosen is None and rounds[0].trials:
-        rounds = look_ahead(inference, rounds[0])
-    base, floor = start.fit, start.floor
+    rounds = look_ahead(inference, first) if first.chosen is None and first.trials else [first]
+    at, floor = start.fit, start.floor
     found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
         found.append(step)
-        base = step.fit
+        at = step.fit
         if len(found) == most or inference.is_settled(step.errors):
             break
-        floor = inference.floor(base.point)
-        rounds.append(inference.round(base, floor, found))
-    base, found = drop(inference, base, floor, found)
+        floor = inference.floor(at.point)
+        rounds.append(inference.round(at, floor, found))
+    at, found = drop(inference, at, floor, found)
     if len(found) > 1:
-        base, found = narrow(inference, base, floor, found, rounds)
-    return conclude(inference, start.fit.point, base, found, rounds, floor)
+        at, found = narrow(inference, at, floor, found, rounds)
+    return conclude(inference, start.fit.point, at, found, rounds, floor)
+
+
+def first_round(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[int, Round]:
+    """Which of the methods goes on, and its first round.
+
+    The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for.
+    """
+    settled = [i for i, start in enumerate(starts) if tried[i].is_settled(start.errors)]
+    if settled:
+        chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
+        inference, start = tried[chosen], starts[chosen]
+        floors = inference.noise_squares
+        if not inference.is_noise(start.errors):
+            floors = inference.floors(start.fit.point, inference.problem.declared, start.floor)
+        return chosen, Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)
+    # another method must do clearly better before it takes the place of the suggested one
+    handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
+    base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
+    order = sorted(range(len(tried)), key=lambda i: base[i])
+    firsts: dict[int, Round] = {}
+    for i in order:
+        so_far = next(iter(firsts.values()), None)
+        if so_far and so_far.chosen is None and base[i] - base[order[0]] > 2.0 * math.log(WORSE):
+            continue
+        leaders = so_far.leaders if so_far and so_far.chosen else None
+        r = firsts[i] = tried[i].round(starts[i].fit, starts[i].floor, [], leaders)
+        if r.trials and tried[i].is_noise(r.trials[0].errors):
+            break
+        if r.chosen is None and r.over < WITHIN:
+            break
+    best = {i: min([t.score for t in r.trials if not t.reason or t in r.members] + [score(r.errors)]) for i, r in firsts.items()}
+    chosen = min(firsts, key=lambda i: best[i] + handicap[i])
+    return chosen, firsts[chosen]
 
 
 def _limit(problem: Problem) -> float:

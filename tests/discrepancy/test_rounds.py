@@ -127,6 +127,15 @@ def test_what_lies_within_the_floor_is_not_asked_of_another_method():
     assert rounds_of_fits == 2
 
 
+def test_the_method_that_fits_best_begins_and_a_much_worse_one_is_not_asked():
+    lines = []
+    y = Line(lambda t: t, wiggle=0.5).predict([{"a": 1.0}], 0, 1)[0]
+    found = diagnose(Line(lambda t: y + 0.1 * np.sin(33 * t), wiggle=0.5, solvers=(0, 1)), tell=lines.append)
+    assert found.setting == 1
+    assert found.answer in ("none", "unknown")
+    assert sum(line.startswith("fitting ") for line in lines) == 1
+
+
 def test_an_interval_leaves_room_for_what_only_the_held_out_recording_shows():
     inference = Inference(Line(lambda t: 3.0 * t))
     start = inference.start()
