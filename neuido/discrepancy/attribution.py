@@ -94,11 +94,10 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         if start is not None:
             tried.append(inference)
             starts.append(start)
-    chosen, first = first_round(tried, starts)
+    chosen, rounds = first_rounds(tried, starts)
     inference, start = tried[chosen], starts[chosen]
     if len(tried) > 1:
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
-    rounds = look_ahead(inference, first) if first.chosen is None and first.trials else [first]
     at, floor = start.fit, start.floor
     found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
     while rounds[-1].chosen is not None:
@@ -115,8 +114,8 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     return conclude(inference, start.fit.point, at, found, rounds, floor)
 
 
-def first_round(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[int, Round]:
-    """Which of the methods goes on, and its first round.
+def first_rounds(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[int, list[Round]]:
+    """Which of the methods goes on, and its first round, or two where it takes two effects to gain enough.
 
     The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for.
     """
@@ -127,23 +126,27 @@ def first_round(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[in
         floors = inference.noise_squares
         if not inference.is_noise(start.errors):
             floors = inference.floors(start.fit.point, inference.problem.declared, start.floor)
-        return chosen, Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)
+        return chosen, [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]
     # another method must do clearly better before it takes the place of the suggested one
     handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
     order = sorted(range(len(tried)), key=lambda i: base[i])
-    firsts: dict[int, Round] = {}
+    firsts: dict[int, list[Round]] = {}
     for i in order:
-        so_far = next(iter(firsts.values()), None)
-        if so_far and so_far.chosen is None and base[i] - base[order[0]] > 2.0 * math.log(WORSE):
+        named = [rounds[0] for rounds in firsts.values() if rounds[0].chosen]
+        if firsts and not named and base[i] - base[order[0]] > 2.0 * math.log(WORSE):
             continue
-        leaders = so_far.leaders if so_far and so_far.chosen else None
-        r = firsts[i] = tried[i].round(starts[i].fit, starts[i].floor, [], leaders)
-        if r.trials and tried[i].is_noise(r.trials[0].errors):
+        first = tried[i].round(starts[i].fit, starts[i].floor, [], named[0].leaders if named else None)
+        firsts[i] = look_ahead(tried[i], first)
+        last = firsts[i][-1]
+        if last.trials and tried[i].is_noise(last.trials[0].errors):
             break
-        if r.chosen is None and r.over < WITHIN:
+        if last.chosen is None and last.over < WITHIN:
             break
-    best = {i: min([t.score for t in r.trials if not t.reason or t in r.members] + [score(r.errors)]) for i, r in firsts.items()}
+    best = {
+        i: min([t.score for r in rounds for t in r.trials if not t.reason or t in r.members] + [score(rounds[0].errors)])
+        for i, rounds in firsts.items()
+    }
     chosen = min(firsts, key=lambda i: best[i] + handicap[i])
     return chosen, firsts[chosen]
 
@@ -157,6 +160,8 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
 
     Two effects may each be worth little without the other: a body that slides and dissipates is as badly fitted by friction alone.
     """
+    if first.chosen is not None or not first.trials:
+        return [first]
     good = [t for t in first.trials if t.gain > inference.by_chance(first) and not unphysical(t.candidate, t.fit.point)]
     if first.over < _limit(inference.problem):  # it may all be the discretisation
         good = [t for t in good if t.gain > LEAST_GAIN]
