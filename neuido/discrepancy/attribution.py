@@ -11,7 +11,7 @@ from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
-from neuido.discrepancy.rounds import ALPHA, CLASS_RATIO, LEAST_GAIN, WITHIN, Inference, Round, Start, Tell, Trial
+from neuido.discrepancy.rounds import ALPHA, CLASS_RATIO, LEAST_GAIN, MANY, WITHIN, Inference, Round, Start, Tell, Trial
 from neuido.discrepancy.trials import score, unphysical
 
 __all__ = [
@@ -166,7 +166,7 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
     if first.over < _limit(inference.problem):  # it may all be the discretisation
         good = [t for t in good if t.gain > LEAST_GAIN]
     for t in sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]:
-        second = inference.round(t.fit, inference.floor(t.fit.point), [t])
+        second = inference.round(t.fit, inference.floor(t.fit.point), [t], most=MANY)
         if second.chosen is not None and evidence.gain(first.errors, second.chosen.errors, inference.fitted) > 2.0 * LEAST_GAIN:
             t.reason = ""
             members = [other for other in good if inference.is_rival(other, t)]

@@ -281,7 +281,9 @@ class Inference:
 
     # One round.
 
-    def round(self, base: Fit, floor: Floor, found: Sequence[Trial], leaders: Sequence[str] | None = None) -> Round:
+    def round(
+        self, base: Fit, floor: Floor, found: Sequence[Trial], leaders: Sequence[str] | None = None, *, most: float = math.inf
+    ) -> Round:
         """Look for one more effect beside those that were found.
 
         Args:
@@ -289,10 +291,11 @@ class Inference:
             floor: Noise and discretisation there.
             found: The effects so far.
             leaders: Keys of the candidates that led with another solver, where it named one: they and the first of the screening get a fit.
+            most: Parameters that a candidate may have.
         """
         taken = {t.candidate.name for t in found}
         extra = tuple(p for t in found for p in t.candidate.parameters)
-        candidates = [c for c in self.problem.candidates if c.name not in taken]
+        candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
         errors = self.mean_squares([base.point], floor)[0]
         free = (*self.problem.declared, *extra)
         everywhere = list(dict.fromkeys(p.recording for p in self.parts))
