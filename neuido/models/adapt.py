@@ -228,7 +228,7 @@ class AdaptModule(FilmedModule):
         return filmed.frames_at((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """A step whose gradient is not finite is left out, and undone as one whose law does not run."""
+        """A step whose gradient is not finite is left out; where that comes again the fit goes back as from a law that does not run."""
         gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
         if gradients and not bool(torch.stack([g.isfinite().all() for g in gradients]).all()):
             self._log({"train/not_finite": 1.0})
@@ -236,7 +236,7 @@ class AdaptModule(FilmedModule):
                 g.zero_()
             if self._current is not None:
                 name = self._current[0]
-                self._progress[name].undo(self.fit_of(name))
+                self._progress[name].undo(self.fit_of(name), ran=True)
 
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
         name, prepared = self._current  # type: ignore[misc]

@@ -9,7 +9,9 @@ from torch import Tensor, nn
 LEAST = 0.01
 """The share by which a loss must fall to count as lower."""
 RECENT = 5
-"""Steps after a failure within which another one says that the last parameters that ran are themselves at the edge."""
+"""Steps after a failure within which another one counts as of the same row."""
+ENOUGH = 3
+"""Failures in a row that say that the last parameters that ran are themselves at the edge."""
 RECOVERY = 2.0**0.1
 """Factor on the rates of each step that runs, up to their own."""
 
@@ -31,6 +33,8 @@ class Progress:
     """Factor on the rates; it is halved when a step has led to a law that does not run, and comes back in ten that do."""
     failed_at: int = -RECENT - 1
     """Step of the last failure."""
+    failures: int = 0
+    """In a row."""
     lowest: float = float("inf")
     lowest_at: int = 0
     over: bool = False
@@ -48,11 +52,19 @@ class Progress:
         self.first = self.first or self.good
         self.damping = min(1.0, self.damping * RECOVERY)
 
-    def undo(self, fit: nn.Module) -> bool:
-        """Go back to the last parameters that ran, and halfway to the first ones where those lead nowhere; whether there were any."""
-        if self.steps - self.failed_at <= RECENT:
-            self.good = {name: torch.lerp(value, self.first[name], 0.5) for name, value in self.good.items()}
+    def undo(self, fit: nn.Module, *, ran: bool = False) -> bool:
+        """Go back to the last parameters that ran, halfway to the first ones where those lead nowhere; whether there were any.
+
+        Args:
+            fit: What to bring back.
+            ran: The law ran and only its gradient is not finite: momentum may lead on, so that nothing else changes at first.
+        """
+        self.failures = self.failures + 1 if self.steps - self.failed_at <= RECENT else 1
         self.failed_at = self.steps
+        if self.failures >= ENOUGH:
+            self.good = {name: torch.lerp(value, self.first[name], 0.5) for name, value in self.good.items()}
+        elif ran:
+            return True
         self.damping *= 0.5
         return restore(fit, self.good)
 

@@ -200,13 +200,21 @@ def test_parameters_at_the_edge_of_what_runs_are_left():
     put(1.0, True)
     assert put(1.01, False) == 1.0
     put(1.0, True)
+    assert put(1.001, False) == 1.0
     assert put(1.001, False) == 0.5
     assert put(0.6, False) == 0.25
-    assert progress.damping == pytest.approx(0.125 * RECOVERY)
-    for _ in range(40):
+    assert progress.damping == pytest.approx(0.0625 * RECOVERY)
+    for _ in range(50):
         put(0.9, True)
     assert progress.damping == 1.0
     assert put(1.0, False) == pytest.approx(0.9)
+    # a gradient that is not finite may be one step's; the next one is not
+    progress.steps += 20
+    put(0.8, True)
+    before = progress.damping
+    assert progress.undo(fit, ran=True) and float(fit.weight.detach()) == pytest.approx(0.8)
+    assert progress.undo(fit, ran=True) and progress.damping == before
+    assert progress.undo(fit, ran=True) and float(fit.weight.detach()) == pytest.approx(0.4)
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path):
