@@ -9,10 +9,11 @@ import numpy as np
 from neuido.discrepancy import evidence
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
+from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
-from neuido.discrepancy.rounds import ALPHA, CLASS_RATIO, LEAST_GAIN, MANY, WITHIN, Inference, Round, Start, Tell, Trial
-from neuido.discrepancy.trials import score, unphysical
+from neuido.discrepancy.rounds import ALPHA, CLASS_RATIO, MANY, WITHIN, Inference
+from neuido.discrepancy.trials import Round, Start, Trial, score, unphysical
 
 __all__ = [
     "ALPHA",

@@ -1,0 +1,271 @@
+"""What a diagnosis measures on one problem under one setting: fits, floors, and directions of effects in the data."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from neuido.discrepancy import evidence
+from neuido.discrepancy.fit import Fit, Request, levenberg_marquardt, run
+from neuido.discrepancy.floors import Floor, Part, over_time, split
+from neuido.discrepancy.memo import Memo
+from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
+from neuido.discrepancy.trials import Start
+
+LEAST_GAIN = math.log(1.7)
+"""Smaller gains are no reason to name anything: other solvers differ by as much in ways that no setting of one solver shows."""
+NOISE_ALONE = 1.8
+"""Mean squares up to so many times that of the noise are noise."""
+ROUGH = 0.02
+"""Relative gain that ends the fit before the floors are known."""
+
+Tell = Callable[[str], None]
+
+
+class Laboratory:
+    """One problem under one setting of its discretisation.
+
+    Args:
+        problem: What to diagnose.
+        setting: Setting of the discretisation that predicts; the others tell its error.
+        tell: Called with a line of progress.
+        memo: Predictions that are shared with those of other settings.
+    """
+
+    def __init__(self, problem: Problem, *, setting: int = 0, tell: Tell | None = None, memo: Memo | None = None) -> None:
+        self.problem, self.setting = problem, setting
+        self.tell = tell or (lambda line: None)
+        self.memo = memo or Memo(problem)
+        self.parts = split(problem)
+        self.fitted = [p.fitted for p in self.parts]
+        self.fitted_recordings = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
+        self.noise_squares = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
+        """Mean squares of the noise of each part."""
+
+    # Fits.
+
+    def fits(
+        self, requests: Sequence, floor: Floor, *, to: Sequence[Mapping[int, np.ndarray]] | None = None, step: str = "fits"
+    ) -> list[Fit]:
+        """Run fits side by side, to the data or each to motions in their place; their work counts as that of `step`."""
+
+        def tick(count: int) -> None:
+            self.tell(f"{self.memo.simulations} simulations")
+
+        with self.memo.during(step):
+            whiten, rows = floor.whitener(self.parts), self.fitted_recordings
+            return run(self.memo, requests, whiten, rows, setting=self.setting, data=to, tick=tick)
+
+    def mean_squares(self, points: Sequence[Point], floor: Floor) -> list[np.ndarray]:
+        """Of each part, at several points, the nuisances at their most probable values."""
+        found = np.full((len(points), len(self.parts)), np.inf)
+        for n in dict.fromkeys(p.recording for p in self.parts):
+            with self.memo.during("errors of fits"):
+                rows = self.memo.predict(points, n, self.setting) - self.problem.recordings[n].y
+            for j, part in enumerate(self.parts):
+                if part.recording == n:
+                    for i, row in enumerate(rows):
+                        if np.isfinite(row).all():
+                            found[i, j] = np.mean(floor.settle(row, part)[part.rows] ** 2)
+        return list(found)
+
+    def noise(self) -> Floor:
+        """The floor without any discretisation error."""
+        noise = {n: self.noise_of(n) for n in range(len(self.problem.recordings))}
+        ones = {n: np.ones(len(r.y)) for n, r in enumerate(self.problem.recordings)}
+        return Floor(
+            noise,
+            {n: ones[n] / noise[n] for n in noise},
+            {n: np.empty((len(ones[n]), 0)) for n in noise},
+            {n: 0.0 * ones[n] for n in noise},
+        )
+
+    def noise_of(self, n: int) -> float:
+        r = self.problem.recordings[n]
+        return r.noise if r.noise else max(1e-3 * float(np.std(r.y)), 1e-12)
+
+    def floor(self, point: Point) -> Floor:
+        """Noise and discretisation at a point: differences of the settings, and how large they are in the course of time."""
+        plain = self.noise()
+        others = [s for s in range(self.problem.settings) if s != self.setting]
+        if not others:
+            return replace(plain, nuisances=self.nuisances(point, list(plain.noise)))
+        differences, spread, weight = {}, {}, {}
+        for n in plain.noise:
+            with self.memo.during("discretisation"):
+                here = self.memo.predict([point], n, self.setting)[0]
+                there = [self.memo.predict([point], n, s)[0] for s in others]
+            D = np.stack([t - here for t in there if np.isfinite(t).all()] or [np.zeros_like(here)], axis=1)
+            differences[n] = D
+            spread[n] = over_time(np.sqrt(np.mean(D**2, axis=1)), self.problem.recordings[n].times)
+            weight[n] = 1.0 / np.sqrt(plain.noise[n] ** 2 + spread[n] ** 2)
+            self.tell(f"discretisation of {self.problem.recordings[n].name}")
+        return Floor(plain.noise, weight, differences, spread, self.nuisances(point, list(plain.noise)))
+
+    def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
+        """A fit; options of `levenberg_marquardt`."""
+        return levenberg_marquardt(parameters, start, together=self.problem.together, **options)
+
+    def base(self, starts: Sequence[Point], floor: Floor, **options: Any) -> Fit:
+        """The declared parameters fitted from several starts; the best one after a few iterations goes on, with options of the fit."""
+        free = self.problem.declared
+        if len(starts) > 1:
+            short = self.fits([self.request(free, s, iterations=3) for s in starts], floor)
+            starts = [min(short, key=lambda f: f.cost).point]
+        return self.fits([self.request(free, starts[0], **options)], floor)[0]
+
+    def starts(self, point: Point) -> list[Point]:
+        """A point, and half and twice each parameter whose logarithm is fitted."""
+        out = [dict(point)]
+        for p in self.problem.declared:
+            if p.log:
+                value = point.get(p.name, p.value)
+                out += [dict(point) | {p.name: min(max(value * f, p.lower), p.upper)} for f in (0.5, 2.0)]
+        return out
+
+    def start(self, near: Point | None = None) -> Start | None:
+        """The base fit, with what noise and discretisation do to it; from about the declared values, or from them and from `near`.
+
+        None: given `near`, the fit ends where not every recording can be predicted.
+        """
+        # the first fit only says where the floor is to be found
+        fit = self.base([{}, near] if near else self.starts({}), self.noise(), iterations=6, tolerance=ROUGH)
+        if near is not None and not self.runs(fit.point):
+            return None
+        floor = self.floor(fit.point)
+        fit = self.base([fit.point], floor)
+        return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
+
+    def runs(self, point: Point) -> bool:
+        """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""
+        return all(bool(np.isfinite(self.memo.predict([point], p.recording, self.setting)).all()) for p in self.parts)
+
+    def is_noise(self, errors: np.ndarray) -> bool:
+        """Whether nothing but noise is left in any part."""
+        return bool(np.all(errors < NOISE_ALONE * self.noise_squares))
+
+    def is_settled(self, errors: np.ndarray) -> bool:
+        """Whether no effect could be named any more: nothing is left but noise, or too little above it for any gain to be enough."""
+        hopeless = self.problem.settings > 1 and evidence.gain(errors, self.noise_squares, self.fitted) < LEAST_GAIN
+        return hopeless or self.is_noise(errors)
+
+    # Screening.
+
+    def columns(
+        self, point: Point, candidates: Sequence[Candidate], recordings: Sequence[int]
+    ) -> dict[tuple[str, int], dict[int, np.ndarray]]:
+        """Directions of each candidate and start in the data of recordings: (key, start) -> {recording: (n, sizes)}."""
+        asked, places = [], []
+        for c in candidates:
+            for i, start in enumerate(c.starts):
+                sizes = [p.name for p in c.size_parameters]
+                shape = {k: v for k, v in start.items() if k not in sizes}
+                for name in sizes:
+                    asked.append(dict(point) | shape | {name: start[name]})
+                    places.append((c.key, i))
+        out: dict[tuple[str, int], dict[int, np.ndarray]] = {place: {} for place in places}
+        for n in recordings:
+            with self.memo.during("screening"):
+                here, *rows = self.memo.predict([point, *asked], n, self.setting)
+            self.tell(f"directions of {len(asked)} effects in {self.problem.recordings[n].name}")
+            for place in out:
+                out[place][n] = np.stack([row - here for row, p in zip(rows, places, strict=True) if p == place], axis=1)
+        return out
+
+    def slopes(self, parameters: Sequence[Parameter], point: Point, recordings: Sequence[int], step: float = 0.3) -> dict[int, np.ndarray]:
+        """Derivatives of the data by coordinates of parameters, one typical step each; central where the range allows."""
+        out = {}
+        asked, spans = [], []
+        for p in parameters:
+            q = p.coordinate(point.get(p.name, p.value))
+            ends = [p.physical(q + step), p.physical(q - step)]
+            asked += [dict(point) | {p.name: end} for end in ends]
+            spans.append(max(p.coordinate(ends[0]) - p.coordinate(ends[1]), 1e-9))
+        for n in recordings:
+            with self.memo.during("slopes"):
+                rows = self.memo.predict(asked, n, self.setting)
+            parts = [(rows[2 * i] - rows[2 * i + 1]) / span for i, span in enumerate(spans)]
+            out[n] = np.stack([np.where(np.isfinite(part), part, 0.0) for part in parts], axis=1) if parts else np.empty((rows.shape[1], 0))
+        return out
+
+    def screen(self, point: Point, candidates: Sequence[Candidate], floor: Floor, slopes: Mapping[int, np.ndarray]):
+        """Starts of full fits, best first: (predicted share of the misfit that stays, candidate, start, point), and the directions."""
+        fits = [p for p in self.parts if p.fitted]
+        columns = self.columns(point, candidates, [p.recording for p in fits])
+        residual = np.concatenate([self.weighted(floor.settle(self.residual(point, p.recording), p), p, floor) for p in fits])
+        J = np.concatenate([self.weighted(slopes[p.recording], p, floor) for p in fits])
+        q, _ = np.linalg.qr(J) if J.shape[1] else (np.empty((len(residual), 0)), None)
+        left = residual - q @ (q.T @ residual)
+        ranked = []
+        for c in candidates:
+            for i, start in enumerate(c.starts):
+                A = np.concatenate([self.weighted(columns[c.key, i][p.recording], p, floor) for p in fits])
+                if not np.isfinite(A).all():
+                    continue
+                B = A - q @ (q.T @ A)
+                amount = -np.linalg.lstsq(B, left, rcond=1e-6)[0]
+                sizes = c.size_parameters
+                if not c.linear:
+                    amount = np.clip(amount, 0.0, 1.5)
+                for k, p in enumerate(sizes):
+                    low, high = (p.lower / start[p.name], p.upper / start[p.name])
+                    amount[k] = np.clip(amount[k], min(low, high), max(low, high))
+                stays = float(np.sum((left + B @ amount) ** 2) / max(np.sum(left**2), 1e-300))
+                if c.linear:
+                    factor = np.clip(amount, -4.0, 4.0)
+                    factor = np.where(np.abs(factor) < 0.2, np.where(factor < 0, -0.2, 0.2), factor)
+                else:
+                    factor = np.ones(len(sizes))
+                begin = dict(point) | dict(start)
+                for p, f in zip(sizes, factor, strict=True):
+                    begin[p.name] = min(max(start[p.name] * f, p.lower), p.upper)
+                ranked.append((stays, c, i, begin))
+        ranked.sort(key=lambda entry: entry[0])
+        return ranked, columns
+
+    def residual(self, point: Point, n: int) -> np.ndarray:
+        return self.memo.predict([point], n, self.setting)[0] - self.problem.recordings[n].y
+
+    def weighted(self, columns: np.ndarray, part: Part, floor: Floor) -> np.ndarray:
+        w = floor.weight[part.recording][part.rows]
+        return columns[part.rows] * (w[:, None] if columns.ndim == 2 else w)
+
+    def floors(self, point: Point, free: Sequence[Parameter], floor: Floor) -> np.ndarray:
+        """Noise, and what a refit leaves of the discretisation error, together as mean squares of the parts.
+
+        The motions under the other settings of the same method are fitted as if they had been measured: most of what a grid or a step does
+        a stiffness can do as well, so that their differences as they are would hide effects several times larger than what matters.
+        """
+        everywhere = list(floor.noise)
+        with self.memo.during("discretisation"):
+            made = [{n: self.memo.predict([point], n, s)[0] for n in everywhere} for s in self.problem.refinements(self.setting)]
+        made = [y for y in made if all(np.isfinite(row).all() for row in y.values())]
+        if not made:
+            return self.noise_squares
+        requests = [self.request(free, point, iterations=8, tolerance=ROUGH) for _ in made]
+        fits = self.fits(requests, floor, to=made, step="discretisation")
+        with self.memo.during("discretisation"):
+            seen = {n: self.memo.predict([fit.point for fit in fits], n, self.setting) for n in everywhere}
+        left = [
+            [np.mean(floor.settle(row - y[p.recording], p)[p.rows] ** 2) for row, y in zip(seen[p.recording], made, strict=True)]
+            for p in self.parts
+        ]
+        return self.noise_squares + np.nanmean(left, axis=1)
+
+    def nuisances(self, point: Point, recordings: Sequence[int]) -> dict[int, np.ndarray]:
+        """Directions of the nuisances of each recording, of one prior standard deviation."""
+        out = {}
+        for n in recordings:
+            name = self.problem.recordings[n].name
+            own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{name}")]
+            moved = [dict(point) | {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + p.prior)} for p in own]
+            with self.memo.during("nuisances"):
+                rows = self.memo.predict([point, *moved], n, self.setting)
+            out[n] = (
+                np.stack([np.where(np.isfinite(row).all(), row - rows[0], 0.0) for row in rows[1:]], axis=1)
+                if own
+                else np.empty((rows.shape[1], 0))
+            )
+        return out
