@@ -4,7 +4,7 @@ import contextlib
 import ctypes
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import warp as wp
@@ -75,6 +75,23 @@ def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.devic
             _launch_again(kernel, dim, arguments, device)
         return
     wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), block_dim=block)
+
+
+def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, *, block: int = 256) -> Callable[[int], None]:
+    """A launch for many steps, of a kernel whose first argument is the step; `arguments` are the others.
+
+    On a GPU they are packed once, which takes longer than a launch. They must outlive the last one.
+    """
+    if device.type == "cpu":
+        return lambda step: launch(kernel, dim, [step, *arguments], device)
+    inputs = _inputs(kernel, [0, *arguments])
+    command = wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), block_dim=block, record_cmd=True)
+
+    def again(step: int) -> None:
+        command.set_param_at_index(0, step)
+        command.launch()
+
+    return again
 
 
 def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:

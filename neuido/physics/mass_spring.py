@@ -12,7 +12,7 @@ from torch import Tensor
 from neuido.errors import UserError
 from neuido.physics import spring_kernels
 from neuido.physics.colliders import collider_table
-from neuido.physics.device import launch, real_of, torch_stream
+from neuido.physics.device import real_of, repeated, torch_stream
 from neuido.physics.grid_kernels import SLIP, STICKY
 from neuido.types import Scene
 
@@ -21,6 +21,9 @@ SAFETY = 0.5
 
 BLOCK = 32
 """Threads a block: masses are few, and more blocks fill more of a GPU."""
+
+LANES = 32
+"""Threads that share the springs at a mass on a GPU."""
 
 
 class Springs(NamedTuple):
@@ -84,6 +87,7 @@ class MassSpring:
         self.planes, self.kinds = table.plane[0].contiguous(), table.kind[0].contiguous()
         self.gravity = tuple(float(g) for g in scene.gravity)
         self.kernels = spring_kernels.build(real_of(dtype))
+        self.lanes = LANES if self.device.type == "cuda" else 1
         ends = torch.cat([self.pairs, self.pairs.flip(1)])
         order = torch.argsort(ends[:, 0], stable=True)
         counts = torch.bincount(ends[:, 0], minlength=len(mass))
@@ -167,16 +171,20 @@ class _Rollout(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, body: MassSpring, steps: int, dt: float, x: Tensor, v: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:
         xs, vs = x.new_empty(steps + 1, *x.shape), v.new_empty(steps + 1, *v.shape)
-        before = v.new_empty(steps, *v.shape)
+        before, parts = v.new_empty(steps, *v.shape), v.new_empty(len(v) * body.lanes, 3)
         xs[0], vs[0] = x.detach(), v.detach()
-        parameters = tuple(p.detach() for p in parameters)
-        lists = [body.offsets, body.others, body.springs, body.rest]
-        fixed = [dt, body.kernels.vec3(*body.gravity), body.power, *lists, body.mass, body.planes, body.kinds, *parameters]
+        stiffness, damping, grip = (p.detach() for p in parameters)
+        springs = [body.power, body.offsets, body.others, body.springs, body.rest, stiffness, damping]
+        masses = [dt, body.kernels.vec3(*body.gravity), body.mass, body.planes, body.kinds, grip]
+        now = [xs, vs, body.lanes, parts]
         with torch_stream(body.device):
+            pull = repeated(body.kernels.pull, len(parts), [*springs, *now], body.device, block=BLOCK)
+            move = repeated(body.kernels.move, len(x), [*masses, *now, before], body.device, block=BLOCK)
             for n in range(steps):
-                launch(body.kernels.step, len(x), [*fixed, xs[n], vs[n], before[n], xs[n + 1], vs[n + 1]], body.device, block=BLOCK)
+                pull(n)
+                move(n)
         ctx.body, ctx.dt = body, dt
-        ctx.save_for_backward(xs, vs, before, *parameters)
+        ctx.save_for_backward(xs, vs, before, stiffness, damping, grip)
         return xs, vs
 
     @staticmethod
@@ -184,16 +192,20 @@ class _Rollout(torch.autograd.Function):
     def backward(ctx: Any, grad_x: Tensor, grad_v: Tensor) -> tuple[Tensor | None, ...]:
         body, dt = ctx.body, ctx.dt
         xs, vs, before, stiffness, damping, grip = ctx.saved_tensors
+        grad_x, grad_v = grad_x.contiguous(), grad_v.contiguous()
         g_stiffness, g_damping, g_grip = torch.zeros_like(stiffness), torch.zeros_like(damping), torch.zeros_like(body.mass)
-        now, then, force = [grad_x[-1].clone(), grad_v[-1].clone()], [torch.empty_like(xs[0]) for _ in range(2)], torch.empty_like(xs[0])
-        lists = [body.offsets, body.others, body.springs, body.rest]
+        back, force = [grad_x[-1].clone(), grad_v[-1].clone()], torch.empty_like(xs[0])
+        parts = [xs.new_empty(len(force) * body.lanes, 3) for _ in range(2)]
+        springs = [body.power, body.offsets, body.others, body.springs, body.rest, stiffness, damping]
+        contact = [dt, body.mass, body.planes, body.kinds, grip, xs, before, *back, force, g_grip]
+        pulled = [*springs, xs, vs, force, body.lanes, *parts, g_stiffness, g_damping]
+        gathered = [body.lanes, *parts, grad_x, grad_v, *back]
         with torch_stream(body.device):
+            touch = repeated(body.kernels.contact_adjoint, len(force), contact, body.device, block=BLOCK)
+            pull = repeated(body.kernels.pull_adjoint, len(parts[0]), pulled, body.device, block=BLOCK)
+            gather = repeated(body.kernels.gather, len(force), gathered, body.device, block=BLOCK)
             for n in reversed(range(len(before))):
-                contact = [dt, body.mass, body.planes, body.kinds, grip, xs[n], before[n], *now, *then, force, g_grip]
-                launch(body.kernels.contact_adjoint, len(force), contact, body.device, block=BLOCK)
-                springs = [body.power, *lists, stiffness, damping, xs[n], vs[n], force, *then, g_stiffness, g_damping]
-                launch(body.kernels.springs_adjoint, len(force), springs, body.device, block=BLOCK)
-                then[0] += grad_x[n]
-                then[1] += grad_v[n]
-                now, then = then, now
-        return None, None, None, *now, g_stiffness, g_damping, g_grip.sum().reshape(1)
+                touch(n)
+                pull(n)
+                gather(n)
+        return None, None, None, *back, g_stiffness, g_damping, g_grip.sum().reshape(1)

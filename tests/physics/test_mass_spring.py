@@ -93,10 +93,11 @@ def leaves(one, x):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("power", [0.0, 0.5])
-def test_rollout_and_adjoint_equal_the_twin(power, device):
+@pytest.mark.parametrize("power, lanes", [(0.0, 1), (0.5, 1), (0.5, 4), (0.5, 32)])
+def test_rollout_and_adjoint_equal_the_twin(power, lanes, device):
     x = cloud().to(device)
     one = body(scene_with_every_contact(), x, power=power)
+    one.lanes = lanes
     inputs = leaves(one, x)
     xs, vs = one.rollout(30, 2e-3, *inputs, every=10)
     state, frames = inputs[:2], [inputs[:2]]
