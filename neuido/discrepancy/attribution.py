@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neuido.discrepancy import evidence
+from neuido.discrepancy.contests import MANY
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
+from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
-from neuido.discrepancy.rounds import ALPHA, CLASS_RATIO, MANY, WITHIN, Inference
+from neuido.discrepancy.rounds import ALPHA, WITHIN, Inference, as_good
 from neuido.discrepancy.trials import Round, Start, Trial, score, unphysical
 
 __all__ = [
@@ -41,7 +43,9 @@ UNEXPLAINED_EXACT = 3.0
 WORSE = 1.5
 """Times the error of the better method at which the other one is not asked any more, where that found nothing."""
 LOOKED_AHEAD = 2
-"""Effects that are tried with a second one, where none gains enough alone."""
+"""Effects that are tried with a second one, where none gains enough alone, or in the place of one with more parameters."""
+CLOSE = 2.5
+"""Times the error of a chosen effect up to which one with fewer parameters is weighed again once others were found."""
 
 
 @dataclass(eq=False)
@@ -109,8 +113,8 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
             break
         floor = inference.floor(at.point)
         rounds.append(inference.round(at, floor, found))
-    at, found = drop(inference, at, floor, found)
     if len(found) > 1:
+        at, found = drop(inference, at, floor, found)
         at, found = narrow(inference, at, floor, found, rounds)
     return conclude(inference, start.fit.point, at, found, rounds, floor)
 
@@ -178,15 +182,21 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
 
 
 def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:
-    """Weigh each class of effects again beside all others that were found: the best one of each stays, with those near it."""
+    """Weigh each class of effects again beside all others that were found: the best one of each stays, with those near it.
+
+    So are simpler candidates that came close: before the others were found a force of many parameters may have stood for two effects.
+    """
     for r in rounds:
-        if r.chosen not in found or len(r.members) == 1:
+        if r.chosen not in found:
             continue
         rest = [t for t in found if t is not r.chosen]
         beside = tuple(p for t in rest for p in t.candidate.parameters)
         own = {p.name for p in r.chosen.candidate.parameters}
         without = {k: v for k, v in base.point.items() if k not in own}
-        members, requests = [t for t in r.members if t.candidate.name not in {o.candidate.name for o in rest}], []
+        members = [t for t in (*r.members, *simpler(r)) if t.candidate.name not in {o.candidate.name for o in rest}]
+        if len(members) == 1:
+            continue
+        requests = []
         for t in members:
             start = base.point if t is r.chosen else without | {p.name: t.fit.point[p.name] for p in t.candidate.parameters}
             requests.append(inference.request((*inference.problem.declared, *beside, *t.candidate.parameters), start))
@@ -195,18 +205,29 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
         weighed = [replace(t, fit=fit, errors=square) for t, fit, square in zip(members, fits, squares, strict=True)]
         at = min(range(len(weighed)), key=lambda i: weighed[i].penalised)
         for t, new in zip(members, weighed, strict=True):
-            above = new.score - weighed[at].score
-            if new is not weighed[at] and above > 2.0 * math.log(CLASS_RATIO):
-                t.reason = f"beside {' and '.join(o.candidate.name for o in rest)} it leaves {math.exp(0.5 * above):.1f} times the error"
+            above = math.exp(0.5 * (new.score - weighed[at].score))
+            near = new is weighed[at] or as_good(new, weighed[at])
+            t.reason = "" if near else f"with all effects that were found it leaves {above:.1f} times the error of the best"
         found[found.index(r.chosen)] = members[at]
         base, r.chosen, r.members = fits[at], members[at], [t for t in members if not t.reason]
     return base, found
 
 
+def simpler(r: Round) -> list[Trial]:
+    """The best trials of a round that have fewer parameters than the chosen one, are no members, and came close to it."""
+    if r.chosen is None:
+        return []
+    sizes, limit = len(r.chosen.candidate.size_parameters), r.chosen.score + 2.0 * math.log(CLOSE)
+    others = [t for t in r.trials if t not in r.members and len(t.candidate.size_parameters) < sizes and t.score < limit]
+    return sorted((t for t in others if not unphysical(t.candidate, t.fit.point)), key=lambda t: t.penalised)[:LOOKED_AHEAD]
+
+
 def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:
-    """Leave out effects that the later ones made needless."""
-    for trial in list(found[:-1]):
+    """Leave out effects that the others make needless, from where all of them together brought the fit."""
+    for trial in list(found):
         rest = [t for t in found if t is not trial]
+        if not rest:
+            break
         extra = tuple(p for t in rest for p in t.candidate.parameters)
         start = {k: v for k, v in base.point.items() if k.split(".")[0] != trial.candidate.name}
         (fit,) = inference.fits([inference.request((*inference.problem.declared, *extra), start)], floor)
@@ -214,42 +235,6 @@ def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> t
         if evidence.gain(without, with_it, inference.fitted) < LEAST_GAIN / 2:
             base, found = fit, rest
     return base, found
-
-
-def intervals(inference: Inference, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
-    """90 % intervals: noise, and the part of the discretisation error that the residuals leave room for, through the fit.
-
-    The room is that of the part whose residual is largest beside its discretisation: where a fit has taken the error of the solver into its
-    parameters, only what was held out shows it.
-    """
-    parts = [p for p in inference.parts if p.fitted]
-    parameters = [inference.problem.parameter(name) for name in fit.names]
-    slopes = inference.slopes(parameters, fit.point, [p.recording for p in parts], step=0.1)
-    nuisances = floor.nuisances
-    J = np.concatenate([inference.weighted(slopes[p.recording], p, floor) for p in parts])
-    gain = np.linalg.pinv(J)
-    covariance = np.zeros((len(parameters), len(parameters)))
-    shares = [
-        max(float(square) - floor.noise[p.recording] ** 2, 0.0) / max(float(np.mean(floor.spread[p.recording][p.rows] ** 2)), 1e-300)
-        for p, square in zip(inference.parts, errors, strict=True)
-    ]
-    room = min(max(shares), 1.0)
-    at = 0
-    for p in parts:
-        n, w = p.recording, floor.weight[p.recording][p.rows]
-        own = gain[:, at : at + len(w)]
-        at += len(w)
-        covariance += floor.noise[n] ** 2 * (own * w**2) @ own.T
-        shifts = [own @ (inference.weighted(floor.differences[n], p, floor) * math.sqrt(room / max(floor.differences[n].shape[1], 1)))]
-        if n in nuisances:
-            shifts.append(own @ inference.weighted(nuisances[n], p, floor) * math.sqrt(min(room + 0.05, 1.0)))
-        for shift in shifts:
-            covariance += shift @ shift.T
-    out = {}
-    for parameter, deviation in zip(parameters, np.sqrt(np.diag(covariance)), strict=True):
-        q = parameter.coordinate(fit.point[parameter.name])
-        out[parameter.name] = (parameter.physical(q - 1.645 * deviation), parameter.physical(q + 1.645 * deviation))
-    return out
 
 
 def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial], rounds: list[Round], floor: Floor) -> Diagnosis:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from neuido.discrepancy.problem import Problem
 
 DATA = ("auto", "points", "video")
+SOLVERS = ("both", "material_points", "finite_elements")
 KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}
 
 
@@ -28,6 +29,7 @@ def diagnose(
     law: str | None = None,
     data: str = "auto",
     effects: str | None = None,
+    solver: str = "both",
     draws: int = 199,
     seed: int = 0,
     most: int = 3,
@@ -47,6 +49,7 @@ def diagnose(
         law: Neural law of `neuido predict` in place of the folder's elasticity and plasticity; a factor on its stress is fitted.
         data: Of an experiment: points (tracked ones), video (silhouettes), or auto: points where every recording has them.
         effects: Names of the effects to consider, with commas; all that make sense where absent.
+        solver: What may predict the motion of a body: material_points, finite_elements, or both, so that the data choose.
         draws: Draws of the parametric bootstrap; p-values come in steps of 1 / (draws + 1).
         seed: Seed of the draws.
         most: Effects that may be added, 1 to 3.
@@ -72,11 +75,11 @@ def diagnose(
     from neuido.discrepancy.attribution import diagnose as infer
 
     chosen = choose_device(device)
-    problems = [restricted(problem, effects) for problem in problems_of(kind, place, model, chosen, law=law, data=data)]
+    problems = [restricted(solved_by(p, solver), effects) for p in problems_of(kind, place, model, chosen, law=law, data=data)]
     files = {"model": model, "law": law}
     given = {key: Path(file).expanduser().read_bytes().hex() if file else None for key, file in files.items()}
     options = {"effects": effects, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": answer.VERSION, "data": data}
-    options |= given
+    options |= given | {"solver": solver}
     plan = store.plan_of(place, options, out=target)
     target.mkdir(parents=True, exist_ok=True)
     work = store.workplace(target, plan, resume=resume)
@@ -168,6 +171,27 @@ def experiment_problem(experiment: "Experiment", data: str, device: str) -> "Bod
     from neuido.discrepancy.video import video_problem
 
     return video_problem(experiment, device=device)
+
+
+def solved_by(problem: "Problem", solver: str) -> "Problem":
+    """The problem with one method of prediction alone.
+
+    Raises:
+        UserError: Another name, or a problem where nothing is discretised.
+    """
+    if solver not in SOLVERS:
+        raise UserError(f"solver = {solver!r}: choose from {', '.join(SOLVERS)}")
+    if solver == "both":
+        return problem
+    if problem.settings == 1:
+        raise UserError(f"solver = {solver}: {problem.name} is no body, and nothing is discretised; leave it out")
+    from neuido.discrepancy.body import SETTINGS
+
+    own = tuple(i for i in problem.solvers if SETTINGS[i].solver == solver)
+    if solver == "material_points":  # the other settings come after these
+        object.__setattr__(problem, "settings", sum(s.solver == solver for s in SETTINGS))
+    object.__setattr__(problem, "solvers", own)
+    return problem
 
 
 def restricted(problem: "Problem", effects: str | None) -> "Problem":

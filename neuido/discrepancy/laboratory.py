@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.fit import Fit, Request, levenberg_marquardt, run
+from neuido.discrepancy.fit import Fit, Request, levenberg_marquardt, residuals, run
 from neuido.discrepancy.floors import Floor, Part, over_time, split
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
@@ -58,10 +58,16 @@ class Laboratory:
             whiten, rows = floor.whitener(self.parts), self.fitted_recordings
             return run(self.memo, requests, whiten, rows, setting=self.setting, data=to, tick=tick)
 
-    def mean_squares(self, points: Sequence[Point], floor: Floor) -> list[np.ndarray]:
-        """Of each part, at several points, the nuisances at their most probable values."""
+    def costs(self, points: Sequence[Point], floor: Floor) -> list[float]:
+        """Sum of squares of the whitened residuals of the fitted parts, without priors; infinite where the model does not run."""
+        with self.memo.during("errors of fits"):
+            rows = residuals(self.memo, points, floor.whitener(self.parts), self.fitted_recordings, self.setting)
+        return [math.inf if row is None else float(row @ row) for row in rows]
+
+    def mean_squares(self, points: Sequence[Point], floor: Floor, *, fitted: bool = False) -> list[np.ndarray]:
+        """Of each part, or of the fitted ones alone, at several points, the nuisances at their most probable values."""
         found = np.full((len(points), len(self.parts)), np.inf)
-        for n in dict.fromkeys(p.recording for p in self.parts):
+        for n in self.fitted_recordings if fitted else dict.fromkeys(p.recording for p in self.parts):
             with self.memo.during("errors of fits"):
                 rows = self.memo.predict(points, n, self.setting) - self.problem.recordings[n].y
             for j, part in enumerate(self.parts):
@@ -69,7 +75,7 @@ class Laboratory:
                     for i, row in enumerate(rows):
                         if np.isfinite(row).all():
                             found[i, j] = np.mean(floor.settle(row, part)[part.rows] ** 2)
-        return list(found)
+        return list(found[:, self.fitted] if fitted else found)
 
     def noise(self) -> Floor:
         """The floor without any discretisation error."""
@@ -232,27 +238,29 @@ class Laboratory:
         w = floor.weight[part.recording][part.rows]
         return columns[part.rows] * (w[:, None] if columns.ndim == 2 else w)
 
-    def floors(self, point: Point, free: Sequence[Parameter], floor: Floor) -> np.ndarray:
-        """Noise, and what a refit leaves of the discretisation error, together as mean squares of the parts.
+    def refits(self, point: Point, free: Sequence[Parameter], floor: Floor) -> list[tuple[Fit, np.ndarray]]:
+        """The motions under the other settings of the same method fitted as if they had been measured: the fits, and what they leave.
 
-        The motions under the other settings of the same method are fitted as if they had been measured: most of what a grid or a step does
-        a stiffness can do as well, so that their differences as they are would hide effects several times larger than what matters.
+        Most of what a grid or a step does a stiffness can do as well: how far a fit goes from `point` is the discretisation error of the
+        parameters, and what it leaves, mean squares of the parts, the one that an effect could be mistaken for.
         """
-        everywhere = list(floor.noise)
         with self.memo.during("discretisation"):
-            made = [{n: self.memo.predict([point], n, s)[0] for n in everywhere} for s in self.problem.refinements(self.setting)]
+            made = [{n: self.memo.predict([point], n, s)[0] for n in floor.noise} for s in self.problem.refinements(self.setting)]
         made = [y for y in made if all(np.isfinite(row).all() for row in y.values())]
-        if not made:
-            return self.noise_squares
         requests = [self.request(free, point, iterations=8, tolerance=ROUGH) for _ in made]
         fits = self.fits(requests, floor, to=made, step="discretisation")
         with self.memo.during("discretisation"):
-            seen = {n: self.memo.predict([fit.point for fit in fits], n, self.setting) for n in everywhere}
-        left = [
-            [np.mean(floor.settle(row - y[p.recording], p)[p.rows] ** 2) for row, y in zip(seen[p.recording], made, strict=True)]
-            for p in self.parts
-        ]
-        return self.noise_squares + np.nanmean(left, axis=1)
+            seen = {n: self.memo.predict([fit.point for fit in fits], n, self.setting) for n in floor.noise} if fits else {}
+
+        def left(i: int, part: Part) -> float:
+            return float(np.mean(floor.settle(seen[part.recording][i] - made[i][part.recording], part)[part.rows] ** 2))
+
+        return [(fit, np.array([left(i, part) for part in self.parts])) for i, fit in enumerate(fits)]
+
+    def floors(self, point: Point, free: Sequence[Parameter], floor: Floor) -> np.ndarray:
+        """Noise, and what a refit leaves of the discretisation error, together as mean squares of the parts."""
+        left = [squares for _, squares in self.refits(point, free, floor)]
+        return self.noise_squares + np.nanmean(left, axis=0) if left else self.noise_squares
 
     def nuisances(self, point: Point, recordings: Sequence[int]) -> dict[int, np.ndarray]:
         """Directions of the nuisances of each recording, of one prior standard deviation."""

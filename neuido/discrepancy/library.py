@@ -98,7 +98,9 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     k = 1.0 / s.duration**2
     centre = np.nanmean(experiment.recordings[0].x.numpy(), axis=(0, 1))
     places = dict(zip("xyz", map(float, centre), strict=True))
-    add("position_force", "flight", [{"k": k, **places}], ("k", "1/s^2", k, -40 * k, 40 * k, False),
+    # a pull to a far centre is a uniform force first of all, and from a centre in the body a fit ends there
+    centres = [places, *(places | {a: c + 2 * s.length} for a, c in places.items())]
+    add("position_force", "flight", [{"k": k, **c} for c in centres], ("k", "1/s^2", k, -40 * k, 40 * k, False),
         *[(a, "m", s.length, c - 20 * s.length, c + 20 * s.length, False) for a, c in places.items()], sizes="k")  # fmt: skip
     knots = [f"{a}{j}" for j in range(KNOTS) for a in "xyz"]
     add("time_force", "flight", [dict.fromkeys(knots, 0.1 * g)], *vector(knots, "m/s^2", 0.1 * g, 2 * g))

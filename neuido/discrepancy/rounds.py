@@ -12,11 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.fit import Fit, Race
+from neuido.discrepancy.contests import MANY, SMALL, Contests
+from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.laboratory import LEAST_GAIN, Laboratory, Tell
+from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo
-from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
+from neuido.discrepancy.problem import Candidate, Problem
 from neuido.discrepancy.trials import Round, Trial, times_over, unphysical
 
 ALPHA = 0.05
@@ -25,32 +26,31 @@ CLASS_RATIO = 1.4
 """Candidates whose errors are within this factor of the best one's are not told from it."""
 LEAST_GAIN_EXACT = math.log(1.15)
 """`LEAST_GAIN` where nothing is discretised."""
+GAIN_AT_FLOOR = math.log(2.5)
+"""What it takes where the residual is as large as the floor; the best candidates of 55 blind nulls gained up to 1.9 times there."""
 GAIN_IN_FLOOR = math.log(4.0)
-"""What it takes where the residual is no larger than the floor: only an effect that the data show far below it."""
-SMALL = 2
-"""Parameters up to which a candidate gets a fit in the first round whatever its place in the screening: a direction says little of what a
-yield stress or a lossy floor does once it acts."""
+"""What it takes well within the floor, where they gained up to 3.3 times: only an effect that the data show far below it."""
+GAIN_TO_NOISE = math.log(2.0)
+"""What it takes where noise alone is left: a candidate can take the place of what the grid does."""
 VAIN = 0.98
 """Share of the misfit that even such a candidate may leave, as the screening predicts it, if small sizes of it act in proportion."""
-MANY = 5
-"""Parameters above which a candidate is fitted after the others, and not at all where one of those leaves noise alone."""
 HOPELESS = 0.75
 """Share of the misfit that a candidate beyond the first few may leave, as the screening predicts it, and still get a fit."""
 OWN = 3
 """Candidates that the screening of a second solver may add to those that led with the first one."""
-LEADERS = 4
-"""Candidates that are fitted before the others."""
 SOME_GAIN = math.log(1.2)
 """Smaller gains are no reason to look further."""
-FAR = 6.0
-"""Times the size that a candidate is screened at, for a fit from elsewhere."""
 WITHIN = 0.5
 """Share of the floor within which a residual that no effect explains is no reason to look further."""
-POLISHED = 3
-"""Candidates whose fits are refined from further starts."""
 
 
-class Inference(Laboratory):
+def as_good(t: Trial, top: Trial) -> bool:
+    """Whether a fit comes near the errors of the best one; with three parameters more it must be better."""
+    more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
+    return t.score - top.score < (-0.1 if more >= 3 else 2.0 * math.log(CLASS_RATIO))
+
+
+class Inference(Contests):
     """The steps of a diagnosis on one problem.
 
     Args:
@@ -109,19 +109,25 @@ class Inference(Laboratory):
             if c.key not in chosen and (keep > 0 or led or small or (leaders is None and stays < near)):
                 keep -= not small
                 chosen[c.key] = i
-                starts.append((c, begin, self._first_slopes(c, i, free, slopes, columns, floor)))
+                starts.append((c, begin, self.first_slopes(c, i, free, slopes, columns, floor)))
                 if not c.linear:
                     starts.append((c, begin | {p.name: p.value for p in self.problem.declared}, None))
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
                 starts.append((c, begin, None))
+        finite = {c.key for _, c, *_ in ranked}
+        for c in candidates:  # what cannot run where the base fit went may run where the model was declared
+            if first and c.key not in finite and len(c.parameters) <= MANY:
+                chosen[c.key] = 0
+                starts.append((c, base.point | {p.name: p.value for p in self.problem.declared} | dict(c.starts[0]), None))
         self.tell(f"fitting {', '.join(chosen)}")
         best = self.contest(free, starts, floor)
         best |= self.polish(free, best, base, floor)
+        best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
         model = self._linear(base.point, floor, slopes, columns, chosen, everywhere, candidates)
         empty = Round(base.point, errors, [], None, [], 1.0, floor, self.floors(base.point, free, floor), null=model.null(self.draws))
         result = self.judge(empty, best, model, list(chosen))
         if first and result.chosen is None and result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials):
-            best |= self.elsewhere(best, {key: c.starts[i] for c in candidates for key, i in chosen.items() if c.key == key}, floor)
+            best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
             result = self.judge(empty, best, model, list(chosen))
         return result
 
@@ -157,105 +163,17 @@ class Inference(Laboratory):
         if self.problem.settings == 1:  # nothing is discretised: only chance is to be beaten
             return LEAST_GAIN_EXACT
         if self.is_noise(left):  # whatever the floor, no error of the discretisation is in there
-            return LEAST_GAIN
-        share = min(max(math.log(times_over(errors, floors)) / math.log(1.5), 0.0), 1.0)  # from the floor itself to half as much again
-        return GAIN_IN_FLOOR + share * (LEAST_GAIN - GAIN_IN_FLOOR)
-
-    def _first_slopes(
-        self,
-        c: Candidate,
-        start: int,
-        free: Sequence[Parameter],
-        slopes: Mapping[int, np.ndarray],
-        columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
-        floor: Floor,
-    ) -> np.ndarray | None:
-        """What the screening says of the slopes of a candidate's fit; none where it probed only sizes, or they do not act in proportion."""
-        if not c.linear or c.size_parameters != c.parameters or any(p.log for p in c.parameters):
-            return None
-        whiten, coordinates = floor.whitener(self.parts), [p.coordinate(c.starts[start][p.name]) for p in c.parameters]
-        parts = []
-        for n in dict.fromkeys(p.recording for p in self.parts if p.fitted):
-            both = (*slopes[n].T, *(columns[c.key, start][n] / coordinates).T)
-            parts.append(np.stack([whiten(column, n) for column in both], axis=1))
-        J = np.concatenate(parts)
-        return J if np.isfinite(J).all() else None
-
-    def contest(
-        self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], floor: Floor
-    ) -> dict[str, tuple[Candidate, Fit]]:
-        """The best fit of each candidate; fits that cannot catch up with the best one stop.
-
-        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all.
-        """
-        best: dict[str, tuple[Candidate, Fit]] = {}
-        race = Race()
-        small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
-        first = list(dict.fromkeys(small))[:LEADERS]
-        waves: list[list[tuple[Candidate, Point, np.ndarray | None]]] = [[], [], []]
-        for entry in starts:
-            key = entry[0].key
-            waves[0 if self.problem.together or key in first else 1 if key in small else 2].append(entry)
-        for own in waves:
-            if own is waves[2] and best:
-                leading = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
-                if self.is_noise(self.mean_squares([leading.point], floor)[0]):
-                    break
-            fits = self.fits([self.request((*free, *c.parameters), begin, race=race, slopes=J) for c, begin, J in own], floor)
-            for (c, *_), fit in zip(own, fits, strict=True):
-                if c.key not in best or fit.cost < best[c.key][1].cost:
-                    best[c.key] = (c, fit)
-        return best
-
-    def polish(
-        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], base: Fit, floor: Floor
-    ) -> dict[str, tuple[Candidate, Fit]]:
-        """The best fits once more, from where they ended and from the declared values: the base fit may have led all of them astray."""
-        data = sum(len(p.rows) for p in self.parts if p.fitted)
-        top = sorted(best.values(), key=lambda entry: entry[1].cost)[:POLISHED]
-        if not top or top[0][1].cost < 1.2 * data or top[0][1].cost > 0.7 * base.cost:
-            return {}
-        requests, of, race = [], [], Race(top[0][1].cost)
-        for c, fit in top:
-            begin = dict(fit.point)
-            for start in (begin, begin | {p.name: p.value for p in self.problem.declared}):
-                requests.append(self.request((*free, *c.parameters), start, race=race))
-                of.append((c, fit))
-        self.tell(f"refining {', '.join(c.key for c, _ in top)}")
-        out: dict[str, tuple[Candidate, Fit]] = {}
-        for (c, before), fit in zip(of, self.fits(requests, floor), strict=True):
-            least = out[c.key][1].cost if c.key in out else before.cost
-            if fit.cost < least:
-                out[c.key] = (c, fit)
-        return out
+            return GAIN_TO_NOISE
+        steps = [math.log(WITHIN), 0.0, math.log(1.5)]
+        return float(np.interp(math.log(times_over(errors, floors)), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
 
     def by_chance(self, r: Round) -> float:
         """Gain up to which an effect is not worth another look, be it alone or with a second one."""
         return max(float(np.quantile(r.null, 1 - ALPHA)) if len(r.null) else 0.0, SOME_GAIN)
 
-    def elsewhere(
-        self, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
-    ) -> dict[str, tuple[Candidate, Fit]]:
-        """Fits of one size once more, from the declared values and a larger size: the slope at zero may have led into a side valley."""
-        requests, of, race = [], [], Race(min(fit.cost for _, fit in best.values()))
-        for key, (c, fit) in best.items():
-            if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
-                continue
-            (p,) = c.size_parameters
-            size = math.copysign(FAR * abs(starts[key][p.name]), fit.point[p.name])
-            begin = dict(fit.point) | {d.name: d.value for d in self.problem.declared} | {p.name: min(max(size, p.lower), p.upper)}
-            requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
-            of.append(c)
-        self.tell(f"again from elsewhere: {', '.join(c.key for c in of)}")
-        fits = zip(of, self.fits(requests, floor), strict=True)
-        return {c.key: (c, fit) for c, fit in fits if fit.cost < best[c.key][1].cost}
-
     def is_rival(self, t: Trial, top: Trial) -> bool:
         """Whether the data cannot tell `t` from the best one: about its errors, a gain of its own, and not by many more parameters."""
-        more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
-        if more >= 3 and t.score > top.score - 0.1:
-            return t is top
-        return t is top or (t.score - top.score < 2.0 * math.log(CLASS_RATIO) and t.gain > 0.4 * top.gain)
+        return t is top or (as_good(t, top) and t.gain > 0.4 * top.gain)
 
     def _why(self, t: Trial, top: Trial, result: Round) -> str:
         if result.chosen is None:

@@ -15,6 +15,9 @@ import yaml
 
 import neuido
 from neuido.cli import main
+from neuido.data.experiments import read_experiment
+from neuido.discrepancy.body import SETTINGS, body_problem
+from neuido.discrepancy.command import solved_by
 from tests import command
 from tests.discrepancy import made
 
@@ -175,6 +178,8 @@ def test_wrong_folder_is_one_line(name, folders, tmp_path, capsys):
         (["--effects", "jelly"], "jelly"),
         (["--effects", "yield"], "drag_linear"),
         (["--model", "nowhere.yaml"], "nowhere.yaml"),
+        (["--solver", "abacus"], "abacus"),
+        (["--solver", "finite_elements"], "nothing is discretised"),
     ],
 )
 def test_wrong_option_is_one_line(more, word, folders, tmp_path, capsys):
@@ -183,6 +188,14 @@ def test_wrong_option_is_one_line(more, word, folders, tmp_path, capsys):
     assert len(err.splitlines()) == 1
     assert word in err
     assert not (tmp_path / "out").exists()
+
+
+def test_one_method_alone(folders):
+    problem = solved_by(body_problem(read_experiment(folders["experiment"])), "material_points")
+    assert (problem.settings, problem.solvers) == (4, (0,))
+    assert all(SETTINGS[i].solver == "material_points" for i in problem.refinements(0))
+    problem = solved_by(body_problem(read_experiment(folders["experiment"])), "finite_elements")
+    assert [SETTINGS[i].solver for i in problem.solvers] == ["finite_elements"]
 
 
 def test_missing_folder(tmp_path, capsys):

@@ -1,0 +1,174 @@
+"""Full fits of candidates side by side: who is fitted from where, who is given up, and whose fit is tried again from elsewhere."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from neuido.discrepancy.fit import Fit, Race
+from neuido.discrepancy.floors import Floor
+from neuido.discrepancy.laboratory import Laboratory
+from neuido.discrepancy.problem import Candidate, Parameter, Point
+from neuido.discrepancy.trials import score
+
+SMALL = 2
+"""Parameters up to which a candidate gets a fit in the first round whatever its place in the screening: a direction says little of what a
+yield stress or a lossy floor does once it acts."""
+MANY = 5
+"""Parameters above which a candidate is fitted after the others, and not at all where one of those leaves noise alone."""
+LEADERS = 4
+"""Candidates that are fitted before the others."""
+FAR = 6.0
+"""Times the size that a candidate is screened at, for a fit from elsewhere."""
+POLISHED = 4
+"""Candidates whose fits are refined from further starts."""
+ALIKE = 0.3
+"""Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
+
+
+class Contests(Laboratory):
+    """The fits of a step of a diagnosis."""
+
+    def first_slopes(
+        self,
+        c: Candidate,
+        start: int,
+        free: Sequence[Parameter],
+        slopes: Mapping[int, np.ndarray],
+        columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
+        floor: Floor,
+    ) -> np.ndarray | None:
+        """What the screening says of the slopes of a candidate's fit; none where it probed only sizes, or they do not act in proportion."""
+        if not c.linear or c.size_parameters != c.parameters or any(p.log for p in c.parameters):
+            return None
+        whiten, coordinates = floor.whitener(self.parts), [p.coordinate(c.starts[start][p.name]) for p in c.parameters]
+        parts = []
+        for n in dict.fromkeys(p.recording for p in self.parts if p.fitted):
+            both = (*slopes[n].T, *(columns[c.key, start][n] / coordinates).T)
+            parts.append(np.stack([whiten(column, n) for column in both], axis=1))
+        J = np.concatenate(parts)
+        return J if np.isfinite(J).all() else None
+
+    def contest(
+        self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """The best fit of each candidate; fits that cannot catch up with the best one stop.
+
+        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all.
+        """
+        best: dict[str, tuple[Candidate, Fit]] = {}
+        race = Race()
+        small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
+        first = list(dict.fromkeys(small))[:LEADERS]
+        waves: list[list[tuple[Candidate, Point, np.ndarray | None]]] = [[], [], []]
+        for entry in starts:
+            key = entry[0].key
+            waves[0 if self.problem.together or key in first else 1 if key in small else 2].append(entry)
+        for own in waves:
+            if own is waves[2] and best:
+                leading = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
+                if self.is_noise(self.mean_squares([leading.point], floor)[0]):
+                    break
+            fits = self.fits([self.request((*free, *c.parameters), begin, race=race, slopes=J) for c, begin, J in own], floor)
+            for (c, *_), fit in zip(own, fits, strict=True):
+                if c.key not in best or fit.cost < best[c.key][1].cost:
+                    best[c.key] = (c, fit)
+        return best
+
+    def polish(
+        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], base: Fit, floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """The best fits once more, from where they ended, from the declared values, and from those of the very best one.
+
+        The base fit may have led all of them astray, and its weights too, for the settings differ most where the model is wrong: each is
+        weighed by the floor where it stands. Which end is the best one is said by the errors, for weights differ.
+        """
+        ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
+        top = [entry for entry in ranked if len(entry[0].parameters) <= MANY][:POLISHED]
+        if not top or top[0][1].cost > 0.7 * base.cost or self.is_noise(self.mean_squares([top[0][1].point], floor)[0]):
+            return {}
+        self.tell(f"refining {', '.join(c.key for c, _ in top)}")
+        declared, leading = {p.name: p.value for p in self.problem.declared}, ranked[0][1].point
+        out: dict[str, tuple[Candidate, Fit]] = {}
+        for c, fit in top:
+            if not self.runs(fit.point):  # there is no floor there
+                continue
+            starts = [fit.point, {**fit.point, **declared}]
+            if fit is not ranked[0][1]:
+                starts.append({**fit.point, **{name: leading[name] for name in declared}})
+            own, race = self.floor(fit.point), Race()
+            ends = [fit, *self.fits([self.request((*free, *c.parameters), start, race=race) for start in starts], own)]
+            left = [score(squares) for squares in self.mean_squares([end.point for end in ends], own, fitted=True)]
+            found = ends[int(np.argmin(left))]
+            out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
+        return out
+
+    def alike(
+        self,
+        free: Sequence[Parameter],
+        best: Mapping[str, tuple[Candidate, Fit]],
+        candidates: Sequence[Candidate],
+        chosen: Mapping[str, int],
+        columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
+        slopes: Mapping[int, np.ndarray],
+        floor: Floor,
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of the candidates that act on the data as the leading one does, from its fit, with the sizes that do as much.
+
+        A fit that started far from there may have been given up, and a class would lack one of its members.
+        """
+        small = [entry for entry in best.values() if len(entry[0].parameters) <= MANY]
+        if not small:
+            return {}
+        lead, fit = min(small, key=lambda entry: entry[1].cost)
+        if not lead.linear or lead.size_parameters != lead.parameters:
+            return {}
+        parts = [p for p in self.parts if p.fitted]
+        q, _ = np.linalg.qr(np.concatenate([self.weighted(slopes[p.recording], p, floor) for p in parts]))
+
+        def seen(key: str, i: int) -> np.ndarray:
+            A = np.concatenate([self.weighted(columns[key, i][p.recording], p, floor) for p in parts])
+            return A - q @ (q.T @ A)
+
+        start = lead.starts[chosen[lead.key]]
+        does = seen(lead.key, chosen[lead.key]) @ np.array([fit.point[p.name] / start[p.name] for p in lead.parameters])
+        if not np.isfinite(does).all():
+            return {}
+        requests, of = [], []
+        without = {k: v for k, v in fit.point.items() if k not in start}
+        for c in candidates:
+            if c is lead or not c.linear or len(c.parameters) > MANY or (c.key in best and best[c.key][1].cost < 1.5 * fit.cost):
+                continue
+            for i, shape in enumerate(c.starts):
+                A = seen(c.key, i)
+                if not np.isfinite(A).all():
+                    continue
+                amount = np.linalg.lstsq(A, does, rcond=1e-6)[0]
+                if np.sum((does - A @ amount) ** 2) < ALIKE * np.sum(does**2):
+                    sizes = {p.name: min(max(shape[p.name] * f, p.lower), p.upper) for p, f in zip(c.size_parameters, amount, strict=True)}
+                    requests.append(self.request((*free, *c.parameters), without | dict(shape) | sizes, race=Race(fit.cost)))
+                    of.append(c)
+                    break
+        out: dict[str, tuple[Candidate, Fit]] = {}
+        for c, other in zip(of, self.fits(requests, floor), strict=True):
+            if c.key not in best or other.cost < best[c.key][1].cost:
+                out[c.key] = (c, other)
+        return out
+
+    def elsewhere(
+        self, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of one size once more, from the declared values and a larger size: the slope at zero may have led into a side valley."""
+        requests, of, race = [], [], Race(min(fit.cost for _, fit in best.values()))
+        for key, (c, fit) in best.items():
+            if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
+                continue
+            (p,) = c.size_parameters
+            size = math.copysign(FAR * abs(starts[key][p.name]), fit.point[p.name])
+            begin = dict(fit.point) | {d.name: d.value for d in self.problem.declared} | {p.name: min(max(size, p.lower), p.upper)}
+            requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
+            of.append(c)
+        self.tell(f"again from elsewhere: {', '.join(c.key for c in of)}")
+        fits = zip(of, self.fits(requests, floor), strict=True)
+        return {c.key: (c, fit) for c, fit in fits if fit.cost < best[c.key][1].cost}
