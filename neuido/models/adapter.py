@@ -53,7 +53,7 @@ class LowRankAdaptation(Method):
         init_from: str = "pretrained",
         rank: int = 16,
         alpha: float = 16.0,
-        lr: float = 1e-3,
+        lr: float = 3e-3,
         latent_lr: float = 3e-2,
         prior_weight: float = 0.0,
         plausibility_weight: float = 1.0,

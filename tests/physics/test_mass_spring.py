@@ -93,7 +93,7 @@ def leaves(one, x):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("power, lanes", [(0.0, 1), (0.5, 1), (0.5, 4), (0.5, 32)])
+@pytest.mark.parametrize(("power", "lanes"), [(0.0, 1), (0.5, 1), (0.5, 4), (0.5, 32)])
 def test_rollout_and_adjoint_equal_the_twin(power, lanes, device):
     x = cloud().to(device)
     one = body(scene_with_every_contact(), x, power=power)
