@@ -4,8 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from neuido.discrepancy import next_experiment
 from neuido.discrepancy import report_figures as draw
 from neuido.discrepancy import report_silhouettes as pictures
@@ -139,7 +137,7 @@ def _ranking(d: Diagnosis) -> list[str]:
     for i, r in enumerate(d.rounds):
         kept = {id(t) for t in r.members} if r.chosen is not None else set()
         trials = sorted(r.trials, key=lambda t: (id(t) not in kept, t.score))
-        threshold = float(np.quantile(r.null, 1 - ALPHA)) if len(r.null) else 0.0
+        threshold = r.by_chance(ALPHA)
         out.append(f"<h2>Ranking{f', step {i + 1}' if len(d.rounds) > 1 else ''}</h2>")
         out.append(draw.ranking([(t.candidate.key, t.gain, id(t) in kept) for t in trials], threshold))
         rows = []

@@ -169,7 +169,7 @@ class Inference(Contests):
 
     def by_chance(self, r: Round) -> float:
         """Gain up to which an effect is not worth another look, be it alone or with a second one."""
-        return max(float(np.quantile(r.null, 1 - ALPHA)) if len(r.null) else 0.0, SOME_GAIN)
+        return max(r.by_chance(ALPHA), SOME_GAIN)
 
     def is_rival(self, t: Trial, top: Trial) -> bool:
         """Whether the data cannot tell `t` from the best one: about its errors, a gain of its own, and not by many more parameters."""
@@ -177,7 +177,7 @@ class Inference(Contests):
 
     def _why(self, t: Trial, top: Trial, result: Round) -> str:
         if result.chosen is None:
-            at_least = max(float(np.quantile(result.null, 1 - ALPHA)), self.least_gain(result.errors, result.floors, t.errors))
+            at_least = max(result.by_chance(ALPHA), self.least_gain(result.errors, result.floors, t.errors))
             return f"lowers the error {math.exp(t.gain):.2f}-fold; with nuisances and discretisation it takes {math.exp(at_least):.2f}-fold"
         return f"leaves {math.exp(0.5 * (t.score - top.score)):.1f} times the error of {top.candidate.name}"
 

@@ -71,6 +71,10 @@ class Round:
         """How far the residual of its base is above its floors: a ratio of errors."""
         return times_over(self.errors, self.floors)
 
+    def by_chance(self, level: float) -> float:
+        """Gain that the best candidate exceeds by chance with this probability; zero where nothing was drawn."""
+        return float(np.quantile(self.null, 1 - level)) if len(self.null) else 0.0
+
     @property
     def leaders(self) -> list[str]:
         """Keys of the candidates that the chosen one could be mistaken for, and of the next best."""
