@@ -23,6 +23,8 @@ FAR = 6.0
 """Times the size that a candidate is screened at, for a fit from elsewhere."""
 POLISHED = 4
 """Candidates whose fits are refined from further starts."""
+IN_REACH = 4.0
+"""Times the lowest cost up to which that of a fit is worth refining: twice its error."""
 ALIKE = 0.3
 """Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
 
@@ -85,7 +87,8 @@ class Contests(Laboratory):
         weighed by the floor where it stands. Which end is the best one is said by the errors, for weights differ.
         """
         ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
-        top = [entry for entry in ranked if len(entry[0].parameters) <= MANY][:POLISHED]
+        within = [entry for entry in ranked if entry[1].cost < IN_REACH * ranked[0][1].cost]
+        top = [entry for entry in within if len(entry[0].parameters) <= MANY][:POLISHED]
         if not top or top[0][1].cost > 0.7 * base.cost or self.is_noise(self.mean_squares([top[0][1].point], floor)[0]):
             return {}
         self.tell(f"refining {', '.join(c.key for c, _ in top)}")
