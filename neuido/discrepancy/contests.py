@@ -1,6 +1,5 @@
 """Full fits of candidates side by side: who is fitted from where, who is given up, and whose fit is tried again from elsewhere."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -163,15 +162,19 @@ class Contests(Laboratory):
         self, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
     ) -> dict[str, tuple[Candidate, Fit]]:
         """Fits of one size once more, from the declared values and a larger size: the slope at zero may have led into a side valley."""
-        requests, of, race = [], [], Race(min(fit.cost for _, fit in best.values()))
+        requests, of, race = [], [], Race(min((fit.cost for _, fit in best.values()), default=np.inf))
         for key, (c, fit) in best.items():
             if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
                 continue
             (p,) = c.size_parameters
-            size = math.copysign(FAR * abs(starts[key][p.name]), fit.point[p.name])
-            begin = dict(fit.point) | {d.name: d.value for d in self.problem.declared} | {p.name: min(max(size, p.lower), p.upper)}
-            requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
-            of.append(c)
-        self.tell(f"again from elsewhere: {', '.join(c.key for c in of)}")
-        fits = zip(of, self.fits(requests, floor), strict=True)
-        return {c.key: (c, fit) for c, fit in fits if fit.cost < best[c.key][1].cost}
+            for sign in (1.0, -1.0) if p.lower < 0 else (1.0,):
+                size = min(max(sign * FAR * abs(starts[key][p.name]), p.lower), p.upper)
+                begin = dict(fit.point) | {d.name: d.value for d in self.problem.declared} | {p.name: size}
+                requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
+                of.append(c)
+        self.tell(f"again from elsewhere: {', '.join(dict.fromkeys(c.key for c in of))}")
+        out: dict[str, tuple[Candidate, Fit]] = {}
+        for c, fit in zip(of, self.fits(requests, floor), strict=True):
+            if fit.cost < (out[c.key] if c.key in out else best[c.key])[1].cost:
+                out[c.key] = (c, fit)
+        return out

@@ -126,7 +126,8 @@ class Inference(Contests):
         model = self._linear(base.point, floor, slopes, columns, chosen, everywhere, candidates)
         empty = Round(base.point, errors, [], None, [], 1.0, floor, self.floors(base.point, free, floor), null=model.null(self.draws))
         result = self.judge(empty, best, model, list(chosen))
-        if first and result.chosen is None and result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials):
+        promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
+        if first and result.chosen is None and (promising or result.over > 1.0):
             best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
             result = self.judge(empty, best, model, list(chosen))
         return result
