@@ -317,3 +317,25 @@ def test_a_size_behind_a_ridge_is_found_from_elsewhere(monkeypatch):
     assert found.after["step.c"] == pytest.approx(1.026, abs=0.01)
     monkeypatch.setattr(contests, "FAR", 1.0)
     assert "step" not in [t.candidate.name for t in diagnose(problem, keep=12).effects]
+
+
+def test_a_size_of_the_other_sign_is_found_from_elsewhere(monkeypatch):
+    class Ridge(Line):
+        """`step` acts as c (c + 5/2) below zero, and the other way round above: no small size does what a large one does."""
+
+        def __init__(self, y):
+            super().__init__(y)
+            own = Candidate("step", (Parameter("step.c", "1", 0.0, 0.1, -5.0, 5.0),), ({"step.c": 0.25},), "flight")
+            self.__dict__["candidates"] = (own,)
+
+        def predict(self, points, recording, setting=0):
+            rows = super().predict(points, recording, setting)
+            c = np.array([p.get("step.c", 0.0) for p in points])
+            return rows + np.where(c < 0, c * (c + 2.5), -0.2 * c)[:, None] * np.sin(50 * T)
+
+    problem = Ridge(lambda t: 3.0 * t + 0.54 * np.sin(50 * t))
+    found = diagnose(problem)
+    assert [t.candidate.name for t in found.effects] == ["step"]
+    assert found.after["step.c"] == pytest.approx(-2.700, abs=0.01)
+    monkeypatch.setattr(contests, "FAR", 1.0)
+    assert not diagnose(problem).effects
