@@ -193,7 +193,7 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
         beside = tuple(p for t in rest for p in t.candidate.parameters)
         own = {p.name for p in r.chosen.candidate.parameters}
         without = {k: v for k, v in base.point.items() if k not in own}
-        members = [t for t in (*r.members, *simpler(r)) if t.candidate.name not in {o.candidate.name for o in rest}]
+        members = [t for t in (*r.members, *simpler(r, r.chosen)) if t.candidate.name not in {o.candidate.name for o in rest}]
         if len(members) == 1:
             continue
         requests = []
@@ -213,11 +213,9 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
     return base, found
 
 
-def simpler(r: Round) -> list[Trial]:
+def simpler(r: Round, chosen: Trial) -> list[Trial]:
     """The best trials of a round that have fewer parameters than the chosen one, are no members, and came close to it."""
-    if r.chosen is None:
-        return []
-    sizes, limit = len(r.chosen.candidate.size_parameters), r.chosen.score + 2.0 * math.log(CLOSE)
+    sizes, limit = len(chosen.candidate.size_parameters), chosen.score + 2.0 * math.log(CLOSE)
     others = [t for t in r.trials if t not in r.members and len(t.candidate.size_parameters) < sizes and t.score < limit]
     return sorted((t for t in others if not unphysical(t.candidate, t.fit.point)), key=lambda t: t.penalised)[:LOOKED_AHEAD]
 

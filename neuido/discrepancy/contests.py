@@ -1,6 +1,6 @@
 """Full fits of candidates side by side: who is fitted from where, who is given up, and whose fit is tried again from elsewhere."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +26,16 @@ IN_REACH = 4.0
 """Times the lowest cost up to which that of a fit is worth refining: twice its error."""
 ALIKE = 0.3
 """Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
+
+
+def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candidate, Fit]]) -> dict[str, tuple[Candidate, Fit]]:
+    """The fit of least cost of each candidate, by its key, where it beats the one there is."""
+    out: dict[str, tuple[Candidate, Fit]] = {}
+    for c, fit in fits:
+        rival = out.get(c.key) or than.get(c.key)
+        if rival is None or fit.cost < rival[1].cost:
+            out[c.key] = (c, fit)
+    return out
 
 
 class Contests(Laboratory):
@@ -72,9 +82,7 @@ class Contests(Laboratory):
                 if self.is_noise(self.mean_squares([leading.point], floor)[0]):
                     break
             fits = self.fits([self.request((*free, *c.parameters), begin, race=race, slopes=J) for c, begin, J in own], floor)
-            for (c, *_), fit in zip(own, fits, strict=True):
-                if c.key not in best or fit.cost < best[c.key][1].cost:
-                    best[c.key] = (c, fit)
+            best |= better(zip((c for c, *_ in own), fits, strict=True), best)
         return best
 
     def polish(
@@ -91,14 +99,14 @@ class Contests(Laboratory):
         if not top or top[0][1].cost > 0.7 * base.cost or self.is_noise(self.mean_squares([top[0][1].point], floor)[0]):
             return {}
         self.tell(f"refining {', '.join(c.key for c, _ in top)}")
-        declared, leading = {p.name: p.value for p in self.problem.declared}, ranked[0][1].point
+        leading = ranked[0][1].point
         out: dict[str, tuple[Candidate, Fit]] = {}
         for c, fit in top:
             if not self.runs(fit.point):  # there is no floor there
                 continue
-            starts = [fit.point, {**fit.point, **declared}]
+            starts = [fit.point, {**fit.point, **self.as_declared}]
             if fit is not ranked[0][1]:
-                starts.append({**fit.point, **{name: leading[name] for name in declared}})
+                starts.append({**fit.point, **{name: leading[name] for name in self.as_declared}})
             own, race = self.floor(fit.point), Race()
             ends = [fit, *self.fits([self.request((*free, *c.parameters), start, race=race) for start in starts], own)]
             left = [score(squares) for squares in self.mean_squares([end.point for end in ends], own, fitted=True)]
@@ -126,15 +134,8 @@ class Contests(Laboratory):
         lead, fit = min(small, key=lambda entry: entry[1].cost)
         if not lead.linear or lead.size_parameters != lead.parameters:
             return {}
-        parts = [p for p in self.parts if p.fitted]
-        q, _ = np.linalg.qr(np.concatenate([self.weighted(slopes[p.recording], p, floor) for p in parts]))
-
-        def seen(key: str, i: int) -> np.ndarray:
-            A = np.concatenate([self.weighted(columns[key, i][p.recording], p, floor) for p in parts])
-            return A - q @ (q.T @ A)
-
-        start = lead.starts[chosen[lead.key]]
-        does = seen(lead.key, chosen[lead.key]) @ np.array([fit.point[p.name] / start[p.name] for p in lead.parameters])
+        past, start = self.past(slopes, floor), lead.starts[chosen[lead.key]]
+        does = past(columns[lead.key, chosen[lead.key]]) @ np.array([fit.point[p.name] / start[p.name] for p in lead.parameters])
         if not np.isfinite(does).all():
             return {}
         requests, of = [], []
@@ -143,7 +144,7 @@ class Contests(Laboratory):
             if c is lead or not c.linear or len(c.parameters) > MANY or (c.key in best and best[c.key][1].cost < 1.5 * fit.cost):
                 continue
             for i, shape in enumerate(c.starts):
-                A = seen(c.key, i)
+                A = past(columns[c.key, i])
                 if not np.isfinite(A).all():
                     continue
                 amount = np.linalg.lstsq(A, does, rcond=1e-6)[0]
@@ -152,11 +153,7 @@ class Contests(Laboratory):
                     requests.append(self.request((*free, *c.parameters), without | dict(shape) | sizes, race=Race(fit.cost)))
                     of.append(c)
                     break
-        out: dict[str, tuple[Candidate, Fit]] = {}
-        for c, other in zip(of, self.fits(requests, floor), strict=True):
-            if c.key not in best or other.cost < best[c.key][1].cost:
-                out[c.key] = (c, other)
-        return out
+        return better(zip(of, self.fits(requests, floor), strict=True), best)
 
     def elsewhere(
         self, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
@@ -169,12 +166,8 @@ class Contests(Laboratory):
             (p,) = c.size_parameters
             for sign in (1.0, -1.0) if p.lower < 0 else (1.0,):
                 size = min(max(sign * FAR * abs(starts[key][p.name]), p.lower), p.upper)
-                begin = dict(fit.point) | {d.name: d.value for d in self.problem.declared} | {p.name: size}
+                begin = dict(fit.point) | self.as_declared | {p.name: size}
                 requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
                 of.append(c)
         self.tell(f"again from elsewhere: {', '.join(dict.fromkeys(c.key for c in of))}")
-        out: dict[str, tuple[Candidate, Fit]] = {}
-        for c, fit in zip(of, self.fits(requests, floor), strict=True):
-            if fit.cost < (out[c.key] if c.key in out else best[c.key])[1].cost:
-                out[c.key] = (c, fit)
-        return out
+        return better(zip(of, self.fits(requests, floor), strict=True), best)

@@ -1,14 +1,19 @@
 """How sure the fitted parameters are: noise, nuisances, and what another grid, step or solver would have made of them."""
 
+from collections.abc import Sequence
+
 import numpy as np
+from scipy.stats import norm
 from scipy.stats import t as student
 
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import Laboratory
+from neuido.discrepancy.problem import Parameter
 
 QUANTILE = 0.95
 """Of each end of a 90 % interval."""
+NORMAL = float(norm.ppf(QUANTILE))
 
 
 def intervals(laboratory: Laboratory, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
@@ -23,30 +28,36 @@ def intervals(laboratory: Laboratory, fit: Fit, floor: Floor, errors: np.ndarray
     noise = np.array([floor.noise[p.recording] ** 2 for p in laboratory.parts])
     above = np.maximum(errors - noise, 0.0)
     spread = np.array([np.mean(floor.spread[p.recording][p.rows] ** 2) for p in laboratory.parts])
-    variances, solver = _first_order(laboratory, fit, floor, room=min(float(np.max(above / np.maximum(spread, 1e-300))), 1.0))
+    variances, solver = _first_order(laboratory, parameters, fit, floor, _room(above, spread))
     if parameters and not laboratory.is_noise(errors):
         refits = laboratory.refits(fit.point, parameters, floor)
         if refits:
-            shares = above / np.maximum(np.mean([squares for _, squares in refits], axis=0), 1e-300)
-            room = min(float(np.max(shares[np.isfinite(shares)], initial=0.0)), 1.0)
+            room = _room(above, np.mean([squares for _, squares in refits], axis=0))
             shifts = np.array([[p.coordinate(f.point[p.name]) - p.coordinate(fit.point[p.name]) for p in parameters] for f, _ in refits])
             solver = np.maximum(solver, room * _widened(len(shifts)) ** 2 * np.mean(shifts**2, axis=0))
     out = {}
     for parameter, deviation in zip(parameters, np.sqrt(variances + solver), strict=True):
-        q, half = parameter.coordinate(fit.point[parameter.name]), student.ppf(QUANTILE, np.inf) * deviation
+        q, half = parameter.coordinate(fit.point[parameter.name]), NORMAL * deviation
         out[parameter.name] = (parameter.physical(q - half), parameter.physical(q + half))
     return out
 
 
+def _room(above: np.ndarray, error: np.ndarray) -> float:
+    """The largest share, at most all, of an error that what is left above the noise has room for; both mean squares of the parts."""
+    shares = above / np.maximum(error, 1e-300)
+    return min(float(np.max(shares[np.isfinite(shares)], initial=0.0)), 1.0)
+
+
 def _widened(count: int) -> float:
     """Student's quantile over the normal one, for a deviation about a known mean of so many values."""
-    return float(student.ppf(QUANTILE, count) / student.ppf(QUANTILE, np.inf))
+    return float(student.ppf(QUANTILE, count)) / NORMAL
 
 
-def _first_order(laboratory: Laboratory, fit: Fit, floor: Floor, room: float) -> tuple[np.ndarray, np.ndarray]:
+def _first_order(
+    laboratory: Laboratory, parameters: Sequence[Parameter], fit: Fit, floor: Floor, room: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Variances of the coordinates by noise and nuisances, and by the differences of the settings, through the slopes."""
     parts = [p for p in laboratory.parts if p.fitted]
-    parameters = [laboratory.problem.parameter(name) for name in fit.names]
     slopes = laboratory.slopes(parameters, fit.point, [p.recording for p in parts], step=0.1)
     gain = np.linalg.pinv(np.concatenate([laboratory.weighted(slopes[p.recording], p, floor) for p in parts]))
     variances, solver, at = np.zeros(len(parameters)), np.zeros(len(parameters)), 0

@@ -41,6 +41,8 @@ class Laboratory:
         self.parts = split(problem)
         self.fitted = [p.fitted for p in self.parts]
         self.fitted_recordings = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
+        self.as_declared = {p.name: p.value for p in problem.declared}
+        """The declared parameters at the values that the model states."""
         self.noise_squares = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
         """Mean squares of the noise of each part."""
 
@@ -200,17 +202,14 @@ class Laboratory:
         """Starts of full fits, best first: (predicted share of the misfit that stays, candidate, start, point), and the directions."""
         fits = [p for p in self.parts if p.fitted]
         columns = self.columns(point, candidates, [p.recording for p in fits])
-        residual = np.concatenate([self.weighted(floor.settle(self.residual(point, p.recording), p), p, floor) for p in fits])
-        J = np.concatenate([self.weighted(slopes[p.recording], p, floor) for p in fits])
-        q, _ = np.linalg.qr(J) if J.shape[1] else (np.empty((len(residual), 0)), None)
-        left = residual - q @ (q.T @ residual)
+        past = self.past(slopes, floor)
+        left = past({p.recording: floor.settle(self.residual(point, p.recording), p) for p in fits})
         ranked = []
         for c in candidates:
             for i, start in enumerate(c.starts):
-                A = np.concatenate([self.weighted(columns[c.key, i][p.recording], p, floor) for p in fits])
-                if not np.isfinite(A).all():
+                B = past(columns[c.key, i])
+                if not np.isfinite(B).all():
                     continue
-                B = A - q @ (q.T @ A)
                 amount = -np.linalg.lstsq(B, left, rcond=1e-6)[0]
                 sizes = c.size_parameters
                 if not c.linear:
@@ -230,6 +229,21 @@ class Laboratory:
                 ranked.append((stays, c, i, begin))
         ranked.sort(key=lambda entry: entry[0])
         return ranked, columns
+
+    def past(self, slopes: Mapping[int, np.ndarray], floor: Floor) -> Callable[[Mapping[int, np.ndarray]], np.ndarray]:
+        """What columns of the fitted recordings, {recording: (n,) or (n, k)}, do past the parameters of the slopes: their weighted rows."""
+        fits = [p for p in self.parts if p.fitted]
+
+        def rows(of: Mapping[int, np.ndarray]) -> np.ndarray:
+            return np.concatenate([self.weighted(of[p.recording], p, floor) for p in fits])
+
+        q, _ = np.linalg.qr(rows(slopes))
+
+        def past(columns: Mapping[int, np.ndarray]) -> np.ndarray:
+            A = rows(columns)
+            return A - q @ (q.T @ A)
+
+        return past
 
     def residual(self, point: Point, n: int) -> np.ndarray:
         return self.memo.predict([point], n, self.setting)[0] - self.problem.recordings[n].y

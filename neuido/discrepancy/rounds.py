@@ -111,14 +111,14 @@ class Inference(Contests):
                 chosen[c.key] = i
                 starts.append((c, begin, self.first_slopes(c, i, free, slopes, columns, floor)))
                 if not c.linear:
-                    starts.append((c, begin | {p.name: p.value for p in self.problem.declared}, None))
+                    starts.append((c, begin | self.as_declared, None))
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
                 starts.append((c, begin, None))
         finite = {c.key for _, c, *_ in ranked}
         for c in candidates:  # what cannot run where the base fit went may run where the model was declared
             if first and c.key not in finite and len(c.parameters) <= MANY:
                 chosen[c.key] = 0
-                starts.append((c, base.point | {p.name: p.value for p in self.problem.declared} | dict(c.starts[0]), None))
+                starts.append((c, base.point | self.as_declared | dict(c.starts[0]), None))
         self.tell(f"fitting {', '.join(chosen)}")
         best = self.contest(free, starts, floor)
         best |= self.polish(free, best, base, floor)
