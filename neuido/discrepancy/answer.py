@@ -95,7 +95,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
     motion = motions(d)
     series = {name: _stages(d, name, arrays) for name, arrays in motion.items() if "positions" in arrays}
     tell("ceiling")
-    ceilings = {when: ceiling.of(d, point, seed=seed) for when, point in (("before", d.before), ("after", d.after))}
+    ceilings = {when: ceiling.of(d, when, seed=seed) for when in ("before", "after")}
     tell("next experiment")
     content = {
         "format": FORMAT,
@@ -110,6 +110,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
             "noise_floor": d.floors["noise"],
             "discretisation_floor": d.floors["discretisation"],
             **{when: errors(d, when) for when in ("before", "after")},
+            **_settings(d),
         },
         "rejected": rejected(d),
         "next_experiment": next_experiment.propose(d),
@@ -130,9 +131,22 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
     return Details(_plain(content), motion, series, ceilings, drawn)
 
 
-def errors(d: Diagnosis, when: str) -> dict[str, Any]:
-    """Errors of the parts that are fitted, of those that are held out, and by recording; joined ones weigh each datum alike."""
-    own = d.errors[when]
+def _settings(d: Diagnosis) -> dict[str, Any]:
+    """Of what is discretised: the amounts of the other settings in the prediction, and the errors without them."""
+    if d.problem.settings == 1:
+        return {}
+    names = [d.problem.setting_name(s) for s in range(d.problem.settings) if s != d.setting]
+    amounts = {when: dict(zip(names, own)) for when, own in d.amounts.items()}
+    return {"amounts": amounts, "one_setting": {when: errors(d, when, one_setting=True) for when in ("before", "after")}}
+
+
+def errors(d: Diagnosis, when: str, *, one_setting: bool = False) -> dict[str, Any]:
+    """Errors of the parts that are fitted, of those that are held out, and by recording; joined ones weigh each datum alike.
+
+    The prediction is a simulation under the setting in use, and the differences of the others to it in the amounts that the fitted
+    recordings hold; `one_setting`: the simulation alone.
+    """
+    own = (d.one_setting if one_setting else d.errors)[when]
 
     def joined(fitted: bool) -> float | None:
         parts = [p for p in d.parts if p.fitted == fitted]
@@ -238,13 +252,13 @@ def motions(d: Diagnosis) -> dict[str, dict[str, np.ndarray]]:
     """What was measured and what is predicted before and after, for each recording, as the errors of the diagnosis count it.
 
     Bodies: `positions` (1), `measured`, `before` and `after` (T, N, 3) [m], the clock, the ruler and the launch at their most probable
-    values, `before_model` and `after_model` without that, `t` (T,). Others: the data as vectors, with `times` and `groups` (which
-    channel a row is of).
+    values and the other settings in their amounts, `before_model` and `after_model` without all that, `t` (T,). Others: the data as
+    vectors, with `times` and `groups` (which channel a row is of).
     """
     out = {}
     problem: Problem = d.problem
     for n, recording in enumerate(problem.recordings):
-        own = {when: ceiling.as_seen(d, point, n) for when, point in (("before", d.before), ("after", d.after))}
+        own = {when: ceiling.as_seen(d, when, n) for when in ("before", "after")}
         if not getattr(problem, "tracked", hasattr(problem, "motion")):
             out[recording.name] = {"times": recording.times, "groups": recording.groups, "measured": recording.y, **own}
             continue

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neuido.discrepancy import evidence
 from neuido.discrepancy.contests import MANY
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
@@ -14,7 +13,7 @@ from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
-from neuido.discrepancy.rounds import ALPHA, WITHIN, Inference, as_good
+from neuido.discrepancy.rounds import ALPHA, WITHIN, Inference
 from neuido.discrepancy.trials import Round, Start, Trial, score, unphysical
 
 __all__ = [
@@ -40,7 +39,7 @@ UNEXPLAINED = 2.0
 """Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
 UNEXPLAINED_EXACT = 3.0
 """The same where nothing is discretised: the noise that a folder states is an estimate."""
-WORSE = 1.5
+WORSE = 3.0
 """Times the error of the better method at which the other one is not asked any more, where that found nothing."""
 LOOKED_AHEAD = 2
 """Effects that are tried with a second one, where none gains enough alone, or in the place of one with more parameters."""
@@ -59,7 +58,13 @@ class Diagnosis:
     after: Point
     parts: list[Part]
     errors: dict[str, dict[str, float]]
-    """`before` and `after`: error of each recording by name."""
+    """`before` and `after`: error of each recording by name, with the differences of the settings that the fitted recordings hold."""
+    one_setting: dict[str, dict[str, float]]
+    """The same of a simulation under one setting alone."""
+    amounts: dict[str, np.ndarray]
+    """`before` and `after`: how much of each difference that is."""
+    final: dict[str, Floor]
+    """`before` and `after`: noise and discretisation there."""
     floors: dict[str, float]
     intervals: dict[str, tuple[float, float]]
     declared_intervals: dict[str, tuple[float, float]]
@@ -103,7 +108,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     inference, start = tried[chosen], starts[chosen]
     if len(tried) > 1:
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
-    at, floor = start.fit, start.floor
+    at = start.fit
     found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
@@ -114,9 +119,10 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         floor = inference.floor(at.point)
         rounds.append(inference.round(at, floor, found))
     if len(found) > 1:
+        floor = inference.floor(at.point)
         at, found = drop(inference, at, floor, found)
         at, found = narrow(inference, at, floor, found, rounds)
-    return conclude(inference, start.fit.point, at, found, rounds, floor)
+    return conclude(inference, start, inference.finished(at), found, rounds)
 
 
 def first_rounds(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[int, list[Round]]:
@@ -172,7 +178,7 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
         good = [t for t in good if t.gain > LEAST_GAIN]
     for t in sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]:
         second = inference.round(t.fit, inference.floor(t.fit.point), [t], most=MANY)
-        if second.chosen is not None and evidence.gain(first.errors, second.chosen.errors, inference.fitted) > 2.0 * LEAST_GAIN:
+        if second.chosen is not None and inference.gain(first.errors, second.chosen.errors) > 2.0 * LEAST_GAIN:
             t.reason = ""
             members = [other for other in good if inference.is_rival(other, t)]
             for other in members:
@@ -206,7 +212,7 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
         at = min(range(len(weighed)), key=lambda i: weighed[i].penalised)
         for t, new in zip(members, weighed, strict=True):
             above = math.exp(0.5 * (new.score - weighed[at].score))
-            near = new is weighed[at] or as_good(new, weighed[at])
+            near = new is weighed[at] or inference.as_good(new, weighed[at])
             t.reason = "" if near else f"with all effects that were found it leaves {above:.1f} times the error of the best"
         found[found.index(r.chosen)] = members[at]
         base, r.chosen, r.members = fits[at], members[at], [t for t in members if not t.reason]
@@ -230,12 +236,12 @@ def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> t
         start = {k: v for k, v in base.point.items() if k.split(".")[0] != trial.candidate.name}
         (fit,) = inference.fits([inference.request((*inference.problem.declared, *extra), start)], floor)
         without, with_it = inference.mean_squares([fit.point, base.point], floor)
-        if evidence.gain(without, with_it, inference.fitted) < LEAST_GAIN / 2:
+        if inference.gain(without, with_it) < LEAST_GAIN / 2:
             base, found = fit, rest
     return base, found
 
 
-def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial], rounds: list[Round], floor: Floor) -> Diagnosis:
+def conclude(inference: Inference, start: Start, base: Fit, found: list[Trial], rounds: list[Round]) -> Diagnosis:
     """The answer and its figures."""
     first = rounds[0]
     kept = {t.candidate.key for t in found}
@@ -247,26 +253,33 @@ def conclude(inference: Inference, before: Point, base: Fit, found: list[Trial],
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"
-    squares = inference.mean_squares([before, base.point], floor)
-    errors = {when: _by_recording(inference, row) for when, row in zip(("before", "after"), squares, strict=True)}
-    after = intervals(inference, base, floor, squares[1])
-    start = Fit(before, tuple(p.name for p in inference.problem.declared), 0.0, np.empty(0), 0, True)
-    declared = intervals(inference, start, first.floor, squares[0]) if inference.problem.declared else {}
-    scale = inference.problem.error(np.ones(1), 0)
-    floors = {
-        "noise": scale * math.sqrt(np.mean([v**2 for v in floor.noise.values()])),
-        "discretisation": scale * math.sqrt(np.mean([np.mean(v**2) for v in floor.spread.values()])),
-    }
+    points = {"before": start.fit.point, "after": base.point}
+    final = {when: inference.floor(point) for when, point in points.items()}
+    squares = {when: inference.mean_squares([point], final[when])[0] for when, point in points.items()}
+    alone = {when: inference.mean_squares([point], final[when], plain=True)[0] for when, point in points.items()}
+    final = {when: inference.sharpened(floor, squares[when]) for when, floor in final.items()}
+    own = intervals(inference, base, final["after"], squares["after"])
+    declared = {}
+    if inference.problem.declared:
+        before = Fit(start.fit.point, tuple(p.name for p in inference.problem.declared), 0.0, np.empty(0), 0, True)
+        declared = intervals(inference, before, final["before"], squares["before"])
+    scale, floor = inference.problem.error(np.ones(1), 0), final["after"]
     return Diagnosis(
         inference.problem,
         answer,
         steps,
-        before,
+        start.fit.point,
         base.point,
         inference.parts,
-        errors,
-        floors,
-        after,
+        {when: _by_recording(inference, row) for when, row in squares.items()},
+        {when: _by_recording(inference, row) for when, row in alone.items()},
+        {when: inference.amounts(point, final[when]) for when, point in points.items()},
+        final,
+        {
+            "noise": scale * math.sqrt(np.mean([v**2 for v in floor.noise.values()])),
+            "discretisation": scale * math.sqrt(np.mean([np.mean(v**2) for v in floor.spread.values()])),
+        },
+        own,
         declared,
         inference.setting,
         inference.memo.work,

@@ -65,9 +65,26 @@ class Setting:
     """Factor of the suggested step."""
     solver: str = "material_points"
     """`material_points` or `finite_elements`."""
+    elements: float = 1.0
+    """Finite elements a particle."""
+
+    @property
+    def name(self) -> str:
+        """For the report."""
+        if self.solver == "finite_elements":
+            return "finite elements" + (f", {self.elements:g} a particle" if self.elements != 1.0 else "")
+        parts = [f"{self.cells:g} times the cells"] * (self.cells != 1.0) + [f"{self.dt:g} of the step"] * (self.dt != 1.0)
+        return ", ".join(parts) or "suggested"
 
 
-SETTINGS = (Setting(1.0, 1.0), Setting(1.0, 0.5), Setting(0.85, 1.0), Setting(1.2, 0.5), Setting(1.0, 1.0, "finite_elements"))
+SETTINGS = (
+    Setting(1.0, 1.0),
+    Setting(1.0, 0.5),
+    Setting(0.85, 1.0),
+    Setting(1.2, 0.5),
+    Setting(1.0, 1.0, "finite_elements"),
+    Setting(1.0, 1.0, "finite_elements", elements=0.6),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +101,7 @@ class BodyProblem(Problem):
     tracked: bool = True
     """Whether the data are positions of points."""
     _simulators: dict[Any, Simulator] = field(default_factory=dict, repr=False)
-    _meshes: dict[int, Mesh] = field(default_factory=dict, repr=False)
+    _meshes: dict[tuple[int, float], Mesh] = field(default_factory=dict, repr=False)
     _maps: dict[int, Any] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
 
@@ -112,15 +129,17 @@ class BodyProblem(Problem):
         return self.device != "cpu"
 
     def refinements(self, setting: int) -> list[int]:
-        """The others of its own method where there are two of them, else all others."""
+        """The others of its own method, or all others where there are none."""
         others = super().refinements(setting)
-        alike = [s for s in others if SETTINGS[s].solver == SETTINGS[setting].solver]
-        return alike if len(alike) > 1 else others
+        return [s for s in others if SETTINGS[s].solver == SETTINGS[setting].solver] or others
 
     def effort(self, recording: int, setting: int = 0) -> float:
         """Particle-substeps; inner steps of the finite elements count as one."""
         r = self.measured[recording]
         return float(len(r.body.x) * _frames(r, r.scene.dt * SETTINGS[setting].dt)[1])
+
+    def setting_name(self, setting: int) -> str:
+        return SETTINGS[setting].name
 
     def error(self, residual: np.ndarray, recording: int) -> float:
         return float(np.sqrt(3.0 * np.mean(residual**2)))
@@ -255,7 +274,7 @@ class BodyProblem(Problem):
                 scene = replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)
                 scenes, bodies, density = [scene] * count, [r.body] * count, self.experiment.model["density"]
                 if s.solver == "finite_elements":
-                    found = FiniteElements(scenes, bodies, density=density, device=self.device, meshes=self._mesh(recording))
+                    found = FiniteElements(scenes, bodies, density=density, device=self.device, meshes=self._mesh(recording, s.elements))
                 else:
                     found = Simulator(scenes, bodies, density=density, device=self.device)
                 while len(self._simulators) >= KEPT[torch.device(self.device).type]:
@@ -263,12 +282,13 @@ class BodyProblem(Problem):
             self._simulators[key] = found  # the last one used is the last one to go
         return found
 
-    def _mesh(self, recording: int) -> Mesh:
+    def _mesh(self, recording: int, elements: float) -> Mesh:
         """The body of a recording as finite elements have it; seconds of work, so that all simulators share it."""
-        if recording not in self._meshes:
+        if (recording, elements) not in self._meshes:
             body = self.measured[recording].body
-            self._meshes[recording] = mesh_body(body.x, body.volume)
-        return self._meshes[recording]
+            wanted = None if elements == 1.0 else round(elements * len(body.x))
+            self._meshes[recording, elements] = mesh_body(body.x, body.volume, elements=wanted)
+        return self._meshes[recording, elements]
 
     def _start(self, simulator: Simulator, points: Sequence[Point], recording: int) -> ParticleState:
         """The start with the velocities and spins of each point."""

@@ -34,25 +34,32 @@ class Ceiling:
     by_part: Mapping[str, float] = field(default_factory=dict)
 
 
-def of(d: Diagnosis, point: Mapping[str, float], *, seed: int = 0) -> Ceiling:
-    """The ceiling of a problem's residual at a point."""
-    floor = d.rounds[-1].floor
+def of(d: Diagnosis, when: str, *, seed: int = 0) -> Ceiling:
+    """The ceiling of a problem's residual; `when`: before or after."""
+    floor = d.final[when]
     rows = []
     for part in d.parts:
         n = part.recording
-        seen = as_seen(d, point, n)
+        seen = as_seen(d, when, n)
         features, target, weight = _samples(d, part, seen, d.problem.recordings[n].y - seen, floor.weight[n])
         rows.append((part.name, part.fitted, features, target, weight, floor.noise[n]))
     return train([row[1:5] for row in rows], noises=[row[5] for row in rows], names=[row[0] for row in rows], seed=seed)
 
 
-def as_seen(d: Diagnosis, point: Mapping[str, float], n: int) -> np.ndarray:
-    """What a point predicts of recording n with its nuisances at their most probable values, as in the errors of a diagnosis, (n,)."""
+def as_seen(d: Diagnosis, when: str, n: int) -> np.ndarray:
+    """What is predicted of recording n, as the errors of a diagnosis count it, (n,); `when`: before or after.
+
+    The nuisances are at their most probable values, and the other settings take part in the amounts that the fitted recordings hold.
+    """
+    point, floor = {"before": d.before, "after": d.after}[when], d.final[when]
     predicted, y = d.problem.predict([point], n, d.setting)[0], d.problem.recordings[n].y
+    r = predicted - y
+    if len(d.amounts[when]):
+        r = r - floor.differences[n] @ d.amounts[when]
     out = predicted.copy()
     for part in d.parts:
         if part.recording == n:
-            out[part.rows] = (y + d.rounds[-1].floor.settle(predicted - y, part))[part.rows]
+            out[part.rows] = (y + floor.settle(r, part))[part.rows]
     return out
 
 

@@ -1,5 +1,6 @@
 """Full fits of candidates side by side: who is fitted from where, who is given up, and whose fit is tried again from elsewhere."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -24,6 +25,13 @@ POLISHED = 4
 """Candidates whose fits are refined from further starts."""
 IN_REACH = 4.0
 """Times the lowest cost up to which that of a fit is worth refining: twice its error."""
+MEASURED, NEAR = 6, 4.0
+"""Fits whose errors are measured with the differences of the settings where they end: so many of the best, within this factor of their
+errors."""
+ONWARD = 3
+"""Further fits of a candidate, each with the differences of the settings where the last one ended, while each gains `SOME_GAIN`."""
+SOME_GAIN = math.log(1.2)
+"""Smaller gains are no reason to look further."""
 ALIKE = 0.3
 """Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
 
@@ -96,7 +104,11 @@ class Contests(Laboratory):
         ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
         within = [entry for entry in ranked if entry[1].cost < IN_REACH * ranked[0][1].cost]
         top = [entry for entry in within if len(entry[0].parameters) <= MANY][:POLISHED]
-        if not top or top[0][1].cost > 0.7 * base.cost or self.is_noise(self.mean_squares([top[0][1].point], floor)[0]):
+        if not top:
+            return {}
+        before, *squares = self.mean_squares([base.point, *(fit.point for _, fit in top)], floor)
+        gains = max(self.gain(before, square) for square in squares)
+        if (top[0][1].cost > 0.7 * self.costs([base.point], floor)[0] and gains < SOME_GAIN) or self.is_noise(squares[0]):
             return {}
         self.tell(f"refining {', '.join(c.key for c, _ in top)}")
         leading = ranked[0][1].point
@@ -107,12 +119,46 @@ class Contests(Laboratory):
             starts = [fit.point, {**fit.point, **self.as_declared}]
             if fit is not ranked[0][1]:
                 starts.append({**fit.point, **{name: leading[name] for name in self.as_declared}})
-            own, race = self.floor(fit.point), Race()
-            ends = [fit, *self.fits([self.request((*free, *c.parameters), start, race=race) for start in starts], own)]
-            left = [score(squares) for squares in self.mean_squares([end.point for end in ends], own, fitted=True)]
-            found = ends[int(np.argmin(left))]
+            found, own = self.from_here((*free, *c.parameters), fit, starts, floor)
+            for _ in range(ONWARD):
+                left = self.mean_squares([found.point], own)[0]
+                if self.is_noise(left) or not self.runs(found.point):
+                    break
+                further, there = self.from_here((*free, *c.parameters), found, [found.point], floor)
+                if score(self.mean_squares([further.point], there)[0]) > score(left) - 2.0 * SOME_GAIN:
+                    break
+                found, own = further, there
             out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
         return out
+
+    def from_here(self, free: Sequence[Parameter], fit: Fit, starts: Sequence[Point], like: Floor) -> tuple[Fit, Floor]:
+        """The best of a fit and of those from some starts, all with the floor where the fit stands; and the floor."""
+        own, race = self.floor(fit.point, like=like), Race()
+        own = self.sharpened(own, self.mean_squares([fit.point], own)[0])
+        ends = [fit, *self.fits([self.request(free, start, race=race) for start in starts], own)]
+        left = [score(squares) for squares in self.mean_squares([end.point for end in ends], own, fitted=True)]
+        return ends[int(np.argmin(left))], own
+
+    def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[np.ndarray]:
+        """Mean squares of the parts for each fit, in their order; those of the leading ones with the floor where they end, if that is less.
+
+        What another grid does moves with the law: the differences at the base say little of it where a fit has gone far.
+        """
+        points = [fit.point for _, fit in best.values()]
+        squares = self.mean_squares(points, floor)
+        if self.problem.settings == 1 or not points:
+            return squares
+        order = sorted(range(len(points)), key=lambda i: score(squares[i]))[:MEASURED]
+        limit = score(squares[order[0]]) + 2.0 * math.log(NEAR)
+        leading = [i for i in order if score(squares[i]) < limit and not self.is_noise(squares[i])]
+        with self.memo.during("discretisation"):  # all of them in one launch
+            for n in floor.noise:
+                for s in range(self.problem.settings):
+                    self.memo.predict([points[i] for i in leading], n, s)
+        for i in leading:
+            if self.runs(points[i]):
+                squares[i] = min(squares[i], self.mean_squares([points[i]], self.floor(points[i], like=floor))[0], key=score)
+        return squares
 
     def alike(
         self,

@@ -1,13 +1,19 @@
 """How far chance, the nuisances and the discretisation alone would go: a linear model of the fits and its parametric bootstrap.
 
 All directions (declared parameters, nuisances, discretisation, candidates) are brought to one orthonormal basis, so that a draw
-costs a few small products. Reference: Westfall and Young, Resampling-Based Multiple Testing, 1993 (the maximum over candidates).
+costs a few small products. Fits hold the differences of the settings beside the parameters, with a prior, and the nuisances are taken
+out of every recording, as in the errors of a diagnosis. Reference: Westfall and Young, Resampling-Based Multiple Testing, 1993 (the
+maximum over candidates).
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+NOISE_ALONE = 1.8
+"""Mean squares up to so many times that of the noise are noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +59,7 @@ class LinearModel:
         fitted = np.concatenate([p.weighted(r) for p, r in zip(self.parts, draw, strict=True) if p.fitted])
         for name, solve in self.solvers.items():
             keys = () if name is None else (name,)
-            q = solve @ fitted
+            q = solve[:, : len(fitted)] @ fitted
             out[name] = np.array([p.square(r - p.design(keys) @ q) for p, r in zip(self.parts, draw, strict=True)])
         return out
 
@@ -63,7 +69,8 @@ class LinearModel:
 
     def _largest(self, errors: Mapping[str | None, np.ndarray]) -> float:
         base = errors[None]
-        return max((gain(base, errors[key], [p.fitted for p in self.parts]) for key in self.keys), default=0.0)
+        fitted, noise = [p.fitted for p in self.parts], np.array([p.noise**2 for p in self.parts])
+        return max((gain(base, errors[key], fitted, noise) for key in self.keys), default=0.0)
 
     def cosine(self, a: str, b: str) -> float:
         """Cosine of two candidates in the fit's metric, the declared parameters projected out (largest over their planes)."""
@@ -75,11 +82,22 @@ class LinearModel:
         return float(np.linalg.svd(A.T @ B, compute_uv=False).max(initial=0.0))
 
 
-def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool]) -> float:
-    """Logarithm of the ratio of errors, before over after: the smaller of those of the fitted and of the held-out recordings."""
+def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: np.ndarray) -> float:
+    """Logarithm of the ratio of errors, before over after: the smaller of those of the fitted and of the held-out recordings.
+
+    Of the held-out ones alone where the fitted ones are at the noise before and after: the declared parameters have taken the effect in
+    there, and what they predict of the others says so. All arguments but `fitted` are mean squares of the parts.
+    """
     fitted = np.array(fitted)
-    groups = [g for g in (fitted, ~fitted) if g.any()]
-    return min(0.5 * float(np.diff(np.log(np.clip([after[g].mean(), before[g].mean()], 1e-300, 1e300)))[0]) for g in groups)
+
+    def ratio(group: np.ndarray) -> float:
+        return 0.5 * math.log(min(max(before[group].mean(), 1e-300), 1e300) / min(max(after[group].mean(), 1e-300), 1e300))
+
+    if not (~fitted).any():
+        return ratio(fitted)
+    if fitted.any() and not max(before[fitted].mean(), after[fitted].mean()) < NOISE_ALONE * noise[fitted].mean():
+        return min(ratio(fitted), ratio(~fitted))
+    return ratio(~fitted)
 
 
 class _Part:
@@ -95,16 +113,24 @@ class _Part:
         basis = (everything @ vectors[:, keep]) / np.sqrt(values[keep])
         self.count, self.noise = len(everything), columns.noise
         self.outside = max(self.count - basis.shape[1], 0)
-        self.declared = basis.T @ columns.declared
-        self.nuisances = basis.T @ columns.nuisances
+        N = basis.T @ columns.nuisances
+        back = np.linalg.solve(N.T @ N / self.noise**2 + np.eye(N.shape[1]), N.T / self.noise**2)
+
+        def past(A: np.ndarray) -> np.ndarray:
+            return A - N @ (back @ A)
+
+        self.past = past
+        self.nuisances, self.smooth = N, basis.T @ columns.smooth
         self.discretisation = basis.T @ columns.discretisation
-        self.smooth = basis.T @ columns.smooth
-        self.candidates = {key: basis.T @ value for key, value in columns.candidates.items()}
+        self.declared = past(basis.T @ columns.declared)
+        self.settings = past(self.discretisation)
+        self.candidates = {key: past(basis.T @ value) for key, value in columns.candidates.items()}
         # the weights vary slowly over the data: in the basis each direction gets its own mean weight
         self.scale = np.sqrt(np.maximum((basis**2).T @ columns.weight**2, 1e-300))
 
     def design(self, keys: Sequence[str]) -> np.ndarray:
-        return np.concatenate([self.declared, *(self.candidates[key] for key in keys)], axis=1)
+        """What a fit moves, the amounts of the settings' differences last."""
+        return np.concatenate([self.declared, *(self.candidates[key] for key in keys), self.settings], axis=1)
 
     def weighted(self, r: np.ndarray) -> np.ndarray:
         return r[: len(self.scale)] * self.scale
@@ -115,7 +141,7 @@ class _Part:
         for columns in (self.nuisances, self.discretisation, self.smooth):
             r = r + columns @ rng.standard_normal(columns.shape[1])
         self.rest = self.noise**2 * (rng.chisquare(self.outside) if self.outside else 0.0)
-        return r
+        return self.past(r)
 
     def square(self, r: np.ndarray) -> float:
         """Mean square over all data of the recording."""
@@ -123,4 +149,7 @@ class _Part:
 
 
 def _solver(parts: Sequence[_Part], keys: Sequence[str]) -> np.ndarray:
-    return np.linalg.pinv(np.concatenate([p.design(keys) * p.scale[:, None] for p in parts]), rcond=1e-8)
+    A = np.concatenate([p.design(keys) * p.scale[:, None] for p in parts])
+    amounts = parts[0].settings.shape[1]
+    prior = np.eye(A.shape[1])[A.shape[1] - amounts :]
+    return np.linalg.pinv(np.concatenate([A, prior]), rcond=1e-8)

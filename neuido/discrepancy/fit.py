@@ -63,6 +63,8 @@ class Fit:
     converged: bool
 
 
+Whiten = Callable[[np.ndarray, int], np.ndarray]
+"""(residual (n,) of a recording, its number) -> whitened residual of its fitted rows."""
 Request = Generator[list[Point], list[np.ndarray | None], Fit]
 
 
@@ -88,6 +90,7 @@ def levenberg_marquardt(
     *,
     iterations: int = 12,
     tolerance: float = 2e-3,
+    nothing: float = NOTHING,
     damping: float = 1e-2,
     together: bool = True,
     race: Race | None = None,
@@ -103,6 +106,7 @@ def levenberg_marquardt(
         start: Where, with the values of all that does not move.
         iterations: At most.
         tolerance: Relative gain of an iteration that ends the fit.
+        nothing: Relative gain, as the linear model promises it, that is not worth a run.
         damping: Of the first step.
         together: Ask for all dampings and slopes of a step at once, where a launch of several points costs as one; else for few.
         race: The fits that it is compared with.
@@ -136,7 +140,7 @@ def levenberg_marquardt(
         A, g = J.T @ J, J.T @ r
         tried = [np.clip(q + move, low, high) for move in _moves(A, g, damping)]
         promise = [-float((t - q) @ (2 * g + A @ (t - q))) for t in tried]
-        if max(promise) < NOTHING * cost and np.abs(tried[0] - q).max() < 0.5:
+        if max(promise) < nothing * cost and np.abs(tried[0] - q).max() < 0.5:
             if fresh:
                 converged = True
                 break
@@ -200,7 +204,7 @@ def _bound(p: Parameter, value: float) -> float:
 def run(
     problem: Problem | Memo,
     requests: Sequence[Request],
-    whiten: Callable[[np.ndarray, int], np.ndarray],
+    whiten: Whiten | Sequence[Whiten],
     recordings: Sequence[int],
     *,
     setting: int = 0,
@@ -212,7 +216,7 @@ def run(
     Args:
         problem: What predicts.
         requests: The fits.
-        whiten: (residual (n,) of a recording, its number) -> whitened residual.
+        whiten: (residual (n,) of a recording, its number) -> whitened residual; one for all fits or one for each.
         recordings: Numbers of the recordings that are fitted.
         setting: Setting of the discretisation.
         tick: Called with the number of points of each round.
@@ -224,8 +228,10 @@ def run(
         wanted[i] = next(request)
     while wanted:
         points = [p for asked in wanted.values() for p in asked]
-        own = None if data is None else [data[i] for i, asked in wanted.items() for _ in asked]
-        answers = residuals(problem, points, whiten, recordings, setting, own)
+        of = [i for i, asked in wanted.items() for _ in asked]
+        own = None if data is None else [data[i] for i in of]
+        white = whiten if callable(whiten) else [whiten[i] for i in of]
+        answers = residuals(problem, points, white, recordings, setting, own)
         if tick is not None:
             tick(len(points))
         at, after = 0, {}
@@ -243,7 +249,7 @@ def run(
 def residuals(
     problem: Problem | Memo,
     points: Sequence[Point],
-    whiten: Callable[[np.ndarray, int], np.ndarray],
+    whiten: Whiten | Sequence[Whiten],
     recordings: Sequence[int],
     setting: int = 0,
     data: Sequence[Mapping[int, np.ndarray]] | None = None,
@@ -254,7 +260,8 @@ def residuals(
     for n in recordings:
         for i, row in enumerate(problem.predict(points, n, setting)):
             if np.isfinite(row).all():
-                parts[i].append(whiten(row - (problem.recordings[n].y if data is None else data[i][n]), n))
+                own = whiten if callable(whiten) else whiten[i]
+                parts[i].append(own(row - (problem.recordings[n].y if data is None else data[i][n]), n))
             else:
                 good[i] = False
     return [np.concatenate(part) if ok else None for part, ok in zip(parts, good, strict=True)]

@@ -1,7 +1,7 @@
 """What is fitted, what is held out, and what noise, nuisances and discretisation do to each."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from neuido.discrepancy.problem import Problem
 
 BOUND = 2.5
 """Prior standard deviations that a nuisance may move by."""
+REACH = 3.0
+"""Times the difference of a setting that the data may lie in its direction: another grid, and one as fine again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,24 +32,65 @@ class Floor:
     weight: dict[int, np.ndarray]
     """One over the standard deviation of each datum."""
     differences: dict[int, np.ndarray]
-    """Of the other settings to the one in use, (n, k)."""
+    """Of the other settings to the one in use, (n, k): a column each, zero for one that cannot run."""
     spread: dict[int, np.ndarray]
     """Root mean square of the discretisation error of each datum."""
     nuisances: dict[int, np.ndarray] = field(default_factory=dict)
     """What one prior standard deviation of each nuisance does, (n, k); empty: they are held."""
 
     def whitener(self, parts: Sequence[Part]) -> Callable[[np.ndarray, int], np.ndarray]:
-        """Residuals of the fitted rows in units of their standard deviation, the nuisances marginalised."""
+        """Residuals (n,) or (n, k) of the fitted rows in units of their standard deviation.
+
+        The nuisances are marginalised, and so are the amounts of the differences of the settings: the data may lie on another grid or
+        under another method, and go with these directions whatever the law (Richardson 1911 takes one of them to its limit).
+        """
         rows = {p.recording: p.rows for p in parts if p.fitted}
-        covariance = {
-            n: Covariance.of(1.0, (self.nuisances[n] * self.weight[n][:, None])[own]) for n, own in rows.items() if n in self.nuisances
+        columns = {
+            n: np.concatenate([c[n] for c in (self.nuisances, self.differences) if n in c], axis=1)
+            for n in rows
+            if n in self.nuisances or n in self.differences
         }
+        covariance = {n: Covariance.of(1.0, (c * self.weight[n][:, None])[rows[n]]) for n, c in columns.items()}
 
         def whiten(r: np.ndarray, n: int) -> np.ndarray:
-            weighted = (r * self.weight[n])[rows[n]]
+            weighted = (r * (self.weight[n][:, None] if r.ndim == 2 else self.weight[n]))[rows[n]]
             return covariance[n].whiten(weighted) if n in covariance else weighted
 
         return whiten
+
+    def weighed(self, share: float) -> "Floor":
+        """The floor with weights that leave so large a share of the discretisation error outside the directions of the differences."""
+        return replace(self, weight={n: 1.0 / np.sqrt(self.noise[n] ** 2 + (share * self.spread[n]) ** 2) for n in self.weight})
+
+    def without(self, setting: int) -> "Floor":
+        """The floor without the difference of one of the other settings, by its place among them."""
+        kept = {n: D * (np.arange(D.shape[1]) != setting) for n, D in self.differences.items()}
+        return replace(self, differences=kept)
+
+    def amounts(self, residuals: Mapping[int, np.ndarray], parts: Sequence[Part]) -> np.ndarray:
+        """How much of each difference of the settings the fitted parts of residuals (n,) hold, (k,): the same for all recordings.
+
+        The prior of each is of mean zero and deviation one, and none is beyond `REACH`.
+        """
+        A, b = [], []
+        for part in parts:
+            if part.fitted and part.recording in self.differences:
+                w, past = self.noise[part.recording], self._past_nuisances(part)
+                A.append(past(self.differences[part.recording][part.rows]) / w)
+                b.append(past(residuals[part.recording][part.rows]) / w)
+        if not A or not A[0].shape[1]:
+            return np.zeros(0)
+        A, b = np.concatenate(A), np.concatenate(b)
+        return _bounded(A.T @ A + np.eye(A.shape[1]), A.T @ b, REACH)
+
+    def _past_nuisances(self, part: Part) -> Callable[[np.ndarray], np.ndarray]:
+        """What the nuisances of a part leave of its rows."""
+        N = self.nuisances.get(part.recording)
+        if N is None or not N.shape[1]:
+            return lambda r: r
+        N, w = N[part.rows], self.noise[part.recording]
+        back = np.linalg.solve(N.T @ N / w**2 + np.eye(N.shape[1]), N.T / w**2)
+        return lambda r: r - N @ (back @ r)
 
     def settle(self, r: np.ndarray, part: Part) -> np.ndarray:
         """A residual (n,) with the nuisances of its recording at their most probable values."""
@@ -56,16 +99,20 @@ class Floor:
             return r
         A, b = N[part.rows], r[part.rows]
         w = self.noise[part.recording]
-        normal, right = A.T @ A / w**2 + np.eye(A.shape[1]), A.T @ b / w**2
-        values, free = np.zeros(len(right)), np.ones(len(right), bool)
-        while free.any():  # thousands of correlated data would outweigh any prior: beyond its bounds a nuisance is held there
-            values[free] = np.linalg.solve(normal[np.ix_(free, free)], right[free] - normal[np.ix_(free, ~free)] @ values[~free])
-            beyond = free & (np.abs(values) > BOUND)
-            if not beyond.any():
-                break
-            values[beyond] = np.clip(values[beyond], -BOUND, BOUND)
-            free &= ~beyond
-        return r - N @ values
+        return r - N @ _bounded(A.T @ A / w**2 + np.eye(A.shape[1]), A.T @ b / w**2, BOUND)
+
+
+def _bounded(normal: np.ndarray, right: np.ndarray, bound: float) -> np.ndarray:
+    """The solution of normal equations within bounds: thousands of correlated data would outweigh any prior."""
+    values, free = np.zeros(len(right)), np.ones(len(right), bool)
+    while free.any():
+        values[free] = np.linalg.solve(normal[np.ix_(free, free)], right[free] - normal[np.ix_(free, ~free)] @ values[~free])
+        beyond = free & (np.abs(values) > bound)
+        if not beyond.any():
+            break
+        values[beyond] = np.clip(values[beyond], -bound, bound)
+        free &= ~beyond
+    return values
 
 
 def split(problem: Problem) -> list[Part]:

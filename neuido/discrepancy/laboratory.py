@@ -8,18 +8,21 @@ from typing import Any
 import numpy as np
 
 from neuido.discrepancy import evidence
+from neuido.discrepancy.evidence import NOISE_ALONE
 from neuido.discrepancy.fit import Fit, Request, levenberg_marquardt, residuals, run
-from neuido.discrepancy.floors import Floor, Part, over_time, split
+from neuido.discrepancy.floors import Floor, over_time, split
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
-from neuido.discrepancy.trials import Start
+from neuido.discrepancy.trials import Start, score
 
 LEAST_GAIN = math.log(1.7)
 """Smaller gains are no reason to name anything: other solvers differ by as much in ways that no setting of one solver shows."""
-NOISE_ALONE = 1.8
-"""Mean squares up to so many times that of the noise are noise."""
 ROUGH = 0.02
 """Relative gain that ends the fit before the floors are known."""
+UNSEEN = 0.1
+"""Largest share of the differences of the settings that lies outside their directions: what a fit weighs the data by, beside the noise."""
+AGAIN = 2
+"""Fits of the declared model with the differences of the settings, each with those of where the last one ended."""
 
 Tell = Callable[[str], None]
 
@@ -49,16 +52,33 @@ class Laboratory:
     # Fits.
 
     def fits(
-        self, requests: Sequence, floor: Floor, *, to: Sequence[Mapping[int, np.ndarray]] | None = None, step: str = "fits"
+        self,
+        requests: Sequence,
+        floor: Floor | Sequence[Floor],
+        *,
+        to: Sequence[Mapping[int, np.ndarray]] | None = None,
+        step: str = "fits",
     ) -> list[Fit]:
-        """Run fits side by side, to the data or each to motions in their place; their work counts as that of `step`."""
+        """Run fits side by side, to the data or each to motions in their place; their work counts as that of `step`.
+
+        `floor`: what weighs the residuals, one for all fits or one for each.
+        """
 
         def tick(count: int) -> None:
             self.tell(f"{self.memo.simulations} simulations")
 
+        floors = [floor] * len(requests) if isinstance(floor, Floor) else floor
+        whiteners = {id(f): f.whitener(self.parts) for f in floors}
         with self.memo.during(step):
-            whiten, rows = floor.whitener(self.parts), self.fitted_recordings
-            return run(self.memo, requests, whiten, rows, setting=self.setting, data=to, tick=tick)
+            return run(
+                self.memo,
+                requests,
+                [whiteners[id(f)] for f in floors],
+                self.fitted_recordings,
+                setting=self.setting,
+                data=to,
+                tick=tick,
+            )
 
     def costs(self, points: Sequence[Point], floor: Floor) -> list[float]:
         """Sum of squares of the whitened residuals of the fitted parts, without priors; infinite where the model does not run."""
@@ -66,18 +86,32 @@ class Laboratory:
             rows = residuals(self.memo, points, floor.whitener(self.parts), self.fitted_recordings, self.setting)
         return [math.inf if row is None else float(row @ row) for row in rows]
 
-    def mean_squares(self, points: Sequence[Point], floor: Floor, *, fitted: bool = False) -> list[np.ndarray]:
-        """Of each part, or of the fitted ones alone, at several points, the nuisances at their most probable values."""
-        found = np.full((len(points), len(self.parts)), np.inf)
-        for n in self.fitted_recordings if fitted else dict.fromkeys(p.recording for p in self.parts):
+    def mean_squares(self, points: Sequence[Point], floor: Floor, *, fitted: bool = False, plain: bool = False) -> list[np.ndarray]:
+        """Of each part, or of the fitted ones alone, at several points, the nuisances at their most probable values.
+
+        So are the amounts of the differences of the settings, as the fitted parts have them (`Floor.amounts`), unless `plain`: what is left
+        then is that of one setting alone.
+        """
+        wanted = self.fitted_recordings if fitted else list(dict.fromkeys(p.recording for p in self.parts))
+        rows = {}
+        for n in wanted:
             with self.memo.during("errors of fits"):
-                rows = self.memo.predict(points, n, self.setting) - self.problem.recordings[n].y
+                rows[n] = self.memo.predict(points, n, self.setting) - self.problem.recordings[n].y
+        found = np.full((len(points), len(self.parts)), np.inf)
+        for i in range(len(points)):
+            own = {n: rows[n][i] for n in wanted if np.isfinite(rows[n][i]).all()}
+            if not plain and all(n in own for n in self.fitted_recordings):
+                amounts = floor.amounts(own, self.parts)
+                own = {n: r - floor.differences[n] @ amounts if n in floor.differences else r for n, r in own.items()}
             for j, part in enumerate(self.parts):
-                if part.recording == n:
-                    for i, row in enumerate(rows):
-                        if np.isfinite(row).all():
-                            found[i, j] = np.mean(floor.settle(row, part)[part.rows] ** 2)
+                if part.recording in own:
+                    found[i, j] = np.mean(floor.settle(own[part.recording], part)[part.rows] ** 2)
         return list(found[:, self.fitted] if fitted else found)
+
+    def amounts(self, point: Point, floor: Floor) -> np.ndarray:
+        """How much of each difference of the settings the fitted recordings hold there, (k,); see `Floor.amounts`."""
+        rows = {n: self.residual(point, n) for n in self.fitted_recordings}
+        return floor.amounts(rows, self.parts) if all(np.isfinite(row).all() for row in rows.values()) else np.zeros(0)
 
     def noise(self) -> Floor:
         """The floor without any discretisation error."""
@@ -94,23 +128,36 @@ class Laboratory:
         r = self.problem.recordings[n]
         return r.noise if r.noise else max(1e-3 * float(np.std(r.y)), 1e-12)
 
-    def floor(self, point: Point) -> Floor:
-        """Noise and discretisation at a point: differences of the settings, and how large they are in the course of time."""
+    def floor(self, point: Point, *, like: Floor | None = None) -> Floor:
+        """Noise and discretisation at a point: differences of the settings, and how large they are in the course of time.
+
+        `like`: a floor whose nuisances serve here too.
+        """
         plain = self.noise()
         others = [s for s in range(self.problem.settings) if s != self.setting]
         if not others:
             return replace(plain, nuisances=self.nuisances(point, list(plain.noise)))
-        differences, spread, weight = {}, {}, {}
+        differences, spread = {}, {}
         for n in plain.noise:
             with self.memo.during("discretisation"):
                 here = self.memo.predict([point], n, self.setting)[0]
                 there = [self.memo.predict([point], n, s)[0] for s in others]
-            D = np.stack([t - here for t in there if np.isfinite(t).all()] or [np.zeros_like(here)], axis=1)
+            able = [bool(np.isfinite(t).all()) for t in there]
+            D = np.stack([t - here if ok else np.zeros_like(here) for t, ok in zip(there, able, strict=True)], axis=1)
             differences[n] = D
-            spread[n] = over_time(np.sqrt(np.mean(D**2, axis=1)), self.problem.recordings[n].times)
-            weight[n] = 1.0 / np.sqrt(plain.noise[n] ** 2 + spread[n] ** 2)
+            spread[n] = over_time(np.sqrt(np.sum(D**2, axis=1) / max(sum(able), 1)), self.problem.recordings[n].times)
             self.tell(f"discretisation of {self.problem.recordings[n].name}")
-        return Floor(plain.noise, weight, differences, spread, self.nuisances(point, list(plain.noise)))
+        nuisances = self.nuisances(point, list(plain.noise)) if like is None else like.nuisances
+        return Floor(plain.noise, plain.weight, differences, spread, nuisances).weighed(UNSEEN)
+
+    def sharpened(self, floor: Floor, errors: np.ndarray) -> Floor:
+        """The floor for fits about where `errors`, mean squares of all parts, are left: no more than that is unseen."""
+        if self.problem.settings == 1 or not np.isfinite(errors[self.fitted]).all():
+            return floor
+        parts = [p for p in self.parts if p.fitted]
+        spread = np.mean([np.mean(floor.spread[p.recording][p.rows] ** 2) for p in parts])
+        above = max(float(np.mean((errors - self.noise_squares)[self.fitted])), 0.0)
+        return floor.weighed(min(UNSEEN, math.sqrt(above / max(float(spread), 1e-300))))
 
     def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
         """A fit; options of `levenberg_marquardt`."""
@@ -123,6 +170,15 @@ class Laboratory:
             short = self.fits([self.request(free, s, iterations=3) for s in starts], floor)
             starts = [min(short, key=lambda f: f.cost).point]
         return self.fits([self.request(free, starts[0], **options)], floor)[0]
+
+    def finished(self, fit: Fit) -> Fit:
+        """A fit once more from its end, with the floor there, until a standard deviation of the noise would show."""
+        floor = self.floor(fit.point)
+        floor = self.sharpened(floor, self.mean_squares([fit.point], floor)[0])
+        unit = 1.0 / sum(int(p.rows.sum()) for p in self.parts if p.fitted)
+        parameters = [self.problem.parameter(name) for name in fit.names]
+        (further,) = self.fits([self.request(parameters, fit.point, iterations=6, tolerance=0.3 * unit, nothing=0.1 * unit)], floor)
+        return further if parameters and self.runs(further.point) else fit
 
     def starts(self, point: Point) -> list[Point]:
         """A point, and half and twice each parameter whose logarithm is fitted."""
@@ -143,8 +199,20 @@ class Laboratory:
         if near is not None and not self.runs(fit.point):
             return None
         floor = self.floor(fit.point)
-        fit = self.base([fit.point], floor)
-        return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
+        if self.problem.settings == 1:
+            fit = self.base([fit.point], floor)
+            return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
+        made = []
+        for left in range(AGAIN, -1, -1):
+            errors = self.mean_squares([fit.point], floor)[0]
+            floor = self.sharpened(floor, errors)
+            made.append(Start(fit, floor, errors))
+            if left:
+                fit = self.base([fit.point], floor)
+                if not self.runs(fit.point):
+                    break
+                floor = self.floor(fit.point, like=floor)
+        return min(made, key=lambda start: score(start.errors[self.fitted]))
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""
@@ -156,8 +224,12 @@ class Laboratory:
 
     def is_settled(self, errors: np.ndarray) -> bool:
         """Whether no effect could be named any more: nothing is left but noise, or too little above it for any gain to be enough."""
-        hopeless = self.problem.settings > 1 and evidence.gain(errors, self.noise_squares, self.fitted) < LEAST_GAIN
+        hopeless = self.problem.settings > 1 and self.gain(errors, self.noise_squares) < LEAST_GAIN
         return hopeless or self.is_noise(errors)
+
+    def gain(self, before: np.ndarray, after: np.ndarray) -> float:
+        """`evidence.gain` of mean squares of the parts."""
+        return evidence.gain(before, after, self.fitted, self.noise_squares)
 
     # Screening.
 
@@ -183,19 +255,26 @@ class Laboratory:
         return out
 
     def slopes(self, parameters: Sequence[Parameter], point: Point, recordings: Sequence[int], step: float = 0.3) -> dict[int, np.ndarray]:
-        """Derivatives of the data by coordinates of parameters, one typical step each; central where the range allows."""
+        """Derivatives of the data by coordinates of parameters, one typical step each; central where the range allows.
+
+        One-sided where the model runs on one side alone, and zero where it runs on neither.
+        """
         out = {}
         asked, spans = [], []
         for p in parameters:
             q = p.coordinate(point.get(p.name, p.value))
             ends = [p.physical(q + step), p.physical(q - step)]
             asked += [dict(point) | {p.name: end} for end in ends]
-            spans.append(max(p.coordinate(ends[0]) - p.coordinate(ends[1]), 1e-9))
+            spans.append([p.coordinate(ends[0]) - q, q - p.coordinate(ends[1])])
         for n in recordings:
             with self.memo.during("slopes"):
-                rows = self.memo.predict(asked, n, self.setting)
-            parts = [(rows[2 * i] - rows[2 * i + 1]) / span for i, span in enumerate(spans)]
-            out[n] = np.stack([np.where(np.isfinite(part), part, 0.0) for part in parts], axis=1) if parts else np.empty((rows.shape[1], 0))
+                here, *rows = self.memo.predict([point, *asked], n, self.setting)
+            columns = [np.empty((len(here), 0))]
+            for i, (up, down) in enumerate(spans):
+                high, low = (bool(np.isfinite(row).all()) for row in rows[2 * i : 2 * i + 2])
+                change = (rows[2 * i] if high else here) - (rows[2 * i + 1] if low else here)
+                columns.append((change / max(up * high + down * low, 1e-9))[:, None])
+            out[n] = np.concatenate(columns, axis=1)
         return out
 
     def screen(self, point: Point, candidates: Sequence[Candidate], floor: Floor, slopes: Mapping[int, np.ndarray]):
@@ -203,7 +282,7 @@ class Laboratory:
         fits = [p for p in self.parts if p.fitted]
         columns = self.columns(point, candidates, [p.recording for p in fits])
         past = self.past(slopes, floor)
-        left = past({p.recording: floor.settle(self.residual(point, p.recording), p) for p in fits})
+        left = past({p.recording: self.residual(point, p.recording) for p in fits})
         ranked = []
         for c in candidates:
             for i, start in enumerate(c.starts):
@@ -231,11 +310,11 @@ class Laboratory:
         return ranked, columns
 
     def past(self, slopes: Mapping[int, np.ndarray], floor: Floor) -> Callable[[Mapping[int, np.ndarray]], np.ndarray]:
-        """What columns of the fitted recordings, {recording: (n,) or (n, k)}, do past the parameters of the slopes: their weighted rows."""
-        fits = [p for p in self.parts if p.fitted]
+        """What columns of the fitted recordings, {recording: (n,) or (n, k)}, do past the parameters of the slopes, whitened."""
+        whiten = floor.whitener(self.parts)
 
         def rows(of: Mapping[int, np.ndarray]) -> np.ndarray:
-            return np.concatenate([self.weighted(of[p.recording], p, floor) for p in fits])
+            return np.concatenate([whiten(of[n], n) for n in self.fitted_recordings])
 
         q, _ = np.linalg.qr(rows(slopes))
 
@@ -248,28 +327,29 @@ class Laboratory:
     def residual(self, point: Point, n: int) -> np.ndarray:
         return self.memo.predict([point], n, self.setting)[0] - self.problem.recordings[n].y
 
-    def weighted(self, columns: np.ndarray, part: Part, floor: Floor) -> np.ndarray:
-        w = floor.weight[part.recording][part.rows]
-        return columns[part.rows] * (w[:, None] if columns.ndim == 2 else w)
-
     def refits(self, point: Point, free: Sequence[Parameter], floor: Floor) -> list[tuple[Fit, np.ndarray]]:
         """The motions under the other settings of the same method fitted as if they had been measured: the fits, and what they leave.
 
-        Most of what a grid or a step does a stiffness can do as well: how far a fit goes from `point` is the discretisation error of the
-        parameters, and what it leaves, mean squares of the parts, the one that an effect could be mistaken for.
+        Each without its own difference. Most of what a grid or a step does a stiffness, or the difference of another grid, can do as well:
+        how far a fit goes from `point` is the discretisation error of the parameters, and what it leaves, mean squares of the parts, the
+        one that an effect could be mistaken for.
         """
+        others = [s for s in range(self.problem.settings) if s != self.setting]
+        wanted = self.problem.refinements(self.setting)
         with self.memo.during("discretisation"):
-            made = [{n: self.memo.predict([point], n, s)[0] for n in floor.noise} for s in self.problem.refinements(self.setting)]
-        made = [y for y in made if all(np.isfinite(row).all() for row in y.values())]
+            made = {s: {n: self.memo.predict([point], n, s)[0] for n in floor.noise} for s in wanted}
+        made = {s: y for s, y in made.items() if all(np.isfinite(row).all() for row in y.values())}
+        floors = [floor.without(others.index(s)) for s in made]
         requests = [self.request(free, point, iterations=8, tolerance=ROUGH) for _ in made]
-        fits = self.fits(requests, floor, to=made, step="discretisation")
-        with self.memo.during("discretisation"):
-            seen = {n: self.memo.predict([fit.point for fit in fits], n, self.setting) for n in floor.noise} if fits else {}
-
-        def left(i: int, part: Part) -> float:
-            return float(np.mean(floor.settle(seen[part.recording][i] - made[i][part.recording], part)[part.rows] ** 2))
-
-        return [(fit, np.array([left(i, part) for part in self.parts])) for i, fit in enumerate(fits)]
+        fits = self.fits(requests, floors, to=list(made.values()), step="discretisation")
+        out = []
+        for fit, own, y in zip(fits, floors, made.values(), strict=True):
+            with self.memo.during("discretisation"):
+                rows = {n: self.memo.predict([fit.point], n, self.setting)[0] - y[n] for n in y}
+            amounts = own.amounts(rows, self.parts)
+            left = [own.settle(rows[p.recording] - own.differences[p.recording] @ amounts, p)[p.rows] for p in self.parts]
+            out.append((fit, np.array([float(np.mean(r**2)) for r in left])))
+        return out
 
     def floors(self, point: Point, free: Sequence[Parameter], floor: Floor) -> np.ndarray:
         """Noise, and what a refit leaves of the discretisation error, together as mean squares of the parts."""

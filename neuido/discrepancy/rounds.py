@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.contests import MANY, SMALL, Contests
+from neuido.discrepancy.contests import MANY, SMALL, SOME_GAIN, Contests
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
@@ -22,8 +22,9 @@ from neuido.discrepancy.trials import Round, Trial, times_over, unphysical
 
 ALPHA = 0.05
 """Family-wise level of a named effect."""
-CLASS_RATIO = 1.4
-"""Candidates whose errors are within this factor of the best one's are not told from it."""
+CLASS_RATIO, CLASS_RATIO_ABOVE = 1.4, 1.8
+"""Candidates whose errors are within this factor of the best one's are not told from it; the larger one where that is above the noise, for
+then the errors are those of the discretisation."""
 LEAST_GAIN_EXACT = math.log(1.15)
 """`LEAST_GAIN` where nothing is discretised."""
 GAIN_AT_FLOOR = math.log(2.5)
@@ -38,16 +39,8 @@ HOPELESS = 0.75
 """Share of the misfit that a candidate beyond the first few may leave, as the screening predicts it, and still get a fit."""
 OWN = 3
 """Candidates that the screening of a second solver may add to those that led with the first one."""
-SOME_GAIN = math.log(1.2)
-"""Smaller gains are no reason to look further."""
 WITHIN = 0.5
 """Share of the floor within which a residual that no effect explains is no reason to look further."""
-
-
-def as_good(t: Trial, top: Trial) -> bool:
-    """Whether a fit comes near the errors of the best one; with three parameters more it must be better."""
-    more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
-    return t.score - top.score < (-0.1 if more >= 3 else 2.0 * math.log(CLASS_RATIO))
 
 
 class Inference(Contests):
@@ -93,6 +86,7 @@ class Inference(Contests):
         extra = tuple(p for t in found for p in t.candidate.parameters)
         candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
         errors = self.mean_squares([base.point], floor)[0]
+        floor = self.sharpened(floor, errors)
         free = (*self.problem.declared, *extra)
         everywhere = list(dict.fromkeys(p.recording for p in self.parts))
         slopes = self.slopes(free, base.point, everywhere)
@@ -115,16 +109,22 @@ class Inference(Contests):
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
                 starts.append((c, begin, None))
         finite = {c.key for _, c, *_ in ranked}
-        for c in candidates:  # what cannot run where the base fit went may run where the model was declared
-            if first and c.key not in finite and len(c.parameters) <= MANY:
+        for c in candidates:  # what cannot run where the base fit went, or does nothing there, may do so where the model was declared
+            if (
+                first
+                and c.key not in chosen
+                and (c.key not in finite or c.linear)
+                and len(c.parameters) <= (SMALL if c.key in finite else MANY)
+            ):
                 chosen[c.key] = 0
                 starts.append((c, base.point | self.as_declared | dict(c.starts[0]), None))
         self.tell(f"fitting {', '.join(chosen)}")
         best = self.contest(free, starts, floor)
         best |= self.polish(free, best, base, floor)
         best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
-        model = self._linear(base.point, floor, slopes, columns, chosen, everywhere, candidates)
-        empty = Round(base.point, errors, [], None, [], 1.0, floor, self.floors(base.point, free, floor), null=model.null(self.draws))
+        floors = self.floors(base.point, free, floor)
+        model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, everywhere, candidates)
+        empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=model.null(self.draws))
         result = self.judge(empty, best, model, list(chosen))
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
         if first and result.chosen is None and (promising or result.over > 1.0):
@@ -135,10 +135,10 @@ class Inference(Contests):
     def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel, asked: Sequence[str]) -> Round:
         """A round with the trials that fits make, and what is chosen of them; `asked` are the keys that were to be fitted."""
         errors = empty.errors
-        squares = self.mean_squares([fit.point for _, fit in best.values()], empty.floor)
+        squares = self.measured(best, empty.floor)
         trials = []
         for (c, fit), square in zip(best.values(), squares, strict=True):
-            trial = Trial(c, fit, square, evidence.gain(errors, square, self.fitted))
+            trial = Trial(c, fit, square, self.gain(errors, square))
             trial.reason = unphysical(c, fit.point)
             trials.append(trial)
         trials.sort(key=lambda t: t.score)
@@ -172,9 +172,15 @@ class Inference(Contests):
         """Gain up to which an effect is not worth another look, be it alone or with a second one."""
         return max(r.by_chance(ALPHA), SOME_GAIN)
 
+    def as_good(self, t: Trial, top: Trial) -> bool:
+        """Whether a fit comes near the errors of the best one; with three parameters more it must be better."""
+        more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
+        exact = self.problem.settings == 1 or self.is_noise(top.errors)
+        return t.score - top.score < (-0.1 if more >= 3 else 2.0 * math.log(CLASS_RATIO if exact else CLASS_RATIO_ABOVE))
+
     def is_rival(self, t: Trial, top: Trial) -> bool:
         """Whether the data cannot tell `t` from the best one: about its errors, a gain of its own, and not by many more parameters."""
-        return t is top or (as_good(t, top) and t.gain > 0.4 * top.gain)
+        return t is top or (self.as_good(t, top) and t.gain > 0.4 * top.gain)
 
     def _why(self, t: Trial, top: Trial, result: Round) -> str:
         if result.chosen is None:
@@ -182,7 +188,8 @@ class Inference(Contests):
             return f"lowers the error {math.exp(t.gain):.2f}-fold; with nuisances and discretisation it takes {math.exp(at_least):.2f}-fold"
         return f"leaves {math.exp(0.5 * (t.score - top.score)):.1f} times the error of {top.candidate.name}"
 
-    def _linear(self, point, floor, slopes, columns, chosen, everywhere, candidates) -> evidence.LinearModel:
+    def _linear(self, point, floor, left, slopes, columns, chosen, everywhere, candidates) -> evidence.LinearModel:
+        """The linear model of the fits; `left` is what the discretisation leaves after a refit, mean squares of the parts."""
         held = [p.recording for p in self.parts if not p.fitted]
         by_key = {c.key: c for c in candidates}
         best = {c.key: 0 for c in candidates} | chosen
@@ -191,15 +198,16 @@ class Inference(Contests):
         there = self.columns(point, one, new) if new else {}
         nuisances = floor.nuisances or {n: np.empty((len(self.problem.recordings[n].y), 0)) for n in everywhere}
         made = []
-        for part in self.parts:
+        for part, square in zip(self.parts, left, strict=True):
             n, rows = part.recording, part.rows
             own = {}
             for key, i in best.items():
                 c = columns[key, i][n] if n in columns[key, i] else there[key, 0][n]
                 if np.isfinite(c).all():
                     own[key] = c[rows]
-            scale = floor.spread[n][rows]
-            smooth = 0.5 * scale[:, None] * self.problem.directions(n)[rows]
+            over_time = floor.spread[n][rows]
+            scale = over_time * math.sqrt(square / max(float(np.mean(over_time**2)), 1e-300))
+            smooth = scale[:, None] * self.problem.directions(n)[rows]
             settings = floor.differences[n][rows]
             made.append(evidence.Columns(floor.weight[n][rows], floor.noise[n], slopes[n][rows], nuisances[n][rows], settings, smooth, own))
         common = set.intersection(*(set(c.candidates) for c in made))

@@ -28,7 +28,7 @@ def diagnosis(problem, points: dict[str, dict[str, float]]) -> Diagnosis:
     floor = Floor({}, {}, {}, {})
     step = Round({}, np.ones(2), trials, trials[0], trials, 0.005, floor, np.ones(2))
     point = trials[0].fit.point
-    return Diagnosis(problem, "class", [step], {}, point, floors.split(problem), {}, {}, {}, {}, 0, {})
+    return Diagnosis(problem, "class", [step], {}, point, floors.split(problem), {}, {}, {}, {}, {}, {}, {}, 0, {})
 
 
 def test_distance_is_half_the_whitened_square_after_a_refit():
