@@ -117,7 +117,20 @@ def _errors(c: dict[str, Any]) -> str:
         if e["before"][name] is not None:
             rows.append((label, e["before"][name], e["after"][name], e["before"][name] / max(e["after"][name], 1e-300)))
     floors = f"Floors: noise {e['noise_floor']:.3g} {e['unit']}, discretisation {e['discretisation_floor']:.3g} {e['unit']}."
-    return f"<h2>Error [{escaped(e['unit'])}]</h2>" + table(("recording", "before", "after", "ratio"), rows) + f"<p>{escaped(floors)}</p>"
+    out = f"<h2>Error [{escaped(e['unit'])}]</h2>" + table(("recording", "before", "after", "ratio"), rows) + f"<p>{escaped(floors)}</p>"
+    return out + _settings(e)
+
+
+def _settings(e: dict[str, Any]) -> str:
+    """What other settings take part in the predictions, and what one simulation leaves without them."""
+    if "one_setting" not in e:
+        return ""
+    held = "The predictions hold the differences of other settings, in the amounts that the fitted recordings ask for."
+    rows = [(name, e["amounts"]["before"][name], amount) for name, amount in e["amounts"]["after"].items()]
+    scored = "held_out" if e["one_setting"]["after"]["held_out"] is not None else "fit"
+    before, after = (e["one_setting"][when][scored] for when in ("before", "after"))
+    alone = f"One simulation without them leaves {before:.3g} {e['unit']} before and {after:.3g} {e['unit']} after."
+    return f"<p>{held}</p>" + table(("other setting", "amount before", "amount after"), rows) + f"<p>{escaped(alone)}</p>"
 
 
 def _ratio(e: dict[str, Any], name: str) -> float:

@@ -140,3 +140,15 @@ def test_figures_are_drawn():
         assert "</svg>" in page
     assert report_figures.stage_curves({}) == ""
     assert report_figures.ranking([], 0.0) == ""
+
+
+def test_other_settings_are_named():
+    e = {
+        "unit": "m",
+        "amounts": {"before": {"half <1>": 0.1}, "after": {"half <1>": -0.75}},
+        "one_setting": {"before": {"fit": 0.3, "held_out": 0.4}, "after": {"fit": 0.03, "held_out": 0.0625}},
+    }
+    text = report._settings(e)
+    assert "half &lt;1&gt;" in text and "-0.75" in text
+    assert "leaves 0.4 m before and 0.0625 m after" in text
+    assert report._settings({"unit": "m"}) == ""
