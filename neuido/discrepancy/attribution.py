@@ -14,7 +14,7 @@ from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import ALPHA, WITHIN, Inference
-from neuido.discrepancy.trials import Round, Start, Trial, score, unphysical
+from neuido.discrepancy.trials import Round, Start, Trial, score, times_over, unphysical
 
 __all__ = [
     "ALPHA",
@@ -41,6 +41,8 @@ UNEXPLAINED_EXACT = 3.0
 """The same where nothing is discretised: the noise that a folder states is an estimate."""
 WORSE = 3.0
 """Times the error of the better method at which the other one is not asked any more, where that found nothing."""
+FURTHER = 1.5
+"""Times its floor above which what an effect leaves is searched for another one: six searches below it found none."""
 LOOKED_AHEAD = 2
 """Effects that are tried with a second one, where none gains enough alone, or in the place of one with more parameters."""
 CLOSE = 2.5
@@ -117,12 +119,21 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         if len(found) == most or inference.is_settled(step.errors):
             break
         floor = inference.floor(at.point)
+        if problem.settings > 1 and over_floor(inference, at, floor) < FURTHER:
+            break
         rounds.append(inference.round(at, floor, found))
     if len(found) > 1:
         floor = inference.floor(at.point)
         at, found = drop(inference, at, floor, found)
         at, found = narrow(inference, at, floor, found, rounds)
     return conclude(inference, start, inference.finished(at), found, rounds)
+
+
+def over_floor(inference: Inference, fit: Fit, floor: Floor) -> float:
+    """How far what a fit leaves is above what noise and discretisation would leave after a refit: a ratio of errors."""
+    left = inference.mean_squares([fit.point], floor)[0]
+    free = [inference.problem.parameter(name) for name in fit.names]
+    return times_over(left, inference.floors(fit.point, free, inference.sharpened(floor, left)))
 
 
 def first_rounds(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[int, list[Round]]:

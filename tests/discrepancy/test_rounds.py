@@ -346,3 +346,20 @@ def test_a_size_of_the_other_sign_is_found_from_elsewhere(monkeypatch):
     assert found.after["step.c"] == pytest.approx(-5.106, abs=0.01)
     monkeypatch.setattr(contests, "FAR", 1.0)
     assert not diagnose(problem).effects
+
+
+def test_what_an_effect_leaves_within_the_floor_is_searched_no_further(monkeypatch):
+    def searches(y):
+        lines = []
+        found = diagnose(Tones(y, "low", "high"), tell=lines.append)
+        return sorted(t.candidate.name for t in found.effects), sum(line.startswith("fitting ") for line in lines)
+
+    def low(t):
+        return 3.0 * t + 0.5 * np.sin(40 * t)
+
+    both, more = searches(lambda t: low(t) + 0.25 * np.sin(62 * t))
+    assert both == ["high", "low"] and more == 2
+    monkeypatch.setattr(Inference, "floors", lambda self, point, free, floor: np.full(2, 0.15**2))
+    assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t)) == (["low"], 1)
+    monkeypatch.setattr("neuido.discrepancy.attribution.FURTHER", 0.0)
+    assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t))[1] == 2
