@@ -118,8 +118,9 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         at = step.fit
         if len(found) == most or inference.is_settled(step.errors):
             break
-        floor = inference.floor(at.point)
-        if problem.settings > 1 and over_floor(inference, at, floor) < FURTHER:
+        floor, left = inference.stand(at.point)
+        free = [problem.parameter(name) for name in at.names]
+        if problem.settings > 1 and times_over(left, inference.floors(at.point, free, floor)) < FURTHER:
             break
         rounds.append(inference.round(at, floor, found))
     if len(found) > 1:
@@ -127,13 +128,6 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         at, found = drop(inference, at, floor, found)
         at, found = narrow(inference, at, floor, found, rounds)
     return conclude(inference, start, inference.finished(at), found, rounds)
-
-
-def over_floor(inference: Inference, fit: Fit, floor: Floor) -> float:
-    """How far what a fit leaves is above what noise and discretisation would leave after a refit: a ratio of errors."""
-    left = inference.mean_squares([fit.point], floor)[0]
-    free = [inference.problem.parameter(name) for name in fit.names]
-    return times_over(left, inference.floors(fit.point, free, inference.sharpened(floor, left)))
 
 
 def first_rounds(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[int, list[Round]]:
@@ -188,7 +182,7 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
     if first.over < _limit(inference.problem):  # it may all be the discretisation
         good = [t for t in good if t.gain > LEAST_GAIN]
     for t in sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]:
-        second = inference.round(t.fit, inference.floor(t.fit.point), [t], most=MANY)
+        second = inference.round(t.fit, inference.stand(t.fit.point)[0], [t], most=MANY)
         if second.chosen is not None and inference.gain(first.errors, second.chosen.errors) > 2.0 * LEAST_GAIN:
             t.reason = ""
             members = [other for other in good if inference.is_rival(other, t)]
@@ -265,10 +259,9 @@ def conclude(inference: Inference, start: Start, base: Fit, found: list[Trial], 
     else:
         answer = "none" if enough(inference) else "insufficient"
     points = {"before": start.fit.point, "after": base.point}
-    final = {when: inference.floor(point) for when, point in points.items()}
-    squares = {when: inference.mean_squares([point], final[when])[0] for when, point in points.items()}
+    stands = {when: inference.stand(point) for when, point in points.items()}
+    final, squares = ({when: both[i] for when, both in stands.items()} for i in (0, 1))
     alone = {when: inference.mean_squares([point], final[when], plain=True)[0] for when, point in points.items()}
-    final = {when: inference.sharpened(floor, squares[when]) for when, floor in final.items()}
     own = intervals(inference, base, final["after"], squares["after"])
     declared = {}
     if inference.problem.declared:

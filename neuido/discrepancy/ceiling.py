@@ -53,13 +53,10 @@ def as_seen(d: Diagnosis, when: str, n: int) -> np.ndarray:
     """
     point, floor = {"before": d.before, "after": d.after}[when], d.final[when]
     predicted, y = d.problem.predict([point], n, d.setting)[0], d.problem.recordings[n].y
-    r = predicted - y
-    if len(d.amounts[when]):
-        r = r - floor.differences[n] @ d.amounts[when]
     out = predicted.copy()
     for part in d.parts:
         if part.recording == n:
-            out[part.rows] = (y + floor.settle(r, part))[part.rows]
+            out[part.rows] = (y + floor.settle(predicted - y, part, d.amounts[when]))[part.rows]
     return out
 
 

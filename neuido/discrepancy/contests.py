@@ -133,8 +133,7 @@ class Contests(Laboratory):
 
     def from_here(self, free: Sequence[Parameter], fit: Fit, starts: Sequence[Point], like: Floor) -> tuple[Fit, Floor]:
         """The best of a fit and of those from some starts, all with the floor where the fit stands; and the floor."""
-        own, race = self.floor(fit.point, like=like), Race()
-        own = self.sharpened(own, self.mean_squares([fit.point], own)[0])
+        (own, _), race = self.stand(fit.point, like=like), Race()
         ends = [fit, *self.fits([self.request(free, start, race=race) for start in starts], own)]
         left = [score(squares) for squares in self.mean_squares([end.point for end in ends], own, fitted=True)]
         return ends[int(np.argmin(left))], own

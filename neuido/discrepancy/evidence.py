@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from neuido.discrepancy.floors import past_nuisances
+
 NOISE_ALONE = 1.8
 """Mean squares up to so many times that of the noise are noise."""
 
@@ -59,7 +61,7 @@ class LinearModel:
         fitted = np.concatenate([p.weighted(r) for p, r in zip(self.parts, draw, strict=True) if p.fitted])
         for name, solve in self.solvers.items():
             keys = () if name is None else (name,)
-            q = solve[:, : len(fitted)] @ fitted
+            q = solve @ fitted
             out[name] = np.array([p.square(r - p.design(keys) @ q) for p, r in zip(self.parts, draw, strict=True)])
         return out
 
@@ -113,14 +115,8 @@ class _Part:
         basis = (everything @ vectors[:, keep]) / np.sqrt(values[keep])
         self.count, self.noise = len(everything), columns.noise
         self.outside = max(self.count - basis.shape[1], 0)
-        N = basis.T @ columns.nuisances
-        back = np.linalg.solve(N.T @ N / self.noise**2 + np.eye(N.shape[1]), N.T / self.noise**2)
-
-        def past(A: np.ndarray) -> np.ndarray:
-            return A - N @ (back @ A)
-
-        self.past = past
-        self.nuisances, self.smooth = N, basis.T @ columns.smooth
+        self.nuisances, self.smooth = basis.T @ columns.nuisances, basis.T @ columns.smooth
+        self.past = past = past_nuisances(self.nuisances, self.noise)
         self.discretisation = basis.T @ columns.discretisation
         self.declared = past(basis.T @ columns.declared)
         self.settings = past(self.discretisation)
@@ -152,4 +148,4 @@ def _solver(parts: Sequence[_Part], keys: Sequence[str]) -> np.ndarray:
     A = np.concatenate([p.design(keys) * p.scale[:, None] for p in parts])
     amounts = parts[0].settings.shape[1]
     prior = np.eye(A.shape[1])[A.shape[1] - amounts :]
-    return np.linalg.pinv(np.concatenate([A, prior]), rcond=1e-8)
+    return np.linalg.pinv(np.concatenate([A, prior]), rcond=1e-8)[:, : len(A)]

@@ -75,31 +75,32 @@ class Floor:
         A, b = [], []
         for part in parts:
             if part.fitted and part.recording in self.differences:
-                w, past = self.noise[part.recording], self._past_nuisances(part)
-                A.append(past(self.differences[part.recording][part.rows]) / w)
-                b.append(past(residuals[part.recording][part.rows]) / w)
+                n, w = part.recording, self.noise[part.recording]
+                N = self.nuisances.get(n, np.empty((len(part.rows), 0)))
+                past = past_nuisances(N[part.rows], w)
+                A.append(past(self.differences[n][part.rows]) / w)
+                b.append(past(residuals[n][part.rows]) / w)
         if not A or not A[0].shape[1]:
             return np.zeros(0)
         A, b = np.concatenate(A), np.concatenate(b)
         return _bounded(A.T @ A + np.eye(A.shape[1]), A.T @ b, REACH)
 
-    def _past_nuisances(self, part: Part) -> Callable[[np.ndarray], np.ndarray]:
-        """What the nuisances of a part leave of its rows."""
-        N = self.nuisances.get(part.recording)
-        if N is None or not N.shape[1]:
-            return lambda r: r
-        N, w = N[part.rows], self.noise[part.recording]
-        back = np.linalg.solve(N.T @ N / w**2 + np.eye(N.shape[1]), N.T / w**2)
-        return lambda r: r - N @ (back @ r)
-
-    def settle(self, r: np.ndarray, part: Part) -> np.ndarray:
-        """A residual (n,) with the nuisances of its recording at their most probable values."""
+    def settle(self, r: np.ndarray, part: Part, amounts: np.ndarray | None = None) -> np.ndarray:
+        """A residual (n,) with the nuisances of its recording at their most probable values, and the differences in their amounts (k,)."""
+        if amounts is not None and len(amounts):
+            r = r - self.differences[part.recording] @ amounts
         N = self.nuisances.get(part.recording)
         if N is None or not N.shape[1]:
             return r
         A, b = N[part.rows], r[part.rows]
         w = self.noise[part.recording]
         return r - N @ _bounded(A.T @ A / w**2 + np.eye(A.shape[1]), A.T @ b / w**2, BOUND)
+
+
+def past_nuisances(N: np.ndarray, noise: float) -> Callable[[np.ndarray], np.ndarray]:
+    """What nuisances N (n, k), columns of one prior standard deviation each, leave of columns of data of that noise."""
+    back = np.linalg.solve(N.T @ N / noise**2 + np.eye(N.shape[1]), N.T / noise**2)
+    return lambda A: A - N @ (back @ A)
 
 
 def _bounded(normal: np.ndarray, right: np.ndarray, bound: float) -> np.ndarray:

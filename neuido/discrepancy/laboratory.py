@@ -97,16 +97,21 @@ class Laboratory:
         for n in wanted:
             with self.memo.during("errors of fits"):
                 rows[n] = self.memo.predict(points, n, self.setting) - self.problem.recordings[n].y
-        found = np.full((len(points), len(self.parts)), np.inf)
+        found = []
         for i in range(len(points)):
             own = {n: rows[n][i] for n in wanted if np.isfinite(rows[n][i]).all()}
+            amounts = None
             if not plain and all(n in own for n in self.fitted_recordings):
                 amounts = floor.amounts(own, self.parts)
-                own = {n: r - floor.differences[n] @ amounts if n in floor.differences else r for n, r in own.items()}
-            for j, part in enumerate(self.parts):
-                if part.recording in own:
-                    found[i, j] = np.mean(floor.settle(own[part.recording], part)[part.rows] ** 2)
-        return list(found[:, self.fitted] if fitted else found)
+            found.append(self.left(own, floor, amounts))
+        return [squares[self.fitted] if fitted else squares for squares in found]
+
+    def left(self, residuals: Mapping[int, np.ndarray], floor: Floor, amounts: np.ndarray | None) -> np.ndarray:
+        """Mean squares of the parts of settled residuals (n,) by recording; infinite for a recording that is not there."""
+        return np.array([
+            np.mean(floor.settle(residuals[p.recording], p, amounts)[p.rows] ** 2) if p.recording in residuals else np.inf
+            for p in self.parts
+        ])  # fmt: skip
 
     def amounts(self, point: Point, floor: Floor) -> np.ndarray:
         """How much of each difference of the settings the fitted recordings hold there, (k,); see `Floor.amounts`."""
@@ -159,6 +164,12 @@ class Laboratory:
         above = max(float(np.mean((errors - self.noise_squares)[self.fitted])), 0.0)
         return floor.weighed(min(UNSEEN, math.sqrt(above / max(float(spread), 1e-300))))
 
+    def stand(self, point: Point, *, like: Floor | None = None) -> tuple[Floor, np.ndarray]:
+        """The floor at a point, sharpened by what is left there, and what that is, mean squares of the parts; `like` as for `floor`."""
+        floor = self.floor(point, like=like)
+        errors = self.mean_squares([point], floor)[0]
+        return self.sharpened(floor, errors), errors
+
     def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
         """A fit; options of `levenberg_marquardt`."""
         return levenberg_marquardt(parameters, start, together=self.problem.together, **options)
@@ -173,8 +184,7 @@ class Laboratory:
 
     def finished(self, fit: Fit) -> Fit:
         """A fit once more from its end, with the floor there, until a standard deviation of the noise would show."""
-        floor = self.floor(fit.point)
-        floor = self.sharpened(floor, self.mean_squares([fit.point], floor)[0])
+        floor, _ = self.stand(fit.point)
         unit = 1.0 / sum(int(p.rows.sum()) for p in self.parts if p.fitted)
         parameters = [self.problem.parameter(name) for name in fit.names]
         (further,) = self.fits([self.request(parameters, fit.point, iterations=6, tolerance=0.3 * unit, nothing=0.1 * unit)], floor)
@@ -198,20 +208,17 @@ class Laboratory:
         fit = self.base([{}, near] if near else self.starts({}), self.noise(), iterations=6, tolerance=ROUGH)
         if near is not None and not self.runs(fit.point):
             return None
-        floor = self.floor(fit.point)
+        floor, errors = self.stand(fit.point)
         if self.problem.settings == 1:
             fit = self.base([fit.point], floor)
             return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
-        made = []
-        for left in range(AGAIN, -1, -1):
-            errors = self.mean_squares([fit.point], floor)[0]
-            floor = self.sharpened(floor, errors)
+        made = [Start(fit, floor, errors)]
+        for _ in range(AGAIN):
+            fit = self.base([fit.point], floor)
+            if not self.runs(fit.point):
+                break
+            floor, errors = self.stand(fit.point, like=floor)
             made.append(Start(fit, floor, errors))
-            if left:
-                fit = self.base([fit.point], floor)
-                if not self.runs(fit.point):
-                    break
-                floor = self.floor(fit.point, like=floor)
         return min(made, key=lambda start: score(start.errors[self.fitted]))
 
     def runs(self, point: Point) -> bool:
@@ -346,9 +353,7 @@ class Laboratory:
         for fit, own, y in zip(fits, floors, made.values(), strict=True):
             with self.memo.during("discretisation"):
                 rows = {n: self.memo.predict([fit.point], n, self.setting)[0] - y[n] for n in y}
-            amounts = own.amounts(rows, self.parts)
-            left = [own.settle(rows[p.recording] - own.differences[p.recording] @ amounts, p)[p.rows] for p in self.parts]
-            out.append((fit, np.array([float(np.mean(r**2)) for r in left])))
+            out.append((fit, self.left(rows, own, own.amounts(rows, self.parts))))
         return out
 
     def floors(self, point: Point, free: Sequence[Parameter], floor: Floor) -> np.ndarray:

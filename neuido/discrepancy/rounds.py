@@ -77,7 +77,7 @@ class Inference(Contests):
 
         Args:
             base: Where the model stands.
-            floor: Noise and discretisation there.
+            floor: Noise and discretisation there, as `stand` gives them.
             found: The effects so far.
             leaders: Keys of the candidates that led with another solver, where it named one: they and the first of the screening get a fit.
             most: Parameters that a candidate may have.
@@ -86,7 +86,6 @@ class Inference(Contests):
         extra = tuple(p for t in found for p in t.candidate.parameters)
         candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
         errors = self.mean_squares([base.point], floor)[0]
-        floor = self.sharpened(floor, errors)
         free = (*self.problem.declared, *extra)
         everywhere = list(dict.fromkeys(p.recording for p in self.parts))
         slopes = self.slopes(free, base.point, everywhere)
@@ -109,13 +108,10 @@ class Inference(Contests):
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
                 starts.append((c, begin, None))
         finite = {c.key for _, c, *_ in ranked}
-        for c in candidates:  # what cannot run where the base fit went, or does nothing there, may do so where the model was declared
-            if (
-                first
-                and c.key not in chosen
-                and (c.key not in finite or c.linear)
-                and len(c.parameters) <= (SMALL if c.key in finite else MANY)
-            ):
+        for c in candidates if first else ():
+            # what cannot run where the base fit went, or does nothing there, may do so where the model was declared
+            small = len(c.parameters) <= MANY if c.key not in finite else c.linear and len(c.parameters) <= SMALL
+            if small and c.key not in chosen:
                 chosen[c.key] = 0
                 starts.append((c, base.point | self.as_declared | dict(c.starts[0]), None))
         self.tell(f"fitting {', '.join(chosen)}")

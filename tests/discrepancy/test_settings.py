@@ -86,7 +86,7 @@ class Bent(Line):
         self.__dict__["candidates"] = ()
 
     def predict(self, points, recording, setting=0):
-        rows = super().predict([{**p} for p in points], recording, 0)
+        rows = super().predict(points, recording, 0)
         size = np.array([p.get("a", 1.0) for p in points])[:, None] * 0.3 * (1.0, 0.25)[setting]
         return rows + size * np.sin(25 * T)
 
