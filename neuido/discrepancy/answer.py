@@ -135,7 +135,7 @@ def _settings(d: Diagnosis) -> dict[str, Any]:
     """Of what is discretised: the amounts of the other settings in the prediction, and the errors without them."""
     if d.problem.settings == 1:
         return {}
-    names = [d.problem.setting_name(s) for s in range(d.problem.settings) if s != d.setting]
+    names = [d.problem.setting_name(s) for s in d.problem.others(d.setting)]
     amounts = {when: dict(zip(names, own)) for when, own in d.amounts.items()}
     return {"amounts": amounts, "one_setting": {when: errors(d, when, one_setting=True) for when in ("before", "after")}}
 

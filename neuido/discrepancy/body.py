@@ -128,11 +128,6 @@ class BodyProblem(Problem):
     def together(self) -> bool:
         return self.device != "cpu"
 
-    def refinements(self, setting: int) -> list[int]:
-        """The others of its own method, or all others where there are none."""
-        others = super().refinements(setting)
-        return [s for s in others if SETTINGS[s].solver == SETTINGS[setting].solver] or others
-
     def effort(self, recording: int, setting: int = 0) -> float:
         """Particle-substeps; inner steps of the finite elements count as one."""
         r = self.measured[recording]

@@ -139,7 +139,7 @@ class Laboratory:
         `like`: a floor whose nuisances serve here too.
         """
         plain = self.noise()
-        others = [s for s in range(self.problem.settings) if s != self.setting]
+        others = self.problem.others(self.setting)
         if not others:
             return replace(plain, nuisances=self.nuisances(point, list(plain.noise)))
         differences, spread = {}, {}
@@ -335,16 +335,15 @@ class Laboratory:
         return self.memo.predict([point], n, self.setting)[0] - self.problem.recordings[n].y
 
     def refits(self, point: Point, free: Sequence[Parameter], floor: Floor) -> list[tuple[Fit, np.ndarray]]:
-        """The motions under the other settings of the same method fitted as if they had been measured: the fits, and what they leave.
+        """The motions under the other settings fitted as if they had been measured: the fits, and what they leave.
 
         Each without its own difference. Most of what a grid or a step does a stiffness, or the difference of another grid, can do as well:
         how far a fit goes from `point` is the discretisation error of the parameters, and what it leaves, mean squares of the parts, the
         one that an effect could be mistaken for.
         """
-        others = [s for s in range(self.problem.settings) if s != self.setting]
-        wanted = self.problem.refinements(self.setting)
+        others = self.problem.others(self.setting)
         with self.memo.during("discretisation"):
-            made = {s: {n: self.memo.predict([point], n, s)[0] for n in floor.noise} for s in wanted}
+            made = {s: {n: self.memo.predict([point], n, s)[0] for n in floor.noise} for s in others}
         made = {s: y for s, y in made.items() if all(np.isfinite(row).all() for row in y.values())}
         floors = [floor.without(others.index(s)) for s in made]
         requests = [self.request(free, point, iterations=8, tolerance=ROUGH) for _ in made]

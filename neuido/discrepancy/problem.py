@@ -128,8 +128,8 @@ class Problem:
         """A residual (n,) as one figure in `unit`."""
         return float(np.sqrt(np.mean(residual**2)))
 
-    def refinements(self, setting: int) -> list[int]:
-        """The other settings that tell the error of one."""
+    def others(self, setting: int) -> list[int]:
+        """The other settings, which tell the discretisation error of one: finite elements tell that of material points too."""
         return [s for s in range(self.settings) if s != setting]
 
     def setting_name(self, setting: int) -> str:
