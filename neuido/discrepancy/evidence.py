@@ -65,14 +65,13 @@ class LinearModel:
             out[name] = np.array([p.square(r - p.design(keys) @ q) for p, r in zip(self.parts, draw, strict=True)])
         return out
 
-    def null(self, count: int = 199) -> np.ndarray:
-        """The largest gain over the candidates in each of `count` draws; see `gain`."""
-        return np.array([self._largest(self.errors(self.draw())) for _ in range(count)])
+    def null(self, data: np.ndarray, count: int = 199) -> np.ndarray:
+        """The largest gain over the candidates in each of `count` draws, weighed as that of the data is; `data` as for `gain`."""
+        return np.array([self._largest(self.errors(self.draw()), data) for _ in range(count)])
 
-    def _largest(self, errors: Mapping[str | None, np.ndarray]) -> float:
-        base = errors[None]
+    def _largest(self, errors: Mapping[str | None, np.ndarray], data: np.ndarray) -> float:
         fitted, noise = [p.fitted for p in self.parts], np.array([p.noise**2 for p in self.parts])
-        return max((gain(base, errors[key], fitted, noise) for key in self.keys), default=0.0)
+        return max((gain(errors[None], errors[key], fitted, noise, data=data) for key in self.keys), default=0.0)
 
     def cosine(self, a: str, b: str) -> float:
         """Cosine of two candidates in the fit's metric, the declared parameters projected out (largest over their planes)."""
@@ -84,11 +83,18 @@ class LinearModel:
         return float(np.linalg.svd(A.T @ B, compute_uv=False).max(initial=0.0))
 
 
-def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: np.ndarray) -> float:
+def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: np.ndarray, *, data: np.ndarray | None = None) -> float:
     """Logarithm of the ratio of errors, before over after: the smaller of those of the fitted and of the held-out recordings.
 
     Of the held-out ones alone where the fitted ones are at the noise before and after: the declared parameters have taken the effect in
     there, and what they predict of the others says so. All arguments but `fitted` are mean squares of the parts.
+
+    Args:
+        before: Of the base.
+        after: With an effect.
+        fitted: Which parts are fitted.
+        noise: Of the noise.
+        data: Of the base with the data themselves, where `before` is of a draw, which is at the noise whatever the data are.
     """
     fitted = np.array(fitted)
 
@@ -97,7 +103,8 @@ def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: n
 
     if not (~fitted).any():
         return ratio(fitted)
-    if fitted.any() and not max(before[fitted].mean(), after[fitted].mean()) < NOISE_ALONE * noise[fitted].mean():
+    seen = [before, after] if data is None else [before, after, data]
+    if fitted.any() and not max(squares[fitted].mean() for squares in seen) < NOISE_ALONE * noise[fitted].mean():
         return min(ratio(fitted), ratio(~fitted))
     return ratio(~fitted)
 

@@ -120,7 +120,7 @@ class Inference(Contests):
         best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
         floors = self.floors(base.point, free, floor)
         model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, everywhere, candidates)
-        empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=model.null(self.draws))
+        empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=model.null(errors, self.draws))
         result = self.judge(empty, best, model, list(chosen))
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
         if first and result.chosen is None and (promising or result.over > 1.0):

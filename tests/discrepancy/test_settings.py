@@ -66,6 +66,10 @@ def test_gain_is_the_held_out_one_where_the_fitted_recordings_are_noise():
     assert gain(np.array([9.0, 16.0]) * noise, noise, fitted, noise) == pytest.approx(np.log(3.0))
     assert gain(np.array([1.3, 16.0]) * noise, noise, fitted, noise) == pytest.approx(np.log(4.0))
     assert gain(np.array([1.3, 16.0]) * noise, np.array([2.5, 1.0]) * noise, fitted, noise) < 0
+    # a draw is at the noise in any case: it is weighed as the data are
+    draw = np.array([1.3, 16.0]) * noise
+    assert gain(draw, noise, fitted, noise, data=np.array([9.0, 16.0]) * noise) == pytest.approx(0.5 * np.log(1.3))
+    assert gain(draw, noise, fitted, noise, data=draw) == pytest.approx(np.log(4.0))
     assert gain(np.array([4.0]), np.array([1.0]), [True], np.ones(1)) == pytest.approx(np.log(2.0))
 
 
