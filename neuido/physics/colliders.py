@@ -16,6 +16,9 @@ from neuido.errors import UserError
 from neuido.physics.grid_kernels import CONTACTS
 from neuido.types import Box, Plane, Scene
 
+NEAR = 1e-4
+"""Cells within which a node lies on a face: nodes are placed in the simulation's own precision."""
+
 
 class ColliderTable(NamedTuple):
     """K planes for each of S scenes; rows that a scene does not use have kind 0."""
@@ -69,7 +72,7 @@ def collider_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.de
             normal = torch.tensor(given.normal, dtype=torch.float64)
             normal = normal / normal.norm()
             plane[s, c, :3] = normal
-            plane[s, c, 3] = normal @ torch.tensor(given.point, dtype=torch.float64) + 1e-4 * scene.dx
+            plane[s, c, 3] = normal @ torch.tensor(given.point, dtype=torch.float64) + NEAR * scene.dx
             kind[s, c] = CONTACTS[given.contact]
             friction[s, c] = given.friction
     return ColliderTable(plane.to(device, dtype), kind.to(device), friction.to(device, dtype))
@@ -82,9 +85,14 @@ def clamp_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.devic
     upper = torch.full((len(scenes), count, 3), -torch.inf, dtype=torch.float64)
     for s, scene in enumerate(scenes):
         for b, box in enumerate(scene.clamps):
-            lower[s, b] = torch.tensor(box.lower, dtype=torch.float64)
-            upper[s, b] = torch.tensor(box.upper, dtype=torch.float64)
+            lower[s, b], upper[s, b] = reach(box, scene)
     return lower.to(device, dtype), upper.to(device, dtype)
+
+
+def reach(box: Box, scene: Scene) -> tuple[Tensor, Tensor]:
+    """Corners (3,) each [m], float64, of what a clamp holds of nodes: a layer on its face belongs to it however that is rounded."""
+    lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in (box.lower, box.upper))
+    return lower - NEAR * scene.dx, upper + NEAR * scene.dx
 
 
 def inside_box(x: Tensor, box: Box, *, name: str) -> Tensor:

@@ -278,6 +278,20 @@ def test_a_clamped_beam_sags_and_its_clamp_holds():
     assert float((frames.x[1] - body.x)[body.x[:, 0] > 0.65][:, 1].max()) < -0.01
 
 
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+@pytest.mark.parametrize("cells", [30, 36, 42, 60])
+def test_a_clamp_whose_face_is_a_layer_of_nodes_holds_it(cells, kind):
+    """In single precision 6 * (0.15 / 36) is past 0.025; a beam whose last clamped layer is a cell further in slides out."""
+    body = block((0.06, 0.06, 0.0125), (0.09, 0.09, 0.075), (10, 10, 20))
+    scene = Scene(upper=(0.15, 0.15, 0.15), cells=cells, dt=2e-5, walls=None, clamps=(Box((0.0, 0.0, 0.0), (0.15, 0.15, 0.025)),))
+    sim = Simulator(scene, body, device=DEVICE, dtype=kind)
+    steps = 2500
+    last = sim.rollout(steps, FixedCorotated(3e5, 0.3), every=steps).x[-1].cpu()
+    first = (body.x[:, 2] > 0.025) & (body.x[:, 2] < 0.029)
+    fall = 0.5 * 9.8 * (steps * scene.dt) ** 2
+    assert float((last - body.x)[first].norm(dim=1).max()) < 0.02 * fall
+
+
 class Column:
     """A column between slip walls, fixed below and free above, in its first longitudinal mode."""
 
