@@ -89,7 +89,11 @@ class Contests(Laboratory):
                 leading = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
                 if self.is_noise(self.mean_squares([leading.point], floor)[0]):
                     break
-            fits = self.fits([self.request((*free, *c.parameters), begin, race=race, slopes=J) for c, begin, J in own], floor)
+            requests = []
+            for c, begin, J in own:
+                sizes = [p.name for p in c.size_parameters] if c.linear else []
+                requests.append(self.request((*free, *c.parameters), begin, race=race, slopes=J, sizes=sizes))
+            fits = self.fits(requests, floor)
             best |= better(zip((c for c, *_ in own), fits, strict=True), best)
         return best
 

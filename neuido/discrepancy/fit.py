@@ -8,6 +8,8 @@ import numpy as np
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Parameter, Point, Problem
 
+SMALLER = (0.5, 0.25, 0.12, 0.06)
+"""Factors of sizes that are tried where a fit's start does not run: explicit steps bear only so much viscosity, say."""
 STEP = 0.02
 """Difference step, in typical steps of a parameter."""
 DAMPINGS = (0.1, 1.0, 10.0)
@@ -95,6 +97,7 @@ def levenberg_marquardt(
     together: bool = True,
     race: Race | None = None,
     slopes: np.ndarray | None = None,
+    sizes: Sequence[str] = (),
 ) -> Request:
     """One fit as a generator: it yields the points that it wants and receives their whitened residuals (None: not runnable).
 
@@ -111,6 +114,7 @@ def levenberg_marquardt(
         together: Ask for all dampings and slopes of a step at once, where a launch of several points costs as one; else for few.
         race: The fits that it is compared with.
         slopes: About the derivatives of the whitened residuals by the coordinates at the start, (n, p); without the priors' rows.
+        sizes: Parameters that begin smaller where the start does not run.
     """
     names = tuple(p.name for p in parameters)
     fixed = {k: v for k, v in start.items() if k not in names}
@@ -127,6 +131,13 @@ def levenberg_marquardt(
         return [None if r is None else _with_priors(r, parameters, a) for r, a in zip(answers, asked, strict=True)]
 
     (r,) = yield from ask([q])
+    if r is None and sizes:
+        begun = [_scaled(q, parameters, sizes, factor) for factor in SMALLER]
+        for some in [begun] if together else [[one] for one in begun]:
+            answers = yield from ask(some)
+            q, r = next(((one, a) for one, a in zip(some, answers, strict=True) if a is not None), (q, None))
+            if r is not None:
+                break
     cost = np.inf if r is None else float(r @ r)
     converged, costs, n = r is not None, [cost], 0
     J, fresh = None if slopes is None or together or r is None else _with_prior_rows(slopes, parameters), False
@@ -177,6 +188,12 @@ def levenberg_marquardt(
             break
     point = fixed | {p.name: p.physical(v) for p, v in zip(parameters, q, strict=True)}
     return Fit(point, names, cost, np.empty(0) if r is None else r, count, converged)
+
+
+def _scaled(q: np.ndarray, parameters: Sequence[Parameter], names: Sequence[str], factor: float) -> np.ndarray:
+    """Coordinates with the values of some parameters times a factor, within their bounds."""
+    values = [max(factor * p.physical(v), p.lower) if p.name in names else p.physical(v) for p, v in zip(parameters, q, strict=True)]
+    return np.array([p.coordinate(value) for p, value in zip(parameters, values, strict=True)])
 
 
 def _with_prior_rows(slopes: np.ndarray, parameters: Sequence[Parameter]) -> np.ndarray:

@@ -135,7 +135,7 @@ class Inference(Contests):
         trials = []
         for (c, fit), square in zip(best.values(), squares, strict=True):
             trial = Trial(c, fit, square, self.gain(errors, square))
-            trial.reason = unphysical(c, fit.point)
+            trial.reason = unphysical(c, fit.point) if np.isfinite(square).all() else "not every recording runs where its fit ends"
             trials.append(trial)
         trials.sort(key=lambda t: t.score)
         good = [t for t in trials if not t.reason]

@@ -185,6 +185,45 @@ class Tones(Line):
         return rows + np.stack([sum(p.get(f"{name}.c", 0.0) * shape for name, shape in shapes.items()) for p in points])
 
 
+class Brittle(Line):
+    """A bend beyond a limit does not run, as a viscosity that explicit steps cannot bear."""
+
+    LIMIT = 0.06
+
+    def predict(self, points, recording, setting=0):
+        rows = super().predict(points, recording, setting)
+        rows[[abs(p.get("square.c", 0.0)) > self.LIMIT for p in points]] = np.nan
+        return rows
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_start_that_does_not_run_is_made_smaller(together):
+    problem = Brittle(lambda t: t + 0.05 * t**2, together=together)
+    square = problem.candidates[0]
+    parameters = (*problem.declared, *square.parameters)
+    for sizes, found in (((), 0.3), (("square.c",), 0.05)):
+        request = levenberg_marquardt(parameters, {"square.c": 0.3}, together=together, sizes=sizes)
+        (fit,) = run(problem, [request], lambda r, n: r / NOISE, [0])
+        assert fit.point["square.c"] == pytest.approx(found, abs=0.02)
+        assert np.isfinite(fit.cost) == bool(sizes)
+
+
+def test_an_effect_that_does_not_run_in_every_recording_says_so():
+    class Torn(Line):
+        def predict(self, points, recording, setting=0):
+            rows = super().predict(points, recording, setting)
+            rows[[recording == 1 and abs(p.get("square.c", 0.0)) > 1.0 for p in points]] = np.nan
+            return rows
+
+    inference = Inference(Torn(lambda t: t + 2.0 * t**2, wiggle=0.0))
+    start = inference.start()
+    result = inference.round(start.fit, start.floor, [])
+    (square,) = [t for t in result.trials if t.candidate.key == "square"]
+    assert square.fit.point["square.c"] == pytest.approx(2.0, abs=0.1)
+    assert square.reason == "not every recording runs where its fit ends"
+    assert result.chosen is None or result.chosen.candidate.key != "square"
+
+
 def test_two_effects_of_which_none_gains_enough_alone():
     def both(t):
         return 3.0 * t + 0.3 * np.sin(40 * t) + 0.3 * np.sin(62 * t)
