@@ -20,7 +20,7 @@ from neuido.data.experiments import Recording as Measured
 from neuido.discrepancy.believed import CLASSICAL, classical, laws_of
 from neuido.discrepancy.declared import declared
 from neuido.discrepancy.library import body_candidates, effects_of, present
-from neuido.discrepancy.problem import Parameter, Point, Problem, Recording
+from neuido.discrepancy.problem import Ask, Parameter, Point, Problem, Recording
 from neuido.errors import UserError
 from neuido.physics import effect_kernels, law_kernels
 from neuido.physics.device import real_of
@@ -106,23 +106,32 @@ class BodyProblem(Problem):
     _lock: Any = field(default_factory=threading.RLock, repr=False)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
-        # instruments alone need no further run: points that move alike share one
+        return self.predict_several([(points, recording, setting)])[0]
+
+    def predict_several(self, asks: Sequence[Ask]) -> list[np.ndarray]:
+        size = 1 if self.device == "cpu" else self.batch or 96
+        found, runs = [], []
+        for points, recording, setting in asks:
+            groups = self._alike(points, recording)
+            found.append(np.empty((len(points), len(self.recordings[recording].y))))
+            runs += [(points, groups[at : at + size], recording, setting, found[-1]) for at in range(0, len(groups), size)]
+        if self.device == "cpu":
+            with _one_thread_each():
+                list(_workers().map(lambda run: self._predict(*run), runs))
+        else:
+            for run in runs:
+                self._predict(*run)
+        return found
+
+    def _alike(self, points: Sequence[Point], recording: int) -> list[list[int]]:
+        """Which points move alike: instruments alone need no further run."""
         name = self.measured[recording].name
         instruments = tuple(f"{kind}:{name}" for kind in self.instruments)
         unique: dict[tuple, list[int]] = {}
         for i, point in enumerate(points):
             key = tuple(sorted((k, v) for k, v in point.items() if k not in instruments and (":" not in k or k.endswith(f":{name}"))))
             unique.setdefault(key, []).append(i)
-        groups = list(unique.values())
-        out = np.empty((len(points), len(self.recordings[recording].y)))
-        if self.device == "cpu":
-            with _one_thread_each():
-                list(_workers().map(lambda own: self._predict(points, [own], recording, setting, out), groups))
-            return out
-        size = self.batch or 96
-        for at in range(0, len(groups), size):
-            self._predict(points, groups[at : at + size], recording, setting, out)
-        return out
+        return list(unique.values())
 
     @property
     def together(self) -> bool:

@@ -155,9 +155,7 @@ class Contests(Laboratory):
         limit = score(squares[order[0]]) + 2.0 * math.log(NEAR)
         leading = [i for i in order if score(squares[i]) < limit and not self.is_noise(squares[i])]
         with self.memo.during("discretisation"):  # all of them in one launch
-            for n in floor.noise:
-                for s in range(self.problem.settings):
-                    self.memo.predict([points[i] for i in leading], n, s)
+            self.predicted([points[i] for i in leading], list(floor.noise), range(self.problem.settings))
         for i in leading:
             if self.runs(points[i]):
                 squares[i] = min(squares[i], self.mean_squares([points[i]], self.floor(points[i], like=floor))[0], key=score)

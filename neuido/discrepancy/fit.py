@@ -274,8 +274,8 @@ def residuals(
     """Whitened residuals of each point over the recordings (or over data of its own), joined; None where one of them cannot run."""
     parts: list[list[np.ndarray]] = [[] for _ in points]
     good = [True] * len(points)
-    for n in recordings:
-        for i, row in enumerate(problem.predict(points, n, setting)):
+    for n, rows in zip(recordings, problem.predict_several([(points, n, setting) for n in recordings]), strict=True):
+        for i, row in enumerate(rows):
             if np.isfinite(row).all():
                 own = whiten if callable(whiten) else whiten[i]
                 parts[i].append(own(row - (problem.recordings[n].y if data is None else data[i][n]), n))

@@ -86,6 +86,13 @@ class Laboratory:
             rows = residuals(self.memo, points, floor.whitener(self.parts), self.fitted_recordings, self.setting)
         return [math.inf if row is None else float(row @ row) for row in rows]
 
+    def predicted(
+        self, points: Sequence[Point], recordings: Sequence[int], settings: Sequence[int] = ()
+    ) -> dict[tuple[int, int], np.ndarray]:
+        """What points predict, (len(points), n), by recording and setting, its own if none is named: all of them side by side."""
+        of = [(n, s) for n in recordings for s in settings or (self.setting,)]
+        return dict(zip(of, self.memo.predict_several([(points, *one) for one in of]), strict=True))
+
     def mean_squares(self, points: Sequence[Point], floor: Floor, *, fitted: bool = False, plain: bool = False) -> list[np.ndarray]:
         """Of each part, or of the fitted ones alone, at several points, the nuisances at their most probable values.
 
@@ -93,10 +100,8 @@ class Laboratory:
         then is that of one setting alone.
         """
         wanted = self.fitted_recordings if fitted else list(dict.fromkeys(p.recording for p in self.parts))
-        rows = {}
-        for n in wanted:
-            with self.memo.during("errors of fits"):
-                rows[n] = self.memo.predict(points, n, self.setting) - self.problem.recordings[n].y
+        with self.memo.during("errors of fits"):
+            rows = {n: of - self.problem.recordings[n].y for (n, _), of in self.predicted(points, wanted).items()}
         found = []
         for i in range(len(points)):
             own = {n: rows[n][i] for n in wanted if np.isfinite(rows[n][i]).all()}
@@ -142,11 +147,11 @@ class Laboratory:
         others = self.problem.others(self.setting)
         if not others:
             return replace(plain, nuisances=self.nuisances(point, list(plain.noise)))
+        with self.memo.during("discretisation"):
+            rows = self.predicted([point], list(plain.noise), (self.setting, *others))
         differences, spread = {}, {}
         for n in plain.noise:
-            with self.memo.during("discretisation"):
-                here = self.memo.predict([point], n, self.setting)[0]
-                there = [self.memo.predict([point], n, s)[0] for s in others]
+            here, *there = (rows[n, s][0] for s in (self.setting, *others))
             able = [bool(np.isfinite(t).all()) for t in there]
             D = np.stack([t - here if ok else np.zeros_like(here) for t, ok in zip(there, able, strict=True)], axis=1)
             differences[n] = D
@@ -223,7 +228,8 @@ class Laboratory:
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""
-        return all(bool(np.isfinite(self.memo.predict([point], p.recording, self.setting)).all()) for p in self.parts)
+        rows = self.predicted([point], list(dict.fromkeys(p.recording for p in self.parts)))
+        return all(bool(np.isfinite(of).all()) for of in rows.values())
 
     def is_noise(self, errors: np.ndarray) -> bool:
         """Whether nothing but noise is left in any part."""
@@ -343,16 +349,18 @@ class Laboratory:
         """
         others = self.problem.others(self.setting)
         with self.memo.during("discretisation"):
-            made = {s: {n: self.memo.predict([point], n, s)[0] for n in floor.noise} for s in others}
+            rows = self.predicted([point], list(floor.noise), others)
+            made = {s: {n: rows[n, s][0] for n in floor.noise} for s in others}
         made = {s: y for s, y in made.items() if all(np.isfinite(row).all() for row in y.values())}
         floors = [floor.without(others.index(s)) for s in made]
         requests = [self.request(free, point, iterations=8, tolerance=ROUGH) for _ in made]
         fits = self.fits(requests, floors, to=list(made.values()), step="discretisation")
+        with self.memo.during("discretisation"):
+            rows = self.predicted([fit.point for fit in fits], list(floor.noise))
         out = []
-        for fit, own, y in zip(fits, floors, made.values(), strict=True):
-            with self.memo.during("discretisation"):
-                rows = {n: self.memo.predict([fit.point], n, self.setting)[0] - y[n] for n in y}
-            out.append((fit, self.left(rows, own, own.amounts(rows, self.parts))))
+        for i, (fit, own, y) in enumerate(zip(fits, floors, made.values(), strict=True)):
+            left = {n: rows[n, self.setting][i] - y[n] for n in y}
+            out.append((fit, self.left(left, own, own.amounts(left, self.parts))))
         return out
 
     def floors(self, point: Point, free: Sequence[Parameter], floor: Floor) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neuido.discrepancy.problem import Point, Problem, Recording
+from neuido.discrepancy.problem import Ask, Point, Problem, Recording
 
 LIMIT = 500_000_000
 """Bytes of the predictions that are kept; the one that was used longest ago goes first."""
@@ -66,21 +66,33 @@ class Memo:
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         """As `Problem.predict`."""
-        keys = [(recording, setting, tuple(sorted(point.items()))) for point in points]
-        found = {key: self._kept[key] for key in keys if key in self._kept}
-        missing = {key: point for key, point in zip(keys, points, strict=True) if key not in found}
+        return self.predict_several([(points, recording, setting)])[0]
+
+    def predict_several(self, asks: Sequence[Ask]) -> list[np.ndarray]:
+        """As `Problem.predict_several`."""
+        keys = [[(n, s, tuple(sorted(point.items()))) for point in points] for points, n, s in asks]
+        found = {key: self._kept[key] for own in keys for key in own if key in self._kept}
+        missing: dict[tuple[int, int], dict[tuple, Point]] = {}
+        for (points, n, s), own in zip(asks, keys, strict=True):
+            missing.setdefault((n, s), {}).update((key, point) for key, point in zip(own, points, strict=True) if key not in found)
+        missing = {of: own for of, own in missing.items() if own}
         work = self.work.setdefault(self._step, Work())
-        work.reused += len(points) - len(missing)
-        if missing:
+        run = sum(len(own) for own in missing.values())
+        work.reused += sum(len(own) for own in keys) - run
+        if run:
             begun = time.monotonic()
-            rows = self.problem.predict(list(missing.values()), recording, setting)
+            answers = self.problem.predict_several([(list(own.values()), *of) for of, own in missing.items()])
             work.seconds += time.monotonic() - begun
-            work.simulations += len(missing)
-            work.effort += len(missing) * self.problem.effort(recording, setting)
-            found |= dict(zip(missing, rows, strict=True))
-        for key in dict.fromkeys(keys):
+            work.simulations += run
+            work.effort += sum(len(own) * self.problem.effort(*of) for of, own in missing.items())
+            for own, rows in zip(missing.values(), answers, strict=True):
+                found |= dict(zip(own, rows, strict=True))
+        for key in dict.fromkeys(key for own in keys for key in own):
             self._keep(key, found[key])
-        return np.stack([found[key] for key in keys]) if keys else np.empty((0, len(self.recordings[recording].y)))
+        return [
+            np.stack([found[key] for key in own]) if own else np.empty((0, len(self.recordings[n].y)))
+            for own, (_, n, _) in zip(keys, asks, strict=True)
+        ]
 
     def _keep(self, key: tuple, row: np.ndarray) -> None:
         if key not in self._kept:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.discrepancy.problem import Point, Problem
+from neuido.discrepancy.problem import Ask, Point, Problem
 
 CHUNK = 32
 """Points in one stored call: what a kill can cost. It holds with and without a store, so that both compute the same."""
@@ -54,11 +54,23 @@ class CachedProblem(Problem):
         return getattr(self.problem, name)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
+        return self.predict_several([(points, recording, setting)])[0]
+
+    def predict_several(self, asks: Sequence[Ask]) -> list[np.ndarray]:
+        calls = [self._calls(*ask) for ask in asks]
+        found: list[list[np.ndarray]] = [[np.empty((0, len(self.recordings[ask[1]].y)))] for ask in asks]
+        for k in range(max(map(len, calls), default=0)):
+            own = [i for i, parts in enumerate(calls) if k < len(parts)]
+            for i, rows in zip(own, self._stored([calls[i][k] for i in own]), strict=True):
+                found[i].append(rows)
+        return [np.concatenate(rows) for rows in found]
+
+    def _calls(self, points: Sequence[Point], recording: int, setting: int) -> list[Ask]:
+        """An ask in the parts in which it is stored."""
         size = CHUNK
         if not self.problem.together:  # each point runs alone: long ones are stored, and told of, in smaller calls
             size = min(max(int(HEAVY / max(self.problem.effort(recording, setting), 1.0)), LEAST), CHUNK)
-        parts = [self._part(points[i : i + size], recording, setting) for i in range(0, len(points), size)]
-        return np.concatenate(parts) if parts else self.problem.predict([], recording, setting)
+        return [(points[i : i + size], recording, setting) for i in range(0, len(points), size)]
 
     def effort(self, recording: int, setting: int = 0) -> float:
         return self.problem.effort(recording, setting)
@@ -79,20 +91,21 @@ class CachedProblem(Problem):
     def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
         return self.problem.model_after(values, effects)
 
-    def _part(self, points: Sequence[Point], recording: int, setting: int) -> np.ndarray:
-        path = None if self.folder is None else self.folder / f"{_key(points, recording, setting)}.npy"
-        shape = (len(points), len(self.recordings[recording].y))
-        kept = None if path is None else _load(path, shape)
-        if kept is not None:
-            self.found += 1
-        else:
-            kept = np.asarray(self.problem.predict(points, recording, setting), dtype=np.float64)
-            self.computed += 1
-            if path is not None:
-                self._keep(path, kept)
+    def _stored(self, calls: Sequence[Ask]) -> list[np.ndarray]:
+        """What is kept of calls, and the rest computed side by side and kept."""
+        paths = [None if self.folder is None else self.folder / f"{_key(*call)}.npy" for call in calls]
+        shapes = [(len(points), len(self.recordings[recording].y)) for points, recording, _ in calls]
+        rows = [None if path is None else _load(path, shape) for path, shape in zip(paths, shapes, strict=True)]
+        missing = [i for i, kept in enumerate(rows) if kept is None]
+        self.found += len(calls) - len(missing)
+        self.computed += len(missing)
+        for i, answer in zip(missing, self.problem.predict_several([calls[i] for i in missing]), strict=True):
+            rows[i] = np.asarray(answer, dtype=np.float64)
+            if paths[i] is not None:
+                self._keep(paths[i], rows[i])
         if self.tick is not None:
-            self.tick(len(points))
-        return kept
+            self.tick(sum(len(points) for points, _, _ in calls))
+        return rows
 
     def _keep(self, path: Path, values: np.ndarray) -> None:
         with np.errstate(over="ignore"):

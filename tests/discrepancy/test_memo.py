@@ -6,6 +6,7 @@ import pytest
 from neuido.discrepancy.fit import Race, levenberg_marquardt, run
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Parameter, Problem, Recording
+from neuido.discrepancy.resume import CachedProblem
 
 T = np.linspace(0.0, 1.0, 40)
 
@@ -41,6 +42,24 @@ def test_a_point_is_run_once_for_each_setting():
     assert (memo.work["second"].simulations, memo.work["second"].reused) == (2, 1)
     assert memo.work["second"].effort == 2 * len(T)
     assert memo.predict([], 0).shape == (0, len(T))
+
+
+def test_several_asks_at_once_are_those_one_after_the_other(tmp_path):
+    asks = [
+        ([{"a": 1.0}, {"a": 2.0}], 0, 0),
+        ([{"a": 1.0}], 0, 1),
+        ([], 0, 0),
+        ([{"a": 2.0}, {"a": 3.0}], 0, 0),
+        ([{"a": float(a)} for a in range(70)], 0, 1),
+    ]
+    plain = [Lines().predict(*ask) if ask[0] else np.empty((0, len(T))) for ask in asks]
+    for problem in (Lines(), CachedProblem(Lines(), tmp_path), CachedProblem(Lines(), tmp_path)):
+        memo = Memo(problem)
+        for got, want in zip(memo.predict_several(asks), plain, strict=True):
+            assert np.array_equal(got, want)
+        assert (memo.simulations, memo.work["other"].reused) == (73, 2)
+    assert problem.problem.ran == []  # all of it was kept
+    assert problem.found > 0
 
 
 def test_the_memory_is_bounded_and_an_answer_is_no_view():

@@ -133,6 +133,13 @@ def test_long_recordings_run_in_pieces(folder, monkeypatch):
     assert len(kept.tape.x) == 10
 
 
+def test_settings_and_recordings_side_by_side_are_those_one_after_the_other(folder):
+    problem = body_problem(read_experiment(folder))
+    asks = [([{"young": 6e4}, {"young": 7e4}], n, s) for n in range(len(problem.recordings)) for s in range(problem.settings)]
+    for ask, rows in zip(asks, problem.predict_several(asks), strict=True):
+        np.testing.assert_array_equal(rows, problem.predict(*ask))
+
+
 def test_long_recordings_are_stored_and_told_of_in_small_calls(folder, tmp_path, monkeypatch):
     problem = body_problem(read_experiment(folder))
     points = [{"young": 6e4 + 100 * i} for i in range(6)]
