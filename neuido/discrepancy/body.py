@@ -7,7 +7,7 @@ moving least-squares map of the nearest particles that reproduces every affine m
 import functools
 import threading
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from neuido.data.experiments import Recording as Measured
 from neuido.discrepancy.believed import CLASSICAL, classical, laws_of
 from neuido.discrepancy.declared import declared
 from neuido.discrepancy.library import body_candidates, effects_of, present
-from neuido.discrepancy.problem import Ask, Parameter, Point, Problem, Recording
+from neuido.discrepancy.problem import Ask, Parameter, Point, Problem, Recording, Rows
 from neuido.errors import UserError
 from neuido.physics import effect_kernels, law_kernels
 from neuido.physics.device import real_of
@@ -106,22 +106,40 @@ class BodyProblem(Problem):
     _lock: Any = field(default_factory=threading.RLock, repr=False)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
-        return self.predict_several([(points, recording, setting)])[0]
+        (rows,) = self.predict_several([(points, recording, setting)])
+        return rows
 
-    def predict_several(self, asks: Sequence[Ask]) -> list[np.ndarray]:
-        size = 1 if self.device == "cpu" else self.batch or 96
-        found, runs = [], []
-        for points, recording, setting in asks:
-            groups = self._alike(points, recording)
-            found.append(np.empty((len(points), len(self.recordings[recording].y))))
-            runs += [(points, groups[at : at + size], recording, setting, found[-1]) for at in range(0, len(groups), size)]
+    def predict_several(self, asks: Sequence[Ask]) -> Rows:
         if self.device == "cpu":
-            with _one_thread_each():
-                list(_workers().map(lambda run: self._predict(*run), runs))
-        else:
-            for run in runs:
-                self._predict(*run)
-        return found
+            yield from self._side_by_side(asks)
+            return
+        size = self.batch or 96
+        for points, recording, setting in asks:
+            groups, out = self._alike(points, recording), self._rows(points, recording)
+            for at in range(0, len(groups), size):
+                self._predict(points, groups[at : at + size], recording, setting, out)
+            yield out
+
+    def _side_by_side(self, asks: Sequence[Ask]) -> Rows:
+        """Every motion of all asks by itself, as many at a time as there are cores."""
+        waiting: list[tuple[np.ndarray, list[Future]]] = []
+        with _one_thread_each():
+            try:
+                for points, recording, setting in asks:
+                    out = self._rows(points, recording)
+                    runs = [(points, [group], recording, setting, out) for group in self._alike(points, recording)]
+                    waiting.append((out, [_workers().submit(self._predict, *run) for run in runs]))
+                for out, runs in waiting:
+                    for run in runs:
+                        run.result()
+                    yield out
+            finally:
+                for _, runs in waiting:
+                    for run in runs:
+                        run.cancel()
+
+    def _rows(self, points: Sequence[Point], recording: int) -> np.ndarray:
+        return np.empty((len(points), len(self.recordings[recording].y)))
 
     def _alike(self, points: Sequence[Point], recording: int) -> list[list[int]]:
         """Which points move alike: instruments alone need no further run."""

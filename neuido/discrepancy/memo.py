@@ -66,10 +66,11 @@ class Memo:
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         """As `Problem.predict`."""
-        return self.predict_several([(points, recording, setting)])[0]
+        (rows,) = self.predict_several([(points, recording, setting)])
+        return rows
 
     def predict_several(self, asks: Sequence[Ask]) -> list[np.ndarray]:
-        """As `Problem.predict_several`."""
+        """As `Problem.predict_several`, all at once."""
         keys = [[(n, s, tuple(sorted(point.items()))) for point in points] for points, n, s in asks]
         found = {key: self._kept[key] for own in keys for key in own if key in self._kept}
         missing: dict[tuple[int, int], dict[tuple, Point]] = {}
@@ -81,7 +82,7 @@ class Memo:
         work.reused += sum(len(own) for own in keys) - run
         if run:
             begun = time.monotonic()
-            answers = self.problem.predict_several([(list(own.values()), *of) for of, own in missing.items()])
+            answers = list(self.problem.predict_several([(list(own.values()), *of) for of, own in missing.items()]))
             work.seconds += time.monotonic() - begun
             work.simulations += run
             work.effort += sum(len(own) * self.problem.effort(*of) for of, own in missing.items())

@@ -4,7 +4,7 @@ The bodies of the material point method, the material point and the point mass a
 (`fit.py`, `attribution.py`) and the report know nothing else of them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,8 @@ Point = Mapping[str, float]
 """Physical values of parameters by name; those that are absent take their `Parameter.value`."""
 Ask = tuple[Sequence[Point], int, int]
 """Points, the number of a recording, and a setting: the arguments of `Problem.predict`."""
+Rows = Generator[np.ndarray, None, None]
+"""What each of several asks is answered, (len(points), n), as it comes."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +115,9 @@ class Problem:
         """The data that each point predicts, (len(points), n); a row of NaN where the model cannot run there."""
         raise NotImplementedError
 
-    def predict_several(self, asks: Sequence[Ask]) -> list[np.ndarray]:
-        """What `predict` says to each of several asks, side by side where one after the other would leave cores idle."""
-        return [self.predict(*ask) for ask in asks]
+    def predict_several(self, asks: Sequence[Ask]) -> Rows:
+        """What `predict` says to each of several asks, in their order: run side by side where one after the other leaves cores idle."""
+        return (self.predict(*ask) for ask in asks)
 
     def effort(self, recording: int, setting: int = 0) -> float:
         """What one prediction costs, in a unit of the model's own (particle-substeps of a body); data where that says enough."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.discrepancy.problem import Ask, Point, Problem
+from neuido.discrepancy.problem import Ask, Point, Problem, Rows
 
 CHUNK = 32
 """Points in one stored call: what a kill can cost. It holds with and without a store, so that both compute the same."""
@@ -54,23 +54,14 @@ class CachedProblem(Problem):
         return getattr(self.problem, name)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
-        return self.predict_several([(points, recording, setting)])[0]
+        (rows,) = self.predict_several([(points, recording, setting)])
+        return rows
 
-    def predict_several(self, asks: Sequence[Ask]) -> list[np.ndarray]:
+    def predict_several(self, asks: Sequence[Ask]) -> Rows:
         calls = [self._calls(*ask) for ask in asks]
-        found: list[list[np.ndarray]] = [[np.empty((0, len(self.recordings[ask[1]].y)))] for ask in asks]
-        for k in range(max(map(len, calls), default=0)):
-            own = [i for i, parts in enumerate(calls) if k < len(parts)]
-            for i, rows in zip(own, self._stored([calls[i][k] for i in own]), strict=True):
-                found[i].append(rows)
-        return [np.concatenate(rows) for rows in found]
-
-    def _calls(self, points: Sequence[Point], recording: int, setting: int) -> list[Ask]:
-        """An ask in the parts in which it is stored."""
-        size = CHUNK
-        if not self.problem.together:  # each point runs alone: long ones are stored, and told of, in smaller calls
-            size = min(max(int(HEAVY / max(self.problem.effort(recording, setting), 1.0)), LEAST), CHUNK)
-        return [(points[i : i + size], recording, setting) for i in range(0, len(points), size)]
+        with contextlib.closing(self._stored([call for own in calls for call in own])) as rows:
+            for ask, own in zip(asks, calls, strict=True):
+                yield np.concatenate([np.empty((0, len(self.recordings[ask[1]].y))), *(next(rows) for _ in own)])
 
     def effort(self, recording: int, setting: int = 0) -> float:
         return self.problem.effort(recording, setting)
@@ -91,21 +82,31 @@ class CachedProblem(Problem):
     def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
         return self.problem.model_after(values, effects)
 
-    def _stored(self, calls: Sequence[Ask]) -> list[np.ndarray]:
-        """What is kept of calls, and the rest computed side by side and kept."""
+    def _calls(self, points: Sequence[Point], recording: int, setting: int) -> list[Ask]:
+        """An ask in the parts in which it is stored."""
+        size = CHUNK
+        if not self.problem.together:  # each point runs alone: long ones are stored, and told of, in smaller calls
+            size = min(max(int(HEAVY / max(self.problem.effort(recording, setting), 1.0)), LEAST), CHUNK)
+        return [(points[i : i + size], recording, setting) for i in range(0, len(points), size)]
+
+    def _stored(self, calls: Sequence[Ask]) -> Rows:
+        """What is kept of calls; the rest is computed, and kept as it comes."""
         paths = [None if self.folder is None else self.folder / f"{_key(*call)}.npy" for call in calls]
         shapes = [(len(points), len(self.recordings[recording].y)) for points, recording, _ in calls]
-        rows = [None if path is None else _load(path, shape) for path, shape in zip(paths, shapes, strict=True)]
-        missing = [i for i, kept in enumerate(rows) if kept is None]
-        self.found += len(calls) - len(missing)
-        self.computed += len(missing)
-        for i, answer in zip(missing, self.problem.predict_several([calls[i] for i in missing]), strict=True):
-            rows[i] = np.asarray(answer, dtype=np.float64)
-            if paths[i] is not None:
-                self._keep(paths[i], rows[i])
-        if self.tick is not None:
-            self.tick(sum(len(points) for points, _, _ in calls))
-        return rows
+        kept = [None if path is None else _load(path, shape) for path, shape in zip(paths, shapes, strict=True)]
+        missing = [call for call, rows in zip(calls, kept, strict=True) if rows is None]
+        with contextlib.closing(self.problem.predict_several(missing)) as computed:
+            for (points, _, _), path, rows in zip(calls, paths, kept, strict=True):
+                if rows is not None:
+                    self.found += 1
+                else:
+                    rows = np.asarray(next(computed), dtype=np.float64)
+                    self.computed += 1
+                    if path is not None:
+                        self._keep(path, rows)
+                if self.tick is not None:
+                    self.tick(len(points))
+                yield rows
 
     def _keep(self, path: Path, values: np.ndarray) -> None:
         with np.errstate(over="ignore"):
