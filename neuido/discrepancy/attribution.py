@@ -115,7 +115,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
         found.append(step)
-        at = step.fit
+        at = inference.finished(step.fit)
         if len(found) == most or inference.is_settled(step.errors):
             break
         floor, left = inference.stand(at.point)
@@ -127,7 +127,8 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         floor = inference.floor(at.point)
         at, found = drop(inference, at, floor, found)
         at, found = narrow(inference, at, floor, found, rounds)
-    return conclude(inference, start, inference.finished(at), found, rounds)
+        at = inference.finished(at)
+    return conclude(inference, start, at, found, rounds)
 
 
 def first_rounds(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[int, list[Round]]:
