@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuido.physics import element_loop
-from neuido.physics.colliders import reach
+from neuido.physics.colliders import NEAR, corners
 from neuido.physics.effect_tables import Tables
 from neuido.physics.element_loop import Fields, Loop
 from neuido.physics.law import ElasticLaw, Law, PlasticLaw
@@ -132,7 +132,7 @@ class Assembly:
         for s, scene in enumerate(self.solver.scenes[self.a : self.b]):
             own = self.node_scene == s
             for box in scene.clamps:
-                lower, upper = (corner.to(self.nodes) for corner in reach(box, scene))
+                lower, upper = (corner.to(self.nodes) for corner in corners(box, NEAR * scene.dx))
                 inside = own & ((self.nodes >= lower) & (self.nodes <= upper)).all(dim=1)
                 if not bool(inside.any()):
                     picked = particles & ((self.x0 >= lower) & (self.x0 <= upper)).all(dim=1)

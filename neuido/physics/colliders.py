@@ -18,6 +18,12 @@ from neuido.types import Box, Plane, Scene
 
 NEAR = 1e-4
 """Cells within which a node lies on a face: nodes are placed in the simulation's own precision."""
+NEAREST = 0.5 - NEAR
+"""Cells beyond its faces in which a clamp holds nodes, so that each face lies on the nearest layer.
+
+Where only the nodes inside are held, the last layer may be almost a cell from the face: the material next to it feels that layer by the
+tail of its stencil alone and slides out, and a beam is 9 % too soft at 20 cells to its length (2.6 % with the nearest layer).
+"""
 
 
 class ColliderTable(NamedTuple):
@@ -79,20 +85,19 @@ def collider_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.de
 
 
 def clamp_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Lower and upper corners of the clamps, (S, B, 3) each [m]; unused rows hold an empty box."""
+    """Lower and upper corners of what the clamps hold of the grid, (S, B, 3) each [m]; unused rows hold an empty box."""
     count = max(len(scene.clamps) for scene in scenes)
     lower = torch.full((len(scenes), count, 3), torch.inf, dtype=torch.float64)
     upper = torch.full((len(scenes), count, 3), -torch.inf, dtype=torch.float64)
     for s, scene in enumerate(scenes):
         for b, box in enumerate(scene.clamps):
-            lower[s, b], upper[s, b] = reach(box, scene)
+            lower[s, b], upper[s, b] = corners(box, NEAREST * scene.dx)
     return lower.to(device, dtype), upper.to(device, dtype)
 
 
-def reach(box: Box, scene: Scene) -> tuple[Tensor, Tensor]:
-    """Corners (3,) each [m], float64, of what a clamp holds of nodes: a layer on its face belongs to it however that is rounded."""
-    lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in (box.lower, box.upper))
-    return lower - NEAR * scene.dx, upper + NEAR * scene.dx
+def corners(box: Box, margin: float) -> tuple[Tensor, Tensor]:
+    """Lower and upper corner (3,) [m], float64, of a box with a margin [m]."""
+    return torch.tensor(box.lower, dtype=torch.float64) - margin, torch.tensor(box.upper, dtype=torch.float64) + margin
 
 
 def inside_box(x: Tensor, box: Box, *, name: str) -> Tensor:

@@ -279,9 +279,9 @@ def test_a_clamped_beam_sags_and_its_clamp_holds():
 
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
-@pytest.mark.parametrize("cells", [30, 36, 42, 60])
-def test_a_clamp_whose_face_is_a_layer_of_nodes_holds_it(cells, kind):
-    """In single precision 6 * (0.15 / 36) is past 0.025; a beam whose last clamped layer is a cell further in slides out."""
+@pytest.mark.parametrize("cells", [30, 35, 36, 41, 47])
+def test_a_body_does_not_slide_out_of_its_clamp(cells, kind):
+    """In single precision 6 * (0.15 / 36) is past 0.025; at 35, 41 and 47 cells the last layer inside is 0.8 of a cell from the face."""
     body = block((0.06, 0.06, 0.0125), (0.09, 0.09, 0.075), (10, 10, 20))
     scene = Scene(upper=(0.15, 0.15, 0.15), cells=cells, dt=2e-5, walls=None, clamps=(Box((0.0, 0.0, 0.0), (0.15, 0.15, 0.025)),))
     sim = Simulator(scene, body, device=DEVICE, dtype=kind)
