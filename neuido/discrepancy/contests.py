@@ -63,7 +63,7 @@ class Contests(Laboratory):
             return None
         whiten, coordinates = floor.whitener(self.parts), [p.coordinate(c.starts[start][p.name]) for p in c.parameters]
         parts = []
-        for n in dict.fromkeys(p.recording for p in self.parts if p.fitted):
+        for n in self.fitted_recordings:
             both = (*slopes[n].T, *(columns[c.key, start][n] / coordinates).T)
             parts.append(np.stack([whiten(column, n) for column in both], axis=1))
         J = np.concatenate(parts)
@@ -158,7 +158,7 @@ class Contests(Laboratory):
             self.predicted([points[i] for i in leading], list(floor.noise), range(self.problem.settings))
         for i in leading:
             if self.runs(points[i]):
-                squares[i] = min(squares[i], self.mean_squares([points[i]], self.floor(points[i], like=floor))[0], key=score)
+                squares[i] = min(squares[i], self.stand(points[i], like=floor)[1], key=score)
         return squares
 
     def alike(

@@ -43,6 +43,7 @@ class Laboratory:
         self.memo = memo or Memo(problem)
         self.parts = split(problem)
         self.fitted = [p.fitted for p in self.parts]
+        self.scored_recordings = list(dict.fromkeys(p.recording for p in self.parts))
         self.fitted_recordings = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
         self.as_declared = {p.name: p.value for p in problem.declared}
         """The declared parameters at the values that the model states."""
@@ -99,7 +100,7 @@ class Laboratory:
         So are the amounts of the differences of the settings, as the fitted parts have them (`Floor.amounts`), unless `plain`: what is left
         then is that of one setting alone.
         """
-        wanted = self.fitted_recordings if fitted else list(dict.fromkeys(p.recording for p in self.parts))
+        wanted = self.fitted_recordings if fitted else self.scored_recordings
         with self.memo.during("errors of fits"):
             rows = {n: of - self.problem.recordings[n].y for (n, _), of in self.predicted(points, wanted).items()}
         found = []
@@ -228,7 +229,7 @@ class Laboratory:
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""
-        rows = self.predicted([point], list(dict.fromkeys(p.recording for p in self.parts)))
+        rows = self.predicted([point], self.scored_recordings)
         return all(bool(np.isfinite(of).all()) for of in rows.values())
 
     def is_noise(self, errors: np.ndarray) -> bool:

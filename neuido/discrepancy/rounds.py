@@ -87,8 +87,7 @@ class Inference(Contests):
         candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
         errors = self.mean_squares([base.point], floor)[0]
         free = (*self.problem.declared, *extra)
-        everywhere = list(dict.fromkeys(p.recording for p in self.parts))
-        slopes = self.slopes(free, base.point, everywhere)
+        slopes = self.slopes(free, base.point, self.scored_recordings)
         ranked, columns = self.screen(base.point, candidates, floor, slopes)
         chosen: dict[str, int] = {}
         starts = []
@@ -119,7 +118,7 @@ class Inference(Contests):
         best |= self.polish(free, best, base, floor)
         best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
         floors = self.floors(base.point, free, floor)
-        model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, everywhere, candidates)
+        model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)
         empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=model.null(errors, self.draws))
         result = self.judge(empty, best, model, list(chosen))
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
@@ -184,15 +183,15 @@ class Inference(Contests):
             return f"lowers the error {math.exp(t.gain):.2f}-fold; with nuisances and discretisation it takes {math.exp(at_least):.2f}-fold"
         return f"leaves {math.exp(0.5 * (t.score - top.score)):.1f} times the error of {top.candidate.name}"
 
-    def _linear(self, point, floor, left, slopes, columns, chosen, everywhere, candidates) -> evidence.LinearModel:
+    def _linear(self, point, floor, left, slopes, columns, chosen, candidates) -> evidence.LinearModel:
         """The linear model of the fits; `left` is what the discretisation leaves after a refit, mean squares of the parts."""
         held = [p.recording for p in self.parts if not p.fitted]
         by_key = {c.key: c for c in candidates}
         best = {c.key: 0 for c in candidates} | chosen
         one = [replace(by_key[key], starts=(by_key[key].starts[i],)) for key, i in best.items()]
-        new = [n for n in held if n not in [p.recording for p in self.parts if p.fitted]]
+        new = [n for n in held if n not in self.fitted_recordings]
         there = self.columns(point, one, new) if new else {}
-        nuisances = floor.nuisances or {n: np.empty((len(self.problem.recordings[n].y), 0)) for n in everywhere}
+        nuisances = floor.nuisances or {n: np.empty((len(self.problem.recordings[n].y), 0)) for n in self.scored_recordings}
         made = []
         for part, square in zip(self.parts, left, strict=True):
             n, rows = part.recording, part.rows

@@ -106,8 +106,7 @@ def inside_box(x: Tensor, box: Box, *, name: str) -> Tensor:
     Raises:
         UserError: The box picks no particle.
     """
-    lower = torch.tensor(box.lower, dtype=torch.float64, device=x.device)
-    upper = torch.tensor(box.upper, dtype=torch.float64, device=x.device)
+    lower, upper = (corner.to(x.device) for corner in corners(box, 0.0))
     picked = ((x >= lower) & (x <= upper)).all(dim=-1)
     if not bool(picked.any()):
         raise UserError(f"{name} {[list(box.lower), list(box.upper)]} picks no particle; move or enlarge the box")

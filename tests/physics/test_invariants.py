@@ -286,7 +286,7 @@ def test_a_body_does_not_slide_out_of_its_clamp(cells, kind):
     scene = Scene(upper=(0.15, 0.15, 0.15), cells=cells, dt=2e-5, walls=None, clamps=(Box((0.0, 0.0, 0.0), (0.15, 0.15, 0.025)),))
     sim = Simulator(scene, body, device=DEVICE, dtype=kind)
     steps = 2500
-    last = sim.rollout(steps, FixedCorotated(3e5, 0.3), every=steps).x[-1].cpu()
+    last = sim.rollout(steps, FixedCorotated(3e5, 0.3), every=steps).x[-1]
     first = (body.x[:, 2] > 0.025) & (body.x[:, 2] < 0.029)
     fall = 0.5 * 9.8 * (steps * scene.dt) ** 2
     assert float((last - body.x)[first].norm(dim=1).max()) < 0.02 * fall
