@@ -11,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.recording import note
 
 
 def choose_device(name: str) -> torch.device:
@@ -146,6 +147,7 @@ def _launch_again(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torc
     packed = command.arguments
     for i, value in scalars:
         setattr(packed, kernel.adj.args[i].label, value)
+    note(command.forward, command.bounds, packed, command)
     command.forward(ctypes.byref(command.bounds), ctypes.byref(packed))
 
 

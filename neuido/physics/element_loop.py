@@ -15,6 +15,7 @@ from neuido.physics.device import launch, real_of, torch_stream
 from neuido.physics.effect_tables import Layout, Tables
 from neuido.physics.graphs import _capture
 from neuido.physics.law import ElasticLaw, Engine, Law, PlasticLaw
+from neuido.physics.recording import Stretches
 
 if TYPE_CHECKING:
     from neuido.physics.assembly import Assembly
@@ -56,7 +57,7 @@ class Loop:
         fields: What the launches read; the loop owns copies.
         laws: Tensors of the elastic and of the plastic law; likewise.
         count: Inner steps of an interval.
-        captured: Replay a CUDA graph from the third interval on.
+        captured: Replay a CUDA graph from the third interval on. On the CPU the second one is recorded and repeated.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Loop:
         self.at_node = like.new_empty(nodes if self.nodal else 0)
         self.graph: torch.cuda.CUDAGraph | None = None
         self.warm = False
+        self.stretches = Stretches()
 
     @property
     def state(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -118,16 +120,23 @@ class Loop:
         for own, value in ((self.fields.pull, pull), (self.fields.growth, growth)):
             if value is not None:
                 own.copy_(value)
-        if not self.captured or not self.warm:  # the first one compiles and loads the kernels
+        if not self.warm:  # the first one compiles and loads the kernels
             self.run()
             self.warm = True
-            return
-        if self.graph is None:
-            self.graph, _ = _capture(self.run)
-        self.graph.replay()
+        elif self.assembly.solver.device.type == "cpu":
+            self.stretches.run("interval", self.run)
+        elif not self.captured:
+            self.run()
+        else:
+            if self.graph is None:
+                self.graph, _ = _capture(self.run)
+            self.graph.replay()
+        if self.count % 2 and self.layout.width > 0:  # the next one begins where this one began
+            self.history.copy_(self.history_next)
 
     def run(self) -> None:
-        """The launches of an interval."""
+        """The launches of an interval; the last history is where an odd number of swaps leaves it."""
+        begun = self.history, self.history_next
         with torch_stream(self.assembly.solver.device):
             elastic, plastic = self._engines()
             for n in range(self.count):
@@ -139,9 +148,7 @@ class Loop:
                 if self.layout.width > 0 or self.flows:
                     self._remember(growth)
                     self.history, self.history_next = self.history_next, self.history
-            if self.count % 2 and self.layout.width > 0:  # a replay begins where the graph began
-                self.history_next.copy_(self.history)
-                self.history, self.history_next = self.history_next, self.history
+        self.history, self.history_next = begun
 
     def _engines(self) -> tuple[Engine, Engine | None]:
         particles = self.assembly.particles

@@ -8,6 +8,7 @@ the laws, last substep first. `autograd.py` makes one `torch.autograd.Function` 
 import copy
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -19,6 +20,7 @@ from neuido.physics import effect_kernels, kernels
 from neuido.physics.device import launch, real_of, torch_stream
 from neuido.physics.effect_tables import Layout, Tables
 from neuido.physics.law import ElasticLaw, Engine, PlasticLaw
+from neuido.physics.recording import Stretches
 
 if TYPE_CHECKING:
     from neuido.physics.mpm import Simulator
@@ -167,7 +169,7 @@ class Plan:
     def forward(self, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
         """Launch the substeps (all, or the first `steps`); checks nothing."""
         sim = self.simulator
-        mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
+        pull, force, friction = inputs[STATES + 1 : STATES + 4]
         stride = self.steps // (len(tape.x) - 1)
         for frame, t in zip(tape.states, inputs):
             frame[0] = t
@@ -175,33 +177,64 @@ class Plan:
         spare = [tuple(torch.empty_like(t) for t in now) for _ in range(2)] if stride > 1 else []
         scratch, other = torch.empty_like(now[3]), torch.empty_like(now[3])
         copies = sim.device.type == "cpu"
+        stretches = Stretches()
+        steady = all(len(t) <= 1 for t in (pull, inputs[STATES + 6]))  # neither pull nor growth has a row for each substep
         tape.status.zero_()
         with torch_stream(sim.device):
             elastic, plastic = self.engines(inputs)
             for n in range(self.steps if steps is None else steps):
                 frame = tuple(frames[(n + 1) // stride] for frames in tape.states) if (n + 1) % stride == 0 else None
-                # on the CPU a frame is a copy: launches whose tensors always lie in the same places need no packing
+                # on the CPU a frame is a copy: launches whose tensors always lie in the same places are repeated as they were
                 then = spare[n % 2] if frame is None or (spare and copies) else frame
-                x, v, C, F, history = now
+                same = n % 2 if spare and copies and steady and n else None
+                reach = self.reach(now[0]) if tape.grid is None else slice(None)
                 tau = scratch if tape.tau is None else tape.tau[n]
                 trial = other if tape.trial is None else tape.trial[n]
-                material = self.material(inputs, n)
-                self.stress(elastic, F, C, history, viscosity, material, tau)
-                reach = self.reach(x) if tape.grid is None else slice(None)
-                grid = self.to_grid(x, v, C, tau, mass, sim.scratch("grid") if tape.grid is None else tape.grid[n], reach)
+                grid = sim.scratch("grid") if tape.grid is None else tape.grid[n]
                 velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
-                self.on_grid(grid, at_step(pull, n), force, friction, velocity, reach)
-                self.launch(sim.kernels.grid_to_particles, len(x),
-                            [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
-                             trial if self.corrects else then[3], n, tape.status], self.block)  # fmt: skip
-                if plastic is not None:
-                    plastic.forward(trial, then[3])
-                if material is not None:
-                    self.remember(material, trial, then[2], history, then[3], then[4])
+                grid[reach].zero_()
+                scatter = partial(self.scatter, inputs, n, now, elastic, tau, grid)
+                update = partial(self.on_grid, grid, at_step(pull, n), force, friction, velocity, reach)
+                gather = partial(self.gather, inputs, n, now, then, plastic, velocity, trial, tape.status)
+                if same is None:
+                    scatter(), update(), gather()
+                else:
+                    stretches.run(("scatter", same), scatter)
+                    stretches.run((reach.start, reach.stop), update)
+                    stretches.run(("gather", same), gather, n)
                 if frame is not None and then is not frame:
                     for kept, t in zip(frame, then):
                         kept.copy_(t)
                 now = then
+
+    def scatter(self, inputs: Sequence[Tensor], n: int, now: Sequence[Tensor], elastic: Engine, tau: Tensor, grid: Tensor) -> None:
+        """Stress, and momentum and mass of the nodes, which are zero before."""
+        x, v, C, F, history = now
+        self.stress(elastic, F, C, history, inputs[STATES + 4], self.material(inputs, n), tau)
+        self.add_to_grid(x, v, C, tau, inputs[STATES], grid)
+
+    def gather(
+        self,
+        inputs: Sequence[Tensor],
+        n: int,
+        now: Sequence[Tensor],
+        then: Sequence[Tensor],
+        plastic: Engine | None,
+        velocity: Tensor,
+        trial: Tensor,
+        status: Tensor,
+    ) -> None:
+        """The particles of the next substep, from the velocity of the nodes."""
+        sim = self.simulator
+        x, _, _, F, history = now
+        material = self.material(inputs, n)
+        self.launch(sim.kernels.grid_to_particles, len(x),
+                    [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
+                     trial if self.corrects else then[3], n, status], self.block)  # fmt: skip
+        if plastic is not None:
+            plastic.forward(trial, then[3])
+        if material is not None:
+            self.remember(material, trial, then[2], history, then[3], then[4])
 
     def stress(
         self, elastic: Engine, F: Tensor, C: Tensor, history: Tensor, viscosity: Tensor, material: Material | None, tau: Tensor
@@ -245,13 +278,16 @@ class Plan:
         first, last = (min(max(int((at - edge) / dx - 0.5), 0), planes - 3) for at in (low, high))
         return slice(max(first - 1, 0) * plane, min(last + 4, planes) * plane)
 
-    def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor, reach: slice = slice(None)) -> Tensor:
-        """Momentum and mass of the nodes; of those beyond `reach` nothing is written."""
+    def to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> Tensor:
+        """Momentum and mass of the nodes."""
+        self.add_to_grid(x, v, C, tau, mass, grid.zero_())
+        return grid
+
+    def add_to_grid(self, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> None:
+        """The same, added to what is there."""
         sim = self.simulator
-        grid[reach].zero_()
         arguments = [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau, grid]
         self.launch(sim.kernels.particles_to_grid, len(x), arguments, self.block)
-        return grid
 
     def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor, velocity: Tensor, reach: slice = slice(None)) -> None:
         sim = self.simulator

@@ -8,8 +8,11 @@ import warp as wp
 
 from neuido.data.shapes import cube
 from neuido.physics import device
-from neuido.physics.laws import FixedCorotated
+from neuido.physics.effects import Effects
+from neuido.physics.finite_elements import FiniteElements
+from neuido.physics.laws import FixedCorotated, Sigma, VonMises
 from neuido.physics.mpm import Simulator
+from neuido.physics.recording import Stretches
 from neuido.types import Scene
 
 CPU = torch.device("cpu")
@@ -86,3 +89,68 @@ def test_planes_beyond_the_body_do_not_matter(monkeypatch, dtype):
     for a, b in zip(few, frames(), strict=True):
         assert torch.equal(a, b)
     assert float(few.x[..., 0].max()) > 0.7  # it went half through the domain
+
+
+@wp.kernel(module="neuido.tests.launches", enable_backward=False)
+def stamp(out: wp.array(dtype=float), shift: float, step: int):
+    out[wp.tid()] = out[wp.tid()] + float(step) + shift
+
+
+def test_a_recorded_stretch_is_repeated_with_its_own_arguments():
+    a, b = torch.zeros(3), torch.zeros(3)
+
+    def stretch():
+        device.launch(stamp, 3, [a, 0.5, 10], CPU)
+        device.launch(stamp, 2, [b[:2], 100.0, 10], CPU)
+
+    stretches = Stretches()
+    stretches.run("a", stretch, 10)
+    device.launch(stamp, 3, [a, -0.5, 0], CPU)  # the same memory with other scalars
+    for step in (20, 30):
+        stretches.run("a", lambda: pytest.fail("it ran again"), step)
+    assert a.tolist() == [61.0] * 3
+    assert b.tolist() == [360.0, 360.0, 0.0]
+
+
+def test_what_is_more_than_launches_runs_again():
+    a, out = torch.ones(3), torch.zeros(3)
+
+    def stretch():
+        device.launch(stamp, 3, [out, 0.0, 1], CPU)
+        a.mul_(2.0)
+
+    stretches = Stretches()
+    for _ in range(3):
+        stretches.run("a", stretch)
+    assert stretches.kept == {"a": None}
+    assert out.tolist() == [3.0] * 3 and a.tolist() == [8.0] * 3
+
+
+def test_threads_record_their_own_launches():
+    def work(n: int) -> list[float]:
+        out, stretches = torch.zeros(2), Stretches()
+        for step in range(50):
+            stretches.run(n, lambda: device.launch(stamp, 2, [out, float(n), step], CPU), step)  # noqa: B023 (run at once)
+        return out.tolist()
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(work, range(8))) == [[1225.0 + 50 * n] * 2 for n in range(8)]
+
+
+@pytest.mark.parametrize("solver", [Simulator, FiniteElements])
+@pytest.mark.parametrize("law", ["elastic", "plastic", "relaxing"])
+def test_repeated_launches_give_the_motion_of_fresh_ones(solver, law, monkeypatch):
+    body = cube(length=0.2, particles_per_side=5, centre=(0.5, 0.16, 0.5), velocity=(0.3, -2.0, 0.1))
+    scene = Scene(cells=16, dt=4e-4)
+    effects = Effects(maxwell_ratio=0.5, maxwell_time=0.02) if law == "relaxing" else None
+    elastic, plastic = (Sigma(1e5, 0.3), VonMises(1e3, 1e5, 0.3)) if law == "plastic" else (FixedCorotated(1e5, 0.3), None)
+
+    def roll():
+        with torch.no_grad():
+            return solver(scene, body).rollout(200, elastic, plastic, every=5, effects=effects)
+
+    repeated = roll()
+    monkeypatch.setattr(Stretches, "run", lambda self, key, stretch, step=0: stretch())
+    for a, b in zip(repeated, roll()):
+        assert torch.equal(a, b)
+    assert float((repeated.x[-1] - repeated.x[0]).abs().max()) > 0.02
