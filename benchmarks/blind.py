@@ -1,13 +1,14 @@
 """Blind cases: experiments with an undeclared effect, or none, diagnosed without their keys and then scored against them.
 
-    python benchmarks/blind.py --out runs/blind [--cases 60] [--curves 0] [--workers 2] [--device cpu]
+    python benchmarks/blind.py --out runs/blind [--cases 60] [--curves 0] [--workers N] [--device cpu]
                                [--ablation single-recording no-discretisation] [--only make|diagnose|score] [--folders FOLDER ...]
 
 A third of the cases are nulls, half of them with wrong nuisances; the others spread evenly over the library's effects, with some of two
 effects and some outside the library, made by three solvers in turn. Whatever is there already is kept, so the command goes on where it was
 stopped. The keys are opened by the scoring alone, after the answers' digests are in results.csv. Ablations `plain-bic`, `no-unknown` and
 `take-smallest-error` follow from the figures of the full run and are always scored; `single-recording` and `no-discretisation` run again.
-`--folders` scores given folders instead (each with a truth.yaml, or a key in ../keys). A GPU takes the cases one after the other.
+`--folders` scores given folders instead (each with a truth.yaml, or a key in ../keys). A GPU takes the cases one after the other unless
+`--workers` says more; under NVIDIA's MPS it does about three times as many in a time with twenty.
 """
 
 import argparse
@@ -212,7 +213,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=60)
     parser.add_argument("--curves", type=int, default=0, help="further cases that are material tests and tracks, in turn")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--workers", type=int, help="processes at a time; 2 on the CPU, 1 on a GPU")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--ablation", nargs="*", choices=RERUN, default=[])
     parser.add_argument("--only", choices=("make", "diagnose", "score"))
@@ -221,7 +222,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=0.0, help="of a body's recordings; 0: 0.4 to 0.6")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    workers = 1 if options.device != "cpu" else options.workers
+    workers = options.workers or (2 if options.device == "cpu" else 1)
     if options.folders:
         folders = [folder.resolve() for folder in options.folders]
     else:
