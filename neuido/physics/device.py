@@ -111,6 +111,7 @@ class _Command:
     __slots__ = ("arguments", "bounds", "forward", "kept", "module")
 
     def __init__(self, kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
+        _contract(kernel)
         recorded = wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), record_cmd=True)
         layout = _layouts.get(kernel)
         if layout is None:
@@ -119,6 +120,15 @@ class _Command:
         packed = layout(*recorded.params[1:])
         self.bounds, self.arguments, self.forward, self.module = recorded.bounds, packed, recorded.hooks.forward, recorded.module_exec
         self.kept = [value for value in arguments if not isinstance(value, Tensor)]  # what the key knows by its address
+
+
+def _contract(kernel: wp.Kernel) -> None:
+    """Let products and sums be rounded once where the processor can: a tenth less time. Warp's default is to do so within an expression."""
+    module = kernel.module
+    if kernel.func.__module__.startswith("neuido.") and module.options["cpu_compiler_flags"] is None:
+        flags = wp.config.cpu_compiler_flags
+        flags = "-march=native" if flags is None else flags
+        wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast".strip()}, module=module)
 
 
 MOST_COMMANDS = 12_000
