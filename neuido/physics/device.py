@@ -95,8 +95,21 @@ def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.dev
     return again
 
 
+def _contract(kernel: wp.Kernel) -> None:
+    """On the CPU let products and sums be rounded once: a tenth less time. Warp's default is to do so within an expression.
+
+    Before the module is first loaded, on whatever device: its options are part of its name there.
+    """
+    module = kernel.module
+    if kernel.func.__module__.startswith("neuido.") and module.options["cpu_compiler_flags"] is None:
+        flags = wp.config.cpu_compiler_flags
+        flags = "-march=native" if flags is None else flags
+        wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast".strip()}, module=module)
+
+
 def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:
     """What Warp takes for the arguments of a kernel."""
+    _contract(kernel)
     return [
         _array(value, arg.type.dtype) if isinstance(value, Tensor) else value for value, arg in zip(arguments, kernel.adj.args, strict=True)
     ]
@@ -111,7 +124,6 @@ class _Command:
     __slots__ = ("arguments", "bounds", "forward", "kept", "module")
 
     def __init__(self, kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
-        _contract(kernel)
         recorded = wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), record_cmd=True)
         layout = _layouts.get(kernel)
         if layout is None:
@@ -120,15 +132,6 @@ class _Command:
         packed = layout(*recorded.params[1:])
         self.bounds, self.arguments, self.forward, self.module = recorded.bounds, packed, recorded.hooks.forward, recorded.module_exec
         self.kept = [value for value in arguments if not isinstance(value, Tensor)]  # what the key knows by its address
-
-
-def _contract(kernel: wp.Kernel) -> None:
-    """Let products and sums be rounded once where the processor can: a tenth less time. Warp's default is to do so within an expression."""
-    module = kernel.module
-    if kernel.func.__module__.startswith("neuido.") and module.options["cpu_compiler_flags"] is None:
-        flags = wp.config.cpu_compiler_flags
-        flags = "-march=native" if flags is None else flags
-        wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast".strip()}, module=module)
 
 
 MOST_COMMANDS = 12_000
