@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import functools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -95,6 +96,7 @@ def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.dev
     return again
 
 
+@functools.cache
 def _contract(kernel: wp.Kernel) -> None:
     """On the CPU let products and sums be rounded once: a tenth less time. Warp's default is to do so within an expression.
 
@@ -108,7 +110,7 @@ def _contract(kernel: wp.Kernel) -> None:
 
 
 def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:
-    """What Warp takes for the arguments of a kernel."""
+    """What Warp takes for the arguments of a kernel, whose module has its options from here on."""
     _contract(kernel)
     return [
         _array(value, arg.type.dtype) if isinstance(value, Tensor) else value for value, arg in zip(arguments, kernel.adj.args, strict=True)

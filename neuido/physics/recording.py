@@ -81,11 +81,13 @@ class Stretches:
 
     def run(self, key: Hashable, stretch: Callable[[], None], step: int = 0) -> None:
         """Run a stretch; where it ran with this key it is repeated, if launches are all that it is."""
-        if (kept := self.kept.get(key, self)) is self:
+        if key not in self.kept:
             with Recording() as recording:
                 stretch()
             self.kept[key] = recording if recording.whole else None
-        elif kept is None:
+            return
+        kept = self.kept[key]
+        if kept is None:
             stretch()
         else:
             kept.repeat(step)

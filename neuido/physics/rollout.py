@@ -192,12 +192,16 @@ class Plan:
                 trial = other if tape.trial is None else tape.trial[n]
                 grid = sim.scratch("grid") if tape.grid is None else tape.grid[n]
                 velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
+                if n == 0 or not steady:
+                    material, pull_now = self.material(inputs, n), at_step(pull, n)
                 grid[reach].zero_()
-                scatter = partial(self.scatter, inputs, n, now, elastic, tau, grid)
-                update = partial(self.on_grid, grid, at_step(pull, n), force, friction, velocity, reach)
-                gather = partial(self.gather, inputs, n, now, then, plastic, velocity, trial, tape.status)
+                scatter = partial(self.scatter, inputs, now, material, elastic, tau, grid)
+                update = partial(self.on_grid, grid, pull_now, force, friction, velocity, reach)
+                gather = partial(self.gather, n, now, then, material, plastic, velocity, trial, tape.status)
                 if same is None:
-                    scatter(), update(), gather()
+                    scatter()
+                    update()
+                    gather()
                 else:
                     stretches.run(("scatter", same), scatter)
                     stretches.run((reach.start, reach.stop), update)
@@ -207,18 +211,20 @@ class Plan:
                         kept.copy_(t)
                 now = then
 
-    def scatter(self, inputs: Sequence[Tensor], n: int, now: Sequence[Tensor], elastic: Engine, tau: Tensor, grid: Tensor) -> None:
+    def scatter(
+        self, inputs: Sequence[Tensor], now: Sequence[Tensor], material: Material | None, elastic: Engine, tau: Tensor, grid: Tensor
+    ) -> None:
         """Stress, and momentum and mass of the nodes, which are zero before."""
         x, v, C, F, history = now
-        self.stress(elastic, F, C, history, inputs[STATES + 4], self.material(inputs, n), tau)
+        self.stress(elastic, F, C, history, inputs[STATES + 4], material, tau)
         self.add_to_grid(x, v, C, tau, inputs[STATES], grid)
 
     def gather(
         self,
-        inputs: Sequence[Tensor],
         n: int,
         now: Sequence[Tensor],
         then: Sequence[Tensor],
+        material: Material | None,
         plastic: Engine | None,
         velocity: Tensor,
         trial: Tensor,
@@ -227,7 +233,6 @@ class Plan:
         """The particles of the next substep, from the velocity of the nodes."""
         sim = self.simulator
         x, _, _, F, history = now
-        material = self.material(inputs, n)
         self.launch(sim.kernels.grid_to_particles, len(x),
                     [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
                      trial if self.corrects else then[3], n, status], self.block)  # fmt: skip
