@@ -6,10 +6,11 @@ moving least-squares map of the nearest particles that reproduces every affine m
 
 import functools
 import threading
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from neuido.errors import UserError
 from neuido.physics import effect_kernels, law_kernels
 from neuido.physics.device import real_of
 from neuido.physics.effect_library import KNOTS
+from neuido.physics.effects import Effects
 from neuido.physics.finite_elements import FiniteElements
 from neuido.physics.meshing import Mesh, follow, mesh_body
 from neuido.physics.mpm import Simulator
@@ -51,6 +53,10 @@ SEGMENT = 200
 """Substeps of the piece that a GPU captures; a rollout replays it. A longer one takes longer to capture than to run."""
 KEPT = {"cpu": 24, "cuda": 96}
 """Simulators that are kept: of each recording, setting, and number of parameter sets or thread. On a GPU they hold captured launches."""
+TOGETHER = 192
+"""Motions in a launch on a GPU."""
+SIZES = (1, 4, 12, 32, 96)
+"""Parameter sets of a recording in a launch, filled up: each number of them has buffers and captured launches of its own."""
 WINDOWS = 6
 """In time, of the patterns of an unknown discretisation error."""
 
@@ -87,6 +93,26 @@ SETTINGS = (
 )
 
 
+Motions = tuple[Sequence[Point], int]
+"""Points, and the number of the recording that moves under each of them."""
+
+
+class Run(NamedTuple):
+    """Motions of one recording that are asked for."""
+
+    points: Sequence[Point]
+    groups: list[list[int]]
+    """Which points move alike."""
+    recording: int
+    out: np.ndarray
+    """A row a point, to be filled."""
+
+    @property
+    def firsts(self) -> list[Point]:
+        """One point of each group."""
+        return [self.points[group[0]] for group in self.groups]
+
+
 @dataclass(frozen=True, eq=False)
 class BodyProblem(Problem):
     """An experiment folder with tracked points."""
@@ -95,7 +121,7 @@ class BodyProblem(Problem):
     measured: tuple[Measured, ...] = ()
     device: str = "cpu"
     batch: int = 0
-    """Parameter sets in a launch on a GPU; 0: 96. On the CPU each runs alone, as many at a time as there are cores."""
+    """Motions in a launch on a GPU; 0: `TOGETHER`. On the CPU each runs alone, as many at a time as there are cores."""
     instruments: tuple[str, ...] = INSTRUMENTS
     """Nuisances that change what is seen of a motion, and not the motion."""
     tracked: bool = True
@@ -110,36 +136,45 @@ class BodyProblem(Problem):
         return rows
 
     def predict_several(self, asks: Sequence[Ask]) -> Rows:
-        if self.device == "cpu":
-            yield from self._side_by_side(asks)
-            return
-        size = self.batch or 96
-        for points, recording, setting in asks:
-            groups, out = self._alike(points, recording), self._rows(points, recording)
-            for at in range(0, len(groups), size):
-                self._predict(points, groups[at : at + size], recording, setting, out)
-            yield out
+        answer = self._side_by_side if self.device == "cpu" else self._in_one_launch
+        yield from answer(self._runs(asks), [setting for *_, setting in asks])
 
-    def _side_by_side(self, asks: Sequence[Ask]) -> Rows:
-        """Every motion of all asks by itself, as many at a time as there are cores."""
-        waiting: list[tuple[np.ndarray, list[Future]]] = []
+    def _runs(self, asks: Sequence[Ask]) -> list[Run]:
+        return [Run(points, self._alike(points, n), n, np.empty((len(points), len(self.recordings[n].y)))) for points, n, _ in asks]
+
+    def _side_by_side(self, runs: Sequence[Run], settings: Sequence[int]) -> Iterator[np.ndarray]:
+        """Every motion by itself, as many at a time as there are cores."""
+        waiting: list[list[Future]] = []
         with _one_thread_each():
             try:
-                for points, recording, setting in asks:
-                    out = self._rows(points, recording)
-                    runs = [(points, [group], recording, setting, out) for group in self._alike(points, recording)]
-                    waiting.append((out, [_workers().submit(self._predict, *run) for run in runs]))
-                for out, runs in waiting:
-                    for run in runs:
-                        run.result()
-                    yield out
+                for run, setting in zip(runs, settings, strict=True):
+                    alone = [run._replace(groups=[group]) for group in run.groups]
+                    waiting.append([_workers().submit(self._predict, [one], setting) for one in alone])
+                for run, own in zip(runs, waiting, strict=True):
+                    for one in own:
+                        one.result()
+                    yield run.out
             finally:
-                for _, runs in waiting:
-                    for run in runs:
-                        run.cancel()
+                for own in waiting:
+                    for one in own:
+                        one.cancel()
 
-    def _rows(self, points: Sequence[Point], recording: int) -> np.ndarray:
-        return np.empty((len(points), len(self.recordings[recording].y)))
+    def _in_one_launch(self, runs: Sequence[Run], settings: Sequence[int]) -> Iterator[np.ndarray]:
+        """The recordings of a setting in launches that they share, where their frames are the same substeps."""
+        shared: dict[tuple, list[Run]] = {}
+        keys, times = [], Counter()
+        for run, setting in zip(runs, settings, strict=True):
+            r = self.measured[run.recording]
+            keys.append((setting, times[setting, run.recording], *_frames(r, r.scene.dt * SETTINGS[setting].dt)))
+            times[setting, run.recording] += 1
+            shared.setdefault(keys[-1], []).append(run)
+        for key, run in zip(keys, runs, strict=True):
+            together = shared.pop(key, [])  # those that were asked for with an earlier one are there
+            size = max((self.batch or TOGETHER) // max(len(together), 1), 1)
+            for at in range(0, max((len(one.groups) for one in together), default=0), size):
+                parts = [one._replace(groups=one.groups[at : at + size]) for one in together]
+                self._predict([part for part in parts if part.groups], key[0])
+            yield run.out
 
     def _alike(self, points: Sequence[Point], recording: int) -> list[list[int]]:
         """Which points move alike: instruments alone need no further run."""
@@ -187,8 +222,13 @@ class BodyProblem(Problem):
 
     def motion(self, point: Point, recording: int, setting: int = 0) -> np.ndarray:
         """Predicted tracked points [m], (T, N, 3)."""
-        x, _ = self._roll([point], recording, setting)
+        ((x, _),) = self._roll([([point], recording)], setting)
         return x[0]
+
+    def _moved(self, point: Point, recording: int, setting: int = 0) -> ParticleState:
+        """The frames of one motion, (T, 1, P, ...)."""
+        (frames,) = self._move([([point], recording)], setting)
+        return frames
 
     def simulated(self, recording: int) -> Measured:
         """The recording as the declared model has it, with its effects and without noise."""
@@ -210,29 +250,30 @@ class BodyProblem(Problem):
 
     # Forward runs.
 
-    def _predict(self, points: Sequence[Point], groups: Sequence[list[int]], recording: int, setting: int, out: np.ndarray) -> None:
-        """Fill the rows of groups of points that move alike; NaN where a simulation is impossible."""
+    def _predict(self, runs: Sequence[Run], setting: int) -> None:
+        """Fill the rows of groups of points that move alike, all in one launch; NaN where a simulation is impossible."""
         try:
-            moved = self._simulate([points[g[0]] for g in groups], recording, setting)
+            moved = self._simulate([(run.firsts, run.recording) for run in runs], setting)
         except UserError:
-            if len(groups) > 1:
-                for g in groups:
-                    self._predict(points, [g], recording, setting, out)
-            else:
-                out[groups[0]] = np.nan
+            halves = _halves(runs)
+            for half in halves:
+                self._predict(half, setting)
+            if not halves:
+                runs[0].out[runs[0].groups[0]] = np.nan
             return
-        self._fill(points, groups, recording, moved, out)
+        for run, own in zip(runs, moved, strict=True):
+            self._fill(run, own)
 
-    def _simulate(self, points: Sequence[Point], recording: int, setting: int) -> Any:
-        """One motion a point, as `_fill` takes them."""
-        return self._roll(points, recording, setting)
+    def _simulate(self, runs: Sequence[Motions], setting: int) -> Sequence[Any]:
+        """The motions of each recording, as `_fill` takes them."""
+        return self._roll(runs, setting)
 
-    def _fill(self, points: Sequence[Point], groups: Sequence[list[int]], recording: int, moved: Any, out: np.ndarray) -> None:
+    def _fill(self, run: Run, moved: Any) -> None:
         """The rows of each group, from its motion."""
-        seen = self.measured[recording].seen.numpy()
-        for g, xs, vs in zip(groups, *moved, strict=True):
-            for i in g:
-                out[i] = self._as_seen(points[i], recording, xs, vs)[1:][seen[1:]].reshape(-1)
+        seen = self.measured[run.recording].seen.numpy()
+        for group, xs, vs in zip(run.groups, *moved, strict=True):
+            for i in group:
+                run.out[i] = self._as_seen(run.points[i], run.recording, xs, vs)[1:][seen[1:]].reshape(-1)
 
     def _as_seen(self, point: Point, recording: int, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Positions as the instruments see them: clock and ruler may be off."""
@@ -244,59 +285,83 @@ class BodyProblem(Problem):
         centre = x[0].mean(axis=0)
         return centre + (1.0 + value["length_scale"]) * (x + (value["release_time"] + value["time_base"] * t) * v - centre)
 
-    def _move(self, points: Sequence[Point], recording: int, setting: int) -> ParticleState:
-        """The frames of the recording under each point, (T, S, P, ...)."""
-        r = self.measured[recording]
-        wanted = len(points)
-        if self.device != "cpu":  # few sizes: each has buffers of its own
-            size = next((n for n in (1, 4, 12, 32, 96) if n >= wanted), wanted)
-            points = [*points, *[points[-1]] * (size - wanted)]
-        simulator = self.simulator(recording, setting, len(points))
-        scene = simulator.scenes[0]
-        full = [{p.name: p.value for p in self.declared} | self.experiment.model.get("effects", {}) | dict(point) for point in points]
+    def _move(self, runs: Sequence[Motions], setting: int) -> list[ParticleState]:
+        """The frames of each recording under each of its points, (T, S, P, ...).
+
+        All move in the same launches: their frames are the same substeps (`_frames`).
+        """
+        size = most = max(len(points) for points, _ in runs)
+        if self.device != "cpu":
+            size = next((n for n in SIZES if n >= most), most)
+        simulator = self.simulator(tuple(n for _, n in runs), setting, size)
+        filled = [[*points, *[points[-1]] * (size - len(points))] for points, _ in runs]
+        base = {p.name: p.value for p in self.declared} | self.experiment.model.get("effects", {})
+        full = [base | dict(point) for points in filled for point in points]
         elasticity, plasticity = self.laws(full)
-        always = () if self.device == "cpu" or len(points) == 1 else [p.name for c in self.candidates for p in c.parameters]
-        turned = self._turn(recording).to(simulator.state.x)
-        material = (simulator.state.x - simulator.state.x[: len(r.body.x)].mean(dim=0)) @ turned  # as the first recording holds the body
-        effects = effects_of(full, material, simulator.particles.scene, self.duration, always=always)
-        if effects.fibre_direction is not None:
-            effects = effects._replace(fibre_direction=torch.as_tensor(effects.fibre_direction).to(material) @ turned.T)
-        every, steps, exact = _frames(r, scene.dt)
+        always = () if self.device == "cpu" or len(full) == 1 else [p.name for c in self.candidates for p in c.parameters]
+        effects = self._effects(simulator, full, [n for _, n in runs], always)
+        every, steps, exact = _frames(self.measured[runs[0][1]], simulator.scenes[0].dt)
         with torch.no_grad():
             out = simulator.rollout(
                 steps,
                 elasticity,
                 plasticity,
-                state=self._start(simulator, full, recording),
+                state=self._start(simulator, full, [n for _, n in runs]),
                 every=every,
                 segment=_segment(steps, every),
                 effects=effects,
             )
-        frames = ParticleState(*(t.unflatten(1, (len(points), len(r.body.x)))[:, :wanted] for t in out))
-        return frames if exact else _at_times(frames, every * scene.dt, r.t.to(out.x))
+        moved, offsets = [], simulator.particles.offsets[::size]
+        for (points, n), a, b in zip(runs, offsets[:-1], offsets[1:], strict=True):
+            frames = ParticleState(*(t[:, a:b].unflatten(1, (size, -1))[:, : len(points)] for t in out))
+            r = self.measured[n]
+            moved.append(frames if exact else _at_times(frames, every * r.scene.dt * SETTINGS[setting].dt, r.t.to(out.x)))
+        return moved
 
-    def _roll(self, points: Sequence[Point], recording: int, setting: int) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities of the tracked points, (S, T, N, 3) each."""
-        frames = self._move(points, recording, setting)
-        index, weight = self._map(recording)
-        x, v = (_gather(t, index, weight) for t in (frames.x, frames.v))
-        return tuple(t.transpose(0, 1).double().cpu().numpy() for t in (x, v))
+    def _effects(self, simulator: Simulator, full: Sequence[Point], recordings: Sequence[int], always: Sequence[str]) -> Effects:
+        """The effects of each scene; what depends on the place in the body holds for the body as the first recording holds it."""
+        x, count = simulator.state.x, len(full) // len(recordings)
+        offsets = simulator.particles.offsets
+        turned = torch.stack([self._turn(n) for n in recordings]).to(x)
+        parts = []
+        for k, R in enumerate(turned):
+            first, last, end = (offsets[k * count + i] for i in (0, 1, count))
+            parts.append((x[first:end] - x[first:last].mean(dim=0)) @ R)
+        effects = effects_of(full, torch.cat(parts), simulator.particles.scene, self.duration, always=always)
+        if effects.fibre_direction is None:
+            return effects
+        direction = torch.as_tensor(effects.fibre_direction).to(x).expand(len(full), 3)
+        return effects._replace(fibre_direction=torch.einsum("sij,sj->si", turned.repeat_interleave(count, dim=0), direction))
+
+    def _roll(self, runs: Sequence[Motions], setting: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Positions and velocities of the tracked points of each recording, (S, T, N, 3) each."""
+        out = []
+        for (_, recording), frames in zip(runs, self._move(runs, setting), strict=True):
+            index, weight = self._map(recording)
+            x, v = (_gather(t, index, weight).transpose(0, 1).double().cpu().numpy() for t in (frames.x, frames.v))
+            out.append((x, v))
+        return out
 
     def laws(self, points: Sequence[Mapping[str, float]]):
         """The declared laws of several points, a row each."""
         return laws_of(self.experiment.model, points)
 
-    def simulator(self, recording: int, setting: int, count: int) -> Simulator:
-        """`count` copies of a recording's scene, kept for the next call of this thread: they hold buffers."""
-        key = (recording, setting, count, threading.get_ident())
+    def simulator(self, recordings: Sequence[int], setting: int, count: int) -> Simulator | FiniteElements:
+        """`count` copies of the scene of each recording, kept for the next call of this thread: they hold buffers."""
+        key = (tuple(recordings), setting, count, threading.get_ident())
         with self._lock:
             found = self._simulators.pop(key, None)
             if found is None:
-                r, s = self.measured[recording], SETTINGS[setting]
-                scene = replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)
-                scenes, bodies, density = [scene] * count, [r.body] * count, self.experiment.model["density"]
-                if s.solver == "finite_elements":
-                    found = FiniteElements(scenes, bodies, density=density, device=self.device, meshes=self._mesh(recording, s.elements))
+                s = SETTINGS[setting]
+                scenes, bodies, meshes = [], [], []
+                for n in recordings:
+                    r = self.measured[n]
+                    scenes += [replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)] * count
+                    bodies += [r.body] * count
+                    meshes += [self._mesh(n, s.elements)] * count if s.solver == "finite_elements" else []
+                density = self.experiment.model["density"]
+                if meshes:
+                    found = FiniteElements(scenes, bodies, density=density, device=self.device, meshes=meshes)
                 else:
                     found = Simulator(scenes, bodies, density=density, device=self.device)
                 while len(self._simulators) >= KEPT[torch.device(self.device).type]:
@@ -312,17 +377,22 @@ class BodyProblem(Problem):
             self._meshes[recording, elements] = mesh_body(body.x, body.volume, elements=wanted)
         return self._meshes[recording, elements]
 
-    def _start(self, simulator: Simulator, points: Sequence[Point], recording: int) -> ParticleState:
-        """The start with the velocities and spins of each point."""
-        name = self.measured[recording].name
-        shift = [[p.get(f"{kind}_{a}:{name}", 0.0) for a in "xyz"] for kind in ("velocity", "spin") for p in points]
+    def _start(self, simulator: Simulator, points: Sequence[Point], recordings: Sequence[int]) -> ParticleState:
+        """The start with the velocities and spins of each point, those of the first recording first."""
+        count = len(points) // len(recordings)
+        names = [self.measured[n].name for n in recordings for _ in range(count)]
+        shift = [
+            [p.get(f"{kind}_{a}:{name}", 0.0) for a in "xyz"]
+            for kind in ("velocity", "spin")
+            for p, name in zip(points, names, strict=True)
+        ]
         if not any(any(row) for row in shift):
             return simulator.state
         change = torch.tensor(shift, dtype=simulator.dtype, device=simulator.device).reshape(2, len(points), 3)
-        scene = simulator.particles.scene.long()
+        scene, offsets = simulator.particles.scene.long(), simulator.particles.offsets
         x, v, C, F = simulator.state
-        count = len(x) // len(points)
-        centre = x[:count].mean(dim=0)
+        centres = torch.stack([x[offsets[s] : offsets[s + 1]].mean(dim=0) for s in range(0, len(points), count)])
+        centre = centres.repeat_interleave(count, dim=0)[scene]
         w = change[1]
         skew = torch.zeros(len(points), 3, 3, dtype=x.dtype, device=x.device)
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -418,6 +488,15 @@ def _workers() -> ThreadPoolExecutor:
     for build in (effect_kernels.build, law_kernels.kernels):
         build(real_of(torch.float32))
     return pool()
+
+
+def _halves(runs: Sequence[Run]) -> list[list[Run]]:
+    """Runs in two parts, by their groups where one has several: a point that is impossible is so in every recording, mostly."""
+    most = max(len(run.groups) for run in runs)
+    if most == 1:
+        return [list(runs[: len(runs) // 2]), list(runs[len(runs) // 2 :])] if len(runs) > 1 else []
+    parts = ([run._replace(groups=run.groups[own]) for run in runs] for own in (slice((most + 1) // 2), slice((most + 1) // 2, None)))
+    return [[run for run in part if run.groups] for part in parts]
 
 
 def _recording(r: Measured) -> Recording:

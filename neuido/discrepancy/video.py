@@ -17,7 +17,7 @@ from neuido.data.cameras import project
 from neuido.data.experiments import Experiment
 from neuido.data.experiments import Recording as Measured
 from neuido.discrepancy import silhouettes
-from neuido.discrepancy.body import INSTRUMENTS, WINDOWS, BodyProblem, body_problem
+from neuido.discrepancy.body import INSTRUMENTS, WINDOWS, BodyProblem, Motions, Run, body_problem
 from neuido.discrepancy.filmed import Film, Look, Splats, body_of, looks, read_film
 from neuido.discrepancy.problem import Parameter, Point, Recording
 from neuido.discrepancy.silhouettes import Outlines, Score, View, outlines
@@ -89,7 +89,7 @@ class VideoProblem(BodyProblem):
     def _scored(self, point: Point, recording: int, setting: int = 0) -> tuple[np.ndarray, dict[str, Score]]:
         """Drawn silhouettes (T, V, H, W), and how well those of the fitted and of the other frames agree with the film's."""
         f = self.footage[recording]
-        drawn = self._drawn(_alone(self._move([point], recording, setting), 0), recording, point)
+        drawn = self._drawn(_alone(self._moved(point, recording, setting), 0), recording, point)
         frames = self.fitted_frames(recording)
         scores = {}
         for name, chosen in (("fit", frames), ("held_out", ~frames)):
@@ -125,7 +125,7 @@ class VideoProblem(BodyProblem):
     def simulated(self, recording: int) -> Measured:
         """All particles as the declared model moves them: nobody tracked a point."""
         r = self.measured[recording]
-        x = self._move([{}], recording, 0).x[:, 0].cpu().float()
+        x = self._moved({}, recording).x[:, 0].cpu().float()
         return replace(r, x=x, track=torch.arange(x.shape[1]), noise=None, video=None, gaussians=None)
 
     def as_tracked(self) -> BodyProblem:
@@ -144,19 +144,19 @@ class VideoProblem(BodyProblem):
 
     # Forward runs.
 
-    def _simulate(self, points: Sequence[Point], recording: int, setting: int) -> Any:
-        return self._move(points, recording, setting)
+    def _simulate(self, runs: Sequence[Motions], setting: int) -> Sequence[Any]:
+        return self._move(runs, setting)
 
-    def _fill(self, points: Sequence[Point], groups: Sequence[list[int]], recording: int, moved: Any, out: np.ndarray) -> None:
-        f = self.footage[recording]
-        for s, g in enumerate(groups):
+    def _fill(self, run: Run, moved: Any) -> None:
+        f = self.footage[run.recording]
+        for s, group in enumerate(run.groups):
             motion = _alone(moved, s)
             drawn: dict[tuple[float, float], Tensor] = {}
-            for i in g:
-                clock = self._clock(points[i], recording)
+            for i in group:
+                clock = self._clock(run.points[i], run.recording)
                 if clock not in drawn:
-                    drawn[clock] = f.look.draw(self._shifted(motion, clock, recording), f.cameras)
-                out[i] = self._seen(drawn[clock], points[i], recording)
+                    drawn[clock] = f.look.draw(self._shifted(motion, clock, run.recording), f.cameras)
+                run.out[i] = self._seen(drawn[clock], run.points[i], run.recording)
 
     def _clock(self, point: Point, recording: int) -> tuple[float, float]:
         name = self.measured[recording].name
@@ -234,7 +234,7 @@ def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0
     plain = replace(experiment, recordings=tuple(measured))
     base = body_problem(plain, device=device, batch=batch)
     # the declared motion of some particles stands for that of the body: typical speeds and places are taken from it
-    moved = [_alone(base._move([{}], n, 0), 0) for n in range(len(measured))]
+    moved = [_alone(base._moved({}, n), 0) for n in range(len(measured))]
     tracked = [_some(r, m) for r, m in zip(measured, moved, strict=True)]
     base = body_problem(replace(experiment, recordings=tuple(tracked)), device=device, batch=batch)
     footage = [_footage(r, experiment, film, m, device) for r, film, m in zip(tracked, films, moved, strict=True)]

@@ -1,0 +1,97 @@
+"""Motions of several recordings in one launch are those that each makes by itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from neuido.discrepancy.body import SETTINGS, body_problem
+from neuido.physics.mpm import Simulator
+from tests.discrepancy import made
+
+CUDA = pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")])
+FIBRES = {"fibre.c": 3e4, "fibre.azimuth": 0.4, "fibre.elevation": 0.7}
+POINTS = [
+    {"young": 6e4, "velocity_x:throw": 0.2, "spin_z:drop": 1.5, "spin_y:throw": -2.0},
+    {"young": 8e4, "stiffness_gradient.x": 2.0, "viscosity_shear.eta": 4.0},
+    {"young": 6e4, **FIBRES, "drag_linear.k": 2.0},
+]
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory):
+    """Bodies of 64 and of 125 particles, the second one turned: fibres and gradients turn with it."""
+    path = tmp_path_factory.mktemp("launches")
+    first, second = (made.experiment(path / str(side), {}, frames=8, side=side).recordings[i] for i, side in enumerate((4, 5)))
+    last = made.experiment(path / "turned", {}, frames=8, side=4).recordings[0]
+    # a quarter turn about z keeps the lattice of a cube, so the noise of a particle tells it
+    body = last.body
+    centre = body.x.mean(dim=0)
+    generator = torch.Generator().manual_seed(3)
+    uneven = body.x + 0.004 * torch.randn(body.x.shape, generator=generator)
+    R = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = replace(last, name="turned", role="held_out", body=body._replace(x=(uneven - uneven.mean(dim=0)) @ R.T + centre))
+    straight = replace(first, body=first.body._replace(x=uneven))
+    whole = made.experiment(path / "whole", {}, frames=8, side=4)
+    return replace(whole, recordings=(straight, second, turned))
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+@pytest.mark.parametrize("setting", [0, 2, 4], ids=lambda s: SETTINGS[s].name)
+def test_recordings_in_one_launch_move_as_alone(setting, device, experiment):
+    problem = body_problem(experiment, device=device)
+    turns = [problem._turn(n) for n in range(3)]
+    assert torch.equal(turns[1], torch.eye(3, dtype=torch.float64)), "another body has no turn"
+    assert torch.allclose(turns[2][:2, :2], torch.tensor([[0.0, -1.0], [1.0, 0.0]], dtype=torch.float64), atol=1e-5)
+    runs = [(POINTS, 0), (POINTS[:2], 1), (POINTS, 2)]
+    for (points, n), frames in zip(runs, problem._move(runs, setting), strict=True):
+        assert frames.x.shape == (8, len(points), len(experiment.recordings[n].body.x), 3)
+        for s, point in enumerate(points):
+            alone = problem._moved(point, n, setting)
+            torch.testing.assert_close(frames.x[:, s], alone.x[:, 0], atol=2e-5, rtol=0.0)
+    assert float((problem._moved(POINTS[2], 0).x - problem._moved({"young": 6e4}, 0).x).abs().max()) > 1e-3
+
+
+def test_fibres_and_gradients_turn_with_the_body(experiment):
+    problem = body_problem(experiment)
+    full = [POINTS[2], {**POINTS[2], "stiffness_gradient.x": 2.0}]
+    effects = problem._effects(problem.simulator((0, 2), 0, 1), full, [0, 2], [])
+    R = problem._turn(2).float()
+    torch.testing.assert_close(effects.fibre_direction[1], R @ effects.fibre_direction[0])
+    assert float((effects.fibre_direction[1] - effects.fibre_direction[0]).abs().max()) > 0.1
+    own = problem._effects(problem.simulator((0,), 0, 1), full[1:], [0], [])
+    torch.testing.assert_close(effects.stiffness[-64:], own.stiffness, rtol=1e-4, atol=0.0)
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_what_is_asked_for_at_once_is_answered_as_one_by_one(device, experiment, monkeypatch):
+    """In their order, with instruments that need no run and points that no simulation bears; one launch a setting."""
+    problem = body_problem(experiment, device=device)
+    impossible = {"young": 1e12}
+    several = [*POINTS, {**POINTS[0], "time_base:throw": 0.01}, impossible]
+    asks = [(several, 0, 0), (POINTS[:1], 0, 0), (several, 1, 0), (POINTS, 2, 0), (several[2:], 1, 2), (several[2:], 0, 2), ([], 2, 2)]
+    alone = [np.concatenate([np.empty((0, len(problem.recordings[n].y))), *(problem.predict([p], n, s) for p in points)])
+             for points, n, s in asks]  # fmt: skip
+    counts, rollout = [], Simulator.rollout
+
+    def watched(self, *args, **options):
+        counts.append(self.scene_count)
+        return rollout(self, *args, **options)
+
+    monkeypatch.setattr(Simulator, "rollout", watched)
+    runs = problem._runs(asks)
+    for (points, n, _), got, one in zip(asks, problem._in_one_launch(runs, [s for *_, s in asks]), alone, strict=True):
+        assert got.shape == (len(points), len(problem.recordings[n].y))
+        np.testing.assert_allclose(got, one, atol=2e-5)
+        assert [np.isnan(row).any() for row in got] == [point is impossible for point in points]
+    assert len(counts) < 16
+    counts.clear()
+    possible = [(POINTS, n, s) for s in (0, 1) for n in (0, 1, 2)]
+    list(problem._in_one_launch(problem._runs(possible), [s for *_, s in possible]))
+    assert len(counts) == 2, "one launch a setting"
+    counts.clear()
+    small = body_problem(experiment, device=device, batch=3)
+    list(small._in_one_launch(small._runs(possible), [s for *_, s in possible]))
+    assert len(counts) == 6
+    assert max(counts) <= 3
