@@ -5,6 +5,7 @@ moving least-squares map of the nearest particles that reproduces every affine m
 """
 
 import functools
+import math
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -127,6 +128,8 @@ class BodyProblem(Problem):
     tracked: bool = True
     """Whether the data are positions of points."""
     _simulators: dict[Any, Simulator] = field(default_factory=dict, repr=False)
+    _still: dict[int, Simulator] = field(default_factory=dict, repr=False)
+    """By setting, one scene a recording, on the CPU: what is asked for its step alone."""
     _meshes: dict[tuple[int, float], Mesh] = field(default_factory=dict, repr=False)
     _maps: dict[int, Any] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
@@ -194,6 +197,24 @@ class BodyProblem(Problem):
         """Particle-substeps; inner steps of the finite elements count as one."""
         r = self.measured[recording]
         return float(len(r.body.x) * _frames(r, r.scene.dt * SETTINGS[setting].dt)[1])
+
+    def margin(self, point: Point, setting: int = 0) -> float:
+        """Of the explicit step, in the recording that bears least; finite elements shorten theirs as they need."""
+        if SETTINGS[setting].solver == "finite_elements":
+            return math.inf
+        recordings = range(len(self.measured))
+        with self._lock:
+            if setting not in self._still:
+                self._still[setting] = self._made(recordings, setting, 1, "cpu")
+        simulator = self._still[setting]
+        full = [self._full(point)] * len(recordings)
+        steps = max(_frames(self.measured[n], scene.dt)[1] for n, scene in enumerate(simulator.scenes))
+        try:
+            elasticity, plasticity = self.laws(full)
+            ratio = simulator.step_margin(steps, elasticity, plasticity, effects=self._effects(simulator, full, recordings, ()))
+        except UserError:
+            return -math.inf
+        return math.log(ratio)
 
     def setting_name(self, setting: int) -> str:
         return SETTINGS[setting].name
@@ -295,8 +316,7 @@ class BodyProblem(Problem):
             size = next((n for n in SIZES if n >= most), most)
         simulator = self.simulator(tuple(n for _, n in runs), setting, size)
         filled = [[*points, *[points[-1]] * (size - len(points))] for points, _ in runs]
-        base = {p.name: p.value for p in self.declared} | self.experiment.model.get("effects", {})
-        full = [base | dict(point) for points in filled for point in points]
+        full = [self._full(point) for points in filled for point in points]
         elasticity, plasticity = self.laws(full)
         always = () if self.device == "cpu" or len(full) == 1 else [p.name for c in self.candidates for p in c.parameters]
         effects = self._effects(simulator, full, [n for _, n in runs], always)
@@ -317,6 +337,10 @@ class BodyProblem(Problem):
             r = self.measured[n]
             moved.append(frames if exact else _at_times(frames, every * r.scene.dt * SETTINGS[setting].dt, r.t.to(out.x)))
         return moved
+
+    def _full(self, point: Point) -> dict[str, float]:
+        """With what is declared beside it."""
+        return {p.name: p.value for p in self.declared} | self.experiment.model.get("effects", {}) | dict(point)
 
     def _effects(self, simulator: Simulator, full: Sequence[Point], recordings: Sequence[int], always: Sequence[str]) -> Effects:
         """The effects of each scene; what depends on the place in the body holds for the body as the first recording holds it."""
@@ -352,22 +376,24 @@ class BodyProblem(Problem):
         with self._lock:
             found = self._simulators.pop(key, None)
             if found is None:
-                s = SETTINGS[setting]
-                scenes, bodies, meshes = [], [], []
-                for n in recordings:
-                    r = self.measured[n]
-                    scenes += [replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)] * count
-                    bodies += [r.body] * count
-                    meshes += [self._mesh(n, s.elements)] * count if s.solver == "finite_elements" else []
-                density = self.experiment.model["density"]
-                if meshes:
-                    found = FiniteElements(scenes, bodies, density=density, device=self.device, meshes=meshes)
-                else:
-                    found = Simulator(scenes, bodies, density=density, device=self.device)
+                found = self._made(recordings, setting, count, self.device)
                 while len(self._simulators) >= KEPT[torch.device(self.device).type]:
                     self._simulators.pop(next(iter(self._simulators)))
             self._simulators[key] = found  # the last one used is the last one to go
         return found
+
+    def _made(self, recordings: Sequence[int], setting: int, count: int, device: str) -> Simulator | FiniteElements:
+        s = SETTINGS[setting]
+        scenes, bodies, meshes = [], [], []
+        for n in recordings:
+            r = self.measured[n]
+            scenes += [replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)] * count
+            bodies += [r.body] * count
+            meshes += [self._mesh(n, s.elements)] * count if s.solver == "finite_elements" else []
+        density = self.experiment.model["density"]
+        if meshes:
+            return FiniteElements(scenes, bodies, density=density, device=device, meshes=meshes)
+        return Simulator(scenes, bodies, density=density, device=device)
 
     def _mesh(self, recording: int, elements: float) -> Mesh:
         """The body of a recording as finite elements have it; seconds of work, so that all simulators share it."""

@@ -16,6 +16,8 @@ DAMPINGS = (0.1, 1.0, 10.0)
 """Tried as factors of the present damping."""
 KEPT_PROMISE = 0.7
 """Share of the gain that the linear model promises at which a step is taken without trying other dampings."""
+EDGE = 0.02
+"""Margin that a step leaves where it would go past the edge of what runs: differences of `STEP` are to run there."""
 NOTHING = 2e-4
 """Relative gain, as the linear model promises it, that is not worth a run."""
 BEHIND = 2.5
@@ -98,6 +100,7 @@ def levenberg_marquardt(
     race: Race | None = None,
     slopes: np.ndarray | None = None,
     sizes: Sequence[str] = (),
+    margin: Callable[[Point], float] | None = None,
 ) -> Request:
     """One fit as a generator: it yields the points that it wants and receives their whitened residuals (None: not runnable).
 
@@ -115,6 +118,7 @@ def levenberg_marquardt(
         race: The fits that it is compared with.
         slopes: About the derivatives of the whitened residuals by the coordinates at the start, (n, p); without the priors' rows.
         sizes: Parameters that begin smaller where the start does not run.
+        margin: `Problem.margin` of a point: steps that would go past it are led along it.
     """
     names = tuple(p.name for p in parameters)
     fixed = {k: v for k, v in start.items() if k not in names}
@@ -123,11 +127,14 @@ def levenberg_marquardt(
     high = np.array([_bound(p, p.upper) for p in parameters])
     count = 0
 
+    def point_at(at: np.ndarray) -> dict[str, float]:
+        return fixed | {p.name: p.physical(v) for p, v in zip(parameters, at, strict=True)}
+
     def ask(asked: Sequence[np.ndarray]):
         """Residuals at coordinates, priors included."""
         nonlocal count
         count += len(asked)
-        answers = yield [fixed | {p.name: p.physical(v) for p, v in zip(parameters, a, strict=True)} for a in asked]
+        answers = yield [point_at(a) for a in asked]
         return [None if r is None else _with_priors(r, parameters, a) for r, a in zip(answers, asked, strict=True)]
 
     (r,) = yield from ask([q])
@@ -145,11 +152,16 @@ def levenberg_marquardt(
         converged = False
         if J is None:
             steps = np.where(q + STEP > high, -STEP, STEP)
+            if margin is not None:
+                ends = [margin(point_at(q + step * e)) for step, e in zip(steps, np.eye(len(q)), strict=True)]
+                steps = np.where(np.array(ends) < 0, -steps, steps)
             columns = yield from ask([q + np.eye(len(q))[i] * steps[i] for i in range(len(q))])
             J = np.stack([np.zeros_like(r) if c is None else (c - r) / s for c, s in zip(columns, steps, strict=True)], axis=1)
             fresh = True
         A, g = J.T @ J, J.T @ r
         tried = [np.clip(q + move, low, high) for move in _moves(A, g, damping)]
+        if margin is not None:
+            tried = _along(lambda at: margin(point_at(at)), q, A, g, damping, tried, (low, high))
         promise = [-float((t - q) @ (2 * g + A @ (t - q))) for t in tried]
         if max(promise) < nothing * cost and np.abs(tried[0] - q).max() < 0.5:
             if fresh:
@@ -186,8 +198,7 @@ def levenberg_marquardt(
         costs.append(cost)
         if converged or (race is not None and race.lost(costs, iterations - n)):
             break
-    point = fixed | {p.name: p.physical(v) for p, v in zip(parameters, q, strict=True)}
-    return Fit(point, names, cost, np.empty(0) if r is None else r, count, converged)
+    return Fit(point_at(q), names, cost, np.empty(0) if r is None else r, count, converged)
 
 
 def _scaled(q: np.ndarray, parameters: Sequence[Parameter], names: Sequence[str], factor: float) -> np.ndarray:
@@ -204,9 +215,47 @@ def _with_prior_rows(slopes: np.ndarray, parameters: Sequence[Parameter]) -> np.
 
 def _moves(A: np.ndarray, g: np.ndarray, damping: float) -> list[np.ndarray]:
     """Steps with each damping for the normal matrix A and the slope g; at most five typical steps at once."""
+    return [_short(-np.linalg.lstsq(H, g, rcond=None)[0]) for H in _damped(A, damping)]
+
+
+def _damped(A: np.ndarray, damping: float) -> list[np.ndarray]:
     scale = np.maximum(np.diag(A), 1e-12 * max(A.diagonal().max(), 1e-300))
-    moves = [-np.linalg.lstsq(A + damping * factor * np.diag(scale), g, rcond=None)[0] for factor in DAMPINGS]
-    return [move * min(1.0, 5.0 / max(np.abs(move).max(), 1e-30)) for move in moves]
+    return [A + damping * factor * np.diag(scale) for factor in DAMPINGS]
+
+
+def _short(move: np.ndarray) -> np.ndarray:
+    return move * min(1.0, 5.0 / max(np.abs(move).max(), 1e-30))
+
+
+def _along(
+    margin: Callable[[np.ndarray], float],
+    q: np.ndarray,
+    A: np.ndarray,
+    g: np.ndarray,
+    damping: float,
+    tried: list[np.ndarray],
+    bounds: tuple[np.ndarray, np.ndarray],
+) -> list[np.ndarray]:
+    """The ends of the steps from q, those past the edge of what runs replaced by the best ones on its tangent.
+
+    Damping would shorten them instead, and a fit would end at the edge wherever it met it.
+    """
+    past = [margin(end) < EDGE for end in tried]
+    here = margin(q) if any(past) else np.inf
+    if not np.isfinite(here):
+        return tried
+    slope = np.array([(margin(q - STEP * e) - here) / -STEP for e in np.eye(len(q))])
+    if not np.isfinite(slope).all():
+        return tried
+    out = []
+    for end, H, beyond in zip(tried, _damped(A, damping), past, strict=True):
+        if beyond:
+            free, back = (-np.linalg.lstsq(H, b, rcond=None)[0] for b in (g, slope))
+            along = float(slope @ back)
+            if along < 0:
+                end = np.clip(q + _short(free - back * (slope @ free + here - EDGE) / along), *bounds)
+        out.append(end)
+    return out
 
 
 def _with_priors(r: np.ndarray, parameters: Sequence[Parameter], q: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """What a diagnosis measures on one problem under one setting: fits, floors, and directions of effects in the data."""
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -23,6 +24,9 @@ UNSEEN = 0.1
 """Largest share of the differences of the settings that lies outside their directions: what a fit weighs the data by, beside the noise."""
 AGAIN = 2
 """Fits of the declared model with the differences of the settings, each with those of where the last one ended."""
+
+ASTRAY = 1.05
+"""Times the error of the fitted parts from which on the end of a fit is not taken for a better one."""
 
 Tell = Callable[[str], None]
 
@@ -178,7 +182,8 @@ class Laboratory:
 
     def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
         """A fit; options of `levenberg_marquardt`."""
-        return levenberg_marquardt(parameters, start, together=self.problem.together, **options)
+        margin = functools.partial(self.problem.margin, setting=self.setting)
+        return levenberg_marquardt(parameters, start, together=self.problem.together, margin=margin, **options)
 
     def base(self, starts: Sequence[Point], floor: Floor, **options: Any) -> Fit:
         """The declared parameters fitted from several starts; the best one after a few iterations goes on, with options of the fit."""
@@ -189,12 +194,20 @@ class Laboratory:
         return self.fits([self.request(free, starts[0], **options)], floor)[0]
 
     def finished(self, fit: Fit) -> Fit:
-        """A fit once more from its end, with the floor there, until a standard deviation of the noise would show."""
-        floor, _ = self.stand(fit.point)
+        """A fit once more from its end, with the floor there, until a standard deviation of the noise would show.
+
+        Unless that leaves more of the fitted parts, each with the floor where it stands: weights are about what another grid does, and a
+        step along that can go further from the data.
+        """
+        floor, errors = self.stand(fit.point)
         unit = 1.0 / sum(int(p.rows.sum()) for p in self.parts if p.fitted)
         parameters = [self.problem.parameter(name) for name in fit.names]
         (further,) = self.fits([self.request(parameters, fit.point, iterations=6, tolerance=0.3 * unit, nothing=0.1 * unit)], floor)
-        return further if parameters and self.runs(further.point) else fit
+        if not parameters or not self.runs(further.point):
+            return fit
+        _, after = self.stand(further.point, like=floor)
+        worse = score(after[self.fitted]) - score(errors[self.fitted])
+        return fit if worse > 2.0 * math.log(ASTRAY) else further
 
     def starts(self, point: Point) -> list[Point]:
         """A point, and half and twice each parameter whose logarithm is fitted."""

@@ -4,6 +4,7 @@ The bodies of the material point method, the material point and the point mass a
 (`fit.py`, `attribution.py`) and the report know nothing else of them.
 """
 
+import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -118,6 +119,13 @@ class Problem:
     def predict_several(self, asks: Sequence[Ask]) -> Rows:
         """What `predict` says to each of several asks, in their order: run side by side where one after the other leaves cores idle."""
         return (self.predict(*ask) for ask in asks)
+
+    def margin(self, point: Point, setting: int = 0) -> float:
+        """How far a point lies from where the model cannot run any more, as the logarithm of a ratio; below zero it does not run.
+
+        Computed without a run; infinite where nothing is known.
+        """
+        return math.inf
 
     def effort(self, recording: int, setting: int = 0) -> float:
         """What one prediction costs, in a unit of the model's own (particle-substeps of a body); data where that says enough."""

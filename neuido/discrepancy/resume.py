@@ -63,6 +63,9 @@ class CachedProblem(Problem):
             for ask, own in zip(asks, calls, strict=True):
                 yield np.concatenate([np.empty((0, len(self.recordings[ask[1]].y))), *(next(rows) for _ in own)])
 
+    def margin(self, point: Point, setting: int = 0) -> float:
+        return self.problem.margin(point, setting)
+
     def effort(self, recording: int, setting: int = 0) -> float:
         return self.problem.effort(recording, setting)
 

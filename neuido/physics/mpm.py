@@ -7,7 +7,7 @@ G2P, F_tr = (I + dt C) F, F = F_hat(F_tr). The slow twin is `reference.py`.
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 import warp as wp
@@ -27,6 +27,13 @@ from neuido.types import Body, Particles, ParticleState, Scene
 
 COURANT_LIMIT = 1.0
 """Largest dt c / dx, c the speed of the elastic P-wave; and of twice dt nu / dx^2, nu the kinematic P-viscosity."""
+
+
+class StepLimit(NamedTuple):
+    """The longest stable steps of one scene [s]."""
+
+    of_waves: float
+    of_viscosity: float
 
 
 def affine_velocity(x: Tensor, v: Tensor, neighbours: int = 32, chunk: int = 2048) -> Tensor:
@@ -212,6 +219,40 @@ class Simulator:
             self._grid[name] = torch.empty(self.node_count, 4, dtype=self.dtype, device=self.device)
         return self._grid[name]
 
+    def step_limits(
+        self,
+        elasticity: ElasticLaw,
+        viscosity: Tensor | None = None,
+        mass: Tensor | None = None,
+        stiffer: tuple[Tensor, Tensor] | None = None,
+    ) -> list["StepLimit"]:
+        """The longest stable step of each scene; arguments are those of `check_step`.
+
+        Raises:
+            UserError: A negative modulus.
+        """
+        out = []
+        for s, (modulus, density) in enumerate(inputs.waves(self, elasticity, mass, stiffer)):
+            dx, viscous = self.scenes[s].dx, math.inf
+            if viscosity is not None:
+                eta, zeta = viscosity.detach()[s].double().tolist()
+                viscous = COURANT_LIMIT * dx**2 * density / max(2.0 * (4.0 / 3.0 * eta + zeta), 1e-30)
+            out.append(StepLimit(COURANT_LIMIT * dx / max((modulus / density) ** 0.5, 1e-30), viscous))
+        return out
+
+    def step_margin(
+        self, steps: int, elasticity: ElasticLaw, plasticity: PlasticLaw | None = None, *, effects: Effects | None = None
+    ) -> float:
+        """The longest stable step over the one in use, of the scene that has least to spare; below 1 a `rollout` of these refuses.
+
+        Raises:
+            UserError: As `rollout`, but for the step.
+        """
+        none = dict.fromkeys(("state", "gravity", "friction", "mass"))
+        given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects, **none)
+        limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self.particles))
+        return min(min(limit) / scene.dt for limit, scene in zip(limits, self.scenes))
+
     def check_step(
         self,
         elasticity: ElasticLaw,
@@ -231,21 +272,18 @@ class Simulator:
             UserError: A negative modulus, dt c / dx above `COURANT_LIMIT`, too viscous for an explicit step, or a body faster than a cell
                 a step.
         """
-        for s, (modulus, density) in enumerate(inputs.waves(self, elasticity, mass, stiffer)):
+        for s, limit in enumerate(self.step_limits(elasticity, viscosity, mass, stiffer)):
             scene = self.scenes[s]
             own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
-            wave = (modulus / density) ** 0.5
-            limit = COURANT_LIMIT * scene.dx / max(wave, 1e-30)
-            if scene.dt > limit:
-                raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit:.3g} s of a wave of {wave:.4g} m/s on cells of "
-                                f"{scene.dx:.4g} m; lower `dt`, `cells` or the stiffness")  # fmt: skip
-            if viscosity is not None:
-                eta, zeta = viscosity.detach()[s].double().tolist()
-                limit = COURANT_LIMIT * scene.dx**2 * density / max(2.0 * (4.0 / 3.0 * eta + zeta), 1e-30)
-                if scene.dt > limit:
-                    bulk = float((viscosity[s, 1] - 2.0 / 3.0 * viscosity[s, 0]).detach())  # in the type in which it was added
-                    raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit:.3g} s of a shear viscosity of "
-                                    f"{eta:.3g} and a bulk viscosity of {bulk:.3g} Pa s; lower `dt` or the viscosity")  # fmt: skip
+            if scene.dt > limit.of_waves:
+                wave = COURANT_LIMIT * scene.dx / limit.of_waves
+                raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_waves:.3g} s of a wave of {wave:.4g} m/s on "
+                                f"cells of {scene.dx:.4g} m; lower `dt`, `cells` or the stiffness")  # fmt: skip
+            if scene.dt > limit.of_viscosity:
+                bulk = float((viscosity[s, 1] - 2.0 / 3.0 * viscosity[s, 0]).detach())  # in the type in which it was added
+                eta = float(viscosity[s, 0].detach())
+                raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_viscosity:.3g} s of a shear viscosity of "
+                                f"{eta:.3g} and a bulk viscosity of {bulk:.3g} Pa s; lower `dt` or the viscosity")  # fmt: skip
             speed = float(self.state.v[own].norm(dim=1).max())
             if speed * scene.dt >= scene.dx:
                 raise UserError(f"the body of scene {s} starts with {speed:.4g} m/s and crosses a cell of {scene.dx:.4g} m in a step of "

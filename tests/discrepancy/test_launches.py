@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from neuido.discrepancy.body import SETTINGS, body_problem
+from neuido.errors import UserError
 from neuido.physics.mpm import Simulator
 from tests.discrepancy import made
 
@@ -95,3 +96,36 @@ def test_what_is_asked_for_at_once_is_answered_as_one_by_one(device, experiment,
     list(small._in_one_launch(small._runs(possible), [s for *_, s in possible]))
     assert len(counts) == 6
     assert max(counts) <= 3
+
+
+BESIDE = {"fibre.c": {"fibre.azimuth": 0.3, "fibre.elevation": 0.2}, "maxwell.ratio": {"maxwell.time": 0.01}}
+LARGE = {"young": 4e6, "viscosity_shear.eta": 2000.0, "fibre.c": 4e6, "maxwell.ratio": 60.0, "stiffness_gradient.x": 20.0}
+
+
+@pytest.mark.parametrize(("name", "value"), LARGE.items())
+def test_the_margin_says_which_points_run(name, value, experiment):
+    """It falls with the size of whatever asks for a shorter step, and every recording runs as long as it is above zero."""
+    problem, beside = body_problem(experiment), BESIDE.get(name, {})
+    sizes = [value * f for f in (0.01, 0.1, 1.0, 3.0)]
+    margins = [problem.margin({**beside, name: size}) for size in sizes]
+    assert np.all(np.diff(margins) < 0)
+    low, high = sizes[0], sizes[-1]
+    assert margins[0] > 0 > margins[-1]
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if problem.margin({**beside, name: middle}) > 0 else (low, middle)
+    refused = [body_refuses(problem, {**beside, name: size}) for size in (0.999 * low, 1.001 * low)]
+    assert refused == [False, True]
+    assert problem.margin({name: value}, 4) == np.inf, "finite elements shorten their step"
+    assert problem.margin({}, 1) > problem.margin({}, 0) + 0.5
+
+
+def body_refuses(problem, point) -> bool:
+    """Whether a rollout of some recording stops at its step."""
+    for n in range(len(problem.measured)):
+        try:
+            problem._moved(point, n)
+        except UserError as error:
+            if "above the limit" in str(error):
+                return True
+    return False

@@ -90,6 +90,42 @@ def test_the_boldest_damping_alone_is_cheaper():
     assert counts[1] < counts[0]
 
 
+class Bounded(Lines):
+    """It runs where a + 2 b <= 5, and not at the end of a free fit, a = 2 and b = 3."""
+
+    def predict(self, points, recording, setting=0):
+        rows = super().predict(points, recording, setting)
+        rows[[self.margin(p) < 0 for p in points]] = np.nan
+        return rows
+
+    def margin(self, point, setting=0):
+        return 5.0 - point.get("a", 1.0) - 2.0 * point.get("b", 1.0)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_fit_goes_along_the_edge_of_what_runs(together):
+    start = {"a": -4.0, "b": 4.48}  # next to the edge, and far from the best point on it
+
+    def fit(**options):
+        request = levenberg_marquardt(problem.declared, start, together=together, **options)
+        return run(problem, [request], lambda r, n: r / 0.1, [0])[0]
+
+    problem = Bounded()
+    along = np.linspace(-5.0, 5.0, 20001)
+    y = problem.recordings[0].y
+    costs = [np.sum((a * T + (5.0 - a) / 2 * T**2 - y) ** 2) / 0.01 for a in along]
+    best = float(along[int(np.argmin(costs))])
+    found, stuck = fit(margin=problem.margin), fit()
+    assert 0 <= problem.margin(found.point) < 0.03
+    assert found.point["a"] == pytest.approx(best, abs=0.1)
+    assert found.cost < 1.2 * min(costs) < 0.2 * stuck.cost
+    counts = len(problem.ran)
+    fit(margin=lambda point: np.inf)
+    again = len(problem.ran) - counts
+    fit()
+    assert len(problem.ran) == counts + 2 * again, "where nothing is known of an edge a fit is as without one"
+
+
 class Decays(Problem):
     """y = sum_k exp(-a_k t) / (k + 1), nonlinear in six parameters."""
 

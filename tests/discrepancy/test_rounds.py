@@ -1,5 +1,7 @@
 """Which candidates a round fits, and which floor it weighs their gain against."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import t as student
@@ -402,3 +404,13 @@ def test_what_an_effect_leaves_within_the_floor_is_searched_no_further(monkeypat
     assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t)) == (["low"], 1)
     monkeypatch.setattr("neuido.discrepancy.attribution.FURTHER", 0.0)
     assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t))[1] == 2
+
+
+def test_a_fit_that_goes_astray_where_it_is_finished_is_not_taken(monkeypatch):
+    inference = Inference(Line(lambda t: 3.0 * t))
+    free = inference.problem.declared
+    (fit,) = inference.fits([inference.request(free, {})], inference.noise())
+    away = replace(fit, point={**fit.point, "square.c": 0.2})
+    for end, taken in ((away, False), (replace(fit, point={"a": fit.point["a"] + 1e-4}), True)):
+        monkeypatch.setattr(Inference, "fits", lambda self, requests, floor, end=end, **options: [end])
+        assert (inference.finished(fit) is end) is taken

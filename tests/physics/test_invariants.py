@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from neuido.errors import UserError
 from neuido.physics.effects import Effects
 from neuido.physics.laws import DruckerPrager, FixedCorotated, Identity, NeoHookean, Sigma, VonMises, stack
 from neuido.physics.mpm import Simulator, affine_velocity
@@ -263,6 +264,21 @@ def test_contacts_do_what_their_names_say():
     assert abs(float(end("separate")[0]) - 1.0) < 1e-6
     assert abs(float(end("sticky")[0])) < 0.3
     assert abs(float(end("separate", math.inf)[0])) < 0.3
+
+
+@pytest.mark.parametrize("effects", [Effects(), Effects(viscosity_shear=400.0), Effects(fibre=3e5, fibre_direction=(1.0, 0.0, 0.0))])
+def test_the_step_margin_is_where_a_rollout_refuses(effects):
+    body, law, dt = block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (5, 5, 5)), FixedCorotated(1e5, 0.3), 1e-4
+
+    def scenes(factor):
+        return simulator([Scene(cells=16, dt=factor * dt), Scene(cells=20, dt=factor * dt)], [body, body])
+
+    margin = scenes(1.0).step_margin(5, law, effects=effects)
+    assert margin == pytest.approx(scenes(0.5).step_margin(5, law, effects=effects) / 2)
+    assert margin < 0.9 * simulator(Scene(cells=16, dt=dt), body).step_margin(5, law, effects=effects), "the finer grid bears less"
+    scenes(0.999 * margin).rollout(5, law, effects=effects)
+    with pytest.raises(UserError, match="above the limit"):
+        scenes(1.001 * margin).rollout(5, law, effects=effects)
 
 
 def test_a_clamped_beam_sags_and_its_clamp_holds():
