@@ -260,14 +260,15 @@ def conclude(inference: Inference, start: Start, base: Fit, found: list[Trial], 
     else:
         answer = "none" if enough(inference) else "insufficient"
     points = {"before": start.fit.point, "after": base.point}
-    stands = {when: inference.stand(point) for when, point in points.items()}
+    before = start.floor, start.errors  # what the effects were weighed against
+    stands = {"before": before, "after": before if base is start.fit else inference.stand(base.point)}
     final, squares = ({when: both[i] for when, both in stands.items()} for i in (0, 1))
     alone = {when: inference.mean_squares([point], final[when], plain=True)[0] for when, point in points.items()}
     own = intervals(inference, base, final["after"], squares["after"])
     declared = {}
     if inference.problem.declared:
-        before = Fit(start.fit.point, tuple(p.name for p in inference.problem.declared), 0.0, np.empty(0), 0, True)
-        declared = intervals(inference, before, final["before"], squares["before"])
+        stated = Fit(start.fit.point, tuple(p.name for p in inference.problem.declared), 0.0, np.empty(0), 0, True)
+        declared = intervals(inference, stated, final["before"], squares["before"])
     scale, floor = inference.problem.error(np.ones(1), 0), final["after"]
     return Diagnosis(
         inference.problem,

@@ -273,9 +273,9 @@ class Laboratory:
                     asked.append(dict(point) | shape | {name: start[name]})
                     places.append((c.key, i))
         out: dict[tuple[str, int], dict[int, np.ndarray]] = {place: {} for place in places}
-        for n in recordings:
-            with self.memo.during("screening"):
-                here, *rows = self.memo.predict([point, *asked], n, self.setting)
+        with self.memo.during("screening"):
+            predicted = self.memo.predict_several([([point, *asked], n, self.setting) for n in recordings])
+        for n, (here, *rows) in zip(recordings, predicted, strict=True):
             self.tell(f"directions of {len(asked)} effects in {self.problem.recordings[n].name}")
             for place in out:
                 out[place][n] = np.stack([row - here for row, p in zip(rows, places, strict=True) if p == place], axis=1)
@@ -293,9 +293,9 @@ class Laboratory:
             ends = [p.physical(q + step), p.physical(q - step)]
             asked += [dict(point) | {p.name: end} for end in ends]
             spans.append([p.coordinate(ends[0]) - q, q - p.coordinate(ends[1])])
-        for n in recordings:
-            with self.memo.during("slopes"):
-                here, *rows = self.memo.predict([point, *asked], n, self.setting)
+        with self.memo.during("slopes"):
+            predicted = self.memo.predict_several([([point, *asked], n, self.setting) for n in recordings])
+        for n, (here, *rows) in zip(recordings, predicted, strict=True):
             columns = [np.empty((len(here), 0))]
             for i, (up, down) in enumerate(spans):
                 high, low = (bool(np.isfinite(row).all()) for row in rows[2 * i : 2 * i + 2])
@@ -384,16 +384,15 @@ class Laboratory:
 
     def nuisances(self, point: Point, recordings: Sequence[int]) -> dict[int, np.ndarray]:
         """Directions of the nuisances of each recording, of one prior standard deviation."""
-        out = {}
+        asks = []
         for n in recordings:
-            name = self.problem.recordings[n].name
-            own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{name}")]
+            own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{self.problem.recordings[n].name}")]
             moved = [dict(point) | {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + p.prior)} for p in own]
-            with self.memo.during("nuisances"):
-                rows = self.memo.predict([point, *moved], n, self.setting)
-            out[n] = (
-                np.stack([np.where(np.isfinite(row).all(), row - rows[0], 0.0) for row in rows[1:]], axis=1)
-                if own
-                else np.empty((rows.shape[1], 0))
-            )
+            asks.append(([point, *moved], n, self.setting))
+        with self.memo.during("nuisances"):
+            predicted = self.memo.predict_several(asks)
+        out = {}
+        for n, (here, *rows) in zip(recordings, predicted, strict=True):
+            columns = [np.where(np.isfinite(row).all(), row - here, 0.0) for row in rows]
+            out[n] = np.stack(columns, axis=1) if columns else np.empty((len(here), 0))
         return out

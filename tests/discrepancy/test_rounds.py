@@ -414,3 +414,13 @@ def test_a_fit_that_goes_astray_where_it_is_finished_is_not_taken(monkeypatch):
     for end, taken in ((away, False), (replace(fit, point={"a": fit.point["a"] + 1e-4}), True)):
         monkeypatch.setattr(Inference, "fits", lambda self, requests, floor, end=end, **options: [end])
         assert (inference.finished(fit) is end) is taken
+
+
+def test_what_is_reported_as_before_is_what_the_effects_were_weighed_against():
+    for law in (lambda t: 3.0 * t, lambda t: 3.0 * t + 2.0 * t**2):
+        found = diagnose(Line(law, turns=True), draws=19)
+        assert found.answer == ("none" if law(1.0) == 3.0 else "effect")
+        (first, *_) = found.rounds
+        assert list(found.errors["before"].values()) == pytest.approx(np.sqrt(first.errors))
+        assert found.final["before"] is first.floor
+        assert (found.errors["after"] == found.errors["before"]) is (found.answer == "none")
