@@ -16,6 +16,8 @@ DAMPINGS = (0.1, 1.0, 10.0)
 """Tried as factors of the present damping."""
 KEPT_PROMISE = 0.7
 """Share of the gain that the linear model promises at which a step is taken without trying other dampings."""
+NEAR = 0.1
+"""Margin below which the differences of the slopes mind the edge."""
 EDGE = 0.02
 """Margin that a step leaves where it would go past the edge of what runs: differences of `STEP` are to run there."""
 NOTHING = 2e-4
@@ -152,7 +154,7 @@ def levenberg_marquardt(
         converged = False
         if J is None:
             steps = np.where(q + STEP > high, -STEP, STEP)
-            if margin is not None:
+            if margin is not None and margin(point_at(q)) < NEAR:
                 ends = [margin(point_at(q + step * e)) for step, e in zip(steps, np.eye(len(q)), strict=True)]
                 steps = np.where(np.array(ends) < 0, -steps, steps)
             columns = yield from ask([q + np.eye(len(q))[i] * steps[i] for i in range(len(q))])
