@@ -185,7 +185,7 @@ def solved_by(problem: "Problem", solver: str) -> "Problem":
         return problem
     if problem.settings == 1:
         raise UserError(f"solver = {solver}: {problem.name} is no body, and nothing is discretised; leave it out")
-    from neuido.discrepancy.body import SETTINGS
+    from neuido.discrepancy.rollouts import SETTINGS
 
     own = tuple(i for i in problem.solvers if SETTINGS[i].solver == solver)
     if solver == "material_points":  # the other settings come after these

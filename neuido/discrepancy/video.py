@@ -17,9 +17,10 @@ from neuido.data.cameras import project
 from neuido.data.experiments import Experiment
 from neuido.data.experiments import Recording as Measured
 from neuido.discrepancy import silhouettes
-from neuido.discrepancy.body import INSTRUMENTS, WINDOWS, BodyProblem, Motions, Run, body_problem
+from neuido.discrepancy.body import INSTRUMENTS, WINDOWS, BodyProblem, Run, body_problem
 from neuido.discrepancy.filmed import Film, Look, Splats, body_of, looks, read_film
 from neuido.discrepancy.problem import Parameter, Point, Recording
+from neuido.discrepancy.rollouts import Motions
 from neuido.discrepancy.silhouettes import Outlines, Score, View, outlines
 from neuido.errors import UserError
 from neuido.types import Cameras, ParticleState

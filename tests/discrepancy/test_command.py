@@ -16,8 +16,9 @@ import yaml
 import neuido
 from neuido.cli import main
 from neuido.data.experiments import read_experiment
-from neuido.discrepancy.body import SETTINGS, body_problem
+from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.command import solved_by
+from neuido.discrepancy.rollouts import SETTINGS
 from tests import command
 from tests.discrepancy import made
 

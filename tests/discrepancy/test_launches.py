@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.discrepancy.body import SETTINGS, body_problem
+from neuido.discrepancy.body import body_problem
+from neuido.discrepancy.rollouts import SETTINGS
 from neuido.errors import UserError
 from neuido.physics.mpm import Simulator
 from tests.discrepancy import made

@@ -9,8 +9,9 @@ import yaml
 
 from neuido.data.experiments import read_experiment
 from neuido.discrepancy.believed import ready
-from neuido.discrepancy.body import SEGMENT, _segment, body_problem
+from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.resume import CachedProblem
+from neuido.discrepancy.rollouts import SEGMENT, segment_of
 from neuido.errors import UserError
 from neuido.physics.laws import FixedCorotated
 from neuido.physics.mpm import Simulator
@@ -112,12 +113,12 @@ def test_a_folder_that_is_there_is_not_overwritten(folder, capsys):
 def test_long_recordings_run_in_pieces(folder, monkeypatch):
     """Pieces fit their recording, and what is kept of one of many substeps are its frames: memory does not grow with the substeps."""
     for steps, every in ((32_000, 400), (26_910, 1), (26_911, 1), (90, 10), (5000, 5000)):
-        piece = _segment(steps, every)
+        piece = segment_of(steps, every)
         assert steps % piece == 0
         assert piece % every == 0
         assert piece == every or piece <= SEGMENT
-    assert _segment(32_000, 10) == 200
-    monkeypatch.setattr("neuido.discrepancy.body.SEGMENT", 30)
+    assert segment_of(32_000, 10) == 200
+    monkeypatch.setattr("neuido.discrepancy.rollouts.SEGMENT", 30)
     problem = body_problem(read_experiment(folder))
     asked, rollout = [], Simulator.rollout
 

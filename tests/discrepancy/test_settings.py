@@ -9,10 +9,11 @@ from neuido.data.undeclared.motion import Solver, move
 from neuido.demo_loop import ELASTIC, record
 from neuido.discrepancy import laboratory
 from neuido.discrepancy.attribution import diagnose
-from neuido.discrepancy.body import SETTINGS, body_problem
+from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.command import restricted
 from neuido.discrepancy.evidence import gain
 from neuido.discrepancy.floors import REACH, Floor, Part
+from neuido.discrepancy.rollouts import SETTINGS
 from neuido.discrepancy.rounds import Inference
 from tests.discrepancy.test_decisions import FALLS, over
 from tests.discrepancy.test_rounds import NOISE, Line, T

@@ -1,0 +1,272 @@
+"""How the bodies of an experiment move under points of parameters: the settings of the discretisation, simulators, and launches.
+
+A launch moves one or several recordings under one or several points each. What is seen of the motions is `body`'s.
+"""
+
+import math
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.data.experiments import Experiment
+from neuido.data.experiments import Recording as Measured
+from neuido.discrepancy.believed import laws_of
+from neuido.discrepancy.library import effects_of
+from neuido.discrepancy.problem import Point, Problem
+from neuido.errors import UserError
+from neuido.physics.effects import Effects
+from neuido.physics.finite_elements import FiniteElements
+from neuido.physics.meshing import Mesh, mesh_body
+from neuido.physics.mpm import Simulator
+from neuido.types import ParticleState
+
+SEGMENT = 200
+"""Substeps of the piece that a GPU captures; a rollout replays it. A longer one takes longer to capture than to run."""
+KEPT = {"cpu": 24, "cuda": 96}
+"""Simulators that are kept: of each recording, setting, and number of parameter sets or thread. On a GPU they hold captured launches."""
+SIZES = (1, 4, 12, 32, 96)
+"""Parameter sets of a recording in a launch, filled up: each number of them has buffers and captured launches of its own."""
+
+Motions = tuple[Sequence[Point], int]
+"""Points, and the number of the recording that moves under each of them."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One discretisation."""
+
+    cells: float
+    """Factor of the suggested number of cells."""
+    dt: float
+    """Factor of the suggested step."""
+    solver: str = "material_points"
+    """`material_points` or `finite_elements`."""
+    elements: float = 1.0
+    """Finite elements a particle."""
+
+    @property
+    def name(self) -> str:
+        """For the report."""
+        if self.solver == "finite_elements":
+            return "finite elements" + (f", {self.elements:g} a particle" if self.elements != 1.0 else "")
+        parts = [f"{self.cells:g} times the cells"] * (self.cells != 1.0) + [f"{self.dt:g} of the step"] * (self.dt != 1.0)
+        return ", ".join(parts) or "suggested"
+
+
+SETTINGS = (
+    Setting(1.0, 1.0),
+    Setting(1.0, 0.5),
+    Setting(0.85, 1.0),
+    Setting(1.2, 0.5),
+    Setting(1.0, 1.0, "finite_elements"),
+    Setting(1.0, 1.0, "finite_elements", elements=0.6),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class BodyRollouts(Problem):
+    """A problem whose data are seen of moving bodies."""
+
+    experiment: Experiment = None  # type: ignore[assignment]
+    measured: tuple[Measured, ...] = ()
+    device: str = "cpu"
+    _simulators: dict[Any, Simulator | FiniteElements] = field(default_factory=dict, repr=False)
+    _still: dict[int, Simulator] = field(default_factory=dict, repr=False)
+    """By setting, one scene a recording, on the CPU: what is asked for its step alone."""
+    _meshes: dict[tuple[int, float], Mesh] = field(default_factory=dict, repr=False)
+    _lock: Any = field(default_factory=threading.RLock, repr=False)
+
+    def effort(self, recording: int, setting: int = 0) -> float:
+        """Particle-substeps; inner steps of the finite elements count as one."""
+        r = self.measured[recording]
+        return float(len(r.body.x) * substeps(r, r.scene.dt * SETTINGS[setting].dt)[1])
+
+    def margin(self, point: Point, setting: int = 0) -> float:
+        """Of the explicit step, in the recording that bears least; finite elements shorten theirs as they need."""
+        if SETTINGS[setting].solver == "finite_elements":
+            return math.inf
+        recordings = range(len(self.measured))
+        with self._lock:
+            if setting not in self._still:
+                self._still[setting] = self._made(recordings, setting, 1, "cpu")
+        simulator = self._still[setting]
+        full = [self._full(point)] * len(recordings)
+        steps = max(substeps(self.measured[n], scene.dt)[1] for n, scene in enumerate(simulator.scenes))
+        try:
+            elasticity, plasticity = self.laws(full)
+            ratio = simulator.step_margin(steps, elasticity, plasticity, effects=self._effects(simulator, full, recordings, ()))
+        except UserError:
+            return -math.inf
+        return math.log(ratio)
+
+    def setting_name(self, setting: int) -> str:
+        return SETTINGS[setting].name
+
+    @property
+    def duration(self) -> float:
+        """Over which the knots of a force in time spread, in every recording [s]: the longest one that is fitted."""
+        return max(float(r.t[-1]) for r in self.measured if r.role == "fit")
+
+    def _moved(self, point: Point, recording: int, setting: int = 0) -> ParticleState:
+        """The frames of one motion, (T, 1, P, ...)."""
+        (frames,) = self._move([([point], recording)], setting)
+        return frames
+
+    def _move(self, runs: Sequence[Motions], setting: int) -> list[ParticleState]:
+        """The frames of each recording under each of its points, (T, S, P, ...).
+
+        All move in the same launches: their frames are the same substeps (`substeps`).
+        """
+        size = most = max(len(points) for points, _ in runs)
+        if self.device != "cpu":
+            size = next((n for n in SIZES if n >= most), most)
+        simulator = self.simulator(tuple(n for _, n in runs), setting, size)
+        filled = [[*points, *[points[-1]] * (size - len(points))] for points, _ in runs]
+        full = [self._full(point) for points in filled for point in points]
+        elasticity, plasticity = self.laws(full)
+        always = () if self.device == "cpu" or len(full) == 1 else [p.name for c in self.candidates for p in c.parameters]
+        effects = self._effects(simulator, full, [n for _, n in runs], always)
+        every, steps, exact = substeps(self.measured[runs[0][1]], simulator.scenes[0].dt)
+        with torch.no_grad():
+            out = simulator.rollout(
+                steps,
+                elasticity,
+                plasticity,
+                state=self._start(simulator, full, [n for _, n in runs]),
+                every=every,
+                segment=segment_of(steps, every),
+                effects=effects,
+            )
+        moved, offsets = [], simulator.particles.offsets[::size]
+        for (points, n), a, b in zip(runs, offsets[:-1], offsets[1:], strict=True):
+            frames = ParticleState(*(t[:, a:b].unflatten(1, (size, -1))[:, : len(points)] for t in out))
+            r = self.measured[n]
+            moved.append(frames if exact else _at_times(frames, every * r.scene.dt * SETTINGS[setting].dt, r.t.to(out.x)))
+        return moved
+
+    def _full(self, point: Point) -> dict[str, float]:
+        """With what is declared beside it."""
+        return {p.name: p.value for p in self.declared} | self.experiment.model.get("effects", {}) | dict(point)
+
+    def _effects(self, simulator: Simulator, full: Sequence[Point], recordings: Sequence[int], always: Sequence[str]) -> Effects:
+        """The effects of each scene; what depends on the place in the body holds for the body as the first recording holds it."""
+        x, count = simulator.state.x, len(full) // len(recordings)
+        offsets = simulator.particles.offsets
+        turned = torch.stack([self._turn(n) for n in recordings]).to(x)
+        parts = []
+        for k, R in enumerate(turned):
+            first, last, end = (offsets[k * count + i] for i in (0, 1, count))
+            parts.append((x[first:end] - x[first:last].mean(dim=0)) @ R)
+        effects = effects_of(full, torch.cat(parts), simulator.particles.scene, self.duration, always=always)
+        if effects.fibre_direction is None:
+            return effects
+        direction = torch.as_tensor(effects.fibre_direction).to(x).expand(len(full), 3)
+        return effects._replace(fibre_direction=torch.einsum("sij,sj->si", turned.repeat_interleave(count, dim=0), direction))
+
+    def laws(self, points: Sequence[Mapping[str, float]]):
+        """The declared laws of several points, a row each."""
+        return laws_of(self.experiment.model, points)
+
+    def simulator(self, recordings: Sequence[int], setting: int, count: int) -> Simulator | FiniteElements:
+        """`count` copies of the scene of each recording, kept for the next call of this thread: they hold buffers."""
+        key = (tuple(recordings), setting, count, threading.get_ident())
+        with self._lock:
+            found = self._simulators.pop(key, None)
+            if found is None:
+                found = self._made(recordings, setting, count, self.device)
+                while len(self._simulators) >= KEPT[torch.device(self.device).type]:
+                    self._simulators.pop(next(iter(self._simulators)))
+            self._simulators[key] = found  # the last one used is the last one to go
+        return found
+
+    def _made(self, recordings: Sequence[int], setting: int, count: int, device: str) -> Simulator | FiniteElements:
+        s = SETTINGS[setting]
+        scenes, bodies, meshes = [], [], []
+        for n in recordings:
+            r = self.measured[n]
+            scenes += [replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)] * count
+            bodies += [r.body] * count
+            meshes += [self._mesh(n, s.elements)] * count if s.solver == "finite_elements" else []
+        density = self.experiment.model["density"]
+        if meshes:
+            return FiniteElements(scenes, bodies, density=density, device=device, meshes=meshes)
+        return Simulator(scenes, bodies, density=density, device=device)
+
+    def _mesh(self, recording: int, elements: float) -> Mesh:
+        """The body of a recording as finite elements have it; seconds of work, so that all simulators share it."""
+        if (recording, elements) not in self._meshes:
+            body = self.measured[recording].body
+            wanted = None if elements == 1.0 else round(elements * len(body.x))
+            self._meshes[recording, elements] = mesh_body(body.x, body.volume, elements=wanted)
+        return self._meshes[recording, elements]
+
+    def _start(self, simulator: Simulator, points: Sequence[Point], recordings: Sequence[int]) -> ParticleState:
+        """The start with the velocities and spins of each point, those of the first recording first."""
+        count = len(points) // len(recordings)
+        names = [self.measured[n].name for n in recordings for _ in range(count)]
+        shift = [
+            [p.get(f"{kind}_{a}:{name}", 0.0) for a in "xyz"]
+            for kind in ("velocity", "spin")
+            for p, name in zip(points, names, strict=True)
+        ]
+        if not any(any(row) for row in shift):
+            return simulator.state
+        change = torch.tensor(shift, dtype=simulator.dtype, device=simulator.device).reshape(2, len(points), 3)
+        scene, offsets = simulator.particles.scene.long(), simulator.particles.offsets
+        x, v, C, F = simulator.state
+        centres = torch.stack([x[offsets[s] : offsets[s + 1]].mean(dim=0) for s in range(0, len(points), count)])
+        centre = centres.repeat_interleave(count, dim=0)[scene]
+        w = change[1]
+        skew = torch.zeros(len(points), 3, 3, dtype=x.dtype, device=x.device)
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            skew[:, k, j], skew[:, j, k] = w[:, i], -w[:, i]
+        v = v + change[0][scene] + torch.einsum("pab,pb->pa", skew[scene], x - centre)
+        return ParticleState(x, v, C + skew[scene], F)
+
+    def _turn(self, recording: int) -> Tensor:
+        """The rotation (3, 3) from the body of the first recording to that of another one: fibres and gradients turn with it.
+
+        The identity where the two are not the same particles in another pose (to 1 % of the body's size).
+        """
+        x, y = (self.measured[n].body.x.double() for n in (0, recording))
+        eye = torch.eye(3, dtype=torch.float64)
+        if recording == 0 or x.shape != y.shape:
+            return eye
+        x, y = x - x.mean(dim=0), y - y.mean(dim=0)
+        U, _, Vt = torch.linalg.svd(y.T @ x)
+        R = U @ torch.diag(torch.stack([eye[0, 0], eye[0, 0], torch.linalg.det(U @ Vt)])) @ Vt
+        size = float(x.norm(dim=1).max())
+        straight, turned = float((x - y).abs().max()), float((x @ R.T - y).abs().max())
+        return R if turned < 0.01 * size and turned < 0.5 * straight else eye
+
+
+def substeps(r: Measured, dt: float) -> tuple[int, int, bool]:
+    """Substeps between kept frames, substeps in all, and whether the kept frames are the recorded ones."""
+    t = r.t.double().numpy()
+    every = round(r.frame_interval / dt)
+    if every >= 1 and np.allclose(t, np.arange(len(t)) * every * dt, rtol=0.0, atol=1e-3 * r.frame_interval):
+        return every, every * (len(t) - 1), True
+    every = max(1, round(float(np.diff(t).min()) / dt / 6))
+    return every, every * int(np.ceil(t[-1] / (every * dt) + 1e-9)), False
+
+
+def segment_of(steps: int, every: int) -> int:
+    """Substeps of a piece of a rollout: a divisor of `steps` and a multiple of `every`, of `SEGMENT` at the most where there is one."""
+    frames = steps // every
+    return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
+
+
+def _at_times(frames: ParticleState, step: float, t: Tensor) -> ParticleState:
+    """Frames (K, S, P, ...) that are `step` apart at other times: cubic Hermite interpolation of x, linear of the rest."""
+    x, v, C, F = frames
+    k = (t / step).floor().long().clamp(max=len(x) - 2)
+    u = (t / step - k)[:, None, None, None]
+    x0, x1, v0, v1 = x[k], x[k + 1], v[k] * step, v[k + 1] * step
+    place = (1 + 2 * u) * (1 - u) ** 2 * x0 + u * (1 - u) ** 2 * v0 + u**2 * (3 - 2 * u) * x1 + u**2 * (u - 1) * v1
+    w = u[..., None]
+    return ParticleState(place, ((1 - u) * v0 + u * v1) / step, (1 - w) * C[k] + w * C[k + 1], (1 - w) * F[k] + w * F[k + 1])
