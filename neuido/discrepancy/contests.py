@@ -29,7 +29,8 @@ MEASURED, NEAR = 6, 4.0
 """Fits whose errors are measured with the differences of the settings where they end: so many of the best, within this factor of their
 errors."""
 ONWARD = 3
-"""Further fits of a candidate, each with the differences of the settings where the last one ended, while each gains `SOME_GAIN`."""
+"""Further fits of a candidate, each with the differences of the settings where the last one ended: while each gains `SOME_GAIN` or has
+not come to its end."""
 SOME_GAIN = math.log(1.2)
 """Smaller gains are no reason to look further."""
 ALIKE = 0.3
@@ -129,9 +130,12 @@ class Contests(Laboratory):
                 if self.is_noise(left) or not self.runs(found.point):
                     break
                 further, there = self.from_here((*free, *c.parameters), found, [found.point], floor)
-                if score(self.mean_squares([further.point], there)[0]) > score(left) - 2.0 * SOME_GAIN:
+                gained = score(left[self.fitted]) - score(self.mean_squares([further.point], there, fitted=True)[0])
+                if gained <= 0:
                     break
                 found, own = further, there
+                if further.converged and gained < 2.0 * SOME_GAIN:
+                    break
             out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
         return out
 

@@ -424,3 +424,24 @@ def test_what_is_reported_as_before_is_what_the_effects_were_weighed_against():
         assert list(found.errors["before"].values()) == pytest.approx(np.sqrt(first.errors))
         assert found.final["before"] is first.floor
         assert (found.errors["after"] == found.errors["before"]) is (found.answer == "none")
+
+
+@pytest.mark.parametrize("converged", [True, False])
+def test_a_fit_goes_on_until_it_has_come_to_its_end(converged, monkeypatch):
+    """Each further fit takes off a sixth of what is left: too little to go on for, unless the fit ended for its iterations."""
+    inference = Inference(Line(lambda t: 3.0 * t + 2.0 * t**2, wiggle=0.0))
+    start = inference.start()
+    square = next(c for c in inference.problem.candidates if c.key == "square")
+    (fit,) = inference.fits([inference.request((*inference.problem.declared, *square.parameters), start.fit.point)], start.floor)
+    ends = iter([1.6, 1.66, 1.715, 1.762, 1.8])
+    asked = []
+
+    def from_here(self, free, fit, starts, like):
+        asked.append(fit)
+        return replace(fit, point={"a": 3.0, "square.c": next(ends)}, converged=converged), like
+
+    monkeypatch.setattr(Inference, "from_here", from_here)
+    monkeypatch.setattr(Inference, "is_noise", lambda self, errors: False)
+    out = inference.polish(inference.problem.declared, {"square": (square, fit)}, start.fit, start.floor)
+    assert len(asked) == (2 if converged else 1 + contests.ONWARD)
+    assert out["square"][1].point["square.c"] == (1.66 if converged else 1.762)
