@@ -91,13 +91,13 @@ class BodyRollouts(Problem):
         if SETTINGS[setting].solver == "finite_elements":
             return math.inf
         recordings = range(len(self.measured))
-        with self._lock:
-            if setting not in self._still:
-                self._still[setting] = self._made(recordings, setting, 1, "cpu")
-        simulator = self._still[setting]
         full = [self._full(point)] * len(recordings)
-        steps = max(substeps(self.measured[n], scene.dt)[1] for n, scene in enumerate(simulator.scenes))
         try:
+            with self._lock:
+                if setting not in self._still:
+                    self._still[setting] = self._made(recordings, setting, 1, "cpu")
+            simulator = self._still[setting]
+            steps = max(substeps(self.measured[n], scene.dt)[1] for n, scene in enumerate(simulator.scenes))
             elasticity, plasticity = self.laws(full)
             ratio = simulator.step_margin(steps, elasticity, plasticity, effects=self._effects(simulator, full, recordings, ()))
         except UserError:

@@ -279,7 +279,7 @@ class Simulator:
                 wave = COURANT_LIMIT * scene.dx / limit.of_waves
                 raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_waves:.3g} s of a wave of {wave:.4g} m/s on "
                                 f"cells of {scene.dx:.4g} m; lower `dt`, `cells` or the stiffness")  # fmt: skip
-            if scene.dt > limit.of_viscosity:
+            if viscosity is not None and scene.dt > limit.of_viscosity:
                 bulk = float((viscosity[s, 1] - 2.0 / 3.0 * viscosity[s, 0]).detach())  # in the type in which it was added
                 eta = float(viscosity[s, 0].detach())
                 raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_viscosity:.3g} s of a shear viscosity of "
