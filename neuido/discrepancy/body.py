@@ -58,6 +58,7 @@ class Run(NamedTuple):
     groups: list[list[int]]
     """Which points move alike."""
     recording: int
+    setting: int
     out: np.ndarray
     """A row a point, to be filled."""
 
@@ -84,20 +85,18 @@ class BodyProblem(BodyRollouts):
         return rows
 
     def predict_several(self, asks: Sequence[Ask]) -> Rows:
-        answer = self._side_by_side if self.device == "cpu" else self._in_one_launch
-        yield from answer(self._runs(asks), [setting for *_, setting in asks])
+        yield from (self._side_by_side if self.device == "cpu" else self._in_one_launch)(self._runs(asks))
 
     def _runs(self, asks: Sequence[Ask]) -> list[Run]:
-        return [Run(points, self._alike(points, n), n, np.empty((len(points), len(self.recordings[n].y)))) for points, n, _ in asks]
+        return [Run(points, self._alike(points, n), n, s, np.empty((len(points), len(self.recordings[n].y)))) for points, n, s in asks]
 
-    def _side_by_side(self, runs: Sequence[Run], settings: Sequence[int]) -> Iterator[np.ndarray]:
+    def _side_by_side(self, runs: Sequence[Run]) -> Iterator[np.ndarray]:
         """Every motion by itself, as many at a time as there are cores."""
         waiting: list[list[Future]] = []
         with _one_thread_each():
             try:
-                for run, setting in zip(runs, settings, strict=True):
-                    alone = [run._replace(groups=[group]) for group in run.groups]
-                    waiting.append([_workers().submit(self._predict, [one], setting) for one in alone])
+                for run in runs:
+                    waiting.append([_workers().submit(self._predict, [run._replace(groups=[group])]) for group in run.groups])
                 for run, own in zip(runs, waiting, strict=True):
                     for one in own:
                         one.result()
@@ -107,21 +106,21 @@ class BodyProblem(BodyRollouts):
                     for one in own:
                         one.cancel()
 
-    def _in_one_launch(self, runs: Sequence[Run], settings: Sequence[int]) -> Iterator[np.ndarray]:
+    def _in_one_launch(self, runs: Sequence[Run]) -> Iterator[np.ndarray]:
         """The recordings of a setting in launches that they share, where their frames are the same substeps."""
         shared: dict[tuple, list[Run]] = {}
         keys, times = [], Counter()
-        for run, setting in zip(runs, settings, strict=True):
-            r = self.measured[run.recording]
-            keys.append((setting, times[setting, run.recording], *substeps(r, r.scene.dt * SETTINGS[setting].dt)))
-            times[setting, run.recording] += 1
+        for run in runs:
+            r, of = self.measured[run.recording], (run.setting, run.recording)
+            keys.append((run.setting, times[of], *substeps(r, r.scene.dt * SETTINGS[run.setting].dt)))
+            times[of] += 1
             shared.setdefault(keys[-1], []).append(run)
         for key, run in zip(keys, runs, strict=True):
             together = shared.pop(key, [])  # those that were asked for with an earlier one are there
             size = max((self.batch or TOGETHER) // max(len(together), 1), 1)
             for at in range(0, max((len(one.groups) for one in together), default=0), size):
                 parts = [one._replace(groups=one.groups[at : at + size]) for one in together]
-                self._predict([part for part in parts if part.groups], key[0])
+                self._predict([part for part in parts if part.groups])
             yield run.out
 
     def _alike(self, points: Sequence[Point], recording: int) -> list[list[int]]:
@@ -180,14 +179,14 @@ class BodyProblem(BodyRollouts):
 
     # Forward runs.
 
-    def _predict(self, runs: Sequence[Run], setting: int) -> None:
-        """Fill the rows of groups of points that move alike, all in one launch; NaN where a simulation is impossible."""
+    def _predict(self, runs: Sequence[Run]) -> None:
+        """Fill the rows of groups of points that move alike, all of one setting and in one launch; NaN where a simulation is impossible."""
         try:
-            moved = self._simulate([(run.firsts, run.recording) for run in runs], setting)
+            moved = self._simulate([(run.firsts, run.recording) for run in runs], runs[0].setting)
         except UserError:
             halves = _halves(runs)
             for half in halves:
-                self._predict(half, setting)
+                self._predict(half)
             if not halves:
                 runs[0].out[runs[0].groups[0]] = np.nan
             return

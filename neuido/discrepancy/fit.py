@@ -102,7 +102,7 @@ def levenberg_marquardt(
     race: Race | None = None,
     slopes: np.ndarray | None = None,
     sizes: Sequence[str] = (),
-    margin: Callable[[Point], float] | None = None,
+    margin: Callable[[Point], float] = lambda point: np.inf,
 ) -> Request:
     """One fit as a generator: it yields the points that it wants and receives their whitened residuals (None: not runnable).
 
@@ -154,7 +154,7 @@ def levenberg_marquardt(
         converged = False
         if J is None:
             steps = np.where(q + STEP > high, -STEP, STEP)
-            if margin is not None and margin(point_at(q)) < NEAR:
+            if margin(point_at(q)) < NEAR:
                 ends = [margin(point_at(q + step * e)) for step, e in zip(steps, np.eye(len(q)), strict=True)]
                 steps = np.where(np.array(ends) < 0, -steps, steps)
             columns = yield from ask([q + np.eye(len(q))[i] * steps[i] for i in range(len(q))])
@@ -162,8 +162,7 @@ def levenberg_marquardt(
             fresh = True
         A, g = J.T @ J, J.T @ r
         tried = [np.clip(q + move, low, high) for move in _moves(A, g, damping)]
-        if margin is not None:
-            tried = _along(lambda at: margin(point_at(at)), q, A, g, damping, tried, (low, high))
+        tried = _along(lambda at: margin(point_at(at)), q, A, g, damping, tried, (low, high))
         promise = [-float((t - q) @ (2 * g + A @ (t - q))) for t in tried]
         if max(promise) < nothing * cost and np.abs(tried[0] - q).max() < 0.5:
             if fresh:

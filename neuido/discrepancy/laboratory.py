@@ -24,7 +24,6 @@ UNSEEN = 0.1
 """Largest share of the differences of the settings that lies outside their directions: what a fit weighs the data by, beside the noise."""
 AGAIN = 2
 """Fits of the declared model with the differences of the settings, each with those of where the last one ended."""
-
 ASTRAY = 1.05
 """Times the error of the fitted parts from which on the end of a fit is not taken for a better one."""
 

@@ -225,7 +225,7 @@ class Simulator:
         viscosity: Tensor | None = None,
         mass: Tensor | None = None,
         stiffer: tuple[Tensor, Tensor] | None = None,
-    ) -> list["StepLimit"]:
+    ) -> list[StepLimit]:
         """The longest stable step of each scene; arguments are those of `check_step`.
 
         Raises:

@@ -83,18 +83,18 @@ def test_what_is_asked_for_at_once_is_answered_as_one_by_one(device, experiment,
 
     monkeypatch.setattr(Simulator, "rollout", watched)
     runs = problem._runs(asks)
-    for (points, n, _), got, one in zip(asks, problem._in_one_launch(runs, [s for *_, s in asks]), alone, strict=True):
+    for (points, n, _), got, one in zip(asks, problem._in_one_launch(runs), alone, strict=True):
         assert got.shape == (len(points), len(problem.recordings[n].y))
         np.testing.assert_allclose(got, one, atol=2e-5)
         assert [np.isnan(row).any() for row in got] == [point is impossible for point in points]
     assert len(counts) < 16
     counts.clear()
     possible = [(POINTS, n, s) for s in (0, 1) for n in (0, 1, 2)]
-    list(problem._in_one_launch(problem._runs(possible), [s for *_, s in possible]))
+    list(problem._in_one_launch(problem._runs(possible)))
     assert len(counts) == 2, "one launch a setting"
     counts.clear()
     small = body_problem(experiment, device=device, batch=3)
-    list(small._in_one_launch(small._runs(possible), [s for *_, s in possible]))
+    list(small._in_one_launch(small._runs(possible)))
     assert len(counts) == 6
     assert max(counts) <= 3
 
