@@ -14,7 +14,7 @@ from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import ALPHA, WITHIN, Inference
-from neuido.discrepancy.trials import Round, Start, Trial, score, times_over, unphysical
+from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
 
 __all__ = [
     "ALPHA",
@@ -27,7 +27,7 @@ __all__ = [
     "Inference",
     "Part",
     "Round",
-    "Start",
+    "Stand",
     "Trial",
     "diagnose",
     "split",
@@ -97,7 +97,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     """
     memo = Memo(problem)
     tried: list[Inference] = []
-    starts: list[Start] = []
+    starts: list[Stand] = []
     for n in problem.solvers:
         inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo)
         if starts and tried[-1].is_settled(starts[-1].errors):
@@ -110,28 +110,27 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     inference, start = tried[chosen], starts[chosen]
     if len(tried) > 1:
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
-    at = start.fit
+    at = start
     found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
         found.append(step)
-        at = inference.finished(step.fit)
+        at = inference.finished(Stand(step.fit, step.floor, step.errors))
         if len(found) == most or inference.is_settled(step.errors):
             break
-        floor, left = inference.stand(at.point)
-        free = [problem.parameter(name) for name in at.names]
-        if problem.settings > 1 and times_over(left, inference.floors(at.point, free, floor)) < FURTHER:
+        free = [problem.parameter(name) for name in at.fit.names]
+        if problem.settings > 1 and times_over(at.errors, inference.floors(at.fit.point, free, at.floor)) < FURTHER:
             break
-        rounds.append(inference.round(at, floor, found))
+        rounds.append(inference.round(at.fit, at.floor, found))
     if len(found) > 1:
-        floor = inference.floor(at.point)
-        at, found = drop(inference, at, floor, found)
-        at, found = narrow(inference, at, floor, found, rounds)
-        at = inference.finished(at)
+        floor = inference.floor(at.fit.point)
+        fit, found = drop(inference, at.fit, floor, found)
+        fit, found = narrow(inference, fit, floor, found, rounds)
+        at = inference.finished(Stand(fit, floor, inference.mean_squares([fit.point], floor)[0]))
     return conclude(inference, start, at, found, rounds)
 
 
-def first_rounds(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[int, list[Round]]:
+def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[int, list[Round]]:
     """Which of the methods goes on, and its first round, or two where it takes two effects to gain enough.
 
     The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for.
@@ -153,8 +152,9 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Start]) -> tuple[i
         named = [rounds[0] for rounds in firsts.values() if rounds[0].chosen]
         if firsts and not named and base[i] - base[order[0]] > 2.0 * math.log(WORSE):
             continue
-        first = tried[i].round(starts[i].fit, starts[i].floor, [], named[0].leaders if named else None)
-        firsts[i] = look_ahead(tried[i], first)
+        first = tried[i].round(starts[i].fit, starts[i].floor, [], named[0] if named else None)
+        beaten = any(r.chosen and r.chosen.score <= min((t.score for t in first.trials), default=math.inf) for r in named)
+        firsts[i] = [first] if beaten else look_ahead(tried[i], first)
         last = firsts[i][-1]
         if last.trials and tried[i].is_noise(last.trials[0].errors):
             break
@@ -214,7 +214,7 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
             requests.append(inference.request((*inference.problem.declared, *beside, *t.candidate.parameters), start))
         fits = inference.fits(requests, floor)
         squares = inference.mean_squares([fit.point for fit in fits], floor)
-        weighed = [replace(t, fit=fit, errors=square) for t, fit, square in zip(members, fits, squares, strict=True)]
+        weighed = [replace(t, fit=fit, floor=floor, errors=square) for t, fit, square in zip(members, fits, squares, strict=True)]
         at = min(range(len(weighed)), key=lambda i: weighed[i].penalised)
         for t, new in zip(members, weighed, strict=True):
             above = math.exp(0.5 * (new.score - weighed[at].score))
@@ -247,40 +247,37 @@ def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> t
     return base, found
 
 
-def conclude(inference: Inference, start: Start, base: Fit, found: list[Trial], rounds: list[Round]) -> Diagnosis:
-    """The answer and its figures."""
+def conclude(inference: Inference, before: Stand, after: Stand, found: list[Trial], rounds: list[Round]) -> Diagnosis:
+    """The answer and its figures, each stand with the floor that its effects were weighed with."""
     first = rounds[0]
     kept = {t.candidate.key for t in found}
     steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
     if found:
         classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
         answer = "class" if max(classes) > 1 else "effect"
-    elif first.over > _limit(inference.problem):
+    elif first.over > _limit(inference.problem) or (inference.problem.settings > 1 and first.held_out_over(inference.fitted) > UNEXPLAINED):
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"
-    points = {"before": start.fit.point, "after": base.point}
-    before = start.floor, start.errors  # what the effects were weighed against
-    stands = {"before": before, "after": before if base is start.fit else inference.stand(base.point)}
-    final, squares = ({when: both[i] for when, both in stands.items()} for i in (0, 1))
-    alone = {when: inference.mean_squares([point], final[when], plain=True)[0] for when, point in points.items()}
-    own = intervals(inference, base, final["after"], squares["after"])
+    stands = {"before": before, "after": after}
+    alone = {when: inference.mean_squares([s.fit.point], s.floor, plain=True)[0] for when, s in stands.items()}
+    own = intervals(inference, after.fit, after.floor, after.errors)
     declared = {}
     if inference.problem.declared:
-        stated = Fit(start.fit.point, tuple(p.name for p in inference.problem.declared), 0.0, np.empty(0), 0, True)
-        declared = intervals(inference, stated, final["before"], squares["before"])
-    scale, floor = inference.problem.error(np.ones(1), 0), final["after"]
+        stated = Fit(before.fit.point, tuple(p.name for p in inference.problem.declared), 0.0, np.empty(0), 0, True)
+        declared = intervals(inference, stated, before.floor, before.errors)
+    scale, floor = inference.problem.error(np.ones(1), 0), after.floor
     return Diagnosis(
         inference.problem,
         answer,
         steps,
-        start.fit.point,
-        base.point,
+        before.fit.point,
+        after.fit.point,
         inference.parts,
-        {when: _by_recording(inference, row) for when, row in squares.items()},
+        {when: _by_recording(inference, s.errors) for when, s in stands.items()},
         {when: _by_recording(inference, row) for when, row in alone.items()},
-        {when: inference.amounts(point, final[when]) for when, point in points.items()},
-        final,
+        {when: inference.amounts(s.fit.point, s.floor) for when, s in stands.items()},
+        {when: s.floor for when, s in stands.items()},
         {
             "noise": scale * math.sqrt(np.mean([v**2 for v in floor.noise.values()])),
             "discretisation": scale * math.sqrt(np.mean([np.mean(v**2) for v in floor.spread.values()])),

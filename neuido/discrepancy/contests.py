@@ -10,7 +10,7 @@ from neuido.discrepancy.fit import Fit, Race
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import Laboratory
 from neuido.discrepancy.problem import Candidate, Parameter, Point
-from neuido.discrepancy.trials import score
+from neuido.discrepancy.trials import Round, score
 
 SMALL = 2
 """Parameters up to which a candidate gets a fit in the first round whatever its place in the screening: a direction says little of what a
@@ -25,6 +25,8 @@ POLISHED = 4
 """Candidates whose fits are refined from further starts."""
 IN_REACH = 4.0
 """Times the lowest cost up to which that of a fit is worth refining: twice its error."""
+BEYOND = 8.0
+"""Times the error of what another solver named beyond which fits are not refined: that has gained up to 7-fold."""
 MEASURED, NEAR = 6, 4.0
 """Fits whose errors are measured with the differences of the settings where they end: so many of the best, within this factor of their
 errors."""
@@ -99,12 +101,18 @@ class Contests(Laboratory):
         return best
 
     def polish(
-        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], base: Fit, floor: Floor
+        self,
+        free: Sequence[Parameter],
+        best: Mapping[str, tuple[Candidate, Fit]],
+        base: Fit,
+        floor: Floor,
+        rival: Round | None = None,
     ) -> dict[str, tuple[Candidate, Fit]]:
         """The best fits once more, from where they ended, from the declared values, and from those of the very best one.
 
         The base fit may have led all of them astray, and its weights too, for the settings differ most where the model is wrong: each is
-        weighed by the floor where it stands. Which end is the best one is said by the errors, for weights differ.
+        weighed by the floor where it stands. Which end is the best one is said by the errors, for weights differ. Where `rival`, the round
+        of another solver, named an effect that leaves far less than any of them, none is refined.
         """
         ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
         within = [entry for entry in ranked if entry[1].cost < IN_REACH * ranked[0][1].cost]
@@ -112,10 +120,13 @@ class Contests(Laboratory):
         if not top:
             return {}
         before, *squares = self.mean_squares([base.point, *(fit.point for _, fit in top)], floor)
+        if rival is not None and rival.chosen is not None and min(map(score, squares)) > rival.chosen.score + 2.0 * math.log(BEYOND):
+            return {}
         gains = max(self.gain(before, square) for square in squares)
         if (top[0][1].cost > 0.7 * self.costs([base.point], floor)[0] and gains < SOME_GAIN) or self.is_noise(squares[0]):
             return {}
-        self.tell(f"refining {', '.join(c.key for c, _ in top)}")
+        ends = (f"{c.key} ({self.typical(square):.3g})" for (c, _), square in zip(top, squares, strict=True))
+        self.tell(f"refining {', '.join(ends)} of {self.typical(before):.3g} {self.problem.unit}")
         leading = ranked[0][1].point
         out: dict[str, tuple[Candidate, Fit]] = {}
         for c, fit in top:
@@ -146,24 +157,25 @@ class Contests(Laboratory):
         left = [score(squares) for squares in self.mean_squares([end.point for end in ends], own, fitted=True)]
         return ends[int(np.argmin(left))], own
 
-    def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[np.ndarray]:
-        """Mean squares of the parts for each fit, in their order; those of the leading ones with the floor where they end, if that is less.
+    def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[tuple[Floor, np.ndarray]]:
+        """Mean squares of the parts for each fit, in their order, with the floor that they are by: `floor`, or for the leading ones that
+        where they end, if it leaves less.
 
         What another grid does moves with the law: the differences at the base say little of it where a fit has gone far.
         """
         points = [fit.point for _, fit in best.values()]
-        squares = self.mean_squares(points, floor)
+        found = [(floor, squares) for squares in self.mean_squares(points, floor)]
         if self.problem.settings == 1 or not points:
-            return squares
-        order = sorted(range(len(points)), key=lambda i: score(squares[i]))[:MEASURED]
-        limit = score(squares[order[0]]) + 2.0 * math.log(NEAR)
-        leading = [i for i in order if score(squares[i]) < limit and not self.is_noise(squares[i])]
+            return found
+        order = sorted(range(len(points)), key=lambda i: score(found[i][1]))[:MEASURED]
+        limit = score(found[order[0]][1]) + 2.0 * math.log(NEAR)
+        leading = [i for i in order if score(found[i][1]) < limit and not self.is_noise(found[i][1])]
         with self.memo.during("discretisation"):  # all of them in one launch
             self.predicted([points[i] for i in leading], list(floor.noise), range(self.problem.settings))
         for i in leading:
             if self.runs(points[i]):
-                squares[i] = min(squares[i], self.stand(points[i], like=floor)[1], key=score)
-        return squares
+                found[i] = min(found[i], self.stand(points[i], like=floor), key=lambda both: score(both[1]))
+        return found
 
     def alike(
         self,

@@ -14,7 +14,7 @@ from neuido.discrepancy.fit import Fit, Request, levenberg_marquardt, residuals,
 from neuido.discrepancy.floors import Floor, over_time, split
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
-from neuido.discrepancy.trials import Start, score
+from neuido.discrepancy.trials import Stand, score
 
 LEAST_GAIN = math.log(1.7)
 """Smaller gains are no reason to name anything: other solvers differ by as much in ways that no setting of one solver shows."""
@@ -192,21 +192,28 @@ class Laboratory:
             starts = [min(short, key=lambda f: f.cost).point]
         return self.fits([self.request(free, starts[0], **options)], floor)[0]
 
-    def finished(self, fit: Fit) -> Fit:
+    def finished(self, named: Stand) -> Stand:
         """A fit once more from its end, with the floor there, until a standard deviation of the noise would show.
 
-        Unless that leaves more of the fitted parts, each with the floor where it stands: weights are about what another grid does, and a
-        step along that can go further from the data.
+        Unless that leaves more of the fitted parts than `named` does, with the floor where it stands or the one that it was named with:
+        weights are about what another grid does, and a step along that can go further from the data.
         """
-        floor, errors = self.stand(fit.point)
+
+        def left(start: Stand) -> float:
+            return score(start.errors[self.fitted])
+
+        fit = named.fit
+        here = Stand(fit, *self.stand(fit.point))
         unit = 1.0 / sum(int(p.rows.sum()) for p in self.parts if p.fitted)
         parameters = [self.problem.parameter(name) for name in fit.names]
-        (further,) = self.fits([self.request(parameters, fit.point, iterations=6, tolerance=0.3 * unit, nothing=0.1 * unit)], floor)
+        (further,) = self.fits([self.request(parameters, fit.point, iterations=6, tolerance=0.3 * unit, nothing=0.1 * unit)], here.floor)
+        least = min(named, here, key=left)
         if not parameters or not self.runs(further.point):
-            return fit
-        _, after = self.stand(further.point, like=floor)
-        worse = score(after[self.fitted]) - score(errors[self.fitted])
-        return fit if worse > 2.0 * math.log(ASTRAY) else further
+            return least
+        _, after = self.stand(further.point, like=here.floor)
+        if score(after[self.fitted]) - left(least) > 2.0 * math.log(ASTRAY):
+            return least
+        return Stand(further, *self.stand(further.point))
 
     def starts(self, point: Point) -> list[Point]:
         """A point, and half and twice each parameter whose logarithm is fitted."""
@@ -217,7 +224,7 @@ class Laboratory:
                 out += [dict(point) | {p.name: min(max(value * f, p.lower), p.upper)} for f in (0.5, 2.0)]
         return out
 
-    def start(self, near: Point | None = None) -> Start | None:
+    def start(self, near: Point | None = None) -> Stand | None:
         """The base fit, with what noise and discretisation do to it; from about the declared values, or from them and from `near`.
 
         None: given `near`, the fit ends where not every recording can be predicted.
@@ -229,20 +236,24 @@ class Laboratory:
         floor, errors = self.stand(fit.point)
         if self.problem.settings == 1:
             fit = self.base([fit.point], floor)
-            return Start(fit, floor, self.mean_squares([fit.point], floor)[0])
-        made = [Start(fit, floor, errors)]
+            return Stand(fit, floor, self.mean_squares([fit.point], floor)[0])
+        made = [Stand(fit, floor, errors)]
         for _ in range(AGAIN):
             fit = self.base([fit.point], floor)
             if not self.runs(fit.point):
                 break
             floor, errors = self.stand(fit.point, like=floor)
-            made.append(Start(fit, floor, errors))
+            made.append(Stand(fit, floor, errors))
         return min(made, key=lambda start: score(start.errors[self.fitted]))
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""
         rows = self.predicted([point], self.scored_recordings)
         return all(bool(np.isfinite(of).all()) for of in rows.values())
+
+    def typical(self, squares: np.ndarray) -> float:
+        """The geometric mean over the parts of root mean squares, in the unit of the data."""
+        return self.problem.error(np.ones(1), 0) * math.exp(0.5 * score(squares))
 
     def is_noise(self, errors: np.ndarray) -> bool:
         """Whether nothing but noise is left in any part."""

@@ -70,18 +70,17 @@ class Inference(Contests):
         super().__init__(problem, setting=setting, tell=tell, memo=memo)
         self.keep, self.draws, self.seed = keep, draws, seed
 
-    def round(
-        self, base: Fit, floor: Floor, found: Sequence[Trial], leaders: Sequence[str] | None = None, *, most: float = math.inf
-    ) -> Round:
+    def round(self, base: Fit, floor: Floor, found: Sequence[Trial], rival: Round | None = None, *, most: float = math.inf) -> Round:
         """Look for one more effect beside those that were found.
 
         Args:
             base: Where the model stands.
             floor: Noise and discretisation there, as `stand` gives them.
             found: The effects so far.
-            leaders: Keys of the candidates that led with another solver, where it named one: they and the first of the screening get a fit.
+            rival: That of another solver which named an effect: what led there and the first of the screening get a fit.
             most: Parameters that a candidate may have.
         """
+        leaders = rival.leaders if rival is not None else None
         taken = {t.candidate.name for t in found}
         extra = tuple(p for t in found for p in t.candidate.parameters)
         candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
@@ -115,12 +114,13 @@ class Inference(Contests):
                 starts.append((c, base.point | self.as_declared | dict(c.starts[0]), None))
         self.tell(f"fitting {', '.join(chosen)}")
         best = self.contest(free, starts, floor)
-        best |= self.polish(free, best, base, floor)
+        best |= self.polish(free, best, base, floor, rival)
         best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
         floors = self.floors(base.point, free, floor)
         model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)
         empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=model.null(errors, self.draws))
         result = self.judge(empty, best, model, list(chosen))
+        self.tell(self.verdict(result))
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
         if first and result.chosen is None and (promising or result.over > 1.0):
             best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
@@ -130,10 +130,9 @@ class Inference(Contests):
     def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel, asked: Sequence[str]) -> Round:
         """A round with the trials that fits make, and what is chosen of them; `asked` are the keys that were to be fitted."""
         errors = empty.errors
-        squares = self.measured(best, empty.floor)
         trials = []
-        for (c, fit), square in zip(best.values(), squares, strict=True):
-            trial = Trial(c, fit, square, self.gain(errors, square))
+        for (c, fit), (floor, square) in zip(best.values(), self.measured(best, empty.floor), strict=True):
+            trial = Trial(c, fit, floor, square, self.gain(errors, square))
             trial.reason = unphysical(c, fit.point) if np.isfinite(square).all() else "not every recording runs where its fit ends"
             trials.append(trial)
         trials.sort(key=lambda t: t.score)
@@ -153,6 +152,15 @@ class Inference(Contests):
             if not t.reason and t not in result.members:
                 t.reason = self._why(t, top, result)
         return result
+
+    def verdict(self, r: Round) -> str:
+        """A line about what a round found."""
+        before = f"{self.typical(r.errors):.3g} {self.problem.unit}"
+        if not r.trials:
+            return f"{before} left, no candidate runs"
+        top = r.chosen or r.trials[0]
+        left = f"{top.candidate.key} leaves {self.typical(top.errors):.3g} of {before}"
+        return f"named: {left}" if r.chosen else f"nothing named: {left}"
 
     def least_gain(self, errors: np.ndarray, floors: np.ndarray, left: np.ndarray) -> float:
         """The gain that an effect must bring, from the residual over the floor and what it leaves, all as mean squares of the parts."""

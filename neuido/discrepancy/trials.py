@@ -1,6 +1,7 @@
 """What the steps of a diagnosis leave: the declared model fitted, candidates fitted in full, and what one step of the growth found."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,11 +17,12 @@ LED = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """The declared model, fitted."""
+class Stand:
+    """A model, fitted: the declared one, or one with effects beside it."""
 
     fit: Fit
     floor: Floor
+    """What `errors` are measured with."""
     errors: np.ndarray
     """Mean squares of each part."""
 
@@ -31,6 +33,8 @@ class Trial:
 
     candidate: Candidate
     fit: Fit
+    floor: Floor
+    """What `errors` are measured with."""
     errors: np.ndarray
     """Mean squares of each part."""
     gain: float
@@ -70,6 +74,11 @@ class Round:
     def over(self) -> float:
         """How far the residual of its base is above its floors: a ratio of errors."""
         return times_over(self.errors, self.floors)
+
+    def held_out_over(self, fitted: Sequence[bool]) -> float:
+        """The same of the parts that were not fitted alone; zero where there are none."""
+        out = ~np.asarray(fitted)
+        return times_over(self.errors[out], self.floors[out]) if out.any() else 0.0
 
     def by_chance(self, level: float) -> float:
         """Gain that the best candidate exceeds by chance with this probability; zero where nothing was drawn."""

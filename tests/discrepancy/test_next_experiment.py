@@ -24,7 +24,7 @@ def diagnosis(problem, points: dict[str, dict[str, float]]) -> Diagnosis:
     for name, point in points.items():
         c = next(c for c in problem.candidates if c.name == name)
         fit = Fit(point, tuple(point), 1.0, np.empty(0), 1, True)
-        trials.append(Trial(c, fit, np.ones(2), 1.0))
+        trials.append(Trial(c, fit, None, np.ones(2), 1.0))
     floor = Floor({}, {}, {}, {})
     step = Round({}, np.ones(2), trials, trials[0], trials, 0.005, floor, np.ones(2))
     point = trials[0].fit.point

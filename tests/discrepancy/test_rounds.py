@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from neuido.discrepancy import contests, rounds
+from neuido.discrepancy import attribution, contests, rounds
 from neuido.discrepancy.answer import rejected, trace
 from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
-from neuido.discrepancy.fit import levenberg_marquardt, run
+from neuido.discrepancy.fit import Fit, levenberg_marquardt, run
 from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import GAIN_IN_FLOOR, GAIN_TO_NOISE, LEAST_GAIN, Inference
-from neuido.discrepancy.trials import Trial
+from neuido.discrepancy.trials import Round, Stand, Trial
 
 T = np.linspace(0.0, 1.0, 120)
 NOISE = 0.01
@@ -132,6 +132,49 @@ def test_what_lies_within_the_floor_is_not_asked_of_another_method():
     assert found.answer == "unknown"
     assert found.rounds[0].over > UNEXPLAINED
     assert rounds_of_fits == 2
+
+
+def test_a_held_out_recording_far_above_its_floor_is_unknown():
+    problem = Line(lambda t: 3.0 * t)
+    other = problem.recordings[1]
+    for size, answer in ((0.02, "none"), (0.07, "unknown")):
+        strange = replace(other, y=other.y + size * np.sin(33 * T))
+        problem.__dict__["recordings"] = (problem.recordings[0], strange)
+        found = diagnose(problem)
+        assert found.answer == answer
+        assert found.rounds[0].over < UNEXPLAINED  # the fitted recording lies at the noise
+
+
+@pytest.mark.parametrize(("left", "looks"), [(0.3, [0]), (0.05, [0, 1])])
+def test_a_method_that_leaves_more_than_what_another_named_is_not_looked_further_with(left, looks, monkeypatch):
+    bend = Line(clipped).candidates[0]
+
+    def trial(error):
+        return Trial(bend, Fit({"a": 1.0, "square.c": 1.0}, ("a", "square.c"), 1.0, np.zeros(1), 1, True), None, np.full(2, error**2), 1.0)
+
+    def found(error, named):
+        t = trial(error)
+        chosen, members = (t, [t]) if named else (None, [])
+        return Round({}, np.ones(2), [t], chosen, members, 0.01, None, np.full(2, 1e-4))
+
+    class Method:
+        def __init__(self, result):
+            self.result = result
+
+        def is_settled(self, errors):
+            return False
+
+        is_noise = is_settled
+
+        def round(self, *_):
+            return self.result
+
+    methods = [Method(found(0.1, True)), Method(found(left, False))]
+    asked = []
+    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: asked.append(methods.index(inference)) or [first])
+    start = Stand(trial(1.0).fit, None, np.ones(2))
+    attribution.first_rounds(methods, [start, start])
+    assert asked == looks
 
 
 def test_the_method_that_fits_best_begins_and_a_much_worse_one_is_not_asked():
@@ -272,7 +315,7 @@ def test_an_effect_that_was_found_last_is_dropped_too():
     low, high = (c for c in problem.candidates if c.name in ("low", "high"))
     free = (*problem.declared, *low.parameters, *high.parameters)
     (both,) = inference.fits([inference.request(free, {"low.c": 0.5, "high.c": 0.1})], start.floor)
-    found = [Trial(c, both, start.errors, 1.0) for c in (low, high)]
+    found = [Trial(c, both, start.floor, start.errors, 1.0) for c in (low, high)]
     fit, left = drop(inference, both, start.floor, found)
     assert [t.candidate.name for t in left] == ["low"]
     assert fit.names == ("a", "low.c")
@@ -410,10 +453,31 @@ def test_a_fit_that_goes_astray_where_it_is_finished_is_not_taken(monkeypatch):
     inference = Inference(Line(lambda t: 3.0 * t))
     free = inference.problem.declared
     (fit,) = inference.fits([inference.request(free, {})], inference.noise())
+    named = Stand(fit, *inference.stand(fit.point))
     away = replace(fit, point={**fit.point, "square.c": 0.2})
-    for end, taken in ((away, False), (replace(fit, point={"a": fit.point["a"] + 1e-4}), True)):
+    near = replace(fit, point={"a": fit.point["a"] + 1e-4})
+    # the floor where an effect was named may leave less than that where its fit stands
+    better = replace(named, errors=0.25 * named.errors)
+    for start, end, taken in ((named, away, False), (named, near, True), (better, near, False)):
         monkeypatch.setattr(Inference, "fits", lambda self, requests, floor, end=end, **options: [end])
-        assert (inference.finished(fit) is end) is taken
+        found = inference.finished(start)
+        assert (found.fit is end) is taken
+        if not taken:
+            assert np.array_equal(found.errors, start.errors)
+
+
+@pytest.mark.parametrize(("times", "refined"), [(4.0, True), (20.0, False)])
+def test_what_leaves_far_more_than_another_method_named_is_not_refined(times, refined):
+    lines = []
+    inference = Inference(Line(lambda t: 3.0 * t + 2.0 * t**2 + 0.3 * np.sin(33 * t), turns=True), tell=lines.append)
+    start = inference.start()
+    alone = inference.round(start.fit, start.floor, [])
+    assert any(line.startswith("refining ") for line in lines)
+    lines.clear()
+    top = alone.trials[0]
+    rival = replace(alone, chosen=replace(top, errors=top.errors / times**2))
+    inference.round(start.fit, start.floor, [], rival)
+    assert any(line.startswith("refining ") for line in lines) is refined
 
 
 def test_what_is_reported_as_before_is_what_the_effects_were_weighed_against():
