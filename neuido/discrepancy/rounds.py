@@ -17,7 +17,7 @@ from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo
-from neuido.discrepancy.problem import Candidate, Problem
+from neuido.discrepancy.problem import Candidate, Point, Problem
 from neuido.discrepancy.trials import Round, Trial, times_over, unphysical
 
 ALPHA = 0.05
@@ -41,6 +41,8 @@ OWN = 3
 """Candidates that the screening of a second solver may add to those that led with the first one."""
 WITHIN = 0.5
 """Share of the floor within which a residual that no effect explains is no reason to look further."""
+LED_FAR = 1.6
+"""Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
 
 
 class Inference(Contests):
@@ -122,9 +124,11 @@ class Inference(Contests):
         result = self.judge(empty, best, model, list(chosen))
         self.tell(self.verdict(result))
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
-        if first and result.chosen is None and (promising or result.over > 1.0):
+        led_far = result.chosen is not None and not self.is_noise(result.chosen.errors) and self.moved(base.point) > LED_FAR
+        if first and (led_far or (result.chosen is None and (promising or result.over > 1.0))):
             best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
             result = self.judge(empty, best, model, list(chosen))
+            self.tell(self.verdict(result))
         return result
 
     def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel, asked: Sequence[str]) -> Round:
@@ -152,6 +156,11 @@ class Inference(Contests):
             if not t.reason and t not in result.members:
                 t.reason = self._why(t, top, result)
         return result
+
+    def moved(self, point: Point) -> float:
+        """The largest ratio of a declared parameter to the value that the model states, or of this to that."""
+        ratios = [point[p.name] / p.value for p in self.problem.declared if p.log]
+        return max((max(r, 1.0 / r) for r in ratios), default=1.0)
 
     def verdict(self, r: Round) -> str:
         """A line about what a round found."""

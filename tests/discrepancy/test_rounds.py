@@ -432,6 +432,19 @@ def test_a_size_of_the_other_sign_is_found_from_elsewhere(monkeypatch):
     assert not diagnose(problem).effects
 
 
+@pytest.mark.parametrize(("declared", "left", "again"), [(1.0, 0.1, True), (2.5, 0.1, False), (1.0, 0.0, False)])
+def test_candidates_are_fitted_from_the_declared_values_where_the_base_went_far(declared, left, again, monkeypatch):
+    problem = Tones(lambda t: 3.0 * t + 0.5 * np.sin(40 * t) + left * np.sin(110 * t), "low")
+    problem.__dict__["declared"] = (Parameter("a", "1", declared, 0.3, 0.01, 20.0, log=True),)
+    calls = []
+    monkeypatch.setattr(Inference, "elsewhere", lambda self, best, *_: calls.append(len(best)) or {})
+    inference = Inference(problem)
+    start = inference.start()
+    assert start.fit.point["a"] == pytest.approx(3.0, rel=0.1)
+    assert inference.round(start.fit, start.floor, []).chosen.candidate.name == "low"
+    assert bool(calls) is again
+
+
 def test_what_an_effect_leaves_within_the_floor_is_searched_no_further(monkeypatch):
     def searches(y):
         lines = []
