@@ -42,7 +42,7 @@ UNEXPLAINED_EXACT = 3.0
 WORSE = 3.0
 """Times the error of the better method at which the other one is not asked any more, where that found nothing."""
 FURTHER = 1.5
-"""Times its floor above which what an effect leaves is searched for another one: seven searches below it found none."""
+"""Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 LOOKED_AHEAD = 2
 """Effects that are tried with a second one, where none gains enough alone, or in the place of one with more parameters."""
 CLOSE = 2.5
