@@ -115,7 +115,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
         found.append(step)
-        at = inference.finished(Stand(step.fit, step.floor, step.errors))
+        at = inference.finished(step.stand)
         if len(found) == most or inference.is_settled(step.errors):
             break
         free = [problem.parameter(name) for name in at.fit.names]
@@ -153,7 +153,8 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
         if firsts and not named and base[i] - base[order[0]] > 2.0 * math.log(WORSE):
             continue
         first = tried[i].round(starts[i].fit, starts[i].floor, [], named[0] if named else None)
-        beaten = any(r.chosen and r.chosen.score <= min((t.score for t in first.trials), default=math.inf) for r in named)
+        least = min((t.score for t in first.trials), default=math.inf)
+        beaten = any(r.chosen and r.chosen.score <= least for r in named)
         firsts[i] = [first] if beaten else look_ahead(tried[i], first)
         last = firsts[i][-1]
         if last.trials and tried[i].is_noise(last.trials[0].errors):
@@ -214,7 +215,7 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
             requests.append(inference.request((*inference.problem.declared, *beside, *t.candidate.parameters), start))
         fits = inference.fits(requests, floor)
         squares = inference.mean_squares([fit.point for fit in fits], floor)
-        weighed = [replace(t, fit=fit, floor=floor, errors=square) for t, fit, square in zip(members, fits, squares, strict=True)]
+        weighed = [replace(t, stand=Stand(fit, floor, square)) for t, fit, square in zip(members, fits, squares, strict=True)]
         at = min(range(len(weighed)), key=lambda i: weighed[i].penalised)
         for t, new in zip(members, weighed, strict=True):
             above = math.exp(0.5 * (new.score - weighed[at].score))
@@ -266,7 +267,7 @@ def conclude(inference: Inference, before: Stand, after: Stand, found: list[Tria
     if inference.problem.declared:
         stated = Fit(before.fit.point, tuple(p.name for p in inference.problem.declared), 0.0, np.empty(0), 0, True)
         declared = intervals(inference, stated, before.floor, before.errors)
-    scale, floor = inference.problem.error(np.ones(1), 0), after.floor
+    scale, floor = inference.scale, after.floor
     return Diagnosis(
         inference.problem,
         answer,
@@ -295,5 +296,4 @@ def enough(inference: Inference) -> bool:
 
 
 def _by_recording(inference: Inference, squares: np.ndarray) -> dict[str, float]:
-    scale = inference.problem.error(np.ones(1), 0)
-    return {p.name: scale * math.sqrt(float(v)) for p, v in zip(inference.parts, squares, strict=True)}
+    return {p.name: inference.scale * math.sqrt(float(v)) for p, v in zip(inference.parts, squares, strict=True)}

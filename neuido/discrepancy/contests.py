@@ -10,7 +10,7 @@ from neuido.discrepancy.fit import Fit, Race
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import Laboratory
 from neuido.discrepancy.problem import Candidate, Parameter, Point
-from neuido.discrepancy.trials import Round, score
+from neuido.discrepancy.trials import Round, Stand, score
 
 SMALL = 2
 """Parameters up to which a candidate gets a fit in the first round whatever its place in the screening: a direction says little of what a
@@ -157,24 +157,25 @@ class Contests(Laboratory):
         left = [score(squares) for squares in self.mean_squares([end.point for end in ends], own, fitted=True)]
         return ends[int(np.argmin(left))], own
 
-    def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[tuple[Floor, np.ndarray]]:
-        """Mean squares of the parts for each fit, in their order, with the floor that they are by: `floor`, or for the leading ones that
-        where they end, if it leaves less.
+    def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[Stand]:
+        """Each fit, in their order, with what it leaves by `floor`, or for the leading ones by that where they end, if it leaves less.
 
         What another grid does moves with the law: the differences at the base say little of it where a fit has gone far.
         """
         points = [fit.point for _, fit in best.values()]
-        found = [(floor, squares) for squares in self.mean_squares(points, floor)]
+        fits = (fit for _, fit in best.values())
+        found = [Stand(fit, floor, squares) for fit, squares in zip(fits, self.mean_squares(points, floor), strict=True)]
         if self.problem.settings == 1 or not points:
             return found
-        order = sorted(range(len(points)), key=lambda i: score(found[i][1]))[:MEASURED]
-        limit = score(found[order[0]][1]) + 2.0 * math.log(NEAR)
-        leading = [i for i in order if score(found[i][1]) < limit and not self.is_noise(found[i][1])]
+        order = sorted(range(len(points)), key=lambda i: score(found[i].errors))[:MEASURED]
+        limit = score(found[order[0]].errors) + 2.0 * math.log(NEAR)
+        leading = [i for i in order if score(found[i].errors) < limit and not self.is_noise(found[i].errors)]
         with self.memo.during("discretisation"):  # all of them in one launch
             self.predicted([points[i] for i in leading], list(floor.noise), range(self.problem.settings))
         for i in leading:
             if self.runs(points[i]):
-                found[i] = min(found[i], self.stand(points[i], like=floor), key=lambda both: score(both[1]))
+                there = Stand(found[i].fit, *self.stand(points[i], like=floor))
+                found[i] = min(found[i], there, key=lambda stand: score(stand.errors))
         return found
 
     def alike(

@@ -52,6 +52,8 @@ class Laboratory:
         """The declared parameters at the values that the model states."""
         self.noise_squares = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
         """Mean squares of the noise of each part."""
+        self.scale = problem.error(np.ones(1), 0)
+        """What a root mean square of one is as an error of the problem."""
 
     # Fits.
 
@@ -199,8 +201,8 @@ class Laboratory:
         weights are about what another grid does, and a step along that can go further from the data.
         """
 
-        def left(start: Stand) -> float:
-            return score(start.errors[self.fitted])
+        def left(stand: Stand) -> float:
+            return score(stand.errors[self.fitted])
 
         fit = named.fit
         here = Stand(fit, *self.stand(fit.point))
@@ -253,7 +255,7 @@ class Laboratory:
 
     def typical(self, squares: np.ndarray) -> float:
         """The geometric mean over the parts of root mean squares, in the unit of the data."""
-        return self.problem.error(np.ones(1), 0) * math.exp(0.5 * score(squares))
+        return self.scale * math.exp(0.5 * score(squares))
 
     def is_noise(self, errors: np.ndarray) -> bool:
         """Whether nothing but noise is left in any part."""

@@ -135,9 +135,9 @@ class Inference(Contests):
         """A round with the trials that fits make, and what is chosen of them; `asked` are the keys that were to be fitted."""
         errors = empty.errors
         trials = []
-        for (c, fit), (floor, square) in zip(best.values(), self.measured(best, empty.floor), strict=True):
-            trial = Trial(c, fit, floor, square, self.gain(errors, square))
-            trial.reason = unphysical(c, fit.point) if np.isfinite(square).all() else "not every recording runs where its fit ends"
+        for (c, fit), stand in zip(best.values(), self.measured(best, empty.floor), strict=True):
+            trial = Trial(c, stand, self.gain(errors, stand.errors))
+            trial.reason = unphysical(c, fit.point) if np.isfinite(stand.errors).all() else "not every recording runs where its fit ends"
             trials.append(trial)
         trials.sort(key=lambda t: t.score)
         good = [t for t in trials if not t.reason]

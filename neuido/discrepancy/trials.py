@@ -32,14 +32,19 @@ class Trial:
     """One candidate fitted in full."""
 
     candidate: Candidate
-    fit: Fit
-    floor: Floor
-    """What `errors` are measured with."""
-    errors: np.ndarray
-    """Mean squares of each part."""
+    stand: Stand
     gain: float
     reason: str = ""
     """Why it is rejected; empty: it is not."""
+
+    @property
+    def fit(self) -> Fit:
+        return self.stand.fit
+
+    @property
+    def errors(self) -> np.ndarray:
+        """Mean squares of each part."""
+        return self.stand.errors
 
     @property
     def score(self) -> float:

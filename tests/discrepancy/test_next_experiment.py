@@ -13,8 +13,8 @@ from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.rounds import Round, Trial
 from neuido.discrepancy.track import TrackProblem
+from neuido.discrepancy.trials import Round, Stand, Trial
 from tests.discrepancy import made
 
 
@@ -24,7 +24,7 @@ def diagnosis(problem, points: dict[str, dict[str, float]]) -> Diagnosis:
     for name, point in points.items():
         c = next(c for c in problem.candidates if c.name == name)
         fit = Fit(point, tuple(point), 1.0, np.empty(0), 1, True)
-        trials.append(Trial(c, fit, None, np.ones(2), 1.0))
+        trials.append(Trial(c, Stand(fit, None, np.ones(2)), 1.0))
     floor = Floor({}, {}, {}, {})
     step = Round({}, np.ones(2), trials, trials[0], trials, 0.005, floor, np.ones(2))
     point = trials[0].fit.point

@@ -150,7 +150,8 @@ def test_a_method_that_leaves_more_than_what_another_named_is_not_looked_further
     bend = Line(clipped).candidates[0]
 
     def trial(error):
-        return Trial(bend, Fit({"a": 1.0, "square.c": 1.0}, ("a", "square.c"), 1.0, np.zeros(1), 1, True), None, np.full(2, error**2), 1.0)
+        fit = Fit({"a": 1.0, "square.c": 1.0}, ("a", "square.c"), 1.0, np.zeros(1), 1, True)
+        return Trial(bend, Stand(fit, None, np.full(2, error**2)), 1.0)
 
     def found(error, named):
         t = trial(error)
@@ -315,7 +316,7 @@ def test_an_effect_that_was_found_last_is_dropped_too():
     low, high = (c for c in problem.candidates if c.name in ("low", "high"))
     free = (*problem.declared, *low.parameters, *high.parameters)
     (both,) = inference.fits([inference.request(free, {"low.c": 0.5, "high.c": 0.1})], start.floor)
-    found = [Trial(c, both, start.floor, start.errors, 1.0) for c in (low, high)]
+    found = [Trial(c, Stand(both, start.floor, start.errors), 1.0) for c in (low, high)]
     fit, left = drop(inference, both, start.floor, found)
     assert [t.candidate.name for t in left] == ["low"]
     assert fit.names == ("a", "low.c")
@@ -488,7 +489,7 @@ def test_what_leaves_far_more_than_another_method_named_is_not_refined(times, re
     assert any(line.startswith("refining ") for line in lines)
     lines.clear()
     top = alone.trials[0]
-    rival = replace(alone, chosen=replace(top, errors=top.errors / times**2))
+    rival = replace(alone, chosen=replace(top, stand=replace(top.stand, errors=top.errors / times**2)))
     inference.round(start.fit, start.floor, [], rival)
     assert any(line.startswith("refining ") for line in lines) is refined
 
