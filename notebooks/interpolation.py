@@ -33,7 +33,7 @@ from neuido.latents import latents
 out = Path(os.environ.get("NEUIDO_NOTEBOOK_OUT", "runs/notebooks/interpolation"))
 small = os.environ.get("NEUIDO_NOTEBOOK_SMALL") == "1"
 if not (out / "interpolation.csv").is_file():  # neuido latents --config configs/experiments/interpolation.yaml
-    latents(out=str(out), parts=["interpolation"], count=5 if small else 9)
+    latents(operator="pretrained-family", out=str(out), parts=["interpolation"], count=5 if small else 9)
 
 # %% [markdown]
 # ## The motion

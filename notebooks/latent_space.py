@@ -31,7 +31,7 @@ from neuido.data.tables import read_rows
 from neuido.latents import latents
 
 out = Path(os.environ.get("NEUIDO_NOTEBOOK_OUT", "runs/notebooks/latent_space"))
-operator = os.environ.get("NEUIDO_OPERATOR", "pretrained")
+operator = os.environ.get("NEUIDO_OPERATOR", "pretrained-family")
 if not (out / "silhouettes.csv").is_file():
     latents(operator=operator, out=str(out), parts=["space"])  # neuido latents --config configs/experiments/latent_space.yaml
 
@@ -59,22 +59,22 @@ figure.savefig(out / "tsne.png", dpi=120)
 # ## Silhouettes
 #
 # t-SNE draws clusters where distances are not clustered. The silhouette of a latent compares its mean distance to its own family with
-# that to the nearest other one: one is apart, zero is mixed. The latents as they are have a low one, although nearly each one's
-# nearest neighbour is of its family. What their laws answer to the same deformations has a high one.
+# that to the nearest other one: one is apart, zero is mixed. Stage I has a prior that draws each latent to the mean of its family, so
+# that the latents as they are have a high one. What their laws answer to the same deformations has one too, and no prior touches that.
 
 # %%
 rows = {row["space"]: row for row in read_rows(out / "silhouettes.csv")}
 print(f"{'space':24s}{'silhouette':>12s}{'neighbours':>12s}")
 for name, row in rows.items():
     print(f"{name:24s}{row['silhouette']:12.3f}{row['neighbours']:12.2f}  {row['meaning']}")
-assert rows["laws"]["silhouette"] > rows["raw"]["silhouette"]
+assert min(rows[space]["silhouette"] for space in ("raw", "laws")) > 0.3
 
 # %% [markdown]
-# ## Why the latents' own is low
+# ## What the laws feel of them
 #
-# A latent starts as noise in 128 dimensions, and the laws feel few of these. Along the other directions the noise of the start
-# stays, and widens every family. Below: how much a law changes when only its most felt directions are kept, and how much
-# of the variance lies along them. A Stage I with `--model.latent_std 0.1` starts with less of that noise.
+# A latent starts as noise in 128 dimensions, and the laws feel few of these. Along the other directions that noise would stay and widen
+# every family, if the prior did not take it: without it (`--model.latent_std 1 --model.latent_decay 0`) the silhouette is 0.08. Below:
+# how much a law changes when only its most felt directions are kept, and how much of the variance lies along them.
 
 # %%
 directions = read_rows(out / "directions.csv")

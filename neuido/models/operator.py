@@ -21,7 +21,10 @@ from neuido.physics import networks
 from neuido.physics.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 
 FORMAT = "neuido-operator/1"
-PRETRAINED = Path(__file__).parent / "weights" / "stage1.safetensors"
+PRETRAINED = {
+    "pretrained": Path(__file__).parent / "weights" / "stage1.safetensors",
+    "pretrained-family": Path(__file__).parent / "weights" / "stage1_family.safetensors",
+}
 LAWS = {"raw": (RawElastic, RawPlastic), "objective": (ObjectiveElastic, ObjectivePlastic)}
 
 
@@ -209,14 +212,16 @@ class IntrinsicDynamicsOperator(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path = "pretrained") -> Self:
-        """Read a file of `save`; `pretrained` is the file that comes with the package.
+        """Read a file of `save`. `pretrained` comes with the package, and the encoders are made for it; so does `pretrained-family`, fitted
+        with a prior that gathers the latents of each family.
 
         Raises:
             UserError: the file is missing or is not one of `save`.
         """
-        path = PRETRAINED if str(path) == "pretrained" else Path(path)
+        named = PRETRAINED.get(str(path))
+        path = named or Path(path)
         if not path.is_file():
-            advice = " (make it: neuido fit --config configs/stage1.yaml, then `save_to`)" if path == PRETRAINED else ""
+            advice = " (make it: neuido fit --config configs/stage1.yaml, then `save_to`)" if named else ""
             raise UserError(f"init_from: the weights {path} are missing{advice}")
         try:
             with safe_open(path, framework="pt") as file:

@@ -11,12 +11,12 @@ from neuido.data.tables import read_rows
 from neuido.errors import UserError
 from neuido.models import latents
 from neuido.models.branch import small_strain_modulus
-from neuido.models.operator import IntrinsicDynamicsOperator
+from neuido.models.operator import PRETRAINED, IntrinsicDynamicsOperator
 
 
-@pytest.fixture(scope="module")
-def operator() -> IntrinsicDynamicsOperator:
-    return IntrinsicDynamicsOperator.load()
+@pytest.fixture(scope="module", params=PRETRAINED)
+def operator(request) -> IntrinsicDynamicsOperator:
+    return IntrinsicDynamicsOperator.load(request.param)
 
 
 def grouped(spread: float) -> IntrinsicDynamicsOperator:
@@ -46,12 +46,18 @@ def test_one_family_has_no_silhouette():
         latents.silhouettes(made)
 
 
+def test_the_prior_gathers_families():
+    """The latents lie apart by family (goal: 0.3) where Stage I had the prior, and not without it."""
+    pytest.importorskip("sklearn")
+    found = {name: latents.silhouettes(IntrinsicDynamicsOperator.load(name))[0]["silhouette"] for name in PRETRAINED}
+    assert found == {"pretrained": pytest.approx(0.083, abs=0.005), "pretrained-family": pytest.approx(0.611, abs=0.005)}
+
+
 def test_silhouettes_of_the_package(operator):
-    """The goal of 0.3 is not met by the latents as they are; it is by what their laws answer. Both are stated (README, LOG)."""
+    """What the laws answer lies apart by family, with the prior and without it."""
     pytest.importorskip("sklearn")
     rows = {row["space"]: row for row in latents.silhouettes(operator)}
     assert set(rows) == set(latents.SPACES) - {"t-sne"}
-    assert rows["raw"]["silhouette"] == pytest.approx(0.083, abs=0.005)
     assert rows["laws"]["silhouette"] > 0.45
     assert rows["plastic coefficients"]["silhouette"] > 0.4
     assert rows["raw"]["neighbours"] > 0.95
@@ -62,7 +68,7 @@ def test_few_directions_are_felt(operator):
     pytest.importorskip("sklearn")
     two, forty = latents.idle(operator, kept=(2, 40))
     assert forty["law changes"] < 0.02 < two["law changes"]
-    assert two["variance"] < 0.2 < forty["variance"] < 0.9
+    assert two["variance"] < 0.2 < forty["variance"] < 0.95
 
 
 def test_felt_directions_are_found():

@@ -118,7 +118,7 @@ def test_errors_name_the_option(tmp_path, monkeypatch):
         IntrinsicDynamicsOperator("cooked")
     with pytest.raises(UserError, match="basis_dim = 0"):
         IntrinsicDynamicsOperator(basis_dim=0)
-    monkeypatch.setattr(module, "PRETRAINED", tmp_path / "none.safetensors")
+    monkeypatch.setitem(module.PRETRAINED, "pretrained", tmp_path / "none.safetensors")
     with pytest.raises(UserError, match=r"missing.*neuido fit"):
         IntrinsicDynamicsOperator.load("pretrained")
     (tmp_path / "text").write_text("not safetensors at all")

@@ -1,7 +1,6 @@
 """The weights that come with the package: small, loadable, near the laws they were trained on, and described by their card."""
 
 import re
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,17 +12,22 @@ from neuido.models.pretrain import PretrainModule
 FAMILY_OF = {name: family for family, (name, _) in PUBLISHED.items()}
 
 
+@pytest.fixture(scope="module", params=PRETRAINED)
+def name_of_file(request) -> str:
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def operator() -> IntrinsicDynamicsOperator:
-    return IntrinsicDynamicsOperator.load()
+def operator(name_of_file) -> IntrinsicDynamicsOperator:
+    return IntrinsicDynamicsOperator.load(name_of_file)
 
 
 def deformations(strain: float, count: int = 2000) -> torch.Tensor:
     return torch.eye(3) + strain * torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0))
 
 
-def test_file(operator):
-    assert PRETRAINED.stat().st_size < 4e6
+def test_file(operator, name_of_file):
+    assert PRETRAINED[name_of_file].stat().st_size < 4e6
     assert set(FAMILY_OF) <= set(operator.latent_names)
     assert len(operator.latents) == 90
     assert operator.config["trunk"] == "objective" and operator.config["latent_dim"] == 128
@@ -59,19 +63,20 @@ def test_materials_differ(operator):
     assert stiffness["jelly"] * 2 < stiffness["plasticine"] < stiffness["sand"] / 2
 
 
-def test_a_fit_starts_from_them(operator):
-    module = PretrainModule(90, init_from="pretrained")
+def test_a_fit_starts_from_them(operator, name_of_file):
+    module = PretrainModule(90, init_from=name_of_file)
     for (name, mine), theirs in zip(module.operator.state_dict().items(), operator.state_dict().values(), strict=True):
         assert torch.equal(mine, theirs), name
     assert torch.equal(module.latents, operator.latents)
-    other = PretrainModule(6, init_from="pretrained")  # other trajectories: the weights without their latents
+    other = PretrainModule(6, init_from=name_of_file)  # other trajectories: the weights without their latents
     assert torch.equal(other.operator.elastic_trunk.out.weight, operator.elastic_trunk.out.weight)
     assert other.latents.shape == (6, 128)
 
 
-def test_the_card_quotes_the_file(operator):
+def test_the_card_quotes_the_file(operator, name_of_file):
     """Every figure of the card's first table is that of the file, and so are date and number of steps."""
-    card = (Path(PRETRAINED).parent / "README.md").read_text()
+    file = PRETRAINED[name_of_file]
+    card = (file.parent / "README.md").read_text().split(f"# Model card: `{file.name}`")[1].split("# Model card: ")[0]
     section = card.split("## Figures")[1].split("Median relative error of the stress, over")[0]
     rows = dict(re.findall(r"^\| ([^|]+?) \| (.+) \|$", section, flags=re.MULTILINE))
     figures = operator.card["figures"]
