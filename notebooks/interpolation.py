@@ -19,6 +19,7 @@
 #
 # Open it with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/interpolation.py`.
 # `NEUIDO_NOTEBOOK_OUT` is the folder of the tables, made where they are missing; `NEUIDO_NOTEBOOK_SMALL=1` takes fewer laws.
+# `NEUIDO_OPERATOR` names another operator.
 
 # %%
 import os
@@ -31,9 +32,10 @@ from neuido.data.tables import read_rows
 from neuido.latents import latents
 
 out = Path(os.environ.get("NEUIDO_NOTEBOOK_OUT", "runs/notebooks/interpolation"))
+operator = os.environ.get("NEUIDO_OPERATOR", "pretrained-family")
 small = os.environ.get("NEUIDO_NOTEBOOK_SMALL") == "1"
 if not (out / "interpolation.csv").is_file():  # neuido latents --config configs/experiments/interpolation.yaml
-    latents(operator="pretrained-family", out=str(out), parts=["interpolation"], count=5 if small else 9)
+    latents(operator=operator, out=str(out), parts=["interpolation"], count=5 if small else 9)
 
 # %% [markdown]
 # ## The motion

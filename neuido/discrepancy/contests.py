@@ -163,8 +163,7 @@ class Contests(Laboratory):
         What another grid does moves with the law: the differences at the base say little of it where a fit has gone far.
         """
         points = [fit.point for _, fit in best.values()]
-        fits = (fit for _, fit in best.values())
-        found = [Stand(fit, floor, squares) for fit, squares in zip(fits, self.mean_squares(points, floor), strict=True)]
+        found = [Stand(fit, floor, squares) for (_, fit), squares in zip(best.values(), self.mean_squares(points, floor), strict=True)]
         if self.problem.settings == 1 or not points:
             return found
         order = sorted(range(len(points)), key=lambda i: score(found[i].errors))[:MEASURED]
