@@ -18,6 +18,7 @@ from neuido.models.filmed import FIGURES, FilmedModule, plainly
 from neuido.models.methods import CARD, Method, scalars
 from neuido.models.pipeline import Laws, Prepared, folder_of, prepare, roll_surely
 from neuido.models.progress import Progress, restore
+from neuido.models.relative_density import RelativeDensity
 from neuido.models.scene_fit import EffectSource, SceneFit
 from neuido.types import ParticleState
 
@@ -44,6 +45,9 @@ class AdaptModule(FilmedModule):
         velocity_lr: Its rate, in m/s and rad/s a step.
         velocity_steps: Steps before the others in which it is fitted alone, with a cosine of their own.
         velocity_frames: Frames that these steps see.
+        estimate_density: Estimate how densely the body is filled, which no first frame shows (`models.relative_density`); paper: no.
+        density_lr: Its rate, of the logarithm a step.
+        density_weight: Of its mean square logarithm: pulls it to an even filling.
         stop_on: When to end a scene early: `none`, `loss` (no lower loss on all training views), `view` (no lower loss on the last
             training view, which is then not trained on). The best parameters are kept.
         patience: Steps without an improvement by 1 % after which a scene ends.
@@ -73,6 +77,9 @@ class AdaptModule(FilmedModule):
         velocity_lr: float = 0.2,
         velocity_steps: int = 40,
         velocity_frames: int = 8,
+        estimate_density: bool = False,
+        density_lr: float = 0.03,
+        density_weight: float = 1e-3,
         stop_on: Literal["none", "loss", "view"] = "none",
         patience: int = 20,
         check_every: int = 5,
@@ -89,6 +96,7 @@ class AdaptModule(FilmedModule):
         counts = {"steps": steps or 0, "fit_frames": fit_frames, "velocity_steps": velocity_steps, "segment": segment}
         counts |= {"views_per_step": views_per_step, "encoder_views": encoder_views}
         weights = {"image_weight": image_weight, "silhouette_weight": silhouette_weight, "velocity_lr": velocity_lr}
+        weights |= {"density_lr": density_lr, "density_weight": density_weight}
         filmed.check_options(counts, weights, curriculum, curriculum_share)
         if image_weight + silhouette_weight == 0:
             raise UserError("model.image_weight and silhouette_weight are both 0: nothing would be compared")
@@ -118,7 +126,12 @@ class AdaptModule(FilmedModule):
 
     def new_fit(self, prepared: Prepared) -> SceneFit:
         """A fit that has not begun."""
-        return SceneFit(self.plan.for_scene(prepared), self.hparams.estimate_velocity, self.effects).to(prepared.images.device)
+        density = None
+        if self.hparams.estimate_density:
+            simulator = prepared.simulator
+            density = RelativeDensity(simulator.state.x, simulator.volume, simulator.scenes[0].dx)
+        method = self.plan.for_scene(prepared)
+        return SceneFit(method, self.hparams.estimate_velocity, self.effects, density).to(prepared.images.device)
 
     def setup(self, stage: str) -> None:
         if stage != "fit" or len(self.fits):
@@ -159,6 +172,9 @@ class AdaptModule(FilmedModule):
             if fit.twist is not None:
                 rate = self.hparams.velocity_lr
                 own.append({"params": [fit.twist], "lr": rate, "of": i, "start_lr": rate, "twist": True})
+            if fit.density is not None:
+                rate = self.hparams.density_lr
+                own.append({"params": list(fit.density.parameters()), "lr": rate, "of": i, "start_lr": rate, "twist": False})
             groups += own
         return self.plan.optimizer(groups) if groups and self.ahead + self.steps else None
 
@@ -197,7 +213,7 @@ class AdaptModule(FilmedModule):
             return fit.method.retreat()
         views = filmed.some_views(self._training_views(prepared), self.hparams.views_per_step, step)
         loss, silhouette = filmed.image_losses(prepared, motion, views)
-        regular = fit.method.regulariser()
+        regular = fit.regulariser(self.hparams.density_weight)
         self._log({"train/loss": loss, "train/silhouette": silhouette, "train/regulariser": regular, "train/frames": float(frames)})
         return self._weighted(loss, silhouette) + regular
 

@@ -121,7 +121,7 @@ class SpringMass(Method):
             UserError: Effects are given; the motion is not finite.
         """
         if effects is not None and effects != Effects():
-            raise UserError("model.method = SpringMass takes no effects: they act on an MPM law")
+            raise UserError("model.effects, estimate_density: SpringMass takes no effects and no density, they act on an MPM law")
         state = scene.simulator.state if state is None else state
         stiffness, damping = self.springs()
         dt = scene.simulator.scenes[0].dt

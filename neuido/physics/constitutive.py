@@ -127,7 +127,7 @@ class Constitutive:
         viscosity = effects.viscosity(scenes, like)
         self._viscosity = None if viscosity is None else viscosity[self.scene]
         self._rate = None if effects.stiffness_change is None else effects.rows("stiffness_change", scenes, like)[self.scene, 0]
-        self._stiffness = None if effects.stiffness is None else effects.particle_stiffness(count, like)
+        self._stiffness = effects.particle_stiffness(count, like)
 
     def start(self) -> History:
         """A history of zeros."""

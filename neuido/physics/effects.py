@@ -23,6 +23,7 @@ Triple = Tensor | tuple[float, float, float] | None
 
 _MATERIAL = (
     "stiffness",
+    "relative_density",
     "stiffness_change",
     "maxwell_ratio",
     "hysteresis",
@@ -125,6 +126,10 @@ class Effects(NamedTuple):
     """Its outward normal velocity alone times exp(-restitution dt) [1/s]: a lossy floor."""
     added_mass: Number = None
     """c of the inertia 1 + c times as large at the same weight [-]."""
+    relative_density: Tensor | None = None
+    """Factor of each particle's mass and elastic stress [-], (P,) in the order of the bodies: a foam or a hollow body, whose modulus
+    goes with its relative density (Gibson and Ashby, exponent 1), or one whose particles lie closer in places than its volumes say. It
+    flows at the strain at which the solid does."""
 
     @classmethod
     def of(cls, values: Mapping[str, Tensor | float], *, x: Tensor | None = None, scene: Tensor | None = None) -> "Effects":
@@ -166,19 +171,28 @@ class Effects(NamedTuple):
             raise UserError(f"{name} is {worst:g}{unit}; it must be {bound} or more")
         return rows.expand(scene_count, width)
 
-    def particle_stiffness(self, count: int, like: Tensor) -> Tensor:
-        """`stiffness` as (P,), checked.
+    def particle_stiffness(self, count: int, like: Tensor) -> Tensor | None:
+        """The factor on each particle's elastic stress, (P,), of `stiffness` and `relative_density`; None: neither is given.
+
+        Raises:
+            UserError: As `particle_factor`.
+        """
+        factors = [self.particle_factor(name, count, like) for name in ("stiffness", "relative_density") if getattr(self, name) is not None]
+        return math.prod(factors[1:], start=factors[0]) if factors else None
+
+    def particle_factor(self, name: str, count: int, like: Tensor) -> Tensor:
+        """`stiffness` or `relative_density` as (P,), checked.
 
         Raises:
             UserError: Another number of particles, or a factor that is not positive.
         """
-        factor = _tensor(self.stiffness).to(like.device, like.dtype)
+        factor = _tensor(getattr(self, name)).to(like.device, like.dtype)
         if factor.ndim == 0:
             factor = factor.expand(count)
         if factor.shape != (count,):
-            raise UserError(f"stiffness has shape {tuple(factor.shape)} for {count} particles; give one factor for each")
+            raise UserError(f"{name} has shape {tuple(factor.shape)} for {count} particles; give one factor for each")
         if bool((~(factor > 0)).any()):
-            raise UserError(f"stiffness is {factor.min().item():g} somewhere; it must be positive")
+            raise UserError(f"{name} is {factor.min().item():g} somewhere; it must be positive")
         return factor
 
     def accelerations(self, gravity: Tensor, dt: Tensor, steps: int) -> Tensor:

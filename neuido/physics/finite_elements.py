@@ -208,7 +208,7 @@ class FiniteElements:
     ) -> ParticleState:
         state, effects, tables, viscosity, stiffness = given.state, given.effects, given.tables, given.viscosity, given.stiffness
         if inner is None:
-            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self.particles))
+            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self))
         else:
             inner_of = [inner] * self.scene_count
         frames = ParticleState(*(t.new_empty(steps // every + 1, *t.shape) for t in state))

@@ -43,7 +43,7 @@ class RolloutInputs(NamedTuple):
     friction: Tensor
     """(S, K), that of the effects included."""
     mass: Tensor
-    """[kg], (P,), added mass included."""
+    """[kg], (P,), added mass and relative density included."""
     viscosity: Tensor | None
     """`Effects.viscosity` [Pa s], (S, 2)."""
     tables: Tables | None
@@ -53,15 +53,19 @@ class RolloutInputs(NamedTuple):
     growth: Tensor | None
     """`Effects.growth` over the solver's own steps, (T, S)."""
 
-    def stiffening(self, particles: Particles) -> tuple[Tensor, Tensor] | None:
-        """What the effects add to each scene's P-wave modulus [Pa], and the largest factor on the sum, (S,) float64 each."""
+    def stiffening(self, solver: Solver) -> tuple[Tensor, Tensor] | None:
+        """What the effects add to each scene's P-wave modulus [Pa], and the factor on the sum, (S,) float64 each.
+
+        Of particles with factors of their own that one whose waves are fastest counts, and its factor is told at the least density.
+        """
         if self.tables is None:
             return None
         added = self.tables.stiffening.double()
         factor = torch.ones(len(self.gravity), dtype=torch.float64, device=self.mass.device)
         if self.stiffness is not None:
-            parts = zip(particles.offsets[:-1], particles.offsets[1:])
-            factor = torch.stack([self.stiffness[i:j].detach().double().max() for i, j in parts])
+            rho = self.mass.detach().double() / solver.volume.double()
+            parts = zip(solver.particles.offsets[:-1], solver.particles.offsets[1:])
+            factor = torch.stack([(self.stiffness[i:j].detach() / rho[i:j]).max() * rho[i:j].min() for i, j in parts])
         if self.growth is not None:
             factor = factor * self.growth.detach().double().amax(dim=0)
         return added, factor
@@ -105,11 +109,12 @@ def prepare(
     mass = like if mass is None else own(mass)
     if effects.added_mass is not None:
         mass = mass * (1 + effects.rows("added_mass", count, mass)[solver.particles.scene.long(), 0])
+    if effects.relative_density is not None:
+        mass = mass * effects.particle_factor("relative_density", len(mass), mass)
     tables = stiffness = growth = None
     if effects.of_material:
         tables = effect_tables.tables(effects, elasticity, plasticity, count, like)
-        if effects.stiffness is not None:
-            stiffness = effects.particle_stiffness(len(mass), mass)
+        stiffness = effects.particle_stiffness(len(mass), mass)
         growth = effects.growth(solver.dt, steps)
     return RolloutInputs(
         state=state,

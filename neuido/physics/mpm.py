@@ -250,7 +250,7 @@ class Simulator:
         """
         none = dict.fromkeys(("state", "gravity", "friction", "mass"))
         given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects, **none)
-        limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self.particles))
+        limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
         return min(min(limit) / scene.dt for limit, scene in zip(limits, self.scenes))
 
     def check_step(
@@ -337,7 +337,7 @@ class Simulator:
         )
         pull = given.effects.accelerations(given.gravity, self.dt, steps).contiguous()
         if check:
-            self.check_step(elasticity, given.viscosity, given.mass, given.stiffening(self.particles))
+            self.check_step(elasticity, given.viscosity, given.mass, given.stiffening(self))
         tables, mass = given.tables, given.mass
         plan = Plan(self, elasticity, plasticity, steps, every, tables)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]

@@ -142,6 +142,8 @@ def rollout(
     pull = effects.accelerations(sim.gravity if gravity is None else gravity, sim.dt, steps)
     if effects.added_mass is not None:
         mass = mass * (1 + effects.rows("added_mass", sim.scene_count, mass)[scene, 0])
+    if effects.relative_density is not None:
+        mass = mass * effects.particle_factor("relative_density", len(mass), mass)
     if effects.friction is not None:
         friction = sim.colliders.friction if friction is None else friction
         friction = (friction + effects.rows("friction", sim.scene_count, mass)).clamp(min=0.0)

@@ -18,11 +18,13 @@ from safetensors.torch import load_file
 from neuido.errors import UserError
 from neuido.models.adapt import AdaptModule
 from neuido.models.adapter import LowRankAdaptation
+from neuido.models.baselines import KnownLaw
 from neuido.models.filmed import image_losses
 from neuido.models.methods import Method
 from neuido.models.operator import IntrinsicDynamicsOperator
 from neuido.models.pipeline import prepare
 from neuido.models.progress import RECOVERY, Progress
+from neuido.models.relative_density import RelativeDensity, lattice
 from neuido.models.scene_fit import EffectSource, SceneFit
 from neuido.physics.effects import Effects
 from tests.models.visual_samples import TinyScenes, tiny_scene
@@ -115,6 +117,58 @@ def test_velocity_is_estimated_from_the_first_frames(tmp_path):
     again = module(tmp_path, start="jelly", adapter=str(tmp_path / "out"), **options)
     _, loaded = again.load_fit(data.scenes[0])
     assert torch.equal(loaded.twist, model.fit_of("tiny").twist)
+
+
+def test_an_uneven_filling_is_found(tmp_path):
+    """A body whose upper half is heavier, of a known law: what its first frame does not show is read from its motion."""
+
+    def uneven(x):
+        factor = torch.where(x[:, 1] > x[:, 1].mean(), 3.0, 0.5)
+        return factor / factor.mean()
+
+    scene = tiny_scene(tmp_path, young=5e4, frames=10, every=10, density=uneven)
+    true = uneven(scene.body.x)
+    data = TinyScenes(str(tmp_path))
+    data.scenes = [scene]
+    known = {"method": KnownLaw(young=5e4, free=["young"], rates={"young": 1e-6}), "steps": 40, "views_per_step": 0}
+    trainer(tmp_path).fit(module(tmp_path, out=str(tmp_path / "even"), **known), data)
+    model = module(tmp_path, estimate_density=True, density_lr=0.1, **known)
+    trainer(tmp_path).fit(model, data)
+    before, after = rows_of(tmp_path / "out" / "scores.csv")
+    assert float(after["rmse"]) < 0.4 * float(before["rmse"]) and float(before["found_density_spread"]) == 0
+    assert float(rows_of(tmp_path / "even" / "scores.csv")[-1]["rmse"]) > 0.9 * float(before["rmse"])
+    found = model.fit_of("tiny").density().detach()
+    assert float(torch.corrcoef(torch.stack([found, true]))[0, 1]) > 0.6
+    again = module(tmp_path, adapter=str(tmp_path / "out"), estimate_density=True, **known)
+    _, loaded = again.load_fit(scene)
+    assert torch.equal(loaded.density(), found)
+
+
+def test_a_density_is_a_smooth_field_of_mean_one():
+    x = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    index, weight, size = lattice(x, 0.3)
+    assert int(index.max()) < size and torch.allclose(weight.sum(1), torch.ones(200, dtype=torch.float64))
+    nodes = torch.zeros(size, 3, dtype=torch.float64)
+    shape = torch.tensor([int(v) + 2 for v in ((x - x.amin(0)) / 0.3).floor().amax(0)])
+    for n in range(size):
+        nodes[n] = x.amin(0) + 0.3 * torch.tensor([n // (shape[1] * shape[2]), n // shape[2] % shape[1], n % shape[2]])
+    assert torch.allclose((nodes[index] * weight[..., None]).sum(1), x)  # what is linear is met
+    volume = torch.linspace(1.0, 2.0, 200, dtype=torch.float64)
+    field = RelativeDensity(x, volume, 0.1)
+    assert torch.equal(field(), torch.ones(200, dtype=torch.float64)) and float(field.prior().detach()) == 0
+    with torch.no_grad():
+        for part in field.fields:
+            part.normal_(0.0, 3.0, generator=torch.Generator().manual_seed(1))
+    factor = field()
+    assert float((factor * volume).sum().detach()) == pytest.approx(float(volume.sum())) and float(factor.detach().min()) > 0
+    assert float(field.prior().detach()) > 0
+
+
+def test_the_density_of_another_body_is_refused(tmp_path):
+    x = torch.rand(50, 3)
+    RelativeDensity(x, torch.ones(50), 0.2).save(tmp_path / "density.safetensors")
+    with pytest.raises(UserError, match="of another body"):
+        RelativeDensity(3 * x, torch.ones(50), 0.2).load(tmp_path / "density.safetensors")
 
 
 class Drag(EffectSource):

@@ -1,5 +1,6 @@
 """Tiny filmed bodies for the tests of Stage II, made in memory: a ball or box under a classical law, seen by three cameras."""
 
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from neuido.data.visual import Truth, VisualScene
 from neuido.data.visual_module import OneByOne, Turns, in_order
 from neuido.models.gaussians import deform, harmonics_of, save_ply
 from neuido.models.splatting import render
+from neuido.physics.effects import Effects
 from neuido.physics.laws import material
 from neuido.physics.mpm import Simulator
 from neuido.types import Gaussians, MultiViewBatch, Scene, Walls
@@ -33,8 +35,9 @@ def tiny_scene(
     poisson: float = 0.25,
     dt: float = 2e-3,
     plasticity: dict | None = None,
+    density: Callable[[torch.Tensor], torch.Tensor] | None = None,
 ) -> VisualScene:
-    """The last view is held out."""
+    """The last view is held out. `density`: the true relative density at points (P, 3), of which the scene's body knows nothing."""
     scene = Scene(cells=16, dt=dt, walls=Walls(friction=float("inf")))
     options = {"spacing": spacing, "velocity": velocity, "angular_velocity": spin, "jitter": 0.5}
     if shape == "ball":
@@ -47,7 +50,9 @@ def tiny_scene(
         law["elasticity"]["law"] = "sigma"
     simulator = Simulator(scene, body)
     with torch.no_grad():
-        motion = simulator.rollout((frames - 1) * every, *material(law["elasticity"], law["plasticity"]), every=every)
+        effects = None if density is None else Effects(relative_density=density(body.x))
+        laws = material(law["elasticity"], law["plasticity"])
+        motion = simulator.rollout((frames - 1) * every, *laws, effects=effects, every=every)
     generator = torch.Generator().manual_seed(len(name) + int(young))
     waves = 25 * torch.randn(3, 3, generator=generator)
     colours = (0.5 + 0.4 * torch.sin(body.x @ waves)).clamp(0, 0.9)

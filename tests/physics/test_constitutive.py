@@ -330,6 +330,7 @@ def test_gradients_of_the_material_reach_the_parameters():
         (Effects(hysteresis=torch.tensor([0.1, float("nan")])), None, "hysteresis is nan"),
         (Effects(stiffness=torch.tensor([1.0, 0.0])), None, "must be positive"),
         (Effects(stiffness=torch.ones(3)), None, "give one factor for each"),
+        (Effects(relative_density=torch.tensor([-1.0, 1.0])), None, "relative_density is -1 somewhere"),
         (Effects(strain_stiffening=torch.ones(3)), None, "3 rows for 2 scenes"),
     ],
 )

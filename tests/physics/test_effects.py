@@ -256,6 +256,38 @@ def test_a_uniform_stiffness_is_another_young_s_modulus(plastic):
     assert float((a.x - drop(None, **laws(5e4)).x).abs().max()) > 1e-3
 
 
+@pytest.mark.parametrize("plastic", [False, True])
+def test_a_relative_density_is_a_body_of_other_volumes(plastic):
+    scene, body = busy_scenes()[0][0], busy_scenes()[1][0]
+    laws = FixedCorotated(5e4, 0.3), VonMises(2e3, 5e4, 0.3) if plastic else None
+    factor = 0.3 + 2 * torch.rand(len(body.x), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    other = Simulator(scene, body._replace(volume=body.volume * factor), dtype=torch.float64, device=DEVICE)
+    expected = other.rollout(60, *laws, every=60)
+    sim = Simulator(scene, body, dtype=torch.float64, device=DEVICE)
+    frames = sim.rollout(60, *laws, effects=Effects(relative_density=factor), every=60)
+    assert float((frames.x - expected.x).abs().max()) < 1e-10
+    assert float((frames.x - sim.rollout(60, *laws, every=60).x).abs().max()) > 1e-4
+
+    def gradient(run):
+        leaf = factor.clone().to(DEVICE).requires_grad_()
+        x = run(12, *laws, effects=Effects(relative_density=leaf), every=12).x
+        weights = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype).to(x.device)
+        return torch.autograd.grad((x * weights).sum(), leaf)[0]
+
+    fast, slow = gradient(sim.rollout), gradient(lambda *a, **k: reference.rollout(sim, *a, **k))
+    assert float((fast - slow).norm()) <= 1e-9 * float(slow.norm()) and float(slow.norm()) > 0
+
+
+def test_waves_of_a_relative_density_are_no_faster():
+    body = block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (4, 4, 4))
+    sim = Simulator(Scene(cells=16, dt=1e-2, gravity=(0.0, 0.0, 0.0)), body, dtype=torch.float64, device=DEVICE)
+    factor = torch.ones(64)
+    factor[7], factor[9] = 9.0, 0.1
+    sim.rollout(1, SOFT, effects=Effects(relative_density=factor))
+    with pytest.raises(UserError, match="lower `dt`"):
+        sim.rollout(1, SOFT, effects=Effects(relative_density=factor, stiffness=factor.clamp(min=1.0)))
+
+
 def test_yield_leaves_a_dent():
     elastic, plastic = drop(None), drop(Effects(yield_inverse=1 / 3e3))
     heights = [float(frames.x[-1, :, 1].amax() - frames.x[-1, :, 1].amin()) for frames in (elastic, plastic)]
