@@ -107,7 +107,8 @@ def test_command_line_accepts_the_runs_of_a_sweep(path, run, capsys, monkeypatch
         printed += out
     for name, value in run.parameters.items():
         if name != "config" and not isinstance(value, list):
-            assert re.search(rf"[.:\- ]{re.escape(str(value))}$", printed, flags=re.MULTILINE), value
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            assert re.search(rf"[.:\- ]{re.escape(text)}$", printed, flags=re.MULTILINE), value
 
 
 def test_the_first_table_has_every_method():
