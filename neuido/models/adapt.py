@@ -19,7 +19,7 @@ from neuido.models.methods import CARD, Method, scalars
 from neuido.models.pipeline import Laws, Prepared, folder_of, prepare, roll_surely
 from neuido.models.progress import Progress, restore
 from neuido.models.relative_density import RelativeDensity
-from neuido.models.scene_fit import EffectSource, SceneFit
+from neuido.models.scene_fit import DENSITY, EffectSource, SceneFit
 from neuido.types import ParticleState
 
 GIGABYTE = 1e9
@@ -124,10 +124,10 @@ class AdaptModule(FilmedModule):
         encoder = self.plan.encoder.to(device) if watched and self.plan.encoder is not None else None
         return prepare(scene, encoder, device=device, encoder_views=self.hparams.encoder_views, cache=self.hparams.cache)
 
-    def new_fit(self, prepared: Prepared) -> SceneFit:
-        """A fit that has not begun."""
+    def new_fit(self, prepared: Prepared, uneven: bool = False) -> SceneFit:
+        """A fit that has not begun; `uneven`: with a density, whatever the option says."""
         density = None
-        if self.hparams.estimate_density:
+        if self.hparams.estimate_density or uneven:
             simulator = prepared.simulator
             density = RelativeDensity(simulator.state.x, simulator.volume, simulator.scenes[0].dx)
         method = self.plan.for_scene(prepared)
@@ -371,9 +371,11 @@ class AdaptModule(FilmedModule):
         if scene.name in self._names:
             return self.open_scene(scene, self.device, watched=False), self.fit_of(scene.name)
         prepared = self.open_scene(scene, self.device, watched=True)
-        fit = self.new_fit(prepared)
-        if self.hparams.adapter is not None:
-            fit.load(self._folder_of_fit(scene.name))
+        if self.hparams.adapter is None:
+            return prepared, self.new_fit(prepared)
+        folder = self._folder_of_fit(scene.name)
+        fit = self.new_fit(prepared, uneven=(folder / DENSITY).is_file())
+        fit.load(folder)
         return prepared, fit
 
     def _folder_of_fit(self, name: str) -> Path:

@@ -52,7 +52,9 @@ class SceneFit(nn.Module):
         """`Method.roll` from the start of this fit."""
         effects = None if self.effects is None else self.effects.of(scene)
         if self.density is not None:
-            effects = (Effects() if effects is None else effects)._replace(relative_density=self.density())
+            effects, own = Effects() if effects is None else effects, self.density()
+            given = effects.relative_density
+            effects = effects._replace(relative_density=own if given is None else given * own)
         return self.method.roll(scene, frames, state=self.start(scene.simulator), effects=effects, segment=segment)
 
     def start(self, simulator: Simulator) -> ParticleState | None:
@@ -87,7 +89,7 @@ class SceneFit(nn.Module):
             UserError: As `Method.load` and `RelativeDensity.load`; a file without `twist`.
         """
         self.method.load(folder)
-        if self.density is not None:
+        if self.density is not None and (folder / DENSITY).is_file():
             self.density.load(folder / DENSITY)
         if (folder / START).is_file():
             found = read_tensors(folder / START).get("twist")

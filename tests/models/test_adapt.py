@@ -139,9 +139,11 @@ def test_an_uneven_filling_is_found(tmp_path):
     assert float(rows_of(tmp_path / "even" / "scores.csv")[-1]["rmse"]) > 0.9 * float(before["rmse"])
     found = model.fit_of("tiny").density().detach()
     assert float(torch.corrcoef(torch.stack([found, true]))[0, 1]) > 0.6
-    again = module(tmp_path, adapter=str(tmp_path / "out"), estimate_density=True, **known)
+    again = module(tmp_path, adapter=str(tmp_path / "out"), **known)  # what was fitted is kept, whatever the option says
     _, loaded = again.load_fit(scene)
     assert torch.equal(loaded.density(), found)
+    _, plain = module(tmp_path, adapter=str(tmp_path / "even"), estimate_density=True, **known).load_fit(scene)
+    assert float(plain.density().detach().std()) == 0
 
 
 def test_a_density_is_a_smooth_field_of_mean_one():
