@@ -47,6 +47,7 @@ class AdaptModule(FilmedModule):
         velocity_frames: Frames that these steps see.
         estimate_density: Estimate how densely the body is filled, which no first frame shows (`models.relative_density`); paper: no.
         density_lr: Its rate, of the logarithm a step.
+        density_from: Share of the steps before it joins the law, which then has the large part of the motion to itself.
         density_weight: Of its mean square logarithm: pulls it to an even filling.
         stop_on: When to end a scene early: `none`, `loss` (no lower loss on all training views), `view` (no lower loss on the last
             training view, which is then not trained on). The best parameters are kept.
@@ -79,6 +80,7 @@ class AdaptModule(FilmedModule):
         velocity_frames: int = 8,
         estimate_density: bool = False,
         density_lr: float = 0.03,
+        density_from: float = 0.0,
         density_weight: float = 1e-3,
         stop_on: Literal["none", "loss", "view"] = "none",
         patience: int = 20,
@@ -98,6 +100,8 @@ class AdaptModule(FilmedModule):
         weights = {"image_weight": image_weight, "silhouette_weight": silhouette_weight, "velocity_lr": velocity_lr}
         weights |= {"density_lr": density_lr, "density_weight": density_weight}
         filmed.check_options(counts, weights, curriculum, curriculum_share)
+        if not 0 <= density_from <= 1:
+            raise UserError(f"model.density_from = {density_from}: it is a share of the steps, from 0 to 1")
         if image_weight + silhouette_weight == 0:
             raise UserError("model.image_weight and silhouette_weight are both 0: nothing would be compared")
         if fit_frames == 1 or velocity_frames < 2:
@@ -168,13 +172,13 @@ class AdaptModule(FilmedModule):
     def configure_optimizers(self) -> torch.optim.Optimizer | None:
         groups = []
         for i, fit in enumerate(self.fits):
-            own = [{**group, "of": i, "start_lr": group["lr"], "twist": False} for group in fit.method.parameter_groups()]
+            own = [{**group, "of": i, "start_lr": group["lr"], "first": self.ahead} for group in fit.method.parameter_groups()]
             if fit.twist is not None:
                 rate = self.hparams.velocity_lr
-                own.append({"params": [fit.twist], "lr": rate, "of": i, "start_lr": rate, "twist": True})
+                own.append({"params": [fit.twist], "lr": rate, "of": i, "start_lr": rate, "first": 0})
             if fit.density is not None:
-                rate = self.hparams.density_lr
-                own.append({"params": list(fit.density.parameters()), "lr": rate, "of": i, "start_lr": rate, "twist": False})
+                rate, first = self.hparams.density_lr, self.ahead + round(self.hparams.density_from * self.steps)
+                own.append({"params": list(fit.density.parameters()), "lr": rate, "of": i, "start_lr": rate, "first": first})
             groups += own
         return self.plan.optimizer(groups) if groups and self.ahead + self.steps else None
 
@@ -276,8 +280,7 @@ class AdaptModule(FilmedModule):
         share = step / ahead if step < ahead else (step - ahead) / max(1, self.steps)
         factor = progress.damping * self.fit_of(name).method.rate(share)
         for group in optimizer.param_groups:
-            waits = step < ahead and not group["twist"]
-            group["lr"] = 0.0 if waits or group["of"] != self._names.index(name) else factor * group["start_lr"]
+            group["lr"] = 0.0 if step < group["first"] or group["of"] != self._names.index(name) else factor * group["start_lr"]
 
     @plainly
     def _look(self, prepared: Prepared, progress: Progress) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from lightning.pytorch import Trainer, seed_everything
+from lightning.pytorch.callbacks import LambdaCallback
 from safetensors.torch import load_file
 
 from neuido.errors import UserError
@@ -144,6 +145,18 @@ def test_an_uneven_filling_is_found(tmp_path):
     assert torch.equal(loaded.density(), found)
     _, plain = module(tmp_path, adapter=str(tmp_path / "even"), estimate_density=True, **known).load_fit(scene)
     assert float(plain.density().detach().std()) == 0
+
+
+@pytest.mark.parametrize(("since", "moved"), [(0.0, True), (0.5, True), (1.0, False)])
+def test_a_density_waits_for_its_share_of_the_steps(tmp_path, since, moved):
+    data = TinyScenes(str(tmp_path))
+    model = module(tmp_path, estimate_density=True, density_from=since, steps=4, curriculum=[])
+    seen = []
+    watch = LambdaCallback(on_train_batch_start=lambda *_: seen.append(float(model.fits[0].density().detach().std())))
+    trainer(tmp_path, callbacks=[watch]).fit(model, data)
+    waited = min(4, round(4 * since) + 1)
+    assert seen[:waited] == [0.0] * waited
+    assert (float(model.fits[0].density().detach().std()) > 0) is moved
 
 
 def test_a_density_is_a_smooth_field_of_mean_one():
@@ -348,6 +361,7 @@ def test_uneven_frames_and_segments(tmp_path, segment):
         ({"fit_frames": 1}, "fit_frames"),
         ({"image_weight": 0.0, "silhouette_weight": 0.0}, "silhouette_weight"),
         ({"curriculum": [2.0]}, "curriculum"),
+        ({"density_from": 1.5}, "density_from"),
         ({"patience": 0}, "patience"),
         ({"segment": -1}, "segment"),
         ({"image_weight": float("nan")}, "image_weight"),
