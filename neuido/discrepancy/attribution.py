@@ -15,6 +15,7 @@ from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import ALPHA, WITHIN, Inference
 from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
+from neuido.physics.effect_library import LIMITS
 
 __all__ = [
     "ALPHA",
@@ -227,10 +228,15 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
 
 
 def simpler(r: Round, chosen: Trial) -> list[Trial]:
-    """The best trials of a round that have fewer parameters than the chosen one, are no members, and came close to it."""
+    """What may take the chosen one's place: the best trials with fewer parameters that came close to it, and what it is in a limit.
+
+    A limit need not come close: what the force of many parameters gained beyond it may be the other effect's.
+    """
     sizes, limit = len(chosen.candidate.size_parameters), chosen.score + 2.0 * math.log(CLOSE)
-    others = [t for t in r.trials if t not in r.members and len(t.candidate.size_parameters) < sizes and t.score < limit]
-    return sorted((t for t in others if not unphysical(t.candidate, t.fit.point)), key=lambda t: t.penalised)[:LOOKED_AHEAD]
+    others = [t for t in r.trials if t not in r.members and not unphysical(t.candidate, t.fit.point)]
+    narrower = [t for t in others if t.candidate.name in LIMITS.get(chosen.candidate.name, ())]
+    fewer = [t for t in others if t not in narrower and len(t.candidate.size_parameters) < sizes and t.score < limit]
+    return narrower + sorted(fewer, key=lambda t: t.penalised)[:LOOKED_AHEAD]
 
 
 def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:

@@ -30,6 +30,8 @@ class Entry(NamedTuple):
     """Where it shows: flight, rotation, internal modes, contact, rest or power."""
     confusions: tuple[str, ...]
     source: str
+    limits: tuple[str, ...] = ()
+    """Effects with fewer parameters that it becomes at an end of its range."""
 
 
 def _vector(field: str, unit: str, size: float, names: str = "xyz") -> tuple[Parameter, ...]:
@@ -90,6 +92,7 @@ LIBRARY = (
         "flight",
         ("uniform_acceleration", "gravity"),
         "Hooke; the first term of a magnet's field gradient",
+        limits=("uniform_acceleration",),
     ),
     Entry(
         "time_force",
@@ -101,6 +104,7 @@ LIBRARY = (
         "flight",
         ("uniform_acceleration",),
         "Newton's second law in a shaken frame",
+        limits=("uniform_acceleration",),
     ),
     Entry(
         "viscosity_shear",
@@ -128,6 +132,7 @@ LIBRARY = (
         "internal modes",
         ("viscosity_shear", "hysteresis"),
         "Maxwell 1867; Simo and Hughes, Computational Inelasticity, 10",
+        limits=("viscosity_shear",),
     ),
     Entry(
         "hysteresis",
@@ -277,3 +282,6 @@ LIBRARY = (
     ),
 )
 """One entry for each effect, in the order of the vocabulary by kind."""
+
+LIMITS = {entry.name: entry.limits for entry in LIBRARY}
+"""What each effect becomes at an end of its range."""

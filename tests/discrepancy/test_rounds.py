@@ -292,7 +292,8 @@ def test_a_class_is_weighed_again_beside_what_was_found_later():
     assert reasons["chord"].startswith("with all effects that were found it leaves")
 
 
-def test_a_simpler_effect_takes_the_place_of_one_that_stood_for_two():
+def standing_for_two() -> Problem:
+    """Two tones, and a candidate `chord` of two parameters that stands for both but for a third tone of its own."""
     problem = Tones(lambda t: 3.0 * t + 0.5 * np.sin(40 * t) + 0.25 * np.sin(62 * t), "low", "high")
     both = tuple(Parameter(f"chord.{name}", "1", 0.0, 0.1, -5.0, 5.0) for name in ("c", "d"))
     broad = Candidate("chord", both, ({"chord.c": 0.1, "chord.d": 0.1},), "flight")
@@ -304,9 +305,20 @@ def test_a_simpler_effect_takes_the_place_of_one_that_stood_for_two():
         return rows + np.stack([p.get("chord.c", 0.0) * low + p.get("chord.d", 0.0) * more for p in points])
 
     problem.__dict__.update(candidates=(*problem.candidates, broad), predict=predict)
-    found = diagnose(problem)
+    return problem
+
+
+def test_a_simpler_effect_takes_the_place_of_one_that_stood_for_two():
+    found = diagnose(standing_for_two())
     assert sorted(t.candidate.name for t in found.effects) == ["high", "low"]
     assert found.rounds[0].trials[0].candidate.name == "chord"  # the best one alone
+
+
+def test_a_limit_of_an_effect_takes_its_place_however_far_it_was_alone(monkeypatch):
+    monkeypatch.setattr(attribution, "CLOSE", 1.0)  # nothing else is close
+    assert "chord" in [t.candidate.name for t in diagnose(standing_for_two()).effects]
+    monkeypatch.setitem(attribution.LIMITS, "chord", ("low",))
+    assert sorted(t.candidate.name for t in diagnose(standing_for_two()).effects) == ["high", "low"]
 
 
 def test_an_effect_that_was_found_last_is_dropped_too():

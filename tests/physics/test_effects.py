@@ -347,7 +347,7 @@ def test_the_library_has_the_vocabulary():
     stages = {"flight", "rotation", "internal modes", "contact", "rest", "power"}
     for entry in LIBRARY:
         assert entry.stage in stages and entry.source and entry.equation
-        assert set(entry.confusions) <= set(names) - {entry.name}
+        assert set(entry.limits) <= set(entry.confusions) <= set(names) - {entry.name}
         for p in entry.parameters:
             assert p.field in Effects._fields and p.low < p.high and p.signed == (p.low < 0.0)
 
