@@ -75,13 +75,15 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         form: str = "",
         sizes: str = "",
         linear: bool = True,
+        apart: str = "",
     ):
         made = tuple(
             Parameter(f"{name}.{key}", unit, 0.0 if not sizes or key in sizes.split() else starts[0][key], scale, low, high, log=log)
             for key, unit, scale, low, high, log in parameters
         )
         named = tuple({f"{name}.{k}": v for k, v in start.items()} for start in starts)
-        out.append(Candidate(name, made, named, where, form, tuple(f"{name}.{k}" for k in sizes.split()), linear))
+        own = tuple(f"{name}.{k}" for k in sizes.split())
+        out.append(Candidate(name, made, named, where, form, own, linear, apart and f"{name}.{apart}"))
 
     def vector(keys: Sequence[str], unit: str, scale: float, high: float) -> list[tuple]:
         return [(key, unit, scale, -high, high, False) for key in keys]
@@ -99,9 +101,9 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     centre = np.nanmean(experiment.recordings[0].x.numpy(), axis=(0, 1))
     places = dict(zip("xyz", map(float, centre), strict=True))
     # a pull to a far centre is a uniform force first of all, and from a centre in the body a fit ends there
-    centres = [places, *(places | {a: c + 2 * s.length} for a, c in places.items())]
+    centres = [places, *(places | {a: c + far * s.length} for a, c in places.items() for far in (2, -2))]
     add("position_force", "flight", [{"k": k, **c} for c in centres], ("k", "1/s^2", k, -40 * k, 40 * k, False),
-        *[(a, "m", s.length, c - 20 * s.length, c + 20 * s.length, False) for a, c in places.items()], sizes="k")  # fmt: skip
+        *[(a, "m", s.length, c - 20 * s.length, c + 20 * s.length, False) for a, c in places.items()], sizes="k", apart="k")  # fmt: skip
     knots = [f"{a}{j}" for j in range(KNOTS) for a in "xyz"]
     add("time_force", "flight", [dict.fromkeys(knots, 0.1 * g)], *vector(knots, "m/s^2", 0.1 * g, 2 * g))
     waves = ("sx", "sy", "sz", "cx", "cy", "cz")

@@ -65,6 +65,8 @@ class Candidate:
     """Names of the parameters whose zero is the effect's absence; the others give its shape. Empty: all are."""
     linear: bool = True
     """Whether small sizes act in proportion; a yield stress does not."""
+    apart: str = ""
+    """A size whose sign no fit changes, for at zero the effect's shape has no meaning: fits begin on either side."""
 
     @property
     def key(self) -> str:

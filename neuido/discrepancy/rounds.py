@@ -107,6 +107,8 @@ class Inference(Contests):
                     starts.append((c, begin | self.as_declared, None))
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
                 starts.append((c, begin, None))
+            elif c.apart and c.key in chosen and all(begin[c.apart] * s[1][c.apart] < 0 for s in starts if s[0].key == c.key):
+                starts.append((c, begin, None))
         finite = {c.key for _, c, *_ in ranked}
         for c in candidates if first else ():
             # what cannot run where the base fit went, or does nothing there, may do so where the model was declared

@@ -321,6 +321,25 @@ def test_a_limit_of_an_effect_takes_its_place_however_far_it_was_alone(monkeypat
     assert sorted(t.candidate.name for t in diagnose(standing_for_two()).effects) == ["high", "low"]
 
 
+@pytest.mark.parametrize("apart", ["pull.k", ""])
+def test_a_size_whose_sign_no_fit_changes_is_fitted_from_either_side(apart):
+    """k (c f - g), which has a place: the best linear start has the wrong k, and on the way to the other sign c would pass infinity."""
+    k, c = Parameter("pull.k", "1", 0.0, 0.3, -5.0, 5.0), Parameter("pull.c", "1", 0.1, 1.0, -20.0, 20.0)
+    starts = {"pull.k": 1.0, "pull.c": 2.0}, {"pull.k": 1.0, "pull.c": 0.1}
+    problem = Line(lambda t: 3.0 * t + 0.2 * (-5.0 * np.sin(40 * t) - np.sin(62 * t)), wiggle=0.0)
+    plain = problem.predict
+
+    def predict(points, recording, setting=0):
+        own = [p.get("pull.k", 0.0) * (p.get("pull.c", 0.0) * np.sin(40 * T) - np.sin(62 * T)) for p in points]
+        return plain(points, recording, setting) + np.stack(own)
+
+    pull = Candidate("pull", (k, c), starts, "flight", sizes=("pull.k",), apart=apart)
+    problem.__dict__.update(candidates=(*problem.candidates, pull), predict=predict)
+    after = diagnose(problem).after
+    right = after.get("pull.k") == pytest.approx(0.2, abs=0.01) and after["pull.c"] == pytest.approx(-5.0, abs=0.3)
+    assert right is bool(apart), after
+
+
 def test_an_effect_that_was_found_last_is_dropped_too():
     problem = Tones(lambda t: 3.0 * t + 0.5 * np.sin(40 * t), "low", "high")
     inference = Inference(problem)
