@@ -127,7 +127,8 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     add("stiffness_gradient", "internal modes", [dict.fromkeys("xyz", 0.6)], *vector("xyz", "1", 0.4, 5.0), form="gradient")
     add("stiffness_gradient", "internal modes", _places(experiment, s.length), ("log_ratio", "1", 0.5, -4.0, 4.0, False),
         *[(a, "m", 0.1 * s.length, -0.6 * s.length, 0.6 * s.length, False) for a in ("cx", "cy", "cz")],
-        ("radius", "m", 0.15, 0.08 * s.length, 0.8 * s.length, True), form="inclusion", sizes="log_ratio")  # fmt: skip
+        ("radius", "m", 0.15, 0.08 * s.length, 0.8 * s.length, True), form="inclusion", sizes="log_ratio",
+        apart="log_ratio")  # fmt: skip
     if plastic != "drucker_prager":
         add("strain_stiffening", "internal modes", [{"k": 1.0}], ("k", "1", 1.0, -1.0, 60.0, False))
         add("second_invariant", "internal modes", [{"c": 0.3}], ("c", "1", 0.3, -0.5, 5.0, False))
