@@ -99,9 +99,7 @@ class AdaptModule(FilmedModule):
         counts |= {"views_per_step": views_per_step, "encoder_views": encoder_views}
         weights = {"image_weight": image_weight, "silhouette_weight": silhouette_weight, "velocity_lr": velocity_lr}
         weights |= {"density_lr": density_lr, "density_weight": density_weight}
-        filmed.check_options(counts, weights, curriculum, curriculum_share)
-        if not 0 <= density_from <= 1:
-            raise UserError(f"model.density_from = {density_from}: it is a share of the steps, from 0 to 1")
+        filmed.check_options(counts, weights, {"curriculum_share": curriculum_share, "density_from": density_from}, curriculum)
         if image_weight + silhouette_weight == 0:
             raise UserError("model.image_weight and silhouette_weight are both 0: nothing would be compared")
         if fit_frames == 1 or velocity_frames < 2:

@@ -97,7 +97,7 @@ class AlignModule(FilmedModule):
             raise UserError(f"model.lr = {lr}: it must be positive")
         counts = {"views_per_step": views_per_step, "encoder_views": encoder_views, "segment": segment, "baselines": baselines}
         weights = {"silhouette_weight": silhouette_weight, "prior_weight": prior_weight, "plausibility_weight": plausibility_weight}
-        check_options(counts, weights, curriculum, curriculum_share)
+        check_options(counts, weights, {"curriculum_share": curriculum_share}, curriculum)
         self.save_hyperparameters()
         flow = {"flow_size": flow_size, "flow_encoding": flow_encoding, "speed_scale": speed_scale}
         sizes = {"width": width, "heads": heads, "conditions": conditions, "dropout": dropout}

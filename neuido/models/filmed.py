@@ -32,7 +32,7 @@ def plainly(method: Callable) -> Callable:
     return run
 
 
-def check_options(counts: dict[str, int], weights: dict[str, float], curriculum: Sequence[float], curriculum_share: float) -> None:
+def check_options(counts: dict[str, int], weights: dict[str, float], shares: dict[str, float], curriculum: Sequence[float]) -> None:
     """Refuse options that are negative, or shares that are none.
 
     Raises:
@@ -41,8 +41,11 @@ def check_options(counts: dict[str, int], weights: dict[str, float], curriculum:
     for name, value in {**counts, **weights}.items():
         if not value >= 0:
             raise UserError(f"model.{name} = {value}: it must not be negative")
-    if not all(0 < share <= 1 for share in curriculum) or not 0 <= curriculum_share <= 1:
-        raise UserError(f"model.curriculum = {curriculum} and curriculum_share = {curriculum_share} must be shares, from 0 to 1")
+    for name, value in shares.items():
+        if not 0 <= value <= 1:
+            raise UserError(f"model.{name} = {value}: it must be a share, from 0 to 1")
+    if not all(0 < share <= 1 for share in curriculum):
+        raise UserError(f"model.curriculum = {curriculum}: each must be a share, above 0 and up to 1")
 
 
 def frames_at(done: float, frames: int, curriculum: Sequence[float], curriculum_share: float) -> int:

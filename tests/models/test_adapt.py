@@ -361,6 +361,7 @@ def test_uneven_frames_and_segments(tmp_path, segment):
         ({"fit_frames": 1}, "fit_frames"),
         ({"image_weight": 0.0, "silhouette_weight": 0.0}, "silhouette_weight"),
         ({"curriculum": [2.0]}, "curriculum"),
+        ({"curriculum_share": 1.5}, "curriculum_share"),
         ({"density_from": 1.5}, "density_from"),
         ({"patience": 0}, "patience"),
         ({"segment": -1}, "segment"),
