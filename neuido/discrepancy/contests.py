@@ -74,12 +74,13 @@ class Contests(Laboratory):
 
     def contest(
         self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], floor: Floor
-    ) -> dict[str, tuple[Candidate, Fit]]:
-        """The best fit of each candidate; fits that cannot catch up with the best one stop.
+    ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
+        """The best fit of each candidate, fits that cannot catch up with the best one stop; and the leading one's of the other sign.
 
         Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all.
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
+        ended: list[tuple[Candidate, Fit]] = []
         race = Race()
         small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
         first = list(dict.fromkeys(small))[:LEADERS]
@@ -96,9 +97,28 @@ class Contests(Laboratory):
             for c, begin, J in own:
                 sizes = [p.name for p in c.size_parameters] if c.linear else []
                 requests.append(self.request((*free, *c.parameters), begin, race=race, slopes=J, sizes=sizes))
-            fits = self.fits(requests, floor)
-            best |= better(zip((c for c, *_ in own), fits, strict=True), best)
-        return best
+            fits = list(zip((c for c, *_ in own), self.fits(requests, floor), strict=True))
+            ended += fits
+            best |= better(fits, best)
+        return best, self.other_sign(free, best, ended, floor)
+
+    def other_sign(
+        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], ended: Sequence[tuple[Candidate, Fit]], floor: Floor
+    ) -> tuple[Candidate, Fit] | None:
+        """The leading candidate's best fit of the other sign, where its signs are apart.
+
+        A stiff end of a body is much like a soft rest of it, and the one that comes down faster has the other given up: it goes on alone.
+        """
+        if not best:
+            return None
+        lead, first = min(best.values(), key=lambda entry: entry[1].cost)
+        beyond = [fit for c, fit in ended if lead.apart and c.key == lead.key and fit.point[lead.apart] * first.point[lead.apart] < 0]
+        if not beyond:
+            return None
+        fit = min(beyond, key=lambda fit: fit.cost)
+        if not fit.converged and np.isfinite(fit.cost):
+            (fit,) = self.fits([self.request((*free, *lead.parameters), fit.point)], floor)
+        return lead, fit
 
     def polish(
         self,
@@ -107,12 +127,14 @@ class Contests(Laboratory):
         base: Fit,
         floor: Floor,
         rival: Round | None = None,
+        other: tuple[Candidate, Fit] | None = None,
     ) -> dict[str, tuple[Candidate, Fit]]:
         """The best fits once more, from where they ended, from the declared values, and from those of the very best one.
 
         The base fit may have led all of them astray, and its weights too, for the settings differ most where the model is wrong: each is
         weighed by the floor where it stands. Which end is the best one is said by the errors, for weights differ. Where `rival`, the round
-        of another solver, named an effect that leaves far less than any of them, none is refined.
+        of another solver, named an effect that leaves far less than any of them, none is refined. `other`, the leading candidate's fit of
+        the other sign, is refined beside it.
         """
         ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
         within = [entry for entry in ranked if entry[1].cost < IN_REACH * ranked[0][1].cost]
@@ -129,6 +151,9 @@ class Contests(Laboratory):
         self.tell(f"refining {', '.join(ends)} of {self.typical(before):.3g} {self.problem.unit}")
         leading = ranked[0][1].point
         out: dict[str, tuple[Candidate, Fit]] = {}
+        least: dict[str, float] = {}
+        if other is not None and other[1].cost < IN_REACH * ranked[0][1].cost:
+            top.append(other)
         for c, fit in top:
             if not self.runs(fit.point):  # there is no floor there
                 continue
@@ -147,7 +172,10 @@ class Contests(Laboratory):
                 found, own = further, there
                 if further.converged and gained < 2.0 * SOME_GAIN:
                     break
-            out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
+            left = score(self.mean_squares([found.point], own, fitted=True)[0])
+            if left < least.get(c.key, math.inf):
+                least[c.key] = left
+                out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
         return out
 
     def from_here(self, free: Sequence[Parameter], fit: Fit, starts: Sequence[Point], like: Floor) -> tuple[Fit, Floor]:

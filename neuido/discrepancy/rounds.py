@@ -117,8 +117,8 @@ class Inference(Contests):
                 chosen[c.key] = 0
                 starts.append((c, base.point | self.as_declared | dict(c.starts[0]), None))
         self.tell(f"fitting {', '.join(chosen)}")
-        best = self.contest(free, starts, floor)
-        best |= self.polish(free, best, base, floor, rival)
+        best, other = self.contest(free, starts, floor)
+        best |= self.polish(free, best, base, floor, rival, other)
         best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
         floors = self.floors(base.point, free, floor)
         model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)

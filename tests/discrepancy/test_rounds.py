@@ -9,7 +9,7 @@ from scipy.stats import t as student
 from neuido.discrepancy import attribution, contests, rounds
 from neuido.discrepancy.answer import rejected, trace
 from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
-from neuido.discrepancy.fit import Fit, levenberg_marquardt, run
+from neuido.discrepancy.fit import Fit, Race, levenberg_marquardt, run
 from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import GAIN_IN_FLOOR, GAIN_TO_NOISE, LEAST_GAIN, Inference
@@ -554,3 +554,34 @@ def test_a_fit_goes_on_until_it_has_come_to_its_end(converged, monkeypatch):
     out = inference.polish(inference.problem.declared, {"square": (square, fit)}, start.fit, start.floor)
     assert len(asked) == (2 if converged else 1 + contests.ONWARD)
     assert out["square"][1].point["square.c"] == (1.66 if converged else 1.762)
+
+
+class Folded(Line):
+    """A line and one candidate whose signs are two effects: c t^2 above zero and -c t^3 below."""
+
+    def __init__(self, y):
+        super().__init__(y, wiggle=0.0)
+        size = Parameter("fold.c", "1", 0.0, 0.022, -5.0, 5.0)
+        self.__dict__["fold"] = Candidate("fold", (size,), ({"fold.c": 0.3},), "flight", apart="fold.c")
+
+    def predict(self, points, recording, setting=0):
+        c = np.array([[p.get("fold.c", 0.0)] for p in points])
+        return super().predict(points, recording, setting) + np.where(c > 0, c * T**2, -c * T**3)
+
+
+def test_the_other_sign_of_the_leading_candidate_is_followed_to_its_end(monkeypatch):
+    def lost(self, costs, left):
+        self.best = min(self.best, costs[-1])
+        return len(costs) > 2 and costs[-1] > 2.0 * self.best
+
+    monkeypatch.setattr(Race, "lost", lost)
+    inference = Inference(Folded(lambda t: 3.0 * t + 1.5 * t**3))
+    start, fold, free = inference.start(), inference.problem.fold, inference.problem.declared
+    starts = [(fold, {"a": 2.5, "fold.c": 2.1}, None), (fold, {"a": 3.5, "fold.c": -0.1}, None)]
+    best, other = inference.contest(free, starts, start.floor)
+    assert best["fold"][1].point["fold.c"] > 0  # it is far down while the other has hardly begun
+    assert other[1].point["fold.c"] == pytest.approx(-1.5, abs=0.05)
+    assert other[1].cost < 0.5 * best["fold"][1].cost
+    assert inference.polish(free, best, start.fit, start.floor, other=other)["fold"][1].point["fold.c"] == pytest.approx(-1.5, abs=0.05)
+    (alone, none) = inference.contest(free, starts[:1], start.floor)
+    assert alone["fold"][1].point["fold.c"] > 0 and none is None
