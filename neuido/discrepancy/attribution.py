@@ -46,6 +46,12 @@ FURTHER = 1.5
 """Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 LOOKED_AHEAD = 2
 """Effects that are tried with a second one, where none gains enough alone, or in the place of one with more parameters."""
+BLIND_GAIN = 2.0 * LEAST_GAIN
+"""What an effect must gain in the fitted recordings to be tried with a second one although it foretells nothing of those held out."""
+PROMISED = 0.6
+"""Share of the misfit that a second effect may leave, as the screening beside a member of a class predicts it, to be fitted there."""
+BESIDE = 3
+"""Members of a class beside which a second effect is looked for."""
 CLOSE = 2.5
 """Times the error of a chosen effect up to which one with fewer parameters is weighed again once others were found."""
 
@@ -123,6 +129,10 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         if problem.settings > 1 and times_over(at.errors, inference.floors(at.fit.point, free, at.floor)) < FURTHER:
             break
         rounds.append(inference.round(at.fit, at.floor, found))
+    if len(found) == 1 and (both := beside_members(inference, rounds, at)):
+        rounds = both
+        found = [r.chosen for r in both if r.chosen is not None]
+        at = inference.finished(found[-1].stand)
     if len(found) > 1:
         floor = inference.floor(at.fit.point)
         fit, found = drop(inference, at.fit, floor, found)
@@ -184,15 +194,60 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
     good = [t for t in first.trials if t.gain > inference.by_chance(first) and not unphysical(t.candidate, t.fit.point)]
     if first.over < _limit(inference.problem):  # it may all be the discretisation
         good = [t for t in good if t.gain > LEAST_GAIN]
-    for t in sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]:
+    bases = sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]
+    blind = fits_alone(inference, first, bases)
+    for t in (*bases, *blind):
         second = inference.round(t.fit, inference.stand(t.fit.point)[0], [t], most=MANY)
-        if second.chosen is not None and inference.gain(first.errors, second.chosen.errors) > 2.0 * LEAST_GAIN:
-            t.reason = ""
-            members = [other for other in good if inference.is_rival(other, t)]
-            for other in members:
-                other.reason = ""
-            return [replace(first, chosen=t, members=members), second]
+        if second.chosen is None or inference.gain(first.errors, second.chosen.errors) < 2.0 * LEAST_GAIN:
+            continue
+        if t in blind and times_over(second.chosen.errors, first.floors) > _limit(inference.problem):
+            continue
+        t.reason = ""
+        members = [t, *(other for other in good if other is not t and inference.is_rival(other, t))]
+        for other in members:
+            other.reason = ""
+        return [replace(first, chosen=t, members=members), second]
     return [first]
+
+
+def fits_alone(inference: Inference, first: Round, others: Sequence[Trial]) -> list[Trial]:
+    """The effect that fits the fitted recordings best, where it does so by far, is none of the others, and foretells nothing.
+
+    What fits in the place of two effects is off wherever these come in another proportion.
+    """
+    if first.over < _limit(inference.problem) or all(inference.fitted):
+        return []
+    fitted = [t for t in first.trials if np.isfinite(t.errors).all() and not unphysical(t.candidate, t.fit.point)]
+    if not fitted:
+        return []
+    best = min(fitted, key=lambda t: score(t.errors[inference.fitted]))
+    far = 0.5 * (score(first.errors[inference.fitted]) - score(best.errors[inference.fitted])) > BLIND_GAIN
+    return [best] if far and best not in others else []
+
+
+def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> list[Round]:
+    """Where a class was found and leaves more than noise: a member beside which a second effect is named, and the round of that one.
+
+    Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two. A member
+    is asked only where the screening beside it promises much; nothing is returned where none names one.
+    """
+    first = rounds[0]
+    if len(first.members) < 2 or first.chosen is None or inference.is_settled(at.errors):
+        return []
+    members = [t for t in sorted(first.members, key=lambda t: t.penalised) if len(t.candidate.parameters) <= MANY]
+    pairs: list[list[Round]] = []
+    for t in members[:BESIDE]:
+        if t is first.chosen and len(rounds) > 1:
+            continue
+        here = at if t is first.chosen else Stand(t.fit, *inference.stand(t.fit.point))
+        if inference.promised(here, t) > PROMISED:
+            continue
+        second = inference.round(here.fit, here.floor, [t], most=MANY)
+        if second.chosen is not None and inference.gain(at.errors, second.chosen.errors) > LEAST_GAIN:
+            pairs.append([replace(first, chosen=t), second])
+            if inference.is_noise(second.chosen.errors):
+                break
+    return min(pairs, key=lambda pair: pair[1].chosen.score, default=[])
 
 
 def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:

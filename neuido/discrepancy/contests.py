@@ -100,7 +100,10 @@ class Contests(Laboratory):
             fits = list(zip((c for c, *_ in own), self.fits(requests, floor), strict=True))
             ended += fits
             best |= better(fits, best)
-        return best, self.other_sign(free, best, ended, floor)
+        other = self.other_sign(free, best, ended, floor)
+        if other is not None and other[1].cost < best[other[0].key][1].cost:
+            best[other[0].key], other = other, best[other[0].key]
+        return best, other
 
     def other_sign(
         self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], ended: Sequence[tuple[Candidate, Fit]], floor: Floor

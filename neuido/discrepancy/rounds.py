@@ -18,7 +18,7 @@ from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Point, Problem
-from neuido.discrepancy.trials import Round, Trial, times_over, unphysical
+from neuido.discrepancy.trials import Round, Stand, Trial, times_over, unphysical
 
 ALPHA = 0.05
 """Family-wise level of a named effect."""
@@ -132,6 +132,13 @@ class Inference(Contests):
             result = self.judge(empty, best, model, list(chosen))
             self.tell(self.verdict(result))
         return result
+
+    def promised(self, at: Stand, beside: Trial) -> float:
+        """The least share of the misfit there that an effect of few parameters would leave, as the screening predicts it."""
+        candidates = [c for c in self.problem.candidates if c.name != beside.candidate.name and len(c.parameters) <= MANY]
+        slopes = self.slopes((*self.problem.declared, *beside.candidate.parameters), at.fit.point, self.scored_recordings)
+        ranked, _ = self.screen(at.fit.point, candidates, at.floor, slopes)
+        return min((stays for stays, *_ in ranked), default=1.0)
 
     def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel, asked: Sequence[str]) -> Round:
         """A round with the trials that fits make, and what is chosen of them; `asked` are the keys that were to be fitted."""

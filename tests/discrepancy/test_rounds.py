@@ -585,3 +585,54 @@ def test_the_other_sign_of_the_leading_candidate_is_followed_to_its_end(monkeypa
     assert inference.polish(free, best, start.fit, start.floor, other=other)["fold"][1].point["fold.c"] == pytest.approx(-1.5, abs=0.05)
     (alone, none) = inference.contest(free, starts[:1], start.floor)
     assert alone["fold"][1].point["fold.c"] > 0 and none is None
+
+
+class Mixed(Line):
+    """A line and tones; `shapes`: what each candidate does in the fitted recording and in the other one. `rest`: what none does."""
+
+    def __init__(self, shapes, truth, rest=0.0):
+        super().__init__(lambda t: 3.0 * t, wiggle=0.0)
+        own = [Candidate(n, (Parameter(f"{n}.c", "1", 0.0, 0.1, -5.0, 5.0),), ({f"{n}.c": 0.1},), "flight") for n in shapes]
+        self.__dict__ |= {"_shapes": shapes, "candidates": (*self.candidates, *own)}
+        added = [sum(c * shapes[name][n] for name, c in truth.items()) + rest for n in range(2)]
+        self.__dict__["recordings"] = tuple(replace(r, y=r.y + more) for r, more in zip(self.recordings, added, strict=True))
+
+    def predict(self, points, recording, setting=0):
+        own = [sum(p.get(f"{name}.c", 0.0) * both[recording] for name, both in self._shapes.items()) + 0.0 * T for p in points]
+        return super().predict(points, recording, setting) + np.stack(own)
+
+
+def names(found):
+    return sorted(t.candidate.name for t in found.effects)
+
+
+def test_what_fits_alone_and_foretells_nothing_is_tried_with_a_second_effect(monkeypatch):
+    """In the fitted recording one tone stands for both effects; in the other one they go apart."""
+    one, two, three = (np.sin(w * T) for w in (40, 62, 87))
+    shapes = {"low": (one, one), "high": (0.9 * one + 0.3 * two, -three)}
+    problem = Mixed(shapes, {"low": 0.5, "high": 0.5})
+    start = (inference := Inference(problem)).start()
+    alone = inference.round(start.fit, start.floor, [])
+    assert alone.chosen is None and alone.trials[0].gain < 0.2
+    found = diagnose(problem)
+    assert found.answer == "effect" and names(found) == ["high", "low"]
+    assert found.after["low.c"] == pytest.approx(0.5, abs=0.02) and found.after["high.c"] == pytest.approx(0.5, abs=0.02)
+    # what the two leave together must be near the floor
+    assert diagnose(Mixed(shapes, {"low": 0.5, "high": 0.5}, rest=0.1 * np.sin(75 * T))).answer == "unknown"
+    monkeypatch.setattr(attribution, "BLIND_GAIN", np.inf)
+    assert diagnose(problem).answer == "unknown"
+
+
+def test_a_second_effect_is_looked_for_beside_each_member_of_a_class(monkeypatch):
+    """`mix` comes nearest alone, and is neither of the two effects that are there."""
+    one, two, three = (np.sin(w * T) for w in (40, 62, 87))
+    shapes = {"low": one, "high": two, "mix": 0.9 * one + 0.2 * two + 0.15 * three}
+    problem = Mixed({name: (shape, shape) for name, shape in shapes.items()}, {"low": 0.9, "high": 0.3})
+    start = (inference := Inference(problem)).start()
+    alone = inference.round(start.fit, start.floor, [])
+    assert alone.chosen.candidate.name == "mix" and {t.candidate.name for t in alone.members} == {"low", "mix"}
+    found = diagnose(problem)
+    assert found.answer == "effect" and names(found) == ["high", "low"]
+    assert all(e == pytest.approx(NOISE, rel=0.2) for e in found.errors["after"].values())
+    monkeypatch.setattr(attribution, "PROMISED", 0.0)
+    assert names(diagnose(problem)) == ["mix"]
