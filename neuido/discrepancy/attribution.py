@@ -217,11 +217,12 @@ def fits_alone(inference: Inference, first: Round, others: Sequence[Trial]) -> l
     """
     if first.over < _limit(inference.problem) or all(inference.fitted):
         return []
-    fitted = [t for t in first.trials if np.isfinite(t.errors).all() and not unphysical(t.candidate, t.fit.point)]
-    if not fitted:
+    trials = [t for t in first.trials if np.isfinite(t.errors).all() and not unphysical(t.candidate, t.fit.point)]
+    if not trials:
         return []
-    best = min(fitted, key=lambda t: score(t.errors[inference.fitted]))
-    far = 0.5 * (score(first.errors[inference.fitted]) - score(best.errors[inference.fitted])) > BLIND_GAIN
+    fitted = inference.fitted
+    best = min(trials, key=lambda t: score(t.errors[fitted]))
+    far = math.log(times_over(first.errors[fitted], best.errors[fitted])) > BLIND_GAIN
     return [best] if far and best not in others else []
 
 
