@@ -233,7 +233,7 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
     is asked only where the screening beside it promises much; nothing is returned where none names one.
     """
     first = rounds[0]
-    if len(first.members) < 2 or first.chosen is None or inference.is_settled(at.errors):
+    if len(first.members) < 2 or inference.is_settled(at.errors):
         return []
     members = [t for t in sorted(first.members, key=lambda t: t.penalised) if len(t.candidate.parameters) <= MANY]
     pairs: list[list[Round]] = []

@@ -83,13 +83,8 @@ class Inference(Contests):
             most: Parameters that a candidate may have.
         """
         leaders = rival.leaders if rival is not None else None
-        taken = {t.candidate.name for t in found}
-        extra = tuple(p for t in found for p in t.candidate.parameters)
-        candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
+        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most)
         errors = self.mean_squares([base.point], floor)[0]
-        free = (*self.problem.declared, *extra)
-        slopes = self.slopes(free, base.point, self.scored_recordings)
-        ranked, columns = self.screen(base.point, candidates, floor, slopes)
         chosen: dict[str, int] = {}
         starts = []
         # what many parameters could fit says little of how near the others are
@@ -133,11 +128,17 @@ class Inference(Contests):
             self.tell(self.verdict(result))
         return result
 
+    def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float):
+        """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says."""
+        taken = {t.candidate.name for t in found}
+        candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
+        free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
+        slopes = self.slopes(free, point, self.scored_recordings)
+        return candidates, free, slopes, *self.screen(point, candidates, floor, slopes)
+
     def promised(self, at: Stand, beside: Trial) -> float:
         """The least share of the misfit there that an effect of few parameters would leave, as the screening predicts it."""
-        candidates = [c for c in self.problem.candidates if c.name != beside.candidate.name and len(c.parameters) <= MANY]
-        slopes = self.slopes((*self.problem.declared, *beside.candidate.parameters), at.fit.point, self.scored_recordings)
-        ranked, _ = self.screen(at.fit.point, candidates, at.floor, slopes)
+        *_, ranked, _ = self.screened(at.fit.point, at.floor, [beside], MANY)
         return min((stays for stays, *_ in ranked), default=1.0)
 
     def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel, asked: Sequence[str]) -> Round:
