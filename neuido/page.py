@@ -150,6 +150,6 @@ def svg(made: Any) -> str:
 
 def small(ax: Any) -> None:
     """Small ticks, and no frame above and to the right."""
-    ax.tick_params(labelsize=7)
+    ax.tick_params(which="both", labelsize=7)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)

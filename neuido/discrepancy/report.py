@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 STYLE = """h2{font-size:1.15em}
 .answer{font-size:1.2em;padding:.6em 1em;background:#f3f6f9;border-left:4px solid #1f77b4}
 canvas{border:1px solid #ddd;background:#fff;touch-action:none;max-width:100%}
-.player label{margin-right:.8em}.b{color:#c0392b}.a{color:#1f77b4}"""
+.player{margin-bottom:1.2em}.player label{margin-right:.8em}.b{color:#c0392b}.a{color:#1f77b4}"""
 WEAK = "The missing force by the weak residual, which differentiates no measured position; grey: what noise alone makes of it."
 NOTHING = "<p>The residual is noise alone: no effect was fitted.</p>"
 SENTENCES = {

@@ -10,7 +10,7 @@ from neuido.discrepancy.residual import Series
 from neuido.page import figure, small, svg
 
 INK, BEFORE, AFTER = "#333333", "#c0392b", "#1f77b4"
-MOST_POINTS, MOST_FRAMES = 250, 60
+MOST_POINTS, MOST_FRAMES = 400, 60
 
 
 def stage_curves(stages: Mapping[str, Sequence[Series]]) -> str:
@@ -77,11 +77,13 @@ def residual_maps(motion: Mapping[str, Mapping[str, np.ndarray]]) -> str:
         top = max(float(np.quantile(sizes["before"], 0.98)), 1e-9)
         for i, (when, (a, b)) in enumerate((w, v) for w in ("before", "after") for v in ((0, 1), (2, 1))):
             ax = row[i]
-            shown = ax.scatter(place[:, a], place[:, b], c=sizes[when], s=6, cmap="inferno_r", vmin=0.0, vmax=top, linewidths=0)
+            shown = ax.scatter(place[:, a], place[:, b], c=sizes[when], s=6, cmap="viridis", vmin=0.0, vmax=top, linewidths=0)
             ax.set_aspect("equal")
             ax.set_title(f"{name}, {when}, along {'zx'[i % 2]}", fontsize=8)
             small(ax)
-        made.colorbar(shown, ax=list(row), shrink=0.8).set_label("mm", fontsize=7)
+        bar = made.colorbar(shown, ax=list(row), shrink=0.8)
+        bar.set_label("mm", fontsize=7)
+        bar.ax.tick_params(labelsize=7)
     return svg(made)
 
 
@@ -122,6 +124,8 @@ def ranking(trials: Sequence[tuple[str, float, bool]], floor: float) -> str:
     ax.set_yticks(range(len(names)), names)
     ax.axvline(np.exp(floor), color=BEFORE, lw=1, ls="--")
     ax.set_xscale("log")
+    for which in (ax.xaxis.set_major_formatter, ax.xaxis.set_minor_formatter):
+        which("{x:g}")
     ax.set_xlabel("error before over error after (fitted or held out, the smaller); dashed: 95 % of what chance brings", fontsize=7)
     small(ax)
     return svg(made)
@@ -141,8 +145,15 @@ def player(motion: Mapping[str, Mapping[str, np.ndarray]]) -> str:
         for s in sets:
             q = np.where(np.isfinite(s), np.clip((s - middle) / size, -1.0, 1.0) * 32000, -32768).astype("<i2")
             packed.append(base64.b64encode(q.tobytes()).decode())
-        data[name] = {"n": len(points), "k": len(frames), "t": [round(float(v), 5) for v in arrays["t"][frames]], "sets": packed}
+        data[name] = {"n": len(points), "k": len(frames), "t": [round(float(v), 5) for v in arrays["t"][frames]], "sets": packed,
+                      "first": _telling(sets[0], sets[1])}  # fmt: skip
     return PLAYER.replace("/*DATA*/", json.dumps(data).replace("<", "\\u003c")).replace("/*COLOURS*/", json.dumps([INK, BEFORE, AFTER]))
+
+
+def _telling(measured: np.ndarray, before: np.ndarray) -> int:
+    """The frame in which the two lie furthest apart."""
+    square = np.sum((measured - before) ** 2, axis=-1)
+    return int(np.argmax(np.nansum(square, axis=1) / np.maximum(np.isfinite(square).sum(axis=1), 1)))
 
 
 PLAYER = """<div class="player"><canvas width="760" height="460"></canvas><div>
@@ -157,7 +168,7 @@ const pick = box.querySelector("select"), slider = box.querySelector("input[type
 const boxes = [...box.querySelectorAll("input[type=checkbox]")], out = box.querySelector("output"), button = box.querySelector("button");
 let sets = [], now, yaw = 0.5, pitch = 0.25, timer = null;
 for (const name of Object.keys(data)) pick.add(new Option(name));
-const load = () => { now = data[pick.value]; slider.max = now.k - 1; slider.value = 0;
+const load = () => { now = data[pick.value]; slider.max = now.k - 1; slider.value = now.first;
   sets = now.sets.map(s => new Int16Array(Uint8Array.from(atob(s), c => c.charCodeAt(0)).buffer)); draw(); };
 const draw = () => { const k = +slider.value, w = canvas.width, h = canvas.height, r = 0.44 * h / 32000;
   pen.clearRect(0, 0, w, h); out.textContent = now.t[k].toFixed(3) + " s";

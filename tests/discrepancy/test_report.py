@@ -19,10 +19,10 @@ from tests.discrepancy.test_answer import Curve
 RNG = np.random.default_rng(0)
 
 
-def motion(frames: int = 9, points: int = 400) -> dict:
+def motion(frames: int = 9, points: int = 600) -> dict:
     x = RNG.uniform(0, 1, (frames, points, 3))
     seen = x.copy()
-    seen[4, 10] = np.nan
+    seen[4, 0] = np.nan
     return {
         "take <1>": {"positions": np.array(1), "t": np.linspace(0, 0.08, frames), "measured": seen, "before": x + 0.1, "after": x + 0.01}
     }
@@ -98,13 +98,20 @@ def test_player_holds_the_motion():
     assert page.count("</script>") == 1  # a name with markup closes nothing
     data = json.loads(re.search(r"const data = (\{.*?\}), colours", page).group(1))
     own = data["take <1>"]
-    assert (own["n"], own["k"]) == (250, 9)
-    values = [np.frombuffer(base64.b64decode(s), "<i2").reshape(9, 250, 3).astype(float) for s in own["sets"]]
+    assert (own["n"], own["k"]) == (report_figures.MOST_POINTS, 9)
+    values = [np.frombuffer(base64.b64decode(s), "<i2").reshape(9, own["n"], 3).astype(float) for s in own["sets"]]
     x = motion()["take <1>"]
     assert (values[0] == -32768).any()
     shift = values[1] - values[2]  # both are the same motion, 0.09 apart
     low, high = 0.0, float(np.nanmax(x["before"]))
     assert np.median(shift) * (high - low) / 2 / 32000 == pytest.approx(0.09, rel=0.05)
+
+
+def test_player_begins_where_the_motions_lie_furthest_apart():
+    moved = motion()
+    moved["take <1>"]["before"][6, :40] += 2.0
+    moved["take <1>"]["before"][4, 0] += 9.0  # not seen there
+    assert '"first": 6' in report_figures.player(moved)
 
 
 def test_player_runs(tmp_path):
@@ -122,7 +129,7 @@ box.querySelector = q => q === "select" ? pick : q === "canvas" ? element : q.in
 """
     # `new Option(name)` yields an object of the constructor's return only for objects: names are kept as they are
     stub = stub.replace("function (n) { return n; }", "class extends String {}").replace("this.value = o;", "this.value = String(o);")
-    (tmp_path / "p.js").write_text(stub + script + "\nif (drawn < 700) throw new Error('drew ' + drawn);")
+    (tmp_path / "p.js").write_text(stub + script + "\nif (drawn < 1100) throw new Error('drew ' + drawn);")
     answer_ = subprocess.run([node, str(tmp_path / "p.js")], capture_output=True, text=True)
     assert answer_.returncode == 0, answer_.stderr
 
