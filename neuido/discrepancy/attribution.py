@@ -113,8 +113,8 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         if start is not None:
             tried.append(inference)
             starts.append(start)
-    chosen, rounds = first_rounds(tried, starts)
-    inference, start = tried[chosen], starts[chosen]
+    chosen, firsts = first_rounds(tried, starts)
+    inference, start, rounds = tried[chosen], starts[chosen], firsts[chosen]
     if len(tried) > 1:
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
     at = start
@@ -129,10 +129,17 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         if problem.settings > 1 and times_over(at.errors, inference.floors(at.fit.point, free, at.floor)) < FURTHER:
             break
         rounds.append(inference.round(at.fit, at.floor, found))
-    if len(found) == 1 and (both := beside_members(inference, rounds, at)):
-        rounds = both
-        found = [r.chosen for r in both if r.chosen is not None]
-        at = inference.finished(found[-1].stand)
+    if len(found) == 1:
+        pair = beside_members(inference, rounds, at)
+        errors = pair[-1].chosen.errors if pair else at.errors
+        others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
+        if elsewhere := by_another_method(others, inference, errors):
+            inference, pair = elsewhere
+            start = starts[tried.index(inference)]
+        if pair:
+            rounds = pair
+            found = [r.chosen for r in pair]
+            at = inference.finished(found[-1].stand)
     if len(found) > 1:
         floor = inference.floor(at.fit.point)
         fit, found = drop(inference, at.fit, floor, found)
@@ -141,8 +148,8 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
     return conclude(inference, start, at, found, rounds)
 
 
-def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[int, list[Round]]:
-    """Which of the methods goes on, and its first round, or two where it takes two effects to gain enough.
+def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[int, dict[int, list[Round]]]:
+    """Which of the methods goes on, and the first round of each that was asked, or two where it takes two effects to gain enough.
 
     The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for.
     """
@@ -153,7 +160,7 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
         floors = inference.noise_squares
         if not inference.is_noise(start.errors):
             floors = inference.floors(start.fit.point, inference.problem.declared, start.floor)
-        return chosen, [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]
+        return chosen, {chosen: [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]}
     # another method must do clearly better before it takes the place of the suggested one
     handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
@@ -177,7 +184,7 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
         for i, rounds in firsts.items()
     }
     chosen = min(firsts, key=lambda i: best[i] + handicap[i])
-    return chosen, firsts[chosen]
+    return chosen, firsts
 
 
 def _limit(problem: Problem) -> float:
@@ -229,22 +236,50 @@ def fits_alone(inference: Inference, first: Round, others: Sequence[Trial]) -> l
 def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> list[Round]:
     """Where a class was found and leaves more than noise: a member beside which a second effect is named, and the round of that one.
 
-    Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two. A member
-    is asked only where the screening beside it promises much; nothing is returned where none names one.
+    Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two.
     """
     first = rounds[0]
     if len(first.members) < 2 or inference.is_settled(at.errors):
         return []
-    members = [t for t in sorted(first.members, key=lambda t: t.penalised) if len(t.candidate.parameters) <= MANY]
-    pairs: list[list[Round]] = []
-    for t in members[:BESIDE]:
-        if t is first.chosen and len(rounds) > 1:
+    grown = first.chosen if len(rounds) > 1 else None
+    return second_beside(inference, first, [t for t in first.members if t is not grown], at.errors, at)
+
+
+def by_another_method(others: Mapping[Inference, Round], inference: Inference, errors: np.ndarray) -> tuple[Inference, list[Round]] | None:
+    """Where more than noise is left: another method by which two effects leave less than that, and the two rounds.
+
+    The method goes by what one effect leaves. Where there are two, that is no measure: by the wrong method one effect may stand for both
+    and for what the method gets wrong, and beside it there is no other.
+
+    Args:
+        others: The other methods, with their first rounds.
+        inference: The one that named an effect.
+        errors: What that leaves, mean squares of the parts.
+    """
+    made = []
+    for other, first in others.items():
+        if first.chosen is None or inference.is_settled(errors) or first.chosen.score > score(errors) + 2.0 * math.log(WORSE):
             continue
-        here = at if t is first.chosen else Stand(t.fit, *inference.stand(t.fit.point))
+        if pair := second_beside(other, first, first.members, errors):
+            made.append((other, pair))
+    return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)
+
+
+def second_beside(inference: Inference, first: Round, members: Sequence[Trial], errors: np.ndarray, at: Stand | None = None) -> list[Round]:
+    """The member beside which a second effect leaves least, and the round of that one.
+
+    Nothing is returned where none leaves clearly less than `errors`. A member is asked only where the screening beside it promises much.
+    `at` is where the chosen one stands, if its fit was finished.
+    """
+    pairs: list[list[Round]] = []
+    for t in sorted(members, key=lambda t: t.penalised)[:BESIDE]:
+        if len(t.candidate.parameters) > MANY:
+            continue
+        here = at if at is not None and t is first.chosen else Stand(t.fit, *inference.stand(t.fit.point))
         if inference.promised(here, t) > PROMISED:
             continue
         second = inference.round(here.fit, here.floor, [t], most=MANY)
-        if second.chosen is not None and inference.gain(at.errors, second.chosen.errors) > LEAST_GAIN:
+        if second.chosen is not None and inference.gain(errors, second.chosen.errors) > LEAST_GAIN:
             pairs.append([replace(first, chosen=t), second])
             if inference.is_noise(second.chosen.errors):
                 break

@@ -638,3 +638,50 @@ def test_a_second_effect_is_looked_for_beside_each_member_of_a_class(monkeypatch
     assert all(e == pytest.approx(NOISE, rel=0.2) for e in found.errors["after"].values())
     monkeypatch.setattr(attribution, "PROMISED", 0.0)
     assert names(diagnose(problem)) == ["mix"]
+
+
+class Apart(Mixed):
+    """Two tones by setting 0; setting 1 has a wiggle more, and the second tone does not run there."""
+
+    def __init__(self):
+        one, two = np.sin(40 * T), np.sin(62 * T)
+        super().__init__({"low": (one, one), "high": (two, two)}, {"low": 0.9, "high": 0.3})
+        self.__dict__ |= {"_wiggle": 0.02, "solvers": (0, 1)}
+
+    def predict(self, points, recording, setting=0):
+        rows = super().predict(points, recording, setting)
+        rows[[setting == 1 and p.get("high.c", 0.0) != 0.0 for p in points]] = np.nan
+        return rows
+
+
+@pytest.mark.parametrize(("left", "found"), [(1.0, True), (0.4, True), (0.2, False), (0.05, False)])
+def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left, found):
+    """`left`: what the chosen method leaves of what one effect leaves by this one; 0.05 is noise, 0.2 too far away."""
+    problem = Apart()
+    inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
+    start = other.start()
+    first = other.round(start.fit, start.floor, [])
+    assert first.chosen.candidate.name == "low"
+    both = attribution.by_another_method({other: first}, inference, left**2 * first.chosen.errors)
+    assert bool(both) is found
+    if found:
+        assert both[0] is other
+        assert [r.chosen.candidate.name for r in both[1]] == ["low", "high"]
+        assert other.is_noise(both[1][-1].chosen.errors)
+
+
+def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
+    real = attribution.first_rounds
+
+    def other_one(tried, starts):
+        chosen, firsts = real(tried, starts)
+        assert [tried[i].setting for i in (chosen, *(i for i in firsts if i != chosen))] == [0, 1]
+        return 1 - chosen, firsts
+
+    monkeypatch.setattr(attribution, "first_rounds", other_one)
+    found = diagnose(Apart())
+    assert found.setting == 0 and names(found) == ["high", "low"]
+    assert all(e == pytest.approx(NOISE, rel=0.2) for e in found.errors["after"].values())
+    monkeypatch.setattr(attribution, "WORSE", 0.1)
+    found = diagnose(Apart())
+    assert found.setting == 1 and names(found) == ["low"]
