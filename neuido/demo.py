@@ -94,12 +94,12 @@ def video_section(result: "VideoResult") -> str:
         for scene in result.scenes
     ]
     head = ("scene", "", "inference", *(units[key] for key in keys))
-    text = (
-        f"The image loss of Stage II went from {result.losses[0]:.3g} to {result.losses[-1]:.3g} over {len(result.losses)} logged steps. "
-        "Inference: one pass from flow latents to the law. Scores are those of views that were held out."
-        if result.losses
-        else "Scores are those of views that were held out."
-    )
+    half = len(result.losses) // 2
+    text = "Inference: one pass from flow latents to the law. Scores are those of views that were held out."
+    if half:
+        first, second = (sum(part) / len(part) for part in (result.losses[:half], result.losses[half:]))
+        steps = f"{len(result.losses)} steps of Stage II on whole recordings"
+        text = f"The image loss of {steps}: {first:.3g} on average in the first half, {second:.3g} in the second. {text}"
     few = "" if result.adapted is None else adapted_section(result.adapted)
     shown = "".join(f"<h3>{escaped(s.name)}: recorded above, predicted below</h3>{picture(s.picture)}" for s in result.scenes)
     return f"<h2>Stage II: a law from video, in one pass</h2><p>{text}</p>{table(head, rows, digits=3)}{shown}{few}"

@@ -40,7 +40,7 @@ class VideoResult(NamedTuple):
 
     scenes: tuple[SceneResult, ...]
     losses: tuple[float, ...]
-    """Stage II's image loss at each logged step; 1 explains nothing of the motion."""
+    """Stage II's image loss at each step that saw whole recordings; 1 explains nothing of the motion."""
     encoder: Path
     """The encoder after Stage II."""
     adapted: Adapted | None = None
@@ -61,7 +61,8 @@ def demo_video(
     """
     import yaml
 
-    from neuido.cli import find_config, run_lightning
+    from neuido.cli import run_lightning
+    from neuido.config_files import find_config
     from neuido.data.simulate import Film
     from neuido.reconstruct import reconstruct
     from neuido.simulate import simulate
@@ -85,7 +86,9 @@ def demo_video(
     length = ["--trainer.max_epochs", str(epochs), "--trainer.limit_val_batches", "0"]
     fitted = run_lightning(["fit", *common, *start, *length])
     with (Path(fitted.trainer.log_dir) / "metrics.csv").open() as file:
-        losses = tuple(float(row["train/loss"]) for row in csv.DictReader(file) if row.get("train/loss"))
+        steps = [row for row in csv.DictReader(file) if row.get("train/loss")]
+    most = max((float(row["train/frames"]) for row in steps), default=0.0)  # the curriculum begins with fewer
+    losses = tuple(float(row["train/loss"]) for row in steps if float(row["train/frames"]) == most)
     print("[video 4/5] zero-shot: the law of each video in one pass", flush=True)
     trained = ["--model.init_from", str(encoder), "--model.baselines", "0"]
     run_lightning(["predict", *common, *trained])
@@ -99,7 +102,8 @@ def demo_video(
 
 
 def _adapt(folder: Path, encoder: Path, steps: int) -> Adapted:
-    from neuido.cli import find_config, run_lightning
+    from neuido.cli import run_lightning
+    from neuido.config_files import find_config
 
     results = folder / "adapted"
     common = ["--config", find_config("adapt_small"), "--data.root", str(folder / "scenes"), "--data.scenes", _listed(UNSEEN)]
