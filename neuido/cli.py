@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, get_origin
 
 import neuido
 from neuido.chatter import quiet_lightning
+from neuido.config_files import find_config
 from neuido.errors import UserError, one_line
-from neuido.sweep import own_folder, redirect
+from neuido.run_folder import own_folder, redirect
 
 if TYPE_CHECKING:
     from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -165,17 +166,6 @@ def _find_configs(args: list[str]) -> list[str]:
         elif argument.startswith("--config="):
             found[i] = "--config=" + find_config(argument.removeprefix("--config="))
     return found
-
-
-def find_config(name: str, option: str = "--config") -> str:
-    """The path of a configuration: a file here, or one that comes with neuido by its name."""
-    if name.lstrip().startswith("{") or Path(name).is_file():  # jsonargparse accepts the content itself too
-        return name
-    relative = name.removeprefix("configs/").removesuffix(".yaml") + ".yaml"
-    for own in (neuido.configs_root() / relative, neuido.configs_root() / "scenes" / relative):
-        if own.is_file():
-            return str(own)
-    raise UserError(f"no configuration file '{name}', neither here nor in {neuido.configs_root()}: change {option}")
 
 
 def _help() -> str:

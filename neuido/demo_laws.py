@@ -51,7 +51,8 @@ def demo_laws(out: str = "runs/demo", *, settings: str = "quickstart") -> LawsRe
         out: Folder for the trajectories, the run and the picture.
         settings: Configuration to train with.
     """
-    from neuido.cli import find_config, run_lightning
+    from neuido.cli import run_lightning
+    from neuido.config_files import find_config
 
     folder, config = Path(out), find_config(settings, "--settings")
     print(f"[laws 1/2] neuido fit --config {settings} --data.root {folder / 'trajectories'}", flush=True)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from neuido.data.tables import folder_of, read_rows
 from neuido.errors import UserError
-from neuido.sweep import status_of
+from neuido.run_folder import status_of
 
 
 class Entry(NamedTuple):

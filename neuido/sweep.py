@@ -2,7 +2,6 @@
 
 import contextlib
 import fcntl
-import json
 import math
 import os
 import shutil
@@ -13,13 +12,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
+from neuido.config_files import find_config
 from neuido.data.tables import read_rows, write_rows
 from neuido.errors import UserError
+from neuido.run_folder import FOLDER, FORMAT, note, status_of
 from neuido.sweep_file import Metric, Run, SweepFile, command_of, read_sweep, runs_of
-
-FORMAT = "neuido-run/1"
-FOLDER = "NEUIDO_RUN"
-"""The environment variable that names the folder of a run, into which everything of it goes."""
 
 
 def sweep(
@@ -47,8 +44,6 @@ def sweep(
     Raises:
         UserError: A malformed file, a shard that there is not.
     """
-    from neuido.cli import find_config
-
     if not 0 <= shard < shards:
         raise UserError(f"shard = {shard} of shards = {shards}: it must be from 0 to shards - 1")
     if count is not None and count < 1:
@@ -85,13 +80,13 @@ def _one(plan: SweepFile, run: Run, folder: Path) -> str:
             return "done before"
         _empty(folder)
         state: dict[str, Any] = {"format": FORMAT, "run": run.name, "parameters": run.parameters, "command": words}
-        _note(folder, {**state, "status": "started"})
+        note(folder, {**state, "status": "started"})
         start = time.monotonic()
         code = _execute(words, environment, folder / "log.txt", lock)
         state |= {"status": "done" if code == 0 else "failed", "seconds": round(time.monotonic() - start, 1)}
         if code != 0:
             state["error"] = _last_line(folder / "log.txt") or f"exit status {code}"
-        _note(folder, state)
+        note(folder, state)
     return f"{state['status']} in {state['seconds']:.0f} s{': ' + state['error'] if code else ''}"
 
 
@@ -135,21 +130,6 @@ def _empty(folder: Path) -> None:
         raise UserError(f"{folder} holds something that is no run of this sweep: give another folder by --out")
     for path in sorted(there, key=lambda path: path.name == "run.json"):  # what tells whose folder it is goes last
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
-
-
-def status_of(folder: Path) -> dict[str, Any]:
-    """What `run.json` of a run says; empty where there is none."""
-    try:
-        content = json.loads((folder / "run.json").read_text())
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) and content.get("format") == FORMAT else {}
-
-
-def _note(folder: Path, state: Mapping[str, Any]) -> None:
-    from neuido.data.storage import write
-
-    write(folder / "run.json", json.dumps(state, indent=1) + "\n")
 
 
 def _last_line(path: Path) -> str:
@@ -224,32 +204,3 @@ def _report(folder: Path, path: Path) -> None:
 
     beside = path.with_suffix(".paper.csv")
     report([str(folder)], out=str(folder / "report.html"), paper=str(beside) if beside.is_file() else None)
-
-
-def own_folder(environment: Mapping[str, str]) -> Path | None:
-    """The folder of this process where it is a run of a sweep, of this command or of wandb's agent."""
-    if environment.get(FOLDER):
-        return Path(environment[FOLDER])
-    if environment.get("WANDB_SWEEP_ID") and environment.get("WANDB_RUN_ID"):
-        return Path("runs/sweeps", environment["WANDB_SWEEP_ID"], environment["WANDB_RUN_ID"])
-    return None
-
-
-def redirect(options: Any, folder: Path) -> None:
-    """Let a trainer's configuration write into a run's own folder: logs, checkpoints, `save_to` and `out` of the model.
-
-    Args:
-        options: The parsed configuration of a subcommand, changed in place.
-        folder: The folder of the run.
-    """
-    trainer = options["trainer"]
-    trainer["default_root_dir"] = str(folder)
-    loggers = trainer.get("logger")
-    for logger in loggers if isinstance(loggers, list) else [loggers]:
-        arguments = getattr(logger, "init_args", None)
-        if arguments is not None and "save_dir" in arguments:
-            arguments["save_dir"] = str(folder)
-    arguments = options["model"]["init_args"]
-    for name in ("save_to", "out"):
-        if name in arguments and arguments[name] is not None:
-            arguments[name] = str(folder / Path(arguments[name]).name)

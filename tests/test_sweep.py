@@ -16,7 +16,8 @@ import neuido
 from neuido.cli import main
 from neuido.data.tables import write_rows
 from neuido.errors import UserError
-from neuido.sweep import own_folder, redirect, scored, sweep
+from neuido.run_folder import own_folder, redirect
+from neuido.sweep import scored, sweep
 from neuido.sweep_file import command_of, read_sweep, runs_of
 
 ROOT = Path(neuido.__file__).parents[1]

@@ -1,0 +1,17 @@
+"""Configurations by name: a file here, or one that comes with neuido."""
+
+from pathlib import Path
+
+from neuido import configs_root
+from neuido.errors import UserError
+
+
+def find_config(name: str, option: str = "--config") -> str:
+    """The path of a configuration: a file here, or one that comes with neuido by its name."""
+    if name.lstrip().startswith("{") or Path(name).is_file():  # jsonargparse accepts the content itself too
+        return name
+    relative = name.removeprefix("configs/").removesuffix(".yaml") + ".yaml"
+    for own in (configs_root() / relative, configs_root() / "scenes" / relative):
+        if own.is_file():
+            return str(own)
+    raise UserError(f"no configuration file '{name}', neither here nor in {configs_root()}: change {option}")
