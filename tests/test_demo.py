@@ -96,7 +96,8 @@ def test_page_shows_the_scenes(tmp_path):
     )
     text = demo.video_section(VideoResult(scenes, (1.0, 0.25), tmp_path / "encoder"))
     assert "a&lt;b" in text and "a<b" not in text
-    assert all(word in text for word in ("3.4 ms", "12.5 ms", "24.2", "unseen", "2 steps", "1 on average in the first half, 0.25 in the second"))
+    assert all(word in text for word in ("3.4 ms", "12.5 ms", "24.2", "unseen", "2 steps"))
+    assert "1 on average in the first half, 0.25 in the second" in text
     assert text.count("data:image/png") == 2
     assert "SSIM" not in text and "adapted" not in text
     adapted = Adapted("other", {"psnr": 21.5}, {"psnr": 23.5, "cd": 1.25}, 6, 7.0, picture)

@@ -87,6 +87,10 @@ def test_direction(module):
             assert not wrong, f"{module} imports {sorted(wrong)}; {room} may import {allowed} alone"
 
 
+SPEAK_WANDB = ("neuido.cli", "neuido.sweep", "neuido.sweep_file", "neuido.run_folder")
+"""They speak the language of its files and its environment, and import nothing of it."""
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_third_parties(module):
     names = {name.split(".")[0] for name in imports_of(module)}
@@ -98,12 +102,13 @@ def test_third_parties(module):
         assert "peft" not in names, f"{module} imports peft"
     assert "wandb" not in names, f"{module} imports wandb"
     assert "pytorch_lightning" not in names, f"{module} imports pytorch_lightning; the package is lightning"
-    if module not in ("neuido.cli", "neuido.sweep", "neuido.sweep_file"):  # the latter two speak its files' language, and import nothing
+    if module not in SPEAK_WANDB:
         assert "wandb" not in (PACKAGE.parent / (module.replace(".", "/") + ".py")).read_text().lower(), f"{module} names wandb"
 
 
 LIGHT = ("", ".cli", ".__main__", ".errors", ".doctor", ".data.simulate", ".data.undeclared", ".simulate", ".reconstruct", ".models.film",
-         ".discrepancy.command", ".sweep", ".report", ".latents", ".runs", ".page", ".data.tables")  # fmt: skip
+         ".discrepancy.command", ".sweep", ".run_folder", ".config_files", ".report", ".latents",
+         ".runs", ".page", ".data.tables")  # fmt: skip
 
 
 @pytest.mark.parametrize("module", [f"neuido{name}" for name in LIGHT])
