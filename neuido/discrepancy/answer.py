@@ -5,7 +5,6 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,22 +22,6 @@ from neuido.discrepancy.rounds import ALPHA, Round, Trial
 FORMAT = "neuido-diagnosis/1"
 VERSION = neuido.__version__
 Found = Sequence[tuple[Diagnosis, float]]
-
-
-@dataclass(eq=False)
-class Details:
-    """What is computed from a diagnosis for its report."""
-
-    content: dict[str, Any]
-    """Of diagnosis.json."""
-    motion: dict[str, dict[str, np.ndarray]]
-    """Arrays of each recording: measured, before, after, and what they are over."""
-    stages: dict[str, list[residual.Series]] = field(default_factory=dict)
-    """Of each recording of a body."""
-    ceilings: dict[str, ceiling.Ceiling] = field(default_factory=dict)
-    """`before` and `after`."""
-    silhouettes: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Of each recording of a filmed body: masks, those drawn before and after, and their scores."""
 
 
 def write(
@@ -88,7 +71,7 @@ def write(
     write_json(out / "diagnosis.json", whole)
 
 
-def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], None] | None = None) -> Details:
+def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], None] | None = None) -> report.Details:
     """The content of diagnosis.json and what the report shows beside it."""
     tell = tell or (lambda line: None)
     tell("motion before and after")
@@ -128,7 +111,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         content["silhouettes"] = {name: own["scores"] for name, own in drawn.items()}
         for name, own in drawn.items():
             motion[name] |= {key: np.round(255 * own[key]).astype(np.uint8) for key in ("masks", "drawn_before", "drawn_after")}
-    return Details(_plain(content), motion, series, ceilings, drawn)
+    return report.Details(_plain(content), motion, series, ceilings, drawn)
 
 
 def _settings(d: Diagnosis) -> dict[str, Any]:

@@ -2,18 +2,20 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
 
 from neuido.discrepancy import next_experiment
 from neuido.discrepancy import report_figures as draw
 from neuido.discrepancy import report_silhouettes as pictures
 from neuido.discrepancy.attribution import Diagnosis
+from neuido.discrepancy.ceiling import Ceiling
+from neuido.discrepancy.residual import Series
 from neuido.discrepancy.rounds import ALPHA
 from neuido.page import escaped, table
 from neuido.page import page as html_page
-
-if TYPE_CHECKING:
-    from neuido.discrepancy.answer import Details
 
 STYLE = """h2{font-size:1.15em}
 .answer{font-size:1.2em;padding:.6em 1em;background:#f3f6f9;border-left:4px solid #1f77b4}
@@ -30,7 +32,23 @@ SENTENCES = {
 }
 
 
-def page(details: "Sequence[Details]", diagnoses: Sequence[Diagnosis], *, kind: str) -> str:
+@dataclass(eq=False)
+class Details:
+    """What is computed from a diagnosis for its report."""
+
+    content: dict[str, Any]
+    """Of diagnosis.json."""
+    motion: dict[str, dict[str, np.ndarray]]
+    """Arrays of each recording: measured, before, after, and what they are over."""
+    stages: dict[str, list[Series]] = field(default_factory=dict)
+    """Of each recording of a body."""
+    ceilings: dict[str, Ceiling] = field(default_factory=dict)
+    """`before` and `after`."""
+    silhouettes: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Of each recording of a filmed body: masks, those drawn before and after, and their scores."""
+
+
+def page(details: Sequence[Details], diagnoses: Sequence[Diagnosis], *, kind: str) -> str:
     """The whole page.
 
     Args:
@@ -51,7 +69,7 @@ def page(details: "Sequence[Details]", diagnoses: Sequence[Diagnosis], *, kind: 
     return html_page(name, "\n".join(part for part in parts if part), style=STYLE)
 
 
-def _one(made: "Details", d: Diagnosis) -> list[str]:
+def _one(made: Details, d: Diagnosis) -> list[str]:
     c = made.content
     names = " and ".join(" or ".join(e["class"]) for e in c["effects"])
     bodies = {name: arrays for name, arrays in made.motion.items() if "positions" in arrays}
@@ -137,7 +155,7 @@ def _ratio(e: dict[str, Any], name: str) -> float:
     return e["before"]["by_recording"][name] / max(e["after"]["by_recording"][name], 1e-300)
 
 
-def _stages(made: "Details") -> str:
+def _stages(made: Details) -> str:
     rows = []
     for recording, series in made.stages.items():
         for s in series:

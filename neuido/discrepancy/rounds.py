@@ -41,6 +41,10 @@ OWN = 3
 """Candidates that the screening of a second solver may add to those that led with the first one."""
 WITHIN = 0.5
 """Share of the floor within which a residual that no effect explains is no reason to look further."""
+UNEXPLAINED = 2.0
+"""Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
+UNEXPLAINED_EXACT = 3.0
+"""The same where nothing is discretised: the noise that a folder states is an estimate."""
 LED_FAR = 1.6
 """Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
 
@@ -71,6 +75,11 @@ class Inference(Contests):
     ) -> None:
         super().__init__(problem, setting=setting, tell=tell, memo=memo)
         self.keep, self.draws, self.seed = keep, draws, seed
+
+    @property
+    def unexplained(self) -> float:
+        """Times its floor above which a residual that no effect explains is called unknown."""
+        return UNEXPLAINED if self.problem.settings > 1 else UNEXPLAINED_EXACT
 
     def round(self, base: Fit, floor: Floor, found: Sequence[Trial], rival: Round | None = None, *, most: float = math.inf) -> Round:
         """Look for one more effect beside those that were found.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from neuido.discrepancy import attribution, contests, rounds
+from neuido.discrepancy import attribution, contests, pairs, rounds
 from neuido.discrepancy.answer import rejected, trace
 from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
 from neuido.discrepancy.fit import Fit, Race, levenberg_marquardt, run
@@ -621,7 +621,7 @@ def test_what_fits_alone_and_foretells_nothing_is_tried_with_a_second_effect(mon
     assert found.after["low.c"] == pytest.approx(0.5, abs=0.02) and found.after["high.c"] == pytest.approx(0.5, abs=0.02)
     # what the two leave together must be near the floor
     assert diagnose(Mixed(shapes, {"low": 0.5, "high": 0.5}, rest=0.1 * np.sin(75 * T))).answer == "unknown"
-    monkeypatch.setattr(attribution, "BLIND_GAIN", np.inf)
+    monkeypatch.setattr(pairs, "BLIND_GAIN", np.inf)
     assert diagnose(problem).answer == "unknown"
 
 
@@ -636,7 +636,7 @@ def test_a_second_effect_is_looked_for_beside_each_member_of_a_class(monkeypatch
     found = diagnose(problem)
     assert found.answer == "effect" and names(found) == ["high", "low"]
     assert all(e == pytest.approx(NOISE, rel=0.2) for e in found.errors["after"].values())
-    monkeypatch.setattr(attribution, "PROMISED", 0.0)
+    monkeypatch.setattr(pairs, "PROMISED", 0.0)
     assert names(diagnose(problem)) == ["mix"]
 
 
@@ -662,7 +662,7 @@ def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left
     start = other.start()
     first = other.round(start.fit, start.floor, [])
     assert first.chosen.candidate.name == "low"
-    both = attribution.by_another_method({other: first}, inference, left**2 * first.chosen.errors)
+    both = pairs.by_another_method({other: first}, inference, left**2 * first.chosen.errors)
     assert bool(both) is found
     if found:
         assert both[0] is other
@@ -682,6 +682,6 @@ def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
     found = diagnose(Apart())
     assert found.setting == 0 and names(found) == ["high", "low"]
     assert all(e == pytest.approx(NOISE, rel=0.2) for e in found.errors["after"].values())
-    monkeypatch.setattr(attribution, "WORSE", 0.1)
+    monkeypatch.setattr(pairs, "WORSE", 0.1)
     found = diagnose(Apart())
     assert found.setting == 1 and names(found) == ["low"]

@@ -1,0 +1,118 @@
+"""Two effects at once: what is tried with a second one where none is enough alone, and where one leaves more than noise."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from neuido.discrepancy.contests import MANY
+from neuido.discrepancy.laboratory import LEAST_GAIN
+from neuido.discrepancy.rounds import Inference
+from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
+
+WORSE = 3.0
+"""Times the error of the better method at which the other one is not asked any more, where that found nothing."""
+LOOKED_AHEAD = 2
+"""Effects that are tried with a second one, where none gains enough alone, or in the place of one with more parameters."""
+BLIND_GAIN = 2.0 * LEAST_GAIN
+"""What an effect must gain in the fitted recordings to be tried with a second one although it foretells nothing of those held out."""
+PROMISED = 0.6
+"""Share of the misfit that a second effect may leave, as the screening beside a member of a class predicts it, to be fitted there."""
+BESIDE = 3
+"""Members of a class beside which a second effect is looked for."""
+
+
+def look_ahead(inference: Inference, first: Round) -> list[Round]:
+    """Where no single effect gains enough: the one of the best few beside which another does, and the round that found that one.
+
+    Two effects may each be worth little without the other: a body that slides and dissipates is as badly fitted by friction alone.
+    """
+    if first.chosen is not None or not first.trials:
+        return [first]
+    good = [t for t in first.trials if t.gain > inference.by_chance(first) and not unphysical(t.candidate, t.fit.point)]
+    if first.over < inference.unexplained:  # it may all be the discretisation
+        good = [t for t in good if t.gain > LEAST_GAIN]
+    bases = sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]
+    blind = fits_alone(inference, first, bases)
+    for t in (*bases, *blind):
+        second = inference.round(t.fit, inference.stand(t.fit.point)[0], [t], most=MANY)
+        if second.chosen is None or inference.gain(first.errors, second.chosen.errors) < 2.0 * LEAST_GAIN:
+            continue
+        if t in blind and times_over(second.chosen.errors, first.floors) > inference.unexplained:
+            continue
+        t.reason = ""
+        members = [t, *(other for other in good if other is not t and inference.is_rival(other, t))]
+        for other in members:
+            other.reason = ""
+        return [replace(first, chosen=t, members=members), second]
+    return [first]
+
+
+def fits_alone(inference: Inference, first: Round, others: Sequence[Trial]) -> list[Trial]:
+    """The effect that fits the fitted recordings best, where it does so by far, is none of the others, and foretells nothing.
+
+    What fits in the place of two effects is off wherever these come in another proportion.
+    """
+    if first.over < inference.unexplained or all(inference.fitted):
+        return []
+    trials = [t for t in first.trials if np.isfinite(t.errors).all() and not unphysical(t.candidate, t.fit.point)]
+    if not trials:
+        return []
+    fitted = inference.fitted
+    best = min(trials, key=lambda t: score(t.errors[fitted]))
+    far = math.log(times_over(first.errors[fitted], best.errors[fitted])) > BLIND_GAIN
+    return [best] if far and best not in others else []
+
+
+def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> list[Round]:
+    """Where a class was found and leaves more than noise: a member beside which a second effect is named, and the round of that one.
+
+    Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two.
+    """
+    first = rounds[0]
+    if len(first.members) < 2 or inference.is_settled(at.errors):
+        return []
+    grown = first.chosen if len(rounds) > 1 else None
+    return second_beside(inference, first, [t for t in first.members if t is not grown], at.errors, at)
+
+
+def by_another_method(others: Mapping[Inference, Round], inference: Inference, errors: np.ndarray) -> tuple[Inference, list[Round]] | None:
+    """Where more than noise is left: another method by which two effects leave less than that, and the two rounds.
+
+    The method goes by what one effect leaves. Where there are two, that is no measure: by the wrong method one effect may stand for both
+    and for what the method gets wrong, and beside it there is no other.
+
+    Args:
+        others: The other methods, with their first rounds.
+        inference: The one that named an effect.
+        errors: What that leaves, mean squares of the parts.
+    """
+    made = []
+    for other, first in others.items():
+        if first.chosen is None or inference.is_settled(errors) or first.chosen.score > score(errors) + 2.0 * math.log(WORSE):
+            continue
+        if pair := second_beside(other, first, first.members, errors):
+            made.append((other, pair))
+    return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)
+
+
+def second_beside(inference: Inference, first: Round, members: Sequence[Trial], errors: np.ndarray, at: Stand | None = None) -> list[Round]:
+    """The member beside which a second effect leaves least, and the round of that one.
+
+    Nothing is returned where none leaves clearly less than `errors`. A member is asked only where the screening beside it promises much.
+    `at` is where the chosen one stands, if its fit was finished.
+    """
+    pairs: list[list[Round]] = []
+    for t in sorted(members, key=lambda t: t.penalised)[:BESIDE]:
+        if len(t.candidate.parameters) > MANY:
+            continue
+        here = at if at is not None and t is first.chosen else Stand(t.fit, *inference.stand(t.fit.point))
+        if inference.promised(here, t) > PROMISED:
+            continue
+        second = inference.round(here.fit, here.floor, [t], most=MANY)
+        if second.chosen is not None and inference.gain(errors, second.chosen.errors) > LEAST_GAIN:
+            pairs.append([replace(first, chosen=t), second])
+            if inference.is_noise(second.chosen.errors):
+                break
+    return min(pairs, key=lambda pair: pair[1].chosen.score, default=[])
