@@ -116,9 +116,9 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         rounds.append(inference.round(at.fit, at.floor, found))
     if len(found) == 1:
         pair = beside_members(inference, rounds, at)
-        errors = pair[-1].chosen.errors if pair else at.errors
         others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
-        if elsewhere := by_another_method(others, inference, errors):
+        # beside what lies within its floor nothing was looked for
+        if len(rounds) > 1 and (elsewhere := by_another_method(others, inference, pair[-1].chosen.errors if pair else at.errors)):
             inference, pair = elsewhere
             start = starts[tried.index(inference)]
         if pair:

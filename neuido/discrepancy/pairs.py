@@ -74,14 +74,15 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
     if len(first.members) < 2 or inference.is_settled(at.errors):
         return []
     grown = first.chosen if len(rounds) > 1 else None
-    return second_beside(inference, first, [t for t in first.members if t is not grown], at.errors, at)
+    return second_beside(inference, first, [t for t in first.members if t is not grown], at.errors, at=at)
 
 
 def by_another_method(others: Mapping[Inference, Round], inference: Inference, errors: np.ndarray) -> tuple[Inference, list[Round]] | None:
     """Where more than noise is left: another method by which two effects leave less than that, and the two rounds.
 
     The method goes by what one effect leaves. Where there are two, that is no measure: by the wrong method one effect may stand for both
-    and for what the method gets wrong, and beside it there is no other.
+    and for what the method gets wrong, and beside it there is no other. The first one of the other method gets what that of the chosen
+    method had: a search beside it, whatever the screening promises.
 
     Args:
         others: The other methods, with their first rounds.
@@ -92,23 +93,25 @@ def by_another_method(others: Mapping[Inference, Round], inference: Inference, e
     for other, first in others.items():
         if first.chosen is None or inference.is_settled(errors) or first.chosen.score > score(errors) + 2.0 * math.log(WORSE):
             continue
-        if pair := second_beside(other, first, first.members, errors):
+        if pair := second_beside(other, first, first.members, errors, sure=first.chosen):
             made.append((other, pair))
     return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)
 
 
-def second_beside(inference: Inference, first: Round, members: Sequence[Trial], errors: np.ndarray, at: Stand | None = None) -> list[Round]:
+def second_beside(
+    inference: Inference, first: Round, members: Sequence[Trial], errors: np.ndarray, *, at: Stand | None = None, sure: Trial | None = None
+) -> list[Round]:
     """The member beside which a second effect leaves least, and the round of that one.
 
-    Nothing is returned where none leaves clearly less than `errors`. A member is asked only where the screening beside it promises much.
-    `at` is where the chosen one stands, if its fit was finished.
+    Nothing is returned where none leaves clearly less than `errors`. A member is asked where the screening beside it promises much, or it
+    is `sure`. `at` is where the chosen one stands, if its fit was finished.
     """
     pairs: list[list[Round]] = []
     for t in sorted(members, key=lambda t: t.penalised)[:BESIDE]:
         if len(t.candidate.parameters) > MANY:
             continue
         here = at if at is not None and t is first.chosen else Stand(t.fit, *inference.stand(t.fit.point))
-        if inference.promised(here, t) > PROMISED:
+        if t is not sure and inference.promised(here, t) > PROMISED:
             continue
         second = inference.round(here.fit, here.floor, [t], most=MANY)
         if second.chosen is not None and inference.gain(errors, second.chosen.errors) > LEAST_GAIN:
