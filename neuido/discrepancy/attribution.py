@@ -118,7 +118,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         pair = beside_members(inference, rounds, at)
         others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
         # beside what lies within its floor nothing was looked for
-        if len(rounds) > 1 and (elsewhere := by_another_method(others, inference, pair[-1].chosen.errors if pair else at.errors)):
+        if len(rounds) > 1 and (elsewhere := by_another_method(others, inference, pair[-1].chosen.stand if pair else at)):
             inference, pair = elsewhere
             start = starts[tried.index(inference)]
         if pair:

@@ -8,6 +8,7 @@ import numpy as np
 
 from neuido.discrepancy.contests import MANY
 from neuido.discrepancy.laboratory import LEAST_GAIN
+from neuido.discrepancy.problem import Point
 from neuido.discrepancy.rounds import Inference
 from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
 
@@ -77,7 +78,7 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
     return second_beside(inference, first, [t for t in first.members if t is not grown], at.errors, at=at)
 
 
-def by_another_method(others: Mapping[Inference, Round], inference: Inference, errors: np.ndarray) -> tuple[Inference, list[Round]] | None:
+def by_another_method(others: Mapping[Inference, Round], inference: Inference, at: Stand) -> tuple[Inference, list[Round]] | None:
     """Where more than noise is left: another method by which two effects leave less than that, and the two rounds.
 
     The method goes by what one effect leaves. Where there are two, that is no measure: by the wrong method one effect may stand for both
@@ -87,15 +88,27 @@ def by_another_method(others: Mapping[Inference, Round], inference: Inference, e
     Args:
         others: The other methods, with their first rounds.
         inference: The one that named an effect.
-        errors: What that leaves, mean squares of the parts.
+        at: Where that stands.
     """
     made = []
     for other, first in others.items():
-        if first.chosen is None or inference.is_settled(errors) or first.chosen.score > score(errors) + 2.0 * math.log(WORSE):
+        if first.chosen is None or inference.is_settled(at.errors) or first.chosen.score > score(at.errors) + 2.0 * math.log(WORSE):
             continue
-        if pair := second_beside(other, first, first.members, errors, sure=first.chosen):
+        here = from_there(other, first.chosen, at.fit.point)
+        if pair := second_beside(other, first, first.members, at.errors, at=here, sure=first.chosen):
+            first.chosen.stand, first.chosen.gain = here, other.gain(first.errors, here.errors)
             made.append((other, pair))
     return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)
+
+
+def from_there(inference: Inference, t: Trial, point: Point) -> Stand:
+    """An effect's fit, or the one from the declared values of a point, where another method has come further: what leaves less."""
+    declared = inference.problem.declared
+    here, begin = Stand(t.fit, *inference.stand(t.fit.point)), dict(t.fit.point) | {p.name: point[p.name] for p in declared}
+    if not inference.runs(begin):
+        return here
+    (fit,) = inference.fits([inference.request((*declared, *t.candidate.parameters), begin)], inference.stand(begin)[0])
+    return min(here, Stand(fit, *inference.stand(fit.point)), key=lambda stand: score(stand.errors)) if inference.runs(fit.point) else here
 
 
 def second_beside(

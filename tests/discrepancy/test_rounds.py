@@ -662,7 +662,7 @@ def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left
     start = other.start()
     first = other.round(start.fit, start.floor, [])
     assert first.chosen.candidate.name == "low"
-    both = pairs.by_another_method({other: first}, inference, left**2 * first.chosen.errors)
+    both = pairs.by_another_method({other: first}, inference, replace(first.chosen.stand, errors=left**2 * first.chosen.errors))
     assert bool(both) is found
     if found:
         assert both[0] is other
@@ -685,3 +685,24 @@ def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
     monkeypatch.setattr(pairs, "WORSE", 0.1)
     found = diagnose(Apart())
     assert found.setting == 1 and names(found) == ["low"]
+
+
+def test_the_other_method_goes_on_from_where_the_chosen_one_has_come():
+    """`low` acts as sin(40 t) for a near 3 alone: from anywhere below 2 no fit gets there."""
+
+    class Valley(Mixed):
+        def predict(self, points, recording, setting=0):
+            rows = super().predict(points, recording, setting)
+            wrong = np.array([[p.get("a", 1.0) < 2.0] for p in points])
+            return np.where(wrong, rows + 0.4 * np.sin(62 * T) - 2.0 * np.array([[p.get("a", 1.0)] for p in points]) * T, rows)
+
+    one = np.sin(40 * T)
+    inference = Inference(problem := Valley({"low": (one, one)}, {"low": 0.9}))
+    low = problem.candidates[-1]
+    (fit,) = inference.fits([inference.request(low.parameters, {"a": 1.0, "low.c": 0.5})], inference.noise())
+    t = Trial(low, Stand(fit, *inference.stand(fit.point)), 1.0)
+    there = pairs.from_there(inference, t, {"a": 2.9, "other.c": 1.0})
+    assert inference.is_noise(there.errors) and there.fit.point["a"] == pytest.approx(3.0, abs=0.02)
+    assert "other.c" not in there.fit.point
+    better = Trial(low, there, 1.0)
+    assert pairs.from_there(inference, better, {"a": 1.0}).fit is there.fit
