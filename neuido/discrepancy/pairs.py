@@ -120,9 +120,8 @@ def second_beside(
     is `sure`. `at` is where the chosen one stands, if its fit was finished.
     """
     pairs: list[list[Round]] = []
-    for t in sorted(members, key=lambda t: t.penalised)[:BESIDE]:
-        if len(t.candidate.parameters) > MANY:
-            continue
+    small = [t for t in members if len(t.candidate.parameters) <= MANY]
+    for t in sorted(small, key=lambda t: t.penalised)[:BESIDE]:
         here = at if at is not None and t is first.chosen else Stand(t.fit, *inference.stand(t.fit.point))
         if t is not sure and inference.promised(here, t) > PROMISED:
             continue
