@@ -13,7 +13,7 @@ from neuido.discrepancy.rounds import Inference
 from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
 
 WORSE = 3.0
-"""Times the error of the better method at which the other one is not asked any more, where that found nothing."""
+"""Times the error of the better method at which the other one is not asked any more: where that found nothing, and for two effects."""
 LOOKED_AHEAD = 2
 """Effects that are tried with a second one, where none gains enough alone, or in the place of one with more parameters."""
 BLIND_GAIN = 2.0 * LEAST_GAIN
@@ -90,9 +90,11 @@ def by_another_method(others: Mapping[Inference, Round], inference: Inference, a
         inference: The one that named an effect.
         at: Where that stands.
     """
+    if inference.is_settled(at.errors):
+        return None
     made = []
     for other, first in others.items():
-        if first.chosen is None or inference.is_settled(at.errors) or first.chosen.score > score(at.errors) + 2.0 * math.log(WORSE):
+        if first.chosen is None or first.chosen.score > score(at.errors) + 2.0 * math.log(WORSE):
             continue
         here = from_there(other, first.chosen, at.fit.point)
         if pair := second_beside(other, first, first.members, at.errors, at=here, sure=first.chosen):
