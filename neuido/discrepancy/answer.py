@@ -17,6 +17,7 @@ from neuido.discrepancy import ceiling, next_experiment, report, residual
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.believed import beside
 from neuido.discrepancy.problem import Problem
+from neuido.discrepancy.rollouts import CONTACT_HEIGHT
 from neuido.discrepancy.rounds import ALPHA, Round, Trial
 
 FORMAT = "neuido-diagnosis/1"
@@ -98,6 +99,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         "rejected": rejected(d),
         "next_experiment": next_experiment.propose(d),
         "ceiling": {when: {"held_out": c.held_out, "fit": c.fit} for when, c in ceilings.items()},
+        "left_out": list(d.left_out),
         "places": {name: _place(d, name, arrays) for name, arrays in motion.items() if "positions" in arrays},
         "solver": d.problem.setting_name(d.setting),
         "seconds": 0.0,
@@ -120,7 +122,9 @@ def _settings(d: Diagnosis) -> dict[str, Any]:
         return {}
     names = [d.problem.setting_name(s) for s in d.problem.others(d.setting)]
     amounts = {when: dict(zip(names, own)) for when, own in d.amounts.items()}
-    return {"amounts": amounts, "one_setting": {when: errors(d, when, one_setting=True) for when in ("before", "after")}}
+    heights = {when: point.get(CONTACT_HEIGHT, 0.0) for when, point in (("before", d.before), ("after", d.after))}
+    out: dict[str, Any] = {"amounts": amounts, "one_setting": {when: errors(d, when, one_setting=True) for when in ("before", "after")}}
+    return out | ({"contact_height": {**heights, "unit": "m"}} if any(heights.values()) else {})
 
 
 def errors(d: Diagnosis, when: str, *, one_setting: bool = False) -> dict[str, Any]:
@@ -342,7 +346,8 @@ def summary(found: Found) -> str:
         where = f"{d.problem.labels['body']}: " if "body" in d.problem.labels and len(found) > 1 else ""
         scored = "held-out" if key == "held_out" else "fitted"
         floor = math.hypot(d.floors["noise"], d.floors["discretisation"])
-        lines.append(f"{where}{what}; {scored} error {before[key]:.3g} -> {after[key]:.3g} {d.problem.unit} (floor {floor:.2g})")
+        line = f"{where}{what}; {scored} error {before[key]:.3g} -> {after[key]:.3g} {d.problem.unit} (floor {floor:.2g})"
+        lines.append(line + (f"; no time for {', '.join(d.left_out)}: give more minutes" if d.left_out else ""))
     return "\n".join(lines)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
 from neuido.discrepancy.intervals import intervals
@@ -65,6 +66,8 @@ class Diagnosis:
     setting: int
     work: Mapping[str, Work]
     """What each step ran."""
+    left_out: Sequence[str] = ()
+    """What the search had no time for."""
 
     @property
     def evaluations(self) -> int:
@@ -76,7 +79,16 @@ class Diagnosis:
         return [r.chosen for r in self.rounds if r.chosen is not None]
 
 
-def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0, most: int = MOST, tell: Tell | None = None) -> Diagnosis:
+def diagnose(
+    problem: Problem,
+    *,
+    keep: int = 7,
+    draws: int = 199,
+    seed: int = 0,
+    most: int = MOST,
+    tell: Tell | None = None,
+    seconds: float = math.inf,
+) -> Diagnosis:
     """Fit the declared model, look for effects that it lacks, and say what was found.
 
     Args:
@@ -86,13 +98,14 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         seed: Of the draws.
         most: Effects that may be added.
         tell: Called with a line of progress.
+        seconds: After which it comes to its end; see `Deadline`.
     """
-    memo = Memo(problem)
+    memo, deadline = Memo(problem), Deadline(seconds)
     tried: list[Inference] = []
     starts: list[Stand] = []
     for n in problem.solvers:
-        inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo)
-        if starts and tried[-1].is_settled(starts[-1].errors):
+        inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo, deadline=deadline)
+        if starts and (tried[-1].is_settled(starts[-1].errors) or deadline.skips(problem.setting_name(n))):
             continue
         start = inference.start(starts[0].fit.point if starts else None)
         if start is not None:
@@ -108,7 +121,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
         step = rounds[-1].chosen
         found.append(step)
         at = inference.finished(step.stand)
-        if len(found) == most or inference.is_settled(step.errors):
+        if len(found) == most or inference.is_settled(step.errors) or deadline.skips("a further effect"):
             break
         free = [problem.parameter(name) for name in at.fit.names]
         if problem.settings > 1 and times_over(at.errors, inference.floors(at.fit.point, free, at.floor)) < FURTHER:
@@ -125,6 +138,7 @@ def diagnose(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0
             rounds = pair
             found = [r.chosen for r in pair]
             at = inference.finished(found[-1].stand)
+    deadline.conclude()
     if len(found) > 1:
         floor = inference.floor(at.fit.point)
         fit, found = drop(inference, at.fit, floor, found)
@@ -138,14 +152,11 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
 
     The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for.
     """
-    settled = [i for i, start in enumerate(starts) if tried[i].is_settled(start.errors)]
+    settled = [i for i, start in enumerate(starts) if tried[i].is_noise(start.errors)]
     if settled:
         chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
-        inference, start = tried[chosen], starts[chosen]
-        floors = inference.noise_squares
-        if not inference.is_noise(start.errors):
-            floors = inference.floors(start.fit.point, inference.problem.declared, start.floor)
-        return chosen, {chosen: [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]}
+        start = starts[chosen]
+        return chosen, {chosen: [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, tried[chosen].noise_squares)]}
     # another method must do clearly better before it takes the place of the suggested one
     handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
@@ -154,6 +165,8 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     for i in order:
         named = [rounds[0] for rounds in firsts.values() if rounds[0].chosen]
         if firsts and not named and base[i] - base[order[0]] > 2.0 * math.log(WORSE):
+            continue
+        if firsts and tried[i].deadline.skips("effects by the other method"):
             continue
         first = tried[i].round(starts[i].fit, starts[i].floor, [], named[0] if named else None)
         least = min((t.score for t in first.trials), default=math.inf)
@@ -168,7 +181,11 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
         i: min([t.score for r in rounds for t in r.trials if not t.reason or t in r.members] + [score(rounds[0].errors)])
         for i, rounds in firsts.items()
     }
-    chosen = min(firsts, key=lambda i: best[i] + handicap[i])
+    # by a method whose declared model is not the best one an effect must leave clearly less than that one does without any
+    sure = {
+        i: 2.0 * LEAST_GAIN * (i != order[0] and firsts[i][0].chosen is not None and firsts[order[0]][0].chosen is None) for i in firsts
+    }
+    chosen = min(firsts, key=lambda i: best[i] + handicap[i] + sure[i])
     return chosen, firsts
 
 
@@ -270,6 +287,7 @@ def conclude(inference: Inference, before: Stand, after: Stand, found: list[Tria
         declared,
         inference.setting,
         inference.memo.work,
+        tuple(inference.deadline.left_out),
     )
 
 

@@ -21,7 +21,7 @@ from neuido.discrepancy.believed import CLASSICAL, classical
 from neuido.discrepancy.declared import declared
 from neuido.discrepancy.library import body_candidates, present
 from neuido.discrepancy.problem import Ask, Parameter, Point, Recording, Rows
-from neuido.discrepancy.rollouts import SETTINGS, BodyRollouts, Motions, substeps
+from neuido.discrepancy.rollouts import SETTINGS, SOLVERS, BodyRollouts, Motions, substeps
 from neuido.errors import UserError
 from neuido.physics import effect_kernels, law_kernels
 from neuido.physics.device import real_of
@@ -280,7 +280,7 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
         candidates=present(candidates, experiment.model.get("effects", {})),
         recordings=tuple(_recording(r) for r in measured),
         settings=len(SETTINGS),
-        solvers=(0, 4),
+        solvers=SOLVERS,
         experiment=experiment,
         measured=tuple(measured),
         labels={"excluded": neural},

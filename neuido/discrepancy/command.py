@@ -1,6 +1,7 @@
 """The `diagnose` command: signature, help and order of work; `--help` loads no torch."""
 
 import csv
+import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -33,6 +34,7 @@ def diagnose(
     draws: int = 199,
     seed: int = 0,
     most: int = 3,
+    minutes: float = 15.0,
     device: str = "auto",
     resume: bool = True,
     progress: bool = True,
@@ -53,6 +55,8 @@ def diagnose(
         draws: Draws of the parametric bootstrap; p-values come in steps of 1 / (draws + 1).
         seed: Seed of the draws.
         most: Effects that may be added, 1 to 3.
+        minutes: After which the search ends with what it has, for each body; 0: as long as it takes. What was left out is told, and
+            the same command with more minutes goes on from there.
         device: auto, cpu or cuda.
         resume: Go on with the predictions that a killed run left in DIR/.work.
         progress: Show a line of progress.
@@ -65,6 +69,8 @@ def diagnose(
         raise UserError(f"draws = {draws} is too few for a level of 5 %: give at least 19")
     if not 1 <= most <= 3:
         raise UserError(f"most = {most} must be 1, 2 or 3")
+    if not minutes >= 0:
+        raise UserError(f"minutes = {minutes} must not be negative; 0 sets no limit")
     kind, place = kind_of(folder)
     target = Path(out).expanduser()
     if target.exists() and not target.is_dir():
@@ -92,10 +98,12 @@ def diagnose(
         cached = store.CachedProblem(problem, work / str(i), tick=log.tick)
         log.name = problem.name if len(problems) > 1 else ""
         log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
-        found.append((infer(cached, draws=draws, seed=seed, most=most, tell=log), time.monotonic() - started))
+        seconds = 60.0 * minutes or math.inf
+        found.append((infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds), time.monotonic() - started))
     log.name = ""
     answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
-    store.clear(target)
+    if not any(diagnosis.left_out for diagnosis, _ in found):  # else more minutes go on from what is kept
+        store.clear(target)
     for diagnosis, _ in found:
         log.work(diagnosis.work)
     log.close(answer.summary(found))

@@ -89,6 +89,8 @@ class Contests(Laboratory):
             key = entry[0].key
             waves[0 if self.problem.together or key in first else 1 if key in small else 2].append(entry)
         for own in waves:
+            if best and own and self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}"):
+                break
             if own is waves[2] and best:
                 leading = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
                 if self.is_noise(self.mean_squares([leading.point], floor)[0]):
@@ -160,11 +162,11 @@ class Contests(Laboratory):
         for c, fit in top:
             if not self.runs(fit.point):  # there is no floor there
                 continue
-            starts = [fit.point, {**fit.point, **self.as_declared}]
+            starts = [fit.point, self.at_declared(fit.point)]
             if fit is not ranked[0][1]:
                 starts.append({**fit.point, **{name: leading[name] for name in self.as_declared}})
             found, own = self.from_here((*free, *c.parameters), fit, starts, floor)
-            for _ in range(ONWARD):
+            for _ in range(0 if self.deadline.over else ONWARD):
                 left = self.mean_squares([found.point], own)[0]
                 if self.is_noise(left) or not self.runs(found.point):
                     break
@@ -181,10 +183,17 @@ class Contests(Laboratory):
                 out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
         return out
 
+    def at_declared(self, point: Point) -> Point:
+        """The point with the declared parameters, and the problem's own, as the model states them; the effects as they are."""
+        return {k: v for k, v in point.items() if "." in k} | self.as_declared
+
     def from_here(self, free: Sequence[Parameter], fit: Fit, starts: Sequence[Point], like: Floor) -> tuple[Fit, Floor]:
         """The best of a fit and of those from some starts, all with the floor where the fit stands; and the floor."""
         (own, _), race = self.stand(fit.point, like=like), Race()
-        ends = [fit, *self.fits([self.request(free, start, race=race) for start in starts], own)]
+        moved = self.recentred(fit.point, own)
+        follow = {name: value for name, value in moved.items() if value != fit.point.get(name)}
+        begins = [{**start, **follow} if set(start) == set(fit.point) else start for start in starts]
+        ends = [fit, *self.fits([self.request(free, begin, race=race) for begin in begins], own)]
         left = [score(squares) for squares in self.mean_squares([end.point for end in ends], own, fitted=True)]
         return ends[int(np.argmin(left))], own
 
@@ -201,7 +210,7 @@ class Contests(Laboratory):
         limit = score(found[order[0]].errors) + 2.0 * math.log(NEAR)
         leading = [i for i in order if score(found[i].errors) < limit and not self.is_noise(found[i].errors)]
         with self.memo.during("discretisation"):  # all of them in one launch
-            self.predicted([points[i] for i in leading], list(floor.noise), range(self.problem.settings))
+            self.predicted([points[i] for i in leading], list(floor.noise), [self.setting, *self.problem.others(self.setting)])
         for i in leading:
             if self.runs(points[i]):
                 there = Stand(found[i].fit, *self.stand(points[i], like=floor))
@@ -264,4 +273,31 @@ class Contests(Laboratory):
                 requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
                 of.append(c)
         self.tell(f"again from elsewhere: {', '.join(dict.fromkeys(c.key for c in of))}")
-        return better(zip(of, self.fits(requests, floor), strict=True), best)
+        ended = list(zip(of, self.fits(requests, floor), strict=True))
+        found = better(ended, best)
+        return found | self.ahead(ended, {**best, **found}, floor)
+
+    def ahead(
+        self, ended: Sequence[tuple[Candidate, Fit]], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Ends of fits once more with the floor where they stand, those that leave least: candidates that then leave less than their best.
+
+        What another grid does there may be another thing than at the base, and by the weights of that the truth stays behind.
+        """
+        ended = [entry for entry in ended if np.isfinite(entry[1].cost)]
+        if self.problem.settings == 1 or not ended or self.deadline.over:
+            return {}
+        left = [score(squares) for squares in self.mean_squares([fit.point for _, fit in ended], floor)]
+        out: dict[str, tuple[Candidate, Fit]] = {}
+        for i in np.argsort(left)[:POLISHED]:
+            c, fit = ended[i]
+            if not self.runs(fit.point):
+                continue
+            further, own = self.from_here((*self.problem.declared, *c.parameters), fit, [fit.point], floor)
+            rival = (out.get(c.key) or best[c.key])[1]
+            there = self.stand(rival.point, like=floor)[0]
+            pairs = ((further, own), (rival, there))
+            mine, its = (score(self.mean_squares([end.point], f, fitted=True)[0]) for end, f in pairs)
+            if mine < its:
+                out[c.key] = (c, replace(further, cost=self.costs([further.point], floor)[0]))
+        return out

@@ -51,9 +51,9 @@ class LinearModel:
         names = [(None, ())] + [(key, (key,)) for key in self.keys]
         self.solvers = {name: _solver([p for p in self.parts if p.fitted], keys) for name, keys in names}
 
-    def draw(self) -> list[np.ndarray]:
-        """One residual of each part under the null, in its basis."""
-        return [p.draw(self.rng) for p in self.parts]
+    def draw(self, *, exact: bool = False) -> list[np.ndarray]:
+        """One residual of each part under the null, in its basis; `exact`: of noise and nuisances alone."""
+        return [p.draw(self.rng, exact) for p in self.parts]
 
     def errors(self, draw: Sequence[np.ndarray]) -> dict[str | None, np.ndarray]:
         """Mean squares of each part after the fit of the base (None) and of each candidate, (parts,)."""
@@ -65,9 +65,9 @@ class LinearModel:
             out[name] = np.array([p.square(r - p.design(keys) @ q) for p, r in zip(self.parts, draw, strict=True)])
         return out
 
-    def null(self, data: np.ndarray, count: int = 199) -> np.ndarray:
+    def null(self, data: np.ndarray, count: int = 199, *, exact: bool = False) -> np.ndarray:
         """The largest gain over the candidates in each of `count` draws, weighed as that of the data is; `data` as for `gain`."""
-        return np.array([self._largest(self.errors(self.draw()), data) for _ in range(count)])
+        return np.array([self._largest(self.errors(self.draw(exact=exact)), data) for _ in range(count)])
 
     def _largest(self, errors: Mapping[str | None, np.ndarray], data: np.ndarray) -> float:
         fitted, noise = [p.fitted for p in self.parts], np.array([p.noise**2 for p in self.parts])
@@ -138,10 +138,10 @@ class _Part:
     def weighted(self, r: np.ndarray) -> np.ndarray:
         return r[: len(self.scale)] * self.scale
 
-    def draw(self, rng: np.random.Generator) -> np.ndarray:
+    def draw(self, rng: np.random.Generator, exact: bool = False) -> np.ndarray:
         k = len(self.scale)
         r = self.noise * rng.standard_normal(k)
-        for columns in (self.nuisances, self.discretisation, self.smooth):
+        for columns in (self.nuisances,) if exact else (self.nuisances, self.discretisation, self.smooth):
             r = r + columns @ rng.standard_normal(columns.shape[1])
         self.rest = self.noise**2 * (rng.chisquare(self.outside) if self.outside else 0.0)
         return self.past(r)

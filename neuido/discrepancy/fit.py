@@ -103,6 +103,7 @@ def levenberg_marquardt(
     slopes: np.ndarray | None = None,
     sizes: Sequence[str] = (),
     margin: Callable[[Point], float] = lambda point: np.inf,
+    halt: Callable[[], bool] = lambda: False,
 ) -> Request:
     """One fit as a generator: it yields the points that it wants and receives their whitened residuals (None: not runnable).
 
@@ -121,6 +122,7 @@ def levenberg_marquardt(
         slopes: About the derivatives of the whitened residuals by the coordinates at the start, (n, p); without the priors' rows.
         sizes: Parameters that begin smaller where the start does not run.
         margin: `Problem.margin` of a point: steps that would go past it are led along it.
+        halt: Whether to end where the fit is, asked once an iteration.
     """
     names = tuple(p.name for p in parameters)
     fixed = {k: v for k, v in start.items() if k not in names}
@@ -150,7 +152,7 @@ def levenberg_marquardt(
     cost = np.inf if r is None else float(r @ r)
     converged, costs, n = r is not None, [cost], 0
     J, fresh = None if slopes is None or together or r is None else _with_prior_rows(slopes, parameters), False
-    while n < iterations and r is not None and names:
+    while n < iterations and r is not None and names and not halt():
         converged = False
         if J is None:
             steps = np.where(q + STEP > high, -STEP, STEP)

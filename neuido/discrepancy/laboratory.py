@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from neuido.discrepancy import evidence
+from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.evidence import NOISE_ALONE
 from neuido.discrepancy.fit import Fit, Request, levenberg_marquardt, residuals, run
 from neuido.discrepancy.floors import Floor, over_time, split
@@ -20,10 +21,13 @@ LEAST_GAIN = math.log(1.7)
 """Smaller gains are no reason to name anything: other solvers differ by as much in ways that no setting of one solver shows."""
 ROUGH = 0.02
 """Relative gain that ends the fit before the floors are known."""
+FOLLOWED = 1.5
+"""What the errors of the declared model must fall by for a parameter of the problem's own to leave its place."""
 UNSEEN = 0.1
 """Largest share of the differences of the settings that lies outside their directions: what a fit weighs the data by, beside the noise."""
-AGAIN = 2
-"""Fits of the declared model with the differences of the settings, each with those of where the last one ended."""
+AGAIN, MOST_AGAIN = 2, 4
+"""Fits of the declared model with the differences of the settings, each with those of where the last one ended: the least, and the most
+while a parameter of the problem's own follows the amounts."""
 ASTRAY = 1.05
 """Times the error of the fitted parts from which on the end of a fit is not taken for a better one."""
 
@@ -38,10 +42,19 @@ class Laboratory:
         setting: Setting of the discretisation that predicts; the others tell its error.
         tell: Called with a line of progress.
         memo: Predictions that are shared with those of other settings.
+        deadline: When fits end where they are.
     """
 
-    def __init__(self, problem: Problem, *, setting: int = 0, tell: Tell | None = None, memo: Memo | None = None) -> None:
-        self.problem, self.setting = problem, setting
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        setting: int = 0,
+        tell: Tell | None = None,
+        memo: Memo | None = None,
+        deadline: Deadline | None = None,
+    ) -> None:
+        self.problem, self.setting, self.deadline = problem, setting, deadline or Deadline()
         self.tell = tell or (lambda line: None)
         self.memo = memo or Memo(problem)
         self.parts = split(problem)
@@ -50,6 +63,8 @@ class Laboratory:
         self.fitted_recordings = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
         self.as_declared = {p.name: p.value for p in problem.declared}
         """The declared parameters at the values that the model states."""
+        self.still: Point | None = None
+        """Where the declared model fits best without a parameter of the problem's own, if it was given one."""
         self.noise_squares = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
         """Mean squares of the noise of each part."""
         self.scale = problem.error(np.ones(1), 0)
@@ -129,6 +144,11 @@ class Laboratory:
         rows = {n: self.residual(point, n) for n in self.fitted_recordings}
         return floor.amounts(rows, self.parts) if all(np.isfinite(row).all() for row in rows.values()) else np.zeros(0)
 
+    def recentred(self, point: Point, floor: Floor) -> Point:
+        """The point where its own amounts of the differences lead, as far as the problem has a parameter for that."""
+        amounts = self.amounts(point, floor)
+        return self.problem.recentred(point, self.setting, amounts) if len(amounts) else point
+
     def noise(self) -> Floor:
         """The floor without any discretisation error."""
         noise = {n: self.noise_of(n) for n in range(len(self.problem.recordings))}
@@ -184,7 +204,8 @@ class Laboratory:
     def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
         """A fit; options of `levenberg_marquardt`."""
         margin = functools.partial(self.problem.margin, setting=self.setting)
-        return levenberg_marquardt(parameters, start, together=self.problem.together, margin=margin, **options)
+        halt = lambda: self.deadline.over  # noqa: E731
+        return levenberg_marquardt(parameters, start, together=self.problem.together, margin=margin, halt=halt, **options)
 
     def base(self, starts: Sequence[Point], floor: Floor, **options: Any) -> Fit:
         """The declared parameters fitted from several starts; the best one after a few iterations goes on, with options of the fit."""
@@ -208,7 +229,8 @@ class Laboratory:
         here = Stand(fit, *self.stand(fit.point))
         unit = 1.0 / sum(int(p.rows.sum()) for p in self.parts if p.fitted)
         parameters = [self.problem.parameter(name) for name in fit.names]
-        (further,) = self.fits([self.request(parameters, fit.point, iterations=6, tolerance=0.3 * unit, nothing=0.1 * unit)], here.floor)
+        begin = self.recentred(fit.point, here.floor)
+        (further,) = self.fits([self.request(parameters, begin, iterations=6, tolerance=0.3 * unit, nothing=0.1 * unit)], here.floor)
         least = min(named, here, key=left)
         if not parameters or not self.runs(further.point):
             return least
@@ -240,13 +262,34 @@ class Laboratory:
             fit = self.base([fit.point], floor)
             return Stand(fit, floor, self.mean_squares([fit.point], floor)[0])
         made = [Stand(fit, floor, errors)]
-        for _ in range(AGAIN):
-            fit = self.base([fit.point], floor)
+        for turn in range(MOST_AGAIN):
+            begin = self.recentred(fit.point, floor) if turn else fit.point
+            if turn >= AGAIN and begin == fit.point:
+                break
+            # a modulus may have made up for where the floor is
+            fit = self.base([begin] if begin == fit.point else [begin, {**begin, **self.as_declared}], floor)
             if not self.runs(fit.point):
                 break
             floor, errors = self.stand(fit.point, like=floor)
             made.append(Stand(fit, floor, errors))
-        return min(made, key=lambda start: score(start.errors[self.fitted]))
+        return self.plainest(made)
+
+    def plainest(self, made: Sequence[Stand]) -> Stand:
+        """The stand that leaves least of the fitted parts: one whose point follows the amounts must leave clearly less than the others.
+
+        A parameter of the problem's own that makes up for an effect in part stands in the way of all that begins there.
+        """
+
+        def left(stand: Stand) -> float:
+            return score(stand.errors[self.fitted])
+
+        own = [{k: v for k, v in stand.fit.point.items() if k not in self.as_declared} for stand in made]
+        still = min((stand for stand, place in zip(made, own, strict=True) if place == own[0]), key=left)
+        best = min(made, key=left)
+        if left(still) - left(best) <= 2.0 * math.log(FOLLOWED):
+            return still
+        self.still = still.fit.point
+        return best
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""

@@ -37,6 +37,8 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
     bases = sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]
     blind = fits_alone(inference, first, bases)
     for t in (*bases, *blind):
+        if inference.deadline.skips(f"a second effect beside {t.candidate.key}"):
+            break
         second = inference.round(t.fit, inference.stand(t.fit.point)[0], [t], most=MANY)
         if second.chosen is None or inference.gain(first.errors, second.chosen.errors) < 2.0 * LEAST_GAIN:
             continue
@@ -94,6 +96,8 @@ def by_another_method(others: Mapping[Inference, Round], inference: Inference, a
         return None
     made = []
     for other, first in others.items():
+        if inference.deadline.skips("two effects by the other method"):
+            break
         if first.chosen is None or first.chosen.score > score(at.errors) + 2.0 * math.log(WORSE):
             continue
         here = from_there(other, first.chosen, at.fit.point)
@@ -125,6 +129,8 @@ def second_beside(
     small = [t for t in members if len(t.candidate.parameters) <= MANY]
     for t in sorted(small, key=lambda t: t.penalised)[:BESIDE]:
         here = at if at is not None and t is first.chosen else Stand(t.fit, *inference.stand(t.fit.point))
+        if inference.deadline.skips(f"a second effect beside {t.candidate.key}"):
+            break
         if t is not sure and inference.promised(here, t) > PROMISED:
             continue
         second = inference.round(here.fit, here.floor, [t], most=MANY)

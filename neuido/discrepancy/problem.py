@@ -147,8 +147,12 @@ class Problem:
         return float(np.sqrt(np.mean(residual**2)))
 
     def others(self, setting: int) -> list[int]:
-        """The other settings, which tell the discretisation error of one: finite elements tell that of material points too."""
+        """The other settings whose differences to one are directions that the data may lie in, whatever the law."""
         return [s for s in range(self.settings) if s != setting]
+
+    def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
+        """The point moved to where amounts of the differences to `others` lead, as far as a parameter of the problem's own can go there."""
+        return point
 
     def setting_name(self, setting: int) -> str:
         """What a setting is, for the report."""

@@ -74,6 +74,10 @@ def _one(made: Details, d: Diagnosis) -> list[str]:
     names = " and ".join(" or ".join(e["class"]) for e in c["effects"])
     bodies = {name: arrays for name, arrays in made.motion.items() if "positions" in arrays}
     out = [f'<p class="answer">{escaped(SENTENCES[c["answer"]].format(names=names or "it"))}</p>', _effects(c), _errors(c)]
+    if c["left_out"]:
+        out.append(
+            f'<p class="note">{escaped("The time was up before: " + "; ".join(c["left_out"]) + ". More minutes go on from here.")}</p>'
+        )
     if bodies:
         out += [
             "<h2>Motion before and after</h2>",
@@ -148,6 +152,9 @@ def _settings(e: dict[str, Any]) -> str:
     scored = "held_out" if e["one_setting"]["after"]["held_out"] is not None else "fit"
     before, after = (e["one_setting"][when][scored] for when in ("before", "after"))
     alone = f"One simulation without them leaves {before:.3g} {e['unit']} before and {after:.3g} {e['unit']} after."
+    if height := e.get("contact_height"):
+        places = " and ".join(f"{1e3 * height[when]:.3g} mm {when}" for when in ("before", "after"))
+        alone += f" The colliders are higher than declared by {places}, which is within what a grid or a ruler may be off."
     return f"<p>{held}</p>" + table(("other setting", "amount before", "amount after"), rows) + f"<p>{escaped(alone)}</p>"
 
 

@@ -69,6 +69,12 @@ class CachedProblem(Problem):
     def effort(self, recording: int, setting: int = 0) -> float:
         return self.problem.effort(recording, setting)
 
+    def others(self, setting: int) -> list[int]:
+        return self.problem.others(setting)
+
+    def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
+        return self.problem.recentred(point, setting, amounts)
+
     @property
     def together(self) -> bool:
         return self.problem.together

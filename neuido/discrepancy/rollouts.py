@@ -3,6 +3,7 @@
 A launch moves one or several recordings under one or several points each. What is seen of the motions is `body`'s.
 """
 
+import functools
 import math
 import threading
 from collections.abc import Mapping, Sequence
@@ -32,6 +33,10 @@ KEPT = {"cpu": 24, "cuda": 96}
 SIZES = (1, 4, 12, 32, 96)
 """Parameter sets of a recording in a launch, filled up: each number of them has buffers and captured launches of its own."""
 
+LEAST_LIFT, MOST_LIFT, GAP = 0.05, 0.8, 1.0
+"""Suggested cells: what the contact height moves by, at the least; how far from where it is declared it may be; and how far from the
+colliders a body begins that may be lifted against them."""
+
 Motions = tuple[Sequence[Point], int]
 """Points, and the number of the recording that moves under each of them."""
 
@@ -48,13 +53,15 @@ class Setting:
     """`material_points` or `finite_elements`."""
     elements: float = 1.0
     """Finite elements a particle."""
+    lift: float = 0.0
+    """Suggested cells by which the colliders and the grid are higher; see `CONTACT_HEIGHT`."""
 
     @property
     def name(self) -> str:
         """For the report."""
-        if self.solver == "finite_elements":
-            return "finite elements" + (f", {self.elements:g} a particle" if self.elements != 1.0 else "")
-        parts = [f"{self.cells:g} times the cells"] * (self.cells != 1.0) + [f"{self.dt:g} of the step"] * (self.dt != 1.0)
+        parts = ["finite elements"] * (self.solver == "finite_elements") + [f"{self.elements:g} a particle"] * (self.elements != 1.0)
+        parts += [f"{self.cells:g} times the cells"] * (self.cells != 1.0) + [f"{self.dt:g} of the step"] * (self.dt != 1.0)
+        parts += [f"colliders {self.lift:g} cells higher"] * (self.lift != 0.0)
         return ", ".join(parts) or "suggested"
 
 
@@ -63,9 +70,18 @@ SETTINGS = (
     Setting(1.0, 0.5),
     Setting(0.85, 1.0),
     Setting(1.2, 0.5),
+    Setting(1.0, 1.0, lift=0.5),
     Setting(1.0, 1.0, "finite_elements"),
     Setting(1.0, 1.0, "finite_elements", elements=0.6),
 )
+SOLVERS = tuple(next(i for i, s in enumerate(SETTINGS) if s.solver == name) for name in ("material_points", "finite_elements"))
+"""The settings that are methods of their own."""
+CONTACT_HEIGHT = "contact_height"
+"""Name in a point: how much higher [m] than they are declared the colliders are, with the grid.
+
+A body meets a plane of a grid at a layer of nodes, up to a cell from where the plane is declared, and two grids differ by that whatever
+their cells; a real floor is where it was measured to be, more or less. A prediction moves the body instead, and what is seen of it back.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +142,9 @@ class BodyRollouts(Problem):
         if self.device != "cpu":
             size = next((n for n in SIZES if n >= most), most)
         simulator = self.simulator(tuple(n for _, n in runs), setting, size)
-        filled = [[*points, *[points[-1]] * (size - len(points))] for points, _ in runs]
-        full = [self._full(point) for points in filled for point in points]
+        filled = [([*points, *[points[-1]] * (size - len(points))], n) for points, n in runs]
+        lifts = np.array([self._lift(point, n, setting) for points, n in filled for point in points])
+        full = [_against(self._full(point), lift) for point, lift in zip((p for points, _ in filled for p in points), lifts, strict=True)]
         elasticity, plasticity = self.laws(full)
         always = () if self.device == "cpu" or len(full) == 1 else [p.name for c in self.candidates for p in c.parameters]
         effects = self._effects(simulator, full, [n for _, n in runs], always)
@@ -137,17 +154,51 @@ class BodyRollouts(Problem):
                 steps,
                 elasticity,
                 plasticity,
-                state=self._start(simulator, full, [n for _, n in runs]),
+                state=self._start(simulator, full, [n for _, n in runs], lifts),
                 every=every,
                 segment=segment_of(steps, every),
                 effects=effects,
             )
+        if lifts.any():
+            out = out._replace(x=out.x + torch.from_numpy(lifts).to(out.x)[simulator.particles.scene.long()])
         moved, offsets = [], simulator.particles.offsets[::size]
         for (points, n), a, b in zip(runs, offsets[:-1], offsets[1:], strict=True):
             frames = ParticleState(*(t[:, a:b].unflatten(1, (size, -1))[:, : len(points)] for t in out))
             r = self.measured[n]
             moved.append(frames if exact else _at_times(frames, every * r.scene.dt * SETTINGS[setting].dt, r.t.to(out.x)))
         return moved
+
+    @functools.cached_property
+    def _ups(self) -> list[np.ndarray]:
+        return [_up(r) for r in self.measured]
+
+    @property
+    def lifts(self) -> bool:
+        """Whether colliders may be higher than they are declared in some recording."""
+        return any(up.any() for up in self._ups)
+
+    def others(self, setting: int) -> list[int]:
+        """Of material points a finer step and grid and, where the body meets something, a lift of that, else a coarser grid.
+
+        Of finite elements, which meet a plane where it is, another mesh and the grids: what a mesh gets wrong no mesh knows alone.
+        """
+        able = [i for i, s in enumerate(SETTINGS[: self.settings]) if i != setting]
+        if SETTINGS[setting].solver == "finite_elements":
+            return [i for i in able if not SETTINGS[i].lift]
+        without = (lambda s: s.cells < 1.0) if self.lifts else (lambda s: s.lift > 0.0)
+        return [i for i in able if SETTINGS[i].solver == "material_points" and not without(SETTINGS[i])]
+
+    def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
+        others, height, dx = self.others(setting), point.get(CONTACT_HEIGHT, 0.0), self.measured[0].scene.dx
+        moved = -sum(SETTINGS[s].lift * dx * a for s, a in zip(others, amounts, strict=True))
+        if abs(moved) < LEAST_LIFT * dx:
+            return point
+        room = min((_gap(r) for r, up in zip(self.measured, self._ups, strict=True) if up.any()), default=0.0)
+        return {**point, CONTACT_HEIGHT: float(np.clip(height + moved, -MOST_LIFT * dx, min(MOST_LIFT * dx, room - 0.5 * GAP * dx)))}
+
+    def _lift(self, point: Point, recording: int, setting: int) -> np.ndarray:
+        """How much further along their normals the colliders are [m], (3,)."""
+        return (point.get(CONTACT_HEIGHT, 0.0) + SETTINGS[setting].lift * self.measured[recording].scene.dx) * self._ups[recording]
 
     def _full(self, point: Point) -> dict[str, float]:
         """With what is declared beside it."""
@@ -205,8 +256,8 @@ class BodyRollouts(Problem):
             self._meshes[recording, elements] = mesh_body(body.x, body.volume, elements=wanted)
         return self._meshes[recording, elements]
 
-    def _start(self, simulator: Simulator, points: Sequence[Point], recordings: Sequence[int]) -> ParticleState:
-        """The start with the velocities and spins of each point, those of the first recording first."""
+    def _start(self, simulator: Simulator, points: Sequence[Point], recordings: Sequence[int], lifts: np.ndarray) -> ParticleState:
+        """The start with the velocities and spins of each point and below the lifts (S, 3), those of the first recording first."""
         count = len(points) // len(recordings)
         names = [self.measured[n].name for n in recordings for _ in range(count)]
         shift = [
@@ -214,11 +265,14 @@ class BodyRollouts(Problem):
             for kind in ("velocity", "spin")
             for p, name in zip(points, names, strict=True)
         ]
+        state = simulator.state
+        if lifts.any():
+            state = state._replace(x=state.x - torch.from_numpy(lifts).to(state.x)[simulator.particles.scene.long()])
         if not any(any(row) for row in shift):
-            return simulator.state
+            return state
         change = torch.tensor(shift, dtype=simulator.dtype, device=simulator.device).reshape(2, len(points), 3)
         scene, offsets = simulator.particles.scene.long(), simulator.particles.offsets
-        x, v, C, F = simulator.state
+        x, v, C, F = state
         centres = torch.stack([x[offsets[s] : offsets[s + 1]].mean(dim=0) for s in range(0, len(points), count)])
         centre = centres.repeat_interleave(count, dim=0)[scene]
         w = change[1]
@@ -243,6 +297,29 @@ class BodyRollouts(Problem):
         size = float(x.norm(dim=1).max())
         straight, turned = float((x - y).abs().max()), float((x @ R.T - y).abs().max())
         return R if turned < 0.01 * size and turned < 0.5 * straight else eye
+
+
+def _up(r: Measured) -> np.ndarray:
+    """Along the colliders' normals, (3,): where those of a recording go when they are higher.
+
+    Zero where there are none, where the body begins on one, and where it is clamped: it must not move along what holds it.
+    """
+    normals = {tuple(v / math.hypot(*p.normal) for v in p.normal) for p in r.scene.colliders}
+    free = normals and not r.scene.clamps and _gap(r) > GAP * r.scene.dx
+    return np.sum(list(normals), axis=0) if free else np.zeros(3)
+
+
+def _gap(r: Measured) -> float:
+    """How far the body of a recording begins from the colliders [m]."""
+    x = r.body.x.double().numpy()
+    normals = [np.array(p.normal) / math.hypot(*p.normal) for p in r.scene.colliders]
+    return min((float(((x - np.array(p.point)) @ n).min()) for p, n in zip(r.scene.colliders, normals, strict=True)), default=math.inf)
+
+
+def _against(point: dict[str, float], lift: np.ndarray) -> dict[str, float]:
+    """A full point for a body that starts below a lift (3,) [m]: what has a place in space is below it too."""
+    own = {f"position_force.{a}": d for a, d in zip("xyz", lift, strict=True)}
+    return {name: value - own.get(name, 0.0) for name, value in point.items()} if lift.any() else point
 
 
 def substeps(r: Measured, dt: float) -> tuple[int, int, bool]:

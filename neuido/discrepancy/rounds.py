@@ -13,6 +13,7 @@ import numpy as np
 
 from neuido.discrepancy import evidence
 from neuido.discrepancy.contests import MANY, SMALL, SOME_GAIN, Contests
+from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
@@ -22,15 +23,18 @@ from neuido.discrepancy.trials import Round, Stand, Trial, times_over, unphysica
 
 ALPHA = 0.05
 """Family-wise level of a named effect."""
-CLASS_RATIO, CLASS_RATIO_ABOVE = 1.4, 1.8
+CLASS_RATIO, CLASS_RATIO_ABOVE, CLASS_RATIO_EXACT = 1.4, 1.8, 1.15
 """Candidates whose errors are within this factor of the best one's are not told from it; the larger one where that is above the noise, for
-then the errors are those of the discretisation."""
+then the errors are those of the discretisation; the smallest one where these have no part (`EXACT`)."""
 LEAST_GAIN_EXACT = math.log(1.15)
 """`LEAST_GAIN` where nothing is discretised."""
 GAIN_AT_FLOOR = math.log(2.5)
 """What it takes where the residual is as large as the floor; the best candidates of 55 blind nulls gained up to 1.9 times there."""
 GAIN_IN_FLOOR = math.log(4.0)
 """What it takes well within the floor, where they gained up to 3.3 times: only an effect that the data show far below it."""
+EXACT = 1.05
+"""Mean squares up to so many times those of the noise, and three deviations of their own, that one simulation alone leaves where no other
+grid has a part in the data."""
 GAIN_TO_NOISE = math.log(2.0)
 """What it takes where noise alone is left: a candidate can take the place of what the grid does."""
 VAIN = 0.98
@@ -60,6 +64,7 @@ class Inference(Contests):
         seed: Of the draws.
         tell: Called with a line of progress.
         memo: Predictions that are shared with the inferences of other settings.
+        deadline: When the search ends.
     """
 
     def __init__(
@@ -72,8 +77,9 @@ class Inference(Contests):
         seed: int = 0,
         tell: Tell | None = None,
         memo: Memo | None = None,
+        deadline: Deadline | None = None,
     ) -> None:
-        super().__init__(problem, setting=setting, tell=tell, memo=memo)
+        super().__init__(problem, setting=setting, tell=tell, memo=memo, deadline=deadline)
         self.keep, self.draws, self.seed = keep, draws, seed
 
     @property
@@ -108,7 +114,7 @@ class Inference(Contests):
                 chosen[c.key] = i
                 starts.append((c, begin, self.first_slopes(c, i, free, slopes, columns, floor)))
                 if not c.linear:
-                    starts.append((c, begin | self.as_declared, None))
+                    starts.append((c, self.at_declared(begin), None))
             elif not c.linear and c.key in chosen and sum(s[0].key == c.key for s in starts) < 3:
                 starts.append((c, begin, None))
             elif c.apart and c.key in chosen and all(begin[c.apart] * s[1][c.apart] < 0 for s in starts if s[0].key == c.key):
@@ -119,11 +125,16 @@ class Inference(Contests):
             small = len(c.parameters) <= MANY if c.key not in finite else c.linear and len(c.parameters) <= SMALL
             if small and c.key not in chosen:
                 chosen[c.key] = 0
-                starts.append((c, base.point | self.as_declared | dict(c.starts[0]), None))
+                starts.append((c, self.at_declared(base.point) | dict(c.starts[0]), None))
+        if first and self.still is not None:  # what the declared model needs a parameter of the problem's own for may be an effect
+            starts += [
+                (c, {**self.still, **{k: v for k, v in begin.items() if k.startswith(f"{c.name}.")}}, None) for c, begin, _ in starts
+            ]
         self.tell(f"fitting {', '.join(chosen)}")
         best, other = self.contest(free, starts, floor)
-        best |= self.polish(free, best, base, floor, rival, other)
-        best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
+        if not self.deadline.skips("refining the best fits"):
+            best |= self.polish(free, best, base, floor, rival, other)
+            best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
         floors = self.floors(base.point, free, floor)
         model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)
         empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=model.null(errors, self.draws))
@@ -131,7 +142,8 @@ class Inference(Contests):
         self.tell(self.verdict(result))
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
         led_far = result.chosen is not None and not self.is_noise(result.chosen.errors) and self.moved(base.point) > LED_FAR
-        if first and (led_far or (result.chosen is None and (promising or result.over > 1.0))):
+        again = first and (led_far or (result.chosen is None and (promising or result.over > 1.0)))
+        if again and not self.deadline.skips("fits from elsewhere"):
             best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
             result = self.judge(empty, best, model, list(chosen))
             self.tell(self.verdict(result))
@@ -168,13 +180,31 @@ class Inference(Contests):
         for t in trials:
             if t.candidate.key in model.keys and top.candidate.key in model.keys:
                 result.cosines[t.candidate.key] = model.cosine(t.candidate.key, top.candidate.key)
-        if p <= ALPHA and top.gain > self.least_gain(errors, result.floors, top.errors):
+        named = p <= ALPHA and top.gain > self.least_gain(errors, result.floors, top.errors)
+        near = not named and top.gain > LEAST_GAIN_EXACT and self.is_noise(top.errors)
+        if near and not self.is_exact(top):  # fits end where a step gains little, which may be short of the noise
+            top.stand = self.finished(top.stand)
+            top.gain = self.gain(errors, top.errors)
+        if near and self.is_exact(top):  # only chance is to be beaten
+            null = model.null(errors, self.draws, exact=True)
+            result.p_value = float((1 + np.sum(null >= top.gain)) / (1 + len(null)))
+            named = result.p_value <= ALPHA
+        if named:
             result.chosen = top
             result.members = [t for t in good if self.is_rival(t, top)]
         for t in trials:
             if not t.reason and t not in result.members:
                 t.reason = self._why(t, top, result)
         return result
+
+    def is_exact(self, t: Trial) -> bool:
+        """Whether one simulation of a fit, without the differences of the settings, leaves nothing but a noise that is stated."""
+        stated = all(self.problem.recordings[p.recording].noise for p in self.parts)
+        if self.problem.settings == 1 or not stated or not self.is_noise(t.errors):
+            return False
+        alone = self.mean_squares([t.fit.point], t.stand.floor, plain=True)[0]
+        sure = EXACT + 3.0 * np.sqrt([2.0 / int(p.rows.sum()) for p in self.parts])
+        return bool(np.all(alone < sure * self.noise_squares))
 
     def moved(self, point: Point) -> float:
         """The largest ratio of a declared parameter to the value that the model states, or of this to that."""
@@ -206,8 +236,10 @@ class Inference(Contests):
     def as_good(self, t: Trial, top: Trial) -> bool:
         """Whether a fit comes near the errors of the best one; with three parameters more it must be better."""
         more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
-        exact = self.problem.settings == 1 or self.is_noise(top.errors)
-        return t.score - top.score < (-0.1 if more >= 3 else 2.0 * math.log(CLASS_RATIO if exact else CLASS_RATIO_ABOVE))
+        ratio = CLASS_RATIO if self.problem.settings == 1 or self.is_noise(top.errors) else CLASS_RATIO_ABOVE
+        if self.is_exact(top):
+            ratio = CLASS_RATIO_EXACT
+        return t.score - top.score < (-0.1 if more >= 3 else 2.0 * math.log(ratio))
 
     def is_rival(self, t: Trial, top: Trial) -> bool:
         """Whether the data cannot tell `t` from the best one: about its errors, a gain of its own, and not by many more parameters."""

@@ -193,7 +193,7 @@ def test_wrong_option_is_one_line(more, word, folders, tmp_path, capsys):
 
 def test_one_method_alone(folders):
     problem = solved_by(body_problem(read_experiment(folders["experiment"])), "material_points")
-    assert (problem.settings, problem.solvers) == (4, (0,))
+    assert (problem.settings, problem.solvers) == (5, (0,))
     assert all(SETTINGS[i].solver == "material_points" for i in problem.others(0))
     problem = solved_by(body_problem(read_experiment(folders["experiment"])), "finite_elements")
     assert [SETTINGS[i].solver for i in problem.solvers] == ["finite_elements"]

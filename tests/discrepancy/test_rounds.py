@@ -9,6 +9,7 @@ from scipy.stats import t as student
 from neuido.discrepancy import attribution, contests, pairs, rounds
 from neuido.discrepancy.answer import rejected, trace
 from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
+from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit, Race, levenberg_marquardt, run
 from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
@@ -162,6 +163,8 @@ def test_a_method_that_leaves_more_than_what_another_named_is_not_looked_further
         def __init__(self, result):
             self.result = result
 
+            self.deadline = Deadline()
+
         def is_settled(self, errors):
             return False
 
@@ -205,11 +208,19 @@ def test_an_interval_leaves_room_for_what_only_the_held_out_recording_shows():
     assert width(0.0, 0.01) == pytest.approx(width(0.01, 0.0))
 
 
-def test_what_is_too_near_to_the_noise_for_any_gain_is_not_screened():
-    lines = []
-    found = diagnose(Line(lambda t: 3.0 * t + 0.015 * np.sin(33 * t)), tell=lines.append)
-    assert found.answer == "none"
-    assert not any(line.startswith(("fitting ", "directions ")) for line in lines)
+def test_what_is_too_near_to_the_noise_for_the_least_gain_needs_an_exact_effect(monkeypatch):
+    """A gain of 1.5 is enough where one simulation with the effect leaves noise alone: then there is no error of a grid in the data."""
+    assert diagnose(Line(lambda t: 3.0 * t + 0.015 * np.sin(33 * t))).answer == "none"
+    problem = Line(lambda t: 3.0 * t + 0.1 * t**2, wiggle=0.0)
+    found = diagnose(problem)
+    assert found.answer in ("effect", "class") and "square" in [t.candidate.name for t in found.rounds[0].members]
+    before, after = (found.errors[when]["two"] for when in ("before", "after"))
+    assert 1.15 < before / after < np.exp(LEAST_GAIN) and found.rounds[0].p_value <= 0.05
+    monkeypatch.setattr(rounds.Inference, "is_exact", lambda self, t: False)
+    assert diagnose(problem).answer == "none"
+
+
+def test_what_is_too_near_to_the_noise_for_the_least_gain_is_searched_no_further():
     inference = Inference(Line(lambda t: 3.0 * t))
     assert inference.is_settled(np.array([2.5, 100.0]) * NOISE**2)  # the gain is the smaller one of the two
     assert not inference.is_noise(np.array([2.5, 100.0]) * NOISE**2)
@@ -706,3 +717,64 @@ def test_the_other_method_goes_on_from_where_the_chosen_one_has_come():
     assert "other.c" not in there.fit.point
     better = Trial(low, there, 1.0)
     assert pairs.from_there(inference, better, {"a": 1.0}).fit is there.fit
+
+
+@pytest.mark.parametrize(("left", "chosen"), [(0.8, 0), (0.5, 1)])
+def test_an_effect_by_the_worse_method_leaves_clearly_less_than_the_better_one_without_any(left, chosen, monkeypatch):
+    """Else an effect stands for what another method gets wrong."""
+    bend = Line(clipped).candidates[0]
+
+    def stand(error):
+        return Stand(Fit({"a": 1.0}, ("a",), 1.0, np.zeros(1), 1, True), None, np.full(2, error**2))
+
+    class Method:
+        deadline = Deadline()
+
+        def __init__(self, base, error, named):
+            t = Trial(bend, stand(error), 1.0, "" if named else "it gains too little")
+            self.result = Round({}, np.full(2, base**2), [t], t if named else None, [t] if named else [], 0.01, None, np.full(2, 1e-4))
+
+        def is_noise(self, errors):
+            return False
+
+        def round(self, *_):
+            return self.result
+
+    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
+    methods = [Method(1.0, 0.95, False), Method(1.5, left, True)]
+    assert attribution.first_rounds(methods, [stand(1.0), stand(1.5)])[0] == chosen
+
+
+@pytest.mark.parametrize(("error", "moves"), [(0.8, False), (0.5, True)])
+def test_a_parameter_of_the_problems_own_leaves_its_place_for_clearly_less_alone(error, moves):
+    inference = Inference(Line(clipped))
+
+    def stand(point, left):
+        return Stand(Fit(point, ("a",), 1.0, np.zeros(1), 1, True), None, np.array([left, 5.0]) ** 2)
+
+    still, moved = stand({"a": 2.0}, 1.0), stand({"a": 3.0, "height": 0.1}, error)
+    rough = stand({"a": 1.0}, 1.3)
+    assert inference.plainest([rough, still, moved]) is (moved if moves else still)
+    assert inference.still == ({"a": 2.0} if moves else None)
+
+
+class Shifted(Line):
+    """A bend whose other setting lies elsewhere the more it bends: differences at the base say nothing of where the bend's fit ends."""
+
+    def predict(self, points, recording, setting=0):
+        bends = np.array([p.get("square.c", 0.0) for p in points])[:, None]
+        return super().predict(points, recording, 0) + setting * (0.3 * np.sin(25 * T) * bends)
+
+
+def test_ends_from_elsewhere_are_weighed_by_the_floor_where_they_stand():
+    """The recording lies halfway to the other setting: by the base's floor, where the two agree, the truth leaves the sine."""
+    problem = Shifted(lambda t: 3.0 * t + 2.0 * t**2 + 0.3 * np.sin(25 * t))
+    inference = Inference(problem)
+    base = inference.start()
+    square = problem.candidates[0]
+    request = inference.request((*problem.declared, *square.parameters), {"a": 3.0, "square.c": 2.0})
+    (end,) = inference.fits([request], base.floor)
+    wrong = replace(end, point={"a": 5.0, "square.c": -1.0}, cost=0.5 * end.cost)
+    found = inference.ahead([(square, end)], {"square": (square, wrong)}, base.floor)
+    assert found["square"][1].point["square.c"] == pytest.approx(2.0, abs=0.1)
+    assert inference.ahead([(square, wrong)], {"square": (square, end)}, base.floor).get("square", (square, end))[1].point["square.c"] > 1.0

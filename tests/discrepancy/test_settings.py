@@ -13,7 +13,6 @@ from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.command import restricted
 from neuido.discrepancy.evidence import gain
 from neuido.discrepancy.floors import REACH, Floor, Part
-from neuido.discrepancy.rollouts import SETTINGS
 from neuido.discrepancy.rounds import Inference
 from tests.discrepancy.test_decisions import FALLS, over
 from tests.discrepancy.test_rounds import NOISE, Line, T
@@ -127,4 +126,4 @@ def test_a_body_on_a_finer_grid(effect, tmp_path: Path):
     if effect:
         assert found.after["viscosity_shear.eta"] == pytest.approx(150.0, rel=0.15)
         assert found.errors["before"]["b"] > 3 * found.errors["after"]["b"]
-    assert len(found.amounts["after"]) == len(SETTINGS) - 1
+    assert len(found.amounts["after"]) == len(problem.others(found.setting))

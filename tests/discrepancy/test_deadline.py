@@ -1,0 +1,82 @@
+"""A diagnosis that has to come to its end: what it says then, and what it leaves out."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from neuido.discrepancy import attribution
+from neuido.discrepancy.attribution import diagnose
+from neuido.discrepancy.body import body_problem
+from neuido.discrepancy.command import restricted
+from neuido.discrepancy.deadline import SEARCH, Deadline
+from tests import command
+from tests.discrepancy import made
+
+
+class Clock:
+    """Seconds that go on by themselves, one a look."""
+
+    def __init__(self, step: float) -> None:
+        self.now, self.step = 0.0, step
+
+    def __call__(self) -> float:
+        self.now += self.step
+        return self.now
+
+
+def test_the_search_has_a_share_and_the_end_the_rest():
+    clock = Clock(0.0)
+    limit = Deadline(100.0, clock=clock)
+    clock.now = 100.0 * SEARCH
+    assert not limit.over and not limit.skips("this") and limit.left_out == []
+    clock.now += 1.0
+    assert limit.over and limit.skips("this") and limit.skips("that") and limit.skips("this")
+    assert limit.left_out == ["this", "that"]
+    limit.conclude()
+    assert not limit.over
+    clock.now = 101.0
+    assert limit.over
+
+
+def test_without_a_limit_nothing_is_left_out():
+    clock = Clock(1e9)
+    assert not Deadline(clock=clock).over and not Deadline(math.inf, clock=clock).skips("this")
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory):
+    return made.experiment(tmp_path_factory.mktemp("deadline") / "block", {"drag_linear.k": 3.0})
+
+
+@pytest.mark.parametrize("step", [0.0, 1e6])
+def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypatch):
+    """The direction of a drag is all but exact, so that even the start of its fit is worth naming; nothing is refined, and it is told."""
+    monkeypatch.setattr(attribution, "Deadline", lambda seconds: Deadline(seconds, clock=Clock(step)))
+    problem = restricted(body_problem(block), "drag_linear,viscosity_shear,time_force")
+    found = diagnose(problem, draws=39, most=2, seconds=60.0)
+    assert math.isfinite(found.errors["after"]["drop"]) and found.evaluations > 0
+    if step == 0.0:
+        assert found.left_out == () and [t.candidate.name for t in found.effects] == ["drag_linear"]
+        assert found.after["drag_linear.k"] == pytest.approx(3.0, rel=0.05)
+    else:
+        assert "refining the best fits" in found.left_out
+        assert len(found.effects) <= 1
+        assert all(np.isfinite(found.intervals[name]).all() for name in found.intervals)
+
+
+def test_more_minutes_go_on_from_there(block, tmp_path, capsys):
+    out = tmp_path / "out"
+    asked = ["diagnose", block.folder, "--out", out, "--draws", "19", "--device", "cpu", "--progress", "false"]
+    asked += ["--effects", "drag_linear,viscosity_shear"]
+    status, _, err = command.run(capsys, *asked, "--minutes", "-1")
+    assert (status, len(err.splitlines())) == (2, 1) and "minutes = -1.0 must not be negative" in err
+    status, told, _ = command.run(capsys, *asked, "--minutes", "0.0001")
+    content = json.loads((out / "diagnosis.json").read_text())
+    assert status == 0 and content["left_out"] and "give more minutes" in told
+    assert (out / ".work").is_dir() and "The time was up before" in (out / "report.html").read_text()
+    status, told, _ = command.run(capsys, *asked, "--minutes", "0")
+    content = json.loads((out / "diagnosis.json").read_text())
+    assert status == 0 and content["left_out"] == [] and content["effects"][0]["name"] == "drag_linear" and "minutes" not in told
+    assert not (out / ".work").exists()
