@@ -1,7 +1,8 @@
 """Blind cases: experiments with an undeclared effect, or none, diagnosed without their keys and then scored against them.
 
     python benchmarks/blind.py --out runs/blind [--cases 60] [--curves 0] [--workers N] [--device cpu]
-                               [--ablation single-recording no-discretisation] [--only make|diagnose|score] [--folders FOLDER ...]
+                               [--minutes 0] [--ablation single-recording no-discretisation] [--only make|diagnose|score]
+                               [--folders FOLDER ...]
 
 A third of the cases are nulls, half of them with wrong nuisances; the others spread evenly over the library's effects, with some of two
 effects and some outside the library, made by three solvers in turn. Whatever is there already is kept, so the command goes on where it was
@@ -16,6 +17,7 @@ import csv
 import dataclasses
 import hashlib
 import json
+import math
 import multiprocessing
 import os
 import shutil
@@ -83,8 +85,8 @@ def make_one(name: str, seed: int, case: Case, folder: str, device: str) -> str:
     return reason
 
 
-def diagnose_one(folder: str, out: str, ablation: str, device: str) -> str:
-    """Diagnose a folder into `out`, which appears when it is whole; returns what failed."""
+def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: float = 0.0) -> str:
+    """Diagnose a folder into `out`, which appears when it is whole, in so many minutes (0: no limit); returns what failed."""
     from neuido.discrepancy import answer, attribution, command
 
     target = Path(out)
@@ -97,13 +99,13 @@ def diagnose_one(folder: str, out: str, ablation: str, device: str) -> str:
                 begun = time.monotonic()
                 if problem.settings > 1:
                     problem = dataclasses.replace(problem, settings=1, solvers=(0,))
-                found.append((attribution.diagnose(problem), time.monotonic() - begun))
+                found.append((attribution.diagnose(problem, seconds=60.0 * minutes or math.inf), time.monotonic() - begun))
             answer.write(target, found, kind=kind, device=device)
         else:
             given = folder
             if ablation == "single-recording":
                 given = str(_with_one_recording(Path(folder), target.parent / ".inputs" / target.name))
-            command.diagnose(given, out=out, device=device, progress=False)
+            command.diagnose(given, out=out, device=device, minutes=minutes, progress=False)
     except Exception as error:  # a case that fails is scored as failed, and the others go on
         target.mkdir(parents=True, exist_ok=True)
         (target / "failed.txt").write_text(f"{type(error).__name__}: {error}\n")
@@ -215,6 +217,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, help="processes at a time; 2 on the CPU, 1 on a GPU")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--minutes", type=float, default=0.0, help="of a diagnosis, as its own option; 0: as long as it takes")
     parser.add_argument("--ablation", nargs="*", choices=RERUN, default=[])
     parser.add_argument("--only", choices=("make", "diagnose", "score"))
     parser.add_argument("--folders", nargs="+", type=Path, help="score these instead of made ones")
@@ -235,7 +238,7 @@ def main() -> None:
         folders = [folder for folder in folders if folder.is_dir()]
     if options.only in (None, "diagnose"):
         places = [(f, options.out / "answers" / how / f.name, how) for how in ("none", *options.ablation) for f in folders]
-        asked = [(str(folder), str(place), how, options.device) for folder, place, how in places]
+        asked = [(str(folder), str(place), how, options.device, options.minutes) for folder, place, how in places]
         waiting = [task for task in asked if not (Path(task[1]) / "diagnosis.json").is_file()]
         for n, (task, failed) in enumerate(in_parallel(diagnose_one, waiting, workers), 1):
             place = Path(task[1])
