@@ -17,7 +17,7 @@ QUANTILE = 0.95
 NORMAL = float(norm.ppf(QUANTILE))
 ROOM = 4.0
 """Times the mean square that a refit leaves of the discretisation error up to which a residual above the noise widens an interval."""
-NEARBY = 0.001
+NEARBY = 0.02
 """Sum of squares of the amounts of the other settings up to which the data lie on the setting in use."""
 
 

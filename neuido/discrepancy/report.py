@@ -154,7 +154,7 @@ def _settings(e: dict[str, Any]) -> str:
     alone = f"One simulation without them leaves {before:.3g} {e['unit']} before and {after:.3g} {e['unit']} after."
     if height := e.get("contact_height"):
         places = " and ".join(f"{1e3 * height[when]:.3g} mm {when}" for when in ("before", "after"))
-        alone += f" The colliders are higher than declared by {places}, which is within what a grid or a ruler may be off."
+        alone += f" The colliders of that grid are higher than they are declared by {places}: a grid's floor is a layer of its nodes."
     return f"<p>{held}</p>" + table(("other setting", "amount before", "amount after"), rows) + f"<p>{escaped(alone)}</p>"
 
 

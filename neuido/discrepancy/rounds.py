@@ -126,10 +126,7 @@ class Inference(Contests):
             if small and c.key not in chosen:
                 chosen[c.key] = 0
                 starts.append((c, self.at_declared(base.point) | dict(c.starts[0]), None))
-        if first and self.still is not None:  # what the declared model needs a parameter of the problem's own for may be an effect
-            starts += [
-                (c, {**self.still, **{k: v for k, v in begin.items() if k.startswith(f"{c.name}.")}}, None) for c, begin, _ in starts
-            ]
+        starts += self.without_own(base.point, starts, found)
         self.tell(f"fitting {', '.join(chosen)}")
         best, other = self.contest(free, starts, floor)
         if not self.deadline.skips("refining the best fits"):
@@ -148,6 +145,17 @@ class Inference(Contests):
             result = self.judge(empty, best, model, list(chosen))
             self.tell(self.verdict(result))
         return result
+
+    def without_own(
+        self, point: Point, starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], found: Sequence[Trial]
+    ) -> list[tuple[Candidate, Point, None]]:
+        """The starts once more without the problem's own parameters, where the base has some: what it needs them for may be an effect."""
+        plain = {k: v for k, v in point.items() if "." in k or k in self.as_declared}
+        if plain == dict(point):
+            return []
+        if not found and self.still is not None:
+            plain = dict(self.still)
+        return [(c, plain | {k: v for k, v in begin.items() if k.startswith(f"{c.name}.")}, None) for c, begin, _ in starts]
 
     def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float):
         """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says."""

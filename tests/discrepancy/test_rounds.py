@@ -778,3 +778,21 @@ def test_ends_from_elsewhere_are_weighed_by_the_floor_where_they_stand():
     found = inference.ahead([(square, end)], {"square": (square, wrong)}, base.floor)
     assert found["square"][1].point["square.c"] == pytest.approx(2.0, abs=0.1)
     assert inference.ahead([(square, wrong)], {"square": (square, end)}, base.floor).get("square", (square, end))[1].point["square.c"] > 1.0
+
+
+@pytest.mark.parametrize("found", [False, True])
+def test_candidates_are_fitted_without_the_problems_own_parameters_too(found, monkeypatch):
+    inference = Inference(Line(clipped))
+    base = inference.start()
+    cube = next(c for c in inference.problem.candidates if c.name == "cube")
+    inference.still = {"a": 2.5}
+    beside = {"a": 2.0, "cube.c": 0.4} if found else {"a": 2.0}
+    moved = replace(base, fit=replace(base.fit, point={**beside, "height": 0.1}))
+    asked = []
+    monkeypatch.setattr(rounds.Inference, "contest", lambda self, free, starts, floor: asked.extend(starts) or ({}, None))
+    inference.round(moved.fit, moved.floor, [Trial(cube, moved, 1.0)] if found else [])
+    own = [{k: v for k, v in begin.items() if not k.startswith("square.")} for c, begin, _ in asked if c.name == "square"]
+    assert own == [{**beside, "height": 0.1}, beside if found else {"a": 2.5}]
+    asked.clear()
+    inference.round(base.fit, base.floor, [])
+    assert all("height" not in begin for _, begin, _ in asked) and len({c.key for c, *_ in asked}) < len(asked) + 1
