@@ -107,7 +107,9 @@ def diagnose(
         inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo, deadline=deadline)
         if starts and (tried[-1].is_settled(starts[-1].errors) or deadline.skips(problem.setting_name(n))):
             continue
-        start = inference.start(starts[0].fit.point if starts else None)
+        # the problem's own parameters are about the other method
+        near = {name: starts[0].fit.point[name] for name in inference.as_declared} if starts else None
+        start = inference.start(near)
         if start is not None:
             tried.append(inference)
             starts.append(start)

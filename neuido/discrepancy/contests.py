@@ -8,8 +8,8 @@ import numpy as np
 
 from neuido.discrepancy.fit import Fit, Race
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.laboratory import Laboratory
 from neuido.discrepancy.problem import Candidate, Parameter, Point
+from neuido.discrepancy.screening import Screening
 from neuido.discrepancy.trials import Round, Stand, score
 
 SMALL = 2
@@ -49,7 +49,7 @@ def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candi
     return out
 
 
-class Contests(Laboratory):
+class Contests(Screening):
     """The fits of a step of a diagnosis."""
 
     def first_slopes(
@@ -71,6 +71,23 @@ class Contests(Laboratory):
             parts.append(np.stack([whiten(column, n) for column in both], axis=1))
         J = np.concatenate(parts)
         return J if np.isfinite(J).all() else None
+
+    def strong(self, c: Candidate, point: Point, floor: Floor) -> list[Point]:
+        """The best starts of either sign at full strength, by what they leave as they are.
+
+        A part that is many times as stiff as the rest moves the body in another way than the direction of a little stiffness says, and a
+        fit that begins at a little comes down into the nearest valley.
+        """
+        begins: list[Point] = []
+        for start in c.starts:
+            for size in (c.far, -c.far):
+                moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside.get(p.name, 0.0) * size / p.scale)
+                         for p in self.problem.declared if p.log and p.name in c.beside}  # fmt: skip
+                begins.append({**point, **start, c.apart: size, **moved})
+        self.tell(f"{len(begins)} places of {c.key} at full strength")
+        costs = np.array(self.costs(begins, floor))
+        best = (min((i for i, b in enumerate(begins) if b[c.apart] * sign > 0), key=lambda i: costs[i]) for sign in (1, -1))
+        return [begins[i] for i in best if np.isfinite(costs[i])]
 
     def contest(
         self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], floor: Floor

@@ -9,8 +9,8 @@ from scipy.stats import t as student
 
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.laboratory import Laboratory
 from neuido.discrepancy.problem import Parameter
+from neuido.discrepancy.screening import Screening
 
 QUANTILE = 0.95
 """Of each end of a 90 % interval."""
@@ -21,7 +21,7 @@ NEARBY = 0.02
 """Sum of squares of the amounts of the other settings up to which the data lie on the setting in use."""
 
 
-def intervals(laboratory: Laboratory, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
+def intervals(laboratory: Screening, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
     """90 % intervals of the parameters of a fit that leaves `errors`, mean squares of the parts.
 
     Noise, nuisances and the differences of the settings count to first order, as the fit has them. What no difference shows is estimated
@@ -59,7 +59,7 @@ def _widened(count: int) -> float:
     return float(student.ppf(QUANTILE, count)) / NORMAL
 
 
-def _first_order(laboratory: Laboratory, parameters: Sequence[Parameter], fit: Fit, floor: Floor) -> np.ndarray:
+def _first_order(laboratory: Screening, parameters: Sequence[Parameter], fit: Fit, floor: Floor) -> np.ndarray:
     """Variances of the coordinates through the slopes, the nuisances and the amounts of the settings' differences marginalised.
 
     The size of the errors is that of the residual: the weights go by what the settings differ by, which the fit may have taken out.

@@ -76,6 +76,8 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         sizes: str = "",
         linear: bool = True,
         apart: str = "",
+        far: float = 0.0,
+        beside: Mapping[str, float] | None = None,
     ):
         made = tuple(
             Parameter(f"{name}.{key}", unit, 0.0 if not sizes or key in sizes.split() else starts[0][key], scale, low, high, log=log)
@@ -83,7 +85,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         )
         named = tuple({f"{name}.{k}": v for k, v in start.items()} for start in starts)
         own = tuple(f"{name}.{k}" for k in sizes.split())
-        out.append(Candidate(name, made, named, where, form, own, linear, apart and f"{name}.{apart}"))
+        out.append(Candidate(name, made, named, where, form, own, linear, apart and f"{name}.{apart}", far, beside or {}))
 
     def vector(keys: Sequence[str], unit: str, scale: float, high: float) -> list[tuple]:
         return [(key, unit, scale, -high, high, False) for key in keys]
@@ -128,7 +130,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     add("stiffness_gradient", "internal modes", _places(experiment, s.length), ("log_ratio", "1", 0.5, -4.0, 4.0, False),
         *[(a, "m", 0.1 * s.length, -0.6 * s.length, 0.6 * s.length, False) for a in ("cx", "cy", "cz")],
         ("radius", "m", 0.15, 0.08 * s.length, 0.8 * s.length, True), form="inclusion", sizes="log_ratio",
-        apart="log_ratio")  # fmt: skip
+        apart="log_ratio", far=math.log(8.0), beside={"young": -1 / 6})  # fmt: skip
     if plastic != "drucker_prager":
         add("strain_stiffening", "internal modes", [{"k": 1.0}], ("k", "1", 1.0, -1.0, 60.0, False))
         add("second_invariant", "internal modes", [{"c": 0.3}], ("c", "1", 0.3, -0.5, 5.0, False))

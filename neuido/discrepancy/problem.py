@@ -67,6 +67,10 @@ class Candidate:
     """Whether small sizes act in proportion; a yield stress does not."""
     apart: str = ""
     """A size whose sign no fit changes, for at zero the effect's shape has no meaning: fits begin on either side."""
+    far: float = 0.0
+    """What `apart` is, up and down, where every start is tried once at full strength; zero: nowhere."""
+    beside: Mapping[str, float] = field(default_factory=dict)
+    """By how much of `far` the logarithm of a declared parameter goes with it there: a stiff part in a soft rest, as stiff together."""
 
     @property
     def key(self) -> str:

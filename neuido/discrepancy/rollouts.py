@@ -160,7 +160,7 @@ class BodyRollouts(Problem):
                 effects=effects,
             )
         if lifts.any():
-            out = out._replace(x=out.x + torch.from_numpy(lifts).to(out.x)[simulator.particles.scene.long()])
+            out = out._replace(x=out.x + _of_particles(lifts, simulator))
         moved, offsets = [], simulator.particles.offsets[::size]
         for (points, n), a, b in zip(runs, offsets[:-1], offsets[1:], strict=True):
             frames = ParticleState(*(t[:, a:b].unflatten(1, (size, -1))[:, : len(points)] for t in out))
@@ -267,7 +267,7 @@ class BodyRollouts(Problem):
         ]
         state = simulator.state
         if lifts.any():
-            state = state._replace(x=state.x - torch.from_numpy(lifts).to(state.x)[simulator.particles.scene.long()])
+            state = state._replace(x=state.x - _of_particles(lifts, simulator))
         if not any(any(row) for row in shift):
             return state
         change = torch.tensor(shift, dtype=simulator.dtype, device=simulator.device).reshape(2, len(points), 3)
@@ -336,6 +336,11 @@ def segment_of(steps: int, every: int) -> int:
     """Substeps of a piece of a rollout: a divisor of `steps` and a multiple of `every`, of `SEGMENT` at the most where there is one."""
     frames = steps // every
     return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
+
+
+def _of_particles(lifts: np.ndarray, simulator: Simulator | FiniteElements) -> Tensor:
+    """The lift (3,) of each scene at each of its particles, (P, 3)."""
+    return torch.from_numpy(lifts).to(simulator.state.x)[simulator.particles.scene.long()]
 
 
 def _at_times(frames: ParticleState, step: float, t: Tensor) -> ParticleState:

@@ -126,6 +126,8 @@ class Inference(Contests):
             if small and c.key not in chosen:
                 chosen[c.key] = 0
                 starts.append((c, self.at_declared(base.point) | dict(c.starts[0]), None))
+        strong = [c for c in candidates if first and c.far and c.key in chosen]
+        starts += [(c, begin, None) for c in strong for begin in self.strong(c, base.point, floor)]
         starts += self.without_own(base.point, starts, found)
         self.tell(f"fitting {', '.join(chosen)}")
         best, other = self.contest(free, starts, floor)

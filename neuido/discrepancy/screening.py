@@ -1,0 +1,104 @@
+"""Directions of the declared parameters and of candidate effects in the data, and what each candidate could take off the misfit."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from neuido.discrepancy.floors import Floor
+from neuido.discrepancy.laboratory import Laboratory
+from neuido.discrepancy.problem import Candidate, Parameter, Point
+
+
+class Screening(Laboratory):
+    """The linear look at every candidate that comes before full fits of a few."""
+
+    def columns(
+        self, point: Point, candidates: Sequence[Candidate], recordings: Sequence[int]
+    ) -> dict[tuple[str, int], dict[int, np.ndarray]]:
+        """Directions of each candidate and start in the data of recordings: (key, start) -> {recording: (n, sizes)}."""
+        asked, places = [], []
+        for c in candidates:
+            for i, start in enumerate(c.starts):
+                sizes = [p.name for p in c.size_parameters]
+                shape = {k: v for k, v in start.items() if k not in sizes}
+                for name in sizes:
+                    asked.append(dict(point) | shape | {name: start[name]})
+                    places.append((c.key, i))
+        out: dict[tuple[str, int], dict[int, np.ndarray]] = {place: {} for place in places}
+        with self.memo.during("screening"):
+            predicted = self.memo.predict_several([([point, *asked], n, self.setting) for n in recordings])
+        for n, (here, *rows) in zip(recordings, predicted, strict=True):
+            self.tell(f"directions of {len(asked)} effects in {self.problem.recordings[n].name}")
+            for place in out:
+                out[place][n] = np.stack([row - here for row, p in zip(rows, places, strict=True) if p == place], axis=1)
+        return out
+
+    def slopes(self, parameters: Sequence[Parameter], point: Point, recordings: Sequence[int], step: float = 0.3) -> dict[int, np.ndarray]:
+        """Derivatives of the data by coordinates of parameters, one typical step each; central where the range allows.
+
+        One-sided where the model runs on one side alone, and zero where it runs on neither.
+        """
+        out = {}
+        asked, spans = [], []
+        for p in parameters:
+            q = p.coordinate(point.get(p.name, p.value))
+            ends = [p.physical(q + step), p.physical(q - step)]
+            asked += [dict(point) | {p.name: end} for end in ends]
+            spans.append([p.coordinate(ends[0]) - q, q - p.coordinate(ends[1])])
+        with self.memo.during("slopes"):
+            predicted = self.memo.predict_several([([point, *asked], n, self.setting) for n in recordings])
+        for n, (here, *rows) in zip(recordings, predicted, strict=True):
+            columns = [np.empty((len(here), 0))]
+            for i, (up, down) in enumerate(spans):
+                high, low = (bool(np.isfinite(row).all()) for row in rows[2 * i : 2 * i + 2])
+                change = (rows[2 * i] if high else here) - (rows[2 * i + 1] if low else here)
+                columns.append((change / max(up * high + down * low, 1e-9))[:, None])
+            out[n] = np.concatenate(columns, axis=1)
+        return out
+
+    def screen(self, point: Point, candidates: Sequence[Candidate], floor: Floor, slopes: Mapping[int, np.ndarray]):
+        """Starts of full fits, best first: (predicted share of the misfit that stays, candidate, start, point), and the directions."""
+        fits = [p for p in self.parts if p.fitted]
+        columns = self.columns(point, candidates, [p.recording for p in fits])
+        past = self.past(slopes, floor)
+        left = past({p.recording: self.residual(point, p.recording) for p in fits})
+        ranked = []
+        for c in candidates:
+            for i, start in enumerate(c.starts):
+                B = past(columns[c.key, i])
+                if not np.isfinite(B).all():
+                    continue
+                amount = -np.linalg.lstsq(B, left, rcond=1e-6)[0]
+                sizes = c.size_parameters
+                if not c.linear:
+                    amount = np.clip(amount, 0.0, 1.5)
+                for k, p in enumerate(sizes):
+                    low, high = (p.lower / start[p.name], p.upper / start[p.name])
+                    amount[k] = np.clip(amount[k], min(low, high), max(low, high))
+                stays = float(np.sum((left + B @ amount) ** 2) / max(np.sum(left**2), 1e-300))
+                if c.linear:
+                    factor = np.clip(amount, -4.0, 4.0)
+                    factor = np.where(np.abs(factor) < 0.2, np.where(factor < 0, -0.2, 0.2), factor)
+                else:
+                    factor = np.ones(len(sizes))
+                begin = dict(point) | dict(start)
+                for p, f in zip(sizes, factor, strict=True):
+                    begin[p.name] = min(max(start[p.name] * f, p.lower), p.upper)
+                ranked.append((stays, c, i, begin))
+        ranked.sort(key=lambda entry: entry[0])
+        return ranked, columns
+
+    def past(self, slopes: Mapping[int, np.ndarray], floor: Floor) -> Callable[[Mapping[int, np.ndarray]], np.ndarray]:
+        """What columns of the fitted recordings, {recording: (n,) or (n, k)}, do past the parameters of the slopes, whitened."""
+        whiten = floor.whitener(self.parts)
+
+        def rows(of: Mapping[int, np.ndarray]) -> np.ndarray:
+            return np.concatenate([whiten(of[n], n) for n in self.fitted_recordings])
+
+        q, _ = np.linalg.qr(rows(slopes))
+
+        def past(columns: Mapping[int, np.ndarray]) -> np.ndarray:
+            A = rows(columns)
+            return A - q @ (q.T @ A)
+
+        return past

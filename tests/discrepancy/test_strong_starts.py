@@ -1,0 +1,77 @@
+"""Where fits of an effect begin that is no direction: a part of a body many times as stiff as the rest."""
+
+import math
+
+import numpy as np
+import pytest
+
+from neuido.discrepancy.attribution import diagnose
+from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
+from neuido.discrepancy.rounds import Inference
+
+S = np.linspace(-1.0, 1.0, 200)
+NOISE = 0.01
+PLACES = (-0.6, 0.0, 0.6)
+
+
+class Bar(Problem):
+    """Stretches of a bar under two loads, 1 / E(s), with a part of another stiffness about `part.c`."""
+
+    def __init__(self, truth, *, far: float = math.log(8.0)) -> None:
+        size = Parameter("part.log_ratio", "1", 0.0, 0.5, -4.0, 4.0)
+        place = Parameter("part.c", "m", PLACES[0], 0.1, -1.0, 1.0)
+        starts = tuple({size.name: 1.0, place.name: c} for c in PLACES)
+        part = Candidate(
+            "part", (size, place), starts, "internal modes", sizes=(size.name,), apart=size.name, far=far, beside={"young": -1 / 6}
+        )
+        slope = Parameter("slope.k", "1", 0.0, 0.3, -3.0, 3.0)
+        candidates = (part, Candidate("slope", (slope,), ({slope.name: 0.3},), "internal modes"))
+        rng = np.random.default_rng(0)
+        recordings = tuple(
+            Recording(name, role, stretch(truth) + NOISE * rng.normal(size=len(S)), NOISE, np.zeros(len(S), int), S)
+            for name, role in (("one", "fit"), ("two", "held_out"))
+        )
+        declared = (Parameter("young", "Pa", 1.0, 0.15, 0.01, 100.0, log=True),)
+        super().__init__("bar", "rmse", "1", declared, (), candidates, recordings)
+
+    def predict(self, points, recording, setting=0):
+        return np.stack([stretch(p) for p in points])
+
+
+def stretch(p):
+    bump = np.exp(-(((S - p.get("part.c", 0.0)) / 0.15) ** 2))
+    return np.exp(-p.get("slope.k", 0.0) * S - p.get("part.log_ratio", 0.0) * bump) / p.get("young", 1.0)
+
+
+TRUTH = {"young": 0.5, "part.log_ratio": math.log(15.0), "part.c": 0.5}
+
+
+def test_each_sign_begins_at_its_best_place():
+    problem = Bar(TRUTH)
+    inference = Inference(problem)
+    base = inference.start()
+    part = problem.candidates[0]
+    stiff, soft = inference.strong(part, base.fit.point, base.floor)
+    assert stiff["part.log_ratio"] == pytest.approx(math.log(8.0)) and stiff["part.c"] == 0.6
+    assert soft["part.log_ratio"] == pytest.approx(-math.log(8.0))
+    young = base.fit.point["young"]
+    assert stiff["young"] == pytest.approx(young * 8.0 ** (-1 / 6)) and soft["young"] == pytest.approx(young * 8.0 ** (1 / 6))
+    others = [{**stiff, "part.c": c} for c in PLACES if c != 0.6]
+    assert inference.costs([stiff], base.floor)[0] < min(inference.costs(others, base.floor))
+
+
+def test_fits_begin_there(monkeypatch):
+    begun = []
+    request = Inference.request
+
+    def seen(self, parameters, start, **options):
+        begun.append(start)
+        return request(self, parameters, start, **options)
+
+    monkeypatch.setattr(Inference, "request", seen)
+    found = diagnose(Bar(TRUTH), draws=39)
+    assert found.after["part.log_ratio"] == pytest.approx(math.log(15.0), abs=0.2) and found.after["part.c"] == pytest.approx(0.5, abs=0.01)
+    assert any(p.get("part.log_ratio") == pytest.approx(math.log(8.0)) for p in begun)
+    begun.clear()
+    diagnose(Bar(TRUTH, far=0.0), draws=39)
+    assert not any(p.get("part.log_ratio") == pytest.approx(math.log(8.0)) for p in begun)
