@@ -1,7 +1,7 @@
 """Full fits of candidates side by side: who is fitted from where, who is given up, and whose fit is tried again from elsewhere."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,6 +39,10 @@ ALIKE = 0.3
 """Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
 
 
+Start = tuple[Candidate, Point, np.ndarray | None]
+"""A candidate, where a fit of it begins, and about the slopes there, if they are known."""
+
+
 def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candidate, Fit]]) -> dict[str, tuple[Candidate, Fit]]:
     """The fit of least cost of each candidate, by its key, where it beats the one there is."""
     out: dict[str, tuple[Candidate, Fit]] = {}
@@ -72,14 +76,14 @@ class Contests(Screening):
         J = np.concatenate(parts)
         return J if np.isfinite(J).all() else None
 
-    def strong(self, c: Candidate, point: Point, floor: Floor) -> list[Point]:
-        """The best starts of either sign at full strength, by what they leave as they are.
+    def strong(self, c: Candidate, places: Sequence[Point], point: Point, floor: Floor) -> list[Point]:
+        """The best of some starts at full strength, of either sign, by what they leave as they are.
 
         A part that is many times as stiff as the rest moves the body in another way than the direction of a little stiffness says, and a
         fit that begins at a little comes down into the nearest valley.
         """
         begins: list[Point] = []
-        for start in c.starts:
+        for start in places:
             for size in (c.far, -c.far):
                 moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside.get(p.name, 0.0) * size / p.scale)
                          for p in self.problem.declared if p.log and p.name in c.beside}  # fmt: skip
@@ -90,35 +94,60 @@ class Contests(Screening):
         return [begins[i] for i in best if np.isfinite(costs[i])]
 
     def contest(
-        self, free: Sequence[Parameter], starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], floor: Floor
+        self,
+        free: Sequence[Parameter],
+        starts: Sequence[Start],
+        floor: Floor,
+        hopeful: Collection[str] | None = None,
+        then: Callable[[Sequence[str]], Sequence[Start]] = lambda led: (),
     ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
         """The best fit of each candidate, fits that cannot catch up with the best one stop; and the leading one's of the other sign.
 
-        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all.
+        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all. So do
+        those that are not `hopeful` where the first ones leave noise alone, and each of the others begins once then.
+
+        Args:
+            free: What is fitted beside a candidate's parameters.
+            starts: Of the fits.
+            floor: What weighs the residuals.
+            hopeful: Keys of candidates that could take something off by the screening; all where absent.
+            then: Further starts, given the keys of the candidates in the order of their costs.
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
         ended: list[tuple[Candidate, Fit]] = []
         race = Race()
+
+        def fitted(own: Sequence[Start]) -> None:
+            requests = []
+            for c, begin, J in own:
+                sizes = [p.name for p in c.size_parameters] if c.linear else []
+                requests.append(self.request((*free, *c.parameters), begin, race=race, slopes=J, sizes=sizes))
+            fits = list(zip((c for c, *_ in own), self.fits(requests, floor), strict=True))
+            ended.extend(fits)
+            best.update(better(fits, best))
+
+        def at_noise() -> bool:
+            leading = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
+            return self.is_noise(self.mean_squares([leading.point], floor)[0])
+
         small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
         first = list(dict.fromkeys(small))[:LEADERS]
-        waves: list[list[tuple[Candidate, Point, np.ndarray | None]]] = [[], [], []]
+        waves: list[list[Start]] = [[], [], []]
         for entry in starts:
             key = entry[0].key
             waves[0 if self.problem.together or key in first else 1 if key in small else 2].append(entry)
         for own in waves:
             if best and own and self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}"):
                 break
-            if own is waves[2] and best:
-                leading = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
-                if self.is_noise(self.mean_squares([leading.point], floor)[0]):
+            if own and best and at_noise():
+                if own is waves[2]:
                     break
-            requests = []
-            for c, begin, J in own:
-                sizes = [p.name for p in c.size_parameters] if c.linear else []
-                requests.append(self.request((*free, *c.parameters), begin, race=race, slopes=J, sizes=sizes))
-            fits = list(zip((c for c, *_ in own), self.fits(requests, floor), strict=True))
-            ended += fits
-            best |= better(fits, best)
+                if hopeful is not None:
+                    once = {entry[0].key: entry for entry in reversed(own) if entry[0].key in hopeful}
+                    own = [entry for entry in own if once.get(entry[0].key) is entry]
+            fitted(own)
+        if further := then([key for key, _ in sorted(best.items(), key=lambda item: item[1][1].cost)]):
+            fitted(further)
         other = self.other_sign(free, best, ended, floor)
         if other is not None and other[1].cost < best[other[0].key][1].cost:
             best[other[0].key], other = other, best[other[0].key]
@@ -176,43 +205,71 @@ class Contests(Screening):
         least: dict[str, float] = {}
         if other is not None and other[1].cost < IN_REACH * ranked[0][1].cost:
             top.append(other)
-        for c, fit in top:
-            if not self.runs(fit.point):  # there is no floor there
-                continue
+        self.predicted([fit.point for _, fit in top], self.scored_recordings)
+        able = [(c, fit) for c, fit in top if self.runs(fit.point)]  # elsewhere there is no floor
+        entries = []
+        for c, fit in able:
             starts = [fit.point, self.at_declared(fit.point)]
             if fit is not ranked[0][1]:
                 starts.append({**fit.point, **{name: leading[name] for name in self.as_declared}})
-            found, own = self.from_here((*free, *c.parameters), fit, starts, floor)
-            for _ in range(0 if self.deadline.over else ONWARD):
-                left = self.mean_squares([found.point], own)[0]
-                if self.is_noise(left) or not self.runs(found.point):
-                    break
-                further, there = self.from_here((*free, *c.parameters), found, [found.point], floor)
-                gained = score(left[self.fitted]) - score(self.mean_squares([further.point], there, fitted=True)[0])
-                if gained <= 0:
-                    break
-                found, own = further, there
-                if further.converged and gained < 2.0 * SOME_GAIN:
-                    break
+            entries.append(((*free, *c.parameters), fit, starts))
+        for (c, _), (found, own) in zip(able, self.onward(entries, floor), strict=True):
             left = score(self.mean_squares([found.point], own, fitted=True)[0])
             if left < least.get(c.key, math.inf):
                 least[c.key] = left
                 out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
         return out
 
+    def onward(self, entries: Sequence[tuple[Sequence[Parameter], Fit, Sequence[Point]]], floor: Floor) -> list[tuple[Fit, Floor]]:
+        """What `from_here` makes of each entry, and further from where that ends, up to `ONWARD` times."""
+        ends = self.from_here(entries, floor)
+        going = list(range(len(ends)))
+        for _ in range(ONWARD):
+            if self.deadline.over:
+                break
+            self.predicted([ends[i][0].point for i in going], self.scored_recordings)
+            left = {i: self.mean_squares([ends[i][0].point], ends[i][1])[0] for i in going}
+            going = [i for i in going if not self.is_noise(left[i]) and self.runs(ends[i][0].point)]
+            if not going:
+                break
+            made = self.from_here([(entries[i][0], ends[i][0], [ends[i][0].point]) for i in going], floor)
+            further = []
+            for i, (fit, there) in zip(going, made, strict=True):
+                gained = score(left[i][self.fitted]) - score(self.mean_squares([fit.point], there, fitted=True)[0])
+                if gained > 0:
+                    ends[i] = (fit, there)
+                    further += [i] * (not fit.converged or gained >= 2.0 * SOME_GAIN)
+            going = further
+        return ends
+
     def at_declared(self, point: Point) -> Point:
         """The point with the declared parameters, and the problem's own, as the model states them; the effects as they are."""
         return {k: v for k, v in point.items() if "." in k} | self.as_declared
 
-    def from_here(self, free: Sequence[Parameter], fit: Fit, starts: Sequence[Point], like: Floor) -> tuple[Fit, Floor]:
-        """The best of a fit and of those from some starts, all with the floor where the fit stands; and the floor."""
-        (own, _), race = self.stand(fit.point, like=like), Race()
-        moved = self.recentred(fit.point, own)
-        follow = {name: value for name, value in moved.items() if value != fit.point.get(name)}
-        begins = [{**start, **follow} if set(start) == set(fit.point) else start for start in starts]
-        ends = [fit, *self.fits([self.request(free, begin, race=race) for begin in begins], own)]
-        left = [score(squares) for squares in self.mean_squares([end.point for end in ends], own, fitted=True)]
-        return ends[int(np.argmin(left))], own
+    def from_here(self, entries: Sequence[tuple[Sequence[Parameter], Fit, Sequence[Point]]], like: Floor) -> list[tuple[Fit, Floor]]:
+        """Of each entry (what is fitted, a fit, starts) the best of the fit and of those from the starts; and the floor of all of them.
+
+        That is the floor where the fit stands. The fits of all entries run side by side.
+        """
+        with self.memo.during("discretisation"):  # all of them in one launch
+            here = [fit.point for _, fit, _ in entries]
+            self.predicted(here, list(like.noise), [self.setting, *self.problem.others(self.setting)])
+        owns, requests, of = [], [], []
+        for k, (free, fit, starts) in enumerate(entries):
+            (own, _), race = self.stand(fit.point, like=like), Race()
+            moved = self.recentred(fit.point, own)
+            follow = {name: value for name, value in moved.items() if value != fit.point.get(name)}
+            begins = [{**start, **follow} if set(start) == set(fit.point) else start for start in starts]
+            requests += [self.request(free, begin, race=race) for begin in begins]
+            of += [k] * len(begins)
+            owns.append(own)
+        made = self.fits(requests, [owns[k] for k in of])
+        out = []
+        for k, (_, fit, _) in enumerate(entries):
+            ends = [fit, *(end for end, its in zip(made, of, strict=True) if its == k)]
+            left = [score(squares) for squares in self.mean_squares([end.point for end in ends], owns[k], fitted=True)]
+            out.append((ends[int(np.argmin(left))], owns[k]))
+        return out
 
     def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[Stand]:
         """Each fit, in their order, with what it leaves by `floor`, or for the leading ones by that where they end, if it leaves less.
@@ -306,11 +363,11 @@ class Contests(Screening):
             return {}
         left = [score(squares) for squares in self.mean_squares([fit.point for _, fit in ended], floor)]
         out: dict[str, tuple[Candidate, Fit]] = {}
-        for i in np.argsort(left)[:POLISHED]:
-            c, fit = ended[i]
-            if not self.runs(fit.point):
-                continue
-            further, own = self.from_here((*self.problem.declared, *c.parameters), fit, [fit.point], floor)
+        ends = [ended[i] for i in np.argsort(left)[:POLISHED]]
+        self.predicted([fit.point for _, fit in ends], self.scored_recordings)
+        ends = [(c, fit) for c, fit in ends if self.runs(fit.point)]
+        made = self.from_here([((*self.problem.declared, *c.parameters), fit, [fit.point]) for c, fit in ends], floor)
+        for (c, _), (further, own) in zip(ends, made, strict=True):
             rival = (out.get(c.key) or best[c.key])[1]
             there = self.stand(rival.point, like=floor)[0]
             pairs = ((further, own), (rival, there))

@@ -259,13 +259,14 @@ class Laboratory:
         if self.problem.settings == 1:
             fit = self.base([fit.point], floor)
             return Stand(fit, floor, self.mean_squares([fit.point], floor)[0])
-        made = [Stand(fit, floor, errors)]
+        made, asked = [Stand(fit, floor, errors)], False
         for turn in range(MOST_AGAIN):
             begin = self.recentred(fit.point, floor) if turn else fit.point
             if turn >= AGAIN and begin == fit.point:
                 break
-            # a modulus may have made up for where the floor is
-            fit = self.base([begin] if begin == fit.point else [begin, {**begin, **self.as_declared}], floor)
+            # a modulus may have made up for where the floor is; it is asked once
+            moved, asked = begin != fit.point and not asked, asked or begin != fit.point
+            fit = self.base([begin, {**begin, **self.as_declared}] if moved else [begin], floor)
             if not self.runs(fit.point):
                 break
             floor, errors = self.stand(fit.point, like=floor)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.contests import MANY, SMALL, SOME_GAIN, Contests
+from neuido.discrepancy.contests import LEADERS, MANY, SMALL, SOME_GAIN, Contests
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
@@ -41,6 +41,10 @@ VAIN = 0.98
 """Share of the misfit that even such a candidate may leave, as the screening predicts it, if small sizes of it act in proportion."""
 HOPELESS = 0.75
 """Share of the misfit that a candidate beyond the first few may leave, as the screening predicts it, and still get a fit."""
+PLACES = 9
+"""Starts of a candidate that are tried at full strength, the first of the screening."""
+ALSO_WITHOUT = 6
+"""Candidates of the least costs that are fitted without the problem's own parameters too."""
 OWN = 3
 """Candidates that the screening of a second solver may add to those that led with the first one."""
 WITHIN = 0.5
@@ -126,11 +130,12 @@ class Inference(Contests):
             if small and c.key not in chosen:
                 chosen[c.key] = 0
                 starts.append((c, self.at_declared(base.point) | dict(c.starts[0]), None))
-        strong = [c for c in candidates if first and c.far and c.key in chosen]
-        starts += [(c, begin, None) for c in strong for begin in self.strong(c, base.point, floor)]
-        starts += self.without_own(base.point, starts, found)
+        for c in (c for c in candidates if first and c.far and c.key in chosen):
+            places = [c.starts[i] for _, other, i, _ in ranked if other is c][:PLACES]
+            starts += [(c, begin, None) for begin in self.strong(c, places, base.point, floor)]
+        hopeful = {c.key for stays, c, *_ in ranked if stays < HOPELESS or not c.linear}
         self.tell(f"fitting {', '.join(chosen)}")
-        best, other = self.contest(free, starts, floor)
+        best, other = self.contest(free, starts, floor, hopeful, lambda led: self.without_own(base.point, starts, found, led))
         if not self.deadline.skips("refining the best fits"):
             best |= self.polish(free, best, base, floor, rival, other)
             best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
@@ -149,15 +154,23 @@ class Inference(Contests):
         return result
 
     def without_own(
-        self, point: Point, starts: Sequence[tuple[Candidate, Point, np.ndarray | None]], found: Sequence[Trial]
+        self,
+        point: Point,
+        starts: Sequence[tuple[Candidate, Point, np.ndarray | None]],
+        found: Sequence[Trial],
+        led: Sequence[str],
     ) -> list[tuple[Candidate, Point, None]]:
-        """The starts once more without the problem's own parameters, where the base has some: what it needs them for may be an effect."""
+        """The starts once more without the problem's own parameters, where the base has some: what it needs them for may be an effect.
+
+        Of the candidates that the screening or the fits with them (`led`, best first) put among the first.
+        """
         plain = {k: v for k, v in point.items() if "." in k or k in self.as_declared}
         if plain == dict(point):
             return []
         if not found and self.still is not None:
             plain = dict(self.still)
-        return [(c, plain | {k: v for k, v in begin.items() if k.startswith(f"{c.name}.")}, None) for c, begin, _ in starts]
+        keys = {*list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS], *led[:ALSO_WITHOUT]}
+        return [(c, plain | {k: v for k, v in b.items() if k.startswith(f"{c.name}.")}, None) for c, b, _ in starts if c.key in keys]
 
     def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float):
         """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says."""

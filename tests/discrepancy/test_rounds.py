@@ -556,9 +556,10 @@ def test_a_fit_goes_on_until_it_has_come_to_its_end(converged, monkeypatch):
     ends = iter([1.6, 1.66, 1.715, 1.762, 1.8])
     asked = []
 
-    def from_here(self, free, fit, starts, like):
+    def from_here(self, entries, like):
+        ((_, fit, _),) = entries
         asked.append(fit)
-        return replace(fit, point={"a": 3.0, "square.c": next(ends)}, converged=converged), like
+        return [(replace(fit, point={"a": 3.0, "square.c": next(ends)}, converged=converged), like)]
 
     monkeypatch.setattr(Inference, "from_here", from_here)
     monkeypatch.setattr(Inference, "is_noise", lambda self, errors: False)
@@ -789,10 +790,45 @@ def test_candidates_are_fitted_without_the_problems_own_parameters_too(found, mo
     beside = {"a": 2.0, "cube.c": 0.4} if found else {"a": 2.0}
     moved = replace(base, fit=replace(base.fit, point={**beside, "height": 0.1}))
     asked = []
-    monkeypatch.setattr(rounds.Inference, "contest", lambda self, free, starts, floor: asked.extend(starts) or ({}, None))
+
+    def contest(self, free, starts, floor, hopeful, then):
+        asked.extend([*starts, *then(["square"])])
+        return {}, None
+
+    monkeypatch.setattr(rounds.Inference, "contest", contest)
     inference.round(moved.fit, moved.floor, [Trial(cube, moved, 1.0)] if found else [])
     own = [{k: v for k, v in begin.items() if not k.startswith("square.")} for c, begin, _ in asked if c.name == "square"]
     assert own == [{**beside, "height": 0.1}, beside if found else {"a": 2.5}]
+    monkeypatch.setattr(rounds, "LEADERS", 0)
+    asked.clear()
+    inference.round(moved.fit, moved.floor, [Trial(cube, moved, 1.0)] if found else [])
+    again = [c.key for c, begin, _ in asked if c.linear and "height" not in begin]
+    assert again == ["square"]
     asked.clear()
     inference.round(base.fit, base.floor, [])
     assert all("height" not in begin for _, begin, _ in asked) and len({c.key for c, *_ in asked}) < len(asked) + 1
+
+
+def test_where_the_first_fits_leave_noise_alone_only_the_hopeful_are_fitted(monkeypatch):
+    """Alone and once each: a square is there, and every other candidate begins twice."""
+    monkeypatch.setattr(contests, "LEADERS", 1)
+    for law, leaves_noise in ((lambda t: 3.0 * t + 2.0 * t**2, True), (lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t), False)):
+        inference = Inference(Line(law, wiggle=0.0))
+        base = inference.start()
+        by_key = {c.key: c for c in inference.problem.candidates}
+        keys = ["square", "cube", "cube", "clip", "clip"]
+        starts = [(by_key[key], {**base.fit.point, **by_key[key].starts[-1]}, None) for key in keys]
+        begun = []
+        request = Inference.request
+
+        def seen(self, parameters, start, begun=begun, request=request, **options):
+            begun.append(next(k.split(".")[0] for k in start if "." in k))
+            return request(self, parameters, start, **options)
+
+        monkeypatch.setattr(Inference, "request", seen)
+        best, _ = inference.contest(
+            inference.problem.declared, starts, base.floor, {"square", "cube"}, lambda led, starts=starts: starts[:1]
+        )
+        monkeypatch.setattr(Inference, "request", request)
+        assert inference.is_noise(inference.mean_squares([best["square"][1].point], base.floor)[0]) is leaves_noise
+        assert begun == ["square", "cube"] * leaves_noise + keys * (not leaves_noise) + ["square"]

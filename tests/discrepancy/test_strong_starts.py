@@ -51,7 +51,7 @@ def test_each_sign_begins_at_its_best_place():
     inference = Inference(problem)
     base = inference.start()
     part = problem.candidates[0]
-    stiff, soft = inference.strong(part, base.fit.point, base.floor)
+    stiff, soft = inference.strong(part, part.starts, base.fit.point, base.floor)
     assert stiff["part.log_ratio"] == pytest.approx(math.log(8.0)) and stiff["part.c"] == 0.6
     assert soft["part.log_ratio"] == pytest.approx(-math.log(8.0))
     young = base.fit.point["young"]
