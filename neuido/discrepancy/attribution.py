@@ -15,7 +15,7 @@ from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.pairs import LOOKED_AHEAD, WORSE, beside_members, by_another_method, look_ahead
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import ALPHA, UNEXPLAINED, WITHIN, Inference
-from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
+from neuido.discrepancy.trials import LED, Round, Stand, Trial, score, times_over, unphysical
 from neuido.physics.effect_library import LIMITS
 
 __all__ = [
@@ -163,6 +163,7 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
     order = sorted(range(len(tried)), key=lambda i: base[i])
+    order = by_first_fits(tried, starts, order, base)
     firsts: dict[int, list[Round]] = {}
     for i in order:
         named = [rounds[0] for rounds in firsts.values() if rounds[0].chosen]
@@ -189,6 +190,28 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     }
     chosen = min(firsts, key=lambda i: best[i] + handicap[i] + sure[i])
     return chosen, firsts
+
+
+def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: list[int], base: Sequence[float]) -> list[int]:
+    """The methods in the order of what their first fits of effects leave, where those of the first one promise an effect and leave more
+    than noise.
+
+    What a method leaves of the declared model says little of how well it fits with the effect, and to refine by the wrong one takes long.
+    """
+    first, *others = order
+    others = [i for i in others if base[i] - base[first] <= 2.0 * math.log(WORSE)]
+    if not others:
+        return order
+    look = tried[first].look(starts[first].fit, starts[first].floor)
+    if not look.least or tried[first].is_noise(look.least[0]) or tried[first].gain(starts[first].errors, look.least[0]) < LEAST_GAIN:
+        return order
+    left = {first: score(look.least[0]) + base[first] - score(starts[first].errors)}
+    for i in others:
+        if tried[i].deadline.skips("first fits by the other method"):
+            break
+        there = tried[i].look(starts[i].fit, starts[i].floor, leaders=look.led[:LED])
+        left[i] = score(there.least[0]) + base[i] - score(starts[i].errors) if there.least else math.inf
+    return sorted(order, key=lambda i: left.get(i, math.inf))
 
 
 def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:

@@ -8,6 +8,7 @@ recordings that were held out against a parametric bootstrap of the largest gain
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +19,8 @@ from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo
-from neuido.discrepancy.problem import Candidate, Point, Problem
-from neuido.discrepancy.trials import Round, Stand, Trial, times_over, unphysical
+from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
+from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
 
 ALPHA = 0.05
 """Family-wise level of a named effect."""
@@ -57,6 +58,25 @@ LED_FAR = 1.6
 """Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
 
 
+class Look(NamedTuple):
+    """The first fits of a step."""
+
+    base: Fit
+    leaders: Sequence[str] | None
+    candidates: list[Candidate]
+    free: tuple[Parameter, ...]
+    slopes: dict[int, np.ndarray]
+    columns: dict[tuple[str, int], dict[int, np.ndarray]]
+    chosen: dict[str, int]
+    """The start of each candidate that was fitted."""
+    best: dict[str, tuple[Candidate, Fit]]
+    other: tuple[Candidate, Fit] | None
+    led: list[str]
+    """Keys of the candidates, what leaves least first."""
+    least: list[np.ndarray]
+    """What that one leaves, mean squares of the parts; empty where nothing runs."""
+
+
 class Inference(Contests):
     """The steps of a diagnosis on one problem.
 
@@ -85,6 +105,8 @@ class Inference(Contests):
     ) -> None:
         super().__init__(problem, setting=setting, tell=tell, memo=memo, deadline=deadline)
         self.keep, self.draws, self.seed = keep, draws, seed
+        self.seen: Look | None = None
+        """The last look."""
 
     @property
     def unexplained(self) -> float:
@@ -101,9 +123,33 @@ class Inference(Contests):
             rival: That of another solver which named an effect: what led there and the first of the screening get a fit.
             most: Parameters that a candidate may have.
         """
-        leaders = rival.leaders if rival is not None else None
+        first, leaders = rival is None and not found, rival.leaders if rival is not None else None
+        seen = self.seen is not None and self.seen.base is base and self.seen.leaders == leaders and not found
+        look = self.seen if seen else self.look(base, floor, found, leaders, most=most)
+        candidates, free, slopes, columns, chosen = look.candidates, look.free, look.slopes, look.columns, look.chosen
+        best, other, errors = dict(look.best), look.other, self.mean_squares([base.point], floor)[0]
+        if not self.deadline.skips("refining the best fits"):
+            best |= self.polish(free, best, base, floor, rival, other)
+            best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
+        floors = self.floors(base.point, free, floor)
+        model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)
+        empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=model.null(errors, self.draws))
+        result = self.judge(empty, best, model, list(chosen))
+        self.tell(self.verdict(result))
+        promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
+        led_far = result.chosen is not None and not self.is_noise(result.chosen.errors) and self.moved(base.point) > LED_FAR
+        again = first and (led_far or (result.chosen is None and (promising or result.over > 1.0)))
+        if again and not self.deadline.skips("fits from elsewhere"):
+            best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
+            result = self.judge(empty, best, model, list(chosen))
+            self.tell(self.verdict(result))
+        return result
+
+    def look(
+        self, base: Fit, floor: Floor, found: Sequence[Trial] = (), leaders: Sequence[str] | None = None, *, most: float = math.inf
+    ) -> Look:
+        """Screen the candidates, and fit the best; arguments as those of `round`, `leaders` what led by another method."""
         candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most)
-        errors = self.mean_squares([base.point], floor)[0]
         chosen: dict[str, int] = {}
         starts = []
         # what many parameters could fit says little of how near the others are
@@ -136,22 +182,11 @@ class Inference(Contests):
         hopeful = {c.key for stays, c, *_ in ranked if stays < HOPELESS or not c.linear}
         self.tell(f"fitting {', '.join(chosen)}")
         best, other = self.contest(free, starts, floor, hopeful, lambda led: self.without_own(base.point, starts, found, led))
-        if not self.deadline.skips("refining the best fits"):
-            best |= self.polish(free, best, base, floor, rival, other)
-            best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
-        floors = self.floors(base.point, free, floor)
-        model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)
-        empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=model.null(errors, self.draws))
-        result = self.judge(empty, best, model, list(chosen))
-        self.tell(self.verdict(result))
-        promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
-        led_far = result.chosen is not None and not self.is_noise(result.chosen.errors) and self.moved(base.point) > LED_FAR
-        again = first and (led_far or (result.chosen is None and (promising or result.over > 1.0)))
-        if again and not self.deadline.skips("fits from elsewhere"):
-            best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
-            result = self.judge(empty, best, model, list(chosen))
-            self.tell(self.verdict(result))
-        return result
+        keys, ends = list(best), self.mean_squares([fit.point for _, fit in best.values()], floor)
+        order = sorted(range(len(keys)), key=lambda i: score(ends[i]))
+        led, least = [keys[i] for i in order], [ends[i] for i in order[:1]]
+        self.seen = Look(base, leaders, candidates, free, slopes, columns, chosen, best, other, led, least)
+        return self.seen
 
     def without_own(
         self,

@@ -1,6 +1,7 @@
 """Which candidates a round fits, and which floor it weighs their gain against."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -164,6 +165,7 @@ def test_a_method_that_leaves_more_than_what_another_named_is_not_looked_further
             self.result = result
 
             self.deadline = Deadline()
+            self.look = lambda fit, floor: SimpleNamespace(least=[])
 
         def is_settled(self, errors):
             return False
@@ -730,6 +732,7 @@ def test_an_effect_by_the_worse_method_leaves_clearly_less_than_the_better_one_w
 
     class Method:
         deadline = Deadline()
+        look = staticmethod(lambda fit, floor: SimpleNamespace(least=[]))
 
         def __init__(self, base, error, named):
             t = Trial(bend, stand(error), 1.0, "" if named else "it gains too little")
@@ -801,6 +804,7 @@ def test_candidates_are_fitted_without_the_problems_own_parameters_too(found, mo
     assert own == [{**beside, "height": 0.1}, beside if found else {"a": 2.5}]
     monkeypatch.setattr(rounds, "LEADERS", 0)
     asked.clear()
+    inference.seen = None
     inference.round(moved.fit, moved.floor, [Trial(cube, moved, 1.0)] if found else [])
     again = [c.key for c, begin, _ in asked if c.linear and "height" not in begin]
     assert again == ["square"]
@@ -832,3 +836,32 @@ def test_where_the_first_fits_leave_noise_alone_only_the_hopeful_are_fitted(monk
         monkeypatch.setattr(Inference, "request", request)
         assert inference.is_noise(inference.mean_squares([best["square"][1].point], base.floor)[0]) is leaves_noise
         assert begun == ["square", "cube"] * leaves_noise + keys * (not leaves_noise) + ["square"]
+
+
+@pytest.mark.parametrize(("left", "there", "order"), [(0.3, 0.2, [1, 0]), (0.3, 0.4, [0, 1]), (0.9, 0.2, [0, 1]), (0.011, 0.005, [0, 1])])
+def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, order):
+    """Unless those of the first one promise no effect, or leave noise alone."""
+    asked = []
+
+    class Method:
+        deadline = Deadline()
+
+        def __init__(self, error):
+            self.error = error
+
+        def is_noise(self, errors):
+            return bool(np.all(errors < 1.8 * NOISE**2))
+
+        def gain(self, before, after):
+            return 0.5 * float(np.log(before.mean() / after.mean()))
+
+        def look(self, fit, floor, leaders=None):
+            asked.append(leaders)
+            return SimpleNamespace(least=[np.full(2, self.error**2)], led=list("abcdefg"))
+
+    start = Stand(Fit({"a": 1.0}, ("a",), 1.0, np.zeros(1), 1, True), None, np.ones(2))
+    assert attribution.by_first_fits([Method(left), Method(there)], [start, start], [0, 1], [0.0, 0.1]) == order
+    assert asked == ([None, list("abcde")] if left == 0.3 else [None])
+    asked.clear()
+    far = 2.0 * np.log(pairs.WORSE) + 0.1
+    assert attribution.by_first_fits([Method(left), Method(there)], [start, start], [0, 1], [0.0, far]) == [0, 1] and not asked
