@@ -15,6 +15,7 @@ stopped. The keys are opened by the scoring alone, after the answers' digests ar
 import argparse
 import csv
 import dataclasses
+import gc
 import hashlib
 import json
 import math
@@ -110,6 +111,12 @@ def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: flo
         target.mkdir(parents=True, exist_ok=True)
         (target / "failed.txt").write_text(f"{type(error).__name__}: {error}\n")
         return f"{type(error).__name__}: {error}"
+    finally:
+        if device != "cpu":  # else a worker's memory grows from case to case, and twenty of them fill a GPU
+            import torch
+
+            gc.collect()
+            torch.cuda.empty_cache()
     (target / "failed.txt").unlink(missing_ok=True)
     return ""
 

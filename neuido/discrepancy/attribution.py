@@ -209,7 +209,7 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: li
     for i in others:
         if tried[i].deadline.skips("first fits by the other method"):
             break
-        there = tried[i].look(starts[i].fit, starts[i].floor, leaders=look.led[:LED])
+        there = tried[i].look(starts[i].fit, starts[i].floor, leaders=look.led[:LED], alone=True)
         left[i] = score(there.least[0]) + base[i] - score(starts[i].errors) if there.least else math.inf
     return sorted(order, key=lambda i: left.get(i, math.inf))
 

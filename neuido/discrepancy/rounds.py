@@ -106,7 +106,7 @@ class Inference(Contests):
         super().__init__(problem, setting=setting, tell=tell, memo=memo, deadline=deadline)
         self.keep, self.draws, self.seed = keep, draws, seed
         self.seen: Look | None = None
-        """The last look."""
+        """The last look at all candidates."""
 
     @property
     def unexplained(self) -> float:
@@ -146,10 +146,20 @@ class Inference(Contests):
         return result
 
     def look(
-        self, base: Fit, floor: Floor, found: Sequence[Trial] = (), leaders: Sequence[str] | None = None, *, most: float = math.inf
+        self,
+        base: Fit,
+        floor: Floor,
+        found: Sequence[Trial] = (),
+        leaders: Sequence[str] | None = None,
+        *,
+        most: float = math.inf,
+        alone: bool = False,
     ) -> Look:
-        """Screen the candidates, and fit the best; arguments as those of `round`, `leaders` what led by another method."""
-        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most)
+        """Screen the candidates, and fit the best; arguments as those of `round`.
+
+        `leaders`: what led by another method; `alone`: and nothing else.
+        """
+        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most, leaders if alone else None)
         chosen: dict[str, int] = {}
         starts = []
         # what many parameters could fit says little of how near the others are
@@ -185,8 +195,9 @@ class Inference(Contests):
         keys, ends = list(best), self.mean_squares([fit.point for _, fit in best.values()], floor)
         order = sorted(range(len(keys)), key=lambda i: score(ends[i]))
         led, least = [keys[i] for i in order], [ends[i] for i in order[:1]]
-        self.seen = Look(base, leaders, candidates, free, slopes, columns, chosen, best, other, led, least)
-        return self.seen
+        look = Look(base, leaders, candidates, free, slopes, columns, chosen, best, other, led, least)
+        self.seen = self.seen if alone else look
+        return look
 
     def without_own(
         self,
@@ -207,10 +218,12 @@ class Inference(Contests):
         keys = {*list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS], *led[:ALSO_WITHOUT]}
         return [(c, plain | {k: v for k, v in b.items() if k.startswith(f"{c.name}.")}, None) for c, b, _ in starts if c.key in keys]
 
-    def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float):
-        """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says."""
+    def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float, keys: Sequence[str] | None = None):
+        """The candidates beside effects that were found (of these `keys`), the free parameters and their slopes, and what `screen` says."""
         taken = {t.candidate.name for t in found}
-        candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
+        candidates = [
+            c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most and (keys is None or c.key in keys)
+        ]
         free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
         slopes = self.slopes(free, point, self.scored_recordings)
         return candidates, free, slopes, *self.screen(point, candidates, floor, slopes)

@@ -855,7 +855,7 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, o
         def gain(self, before, after):
             return 0.5 * float(np.log(before.mean() / after.mean()))
 
-        def look(self, fit, floor, leaders=None):
+        def look(self, fit, floor, leaders=None, alone=False):
             asked.append(leaders)
             return SimpleNamespace(least=[np.full(2, self.error**2)], led=list("abcdefg"))
 
@@ -865,3 +865,16 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, o
     asked.clear()
     far = 2.0 * np.log(pairs.WORSE) + 0.1
     assert attribution.by_first_fits([Method(left), Method(there)], [start, start], [0, 1], [0.0, far]) == [0, 1] and not asked
+
+
+def test_a_look_at_what_led_by_another_method_is_at_nothing_else():
+    inference = Inference(Line(clipped))
+    base = inference.start()
+    asked = inference.memo.simulations
+    look = inference.look(base.fit, base.floor, leaders=["cube", "square"], alone=True)
+    few = inference.memo.simulations - asked
+    assert sorted(look.led) == sorted(look.chosen) == ["cube", "square"] and inference.seen is None
+    full = inference.look(base.fit, base.floor)
+    assert {"cube", "square", "clip"} < set(full.chosen) and inference.seen is full
+    assert inference.memo.simulations - asked > 2 * few
+    assert inference.round(base.fit, base.floor, []).trials[0].candidate.key == full.led[0] == "clip"
