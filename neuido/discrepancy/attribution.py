@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from neuido.discrepancy.contests import BEYOND
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
@@ -163,11 +164,14 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
     order = sorted(range(len(tried)), key=lambda i: base[i])
-    order = by_first_fits(tried, starts, order, base)
+    seen = by_first_fits(tried, starts, order, base)
+    order = sorted(order, key=lambda i: seen.get(i, math.inf))
     firsts: dict[int, list[Round]] = {}
     for i in order:
         named = [rounds[0] for rounds in firsts.values() if rounds[0].chosen]
         if firsts and not named and base[i] - base[order[0]] > 2.0 * math.log(WORSE):
+            continue
+        if any(r.chosen and seen.get(i, -math.inf) > r.chosen.score + handicap[i] + 2.0 * math.log(BEYOND) for r in named):
             continue
         if firsts and tried[i].deadline.skips("effects by the other method"):
             continue
@@ -192,26 +196,26 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     return chosen, firsts
 
 
-def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: list[int], base: Sequence[float]) -> list[int]:
-    """The methods in the order of what their first fits of effects leave, where those of the first one promise an effect and leave more
-    than noise.
+def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Sequence[int], base: Sequence[float]) -> dict[int, float]:
+    """Score of what the first fits of effects leave by each method, its handicap included.
 
-    What a method leaves of the declared model says little of how well it fits with the effect, and to refine by the wrong one takes long.
+    Asked where those of the first method in the order promise an effect and leave more than noise: what a method leaves of the declared
+    model says little of how well it fits with the effect, and to refine by the wrong one takes long. Of no method else.
     """
     first, *others = order
     others = [i for i in others if base[i] - base[first] <= 2.0 * math.log(WORSE)]
     if not others:
-        return order
+        return {}
     look = tried[first].look(starts[first].fit, starts[first].floor)
     if not look.least or tried[first].is_noise(look.least[0]) or tried[first].gain(starts[first].errors, look.least[0]) < LEAST_GAIN:
-        return order
+        return {}
     left = {first: score(look.least[0]) + base[first] - score(starts[first].errors)}
     for i in others:
         if tried[i].deadline.skips("first fits by the other method"):
             break
         there = tried[i].look(starts[i].fit, starts[i].floor, leaders=look.led[:LED], alone=True)
         left[i] = score(there.least[0]) + base[i] - score(starts[i].errors) if there.least else math.inf
-    return sorted(order, key=lambda i: left.get(i, math.inf))
+    return left
 
 
 def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:

@@ -860,11 +860,40 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, o
             return SimpleNamespace(least=[np.full(2, self.error**2)], led=list("abcdefg"))
 
     start = Stand(Fit({"a": 1.0}, ("a",), 1.0, np.zeros(1), 1, True), None, np.ones(2))
-    assert attribution.by_first_fits([Method(left), Method(there)], [start, start], [0, 1], [0.0, 0.1]) == order
+    seen = attribution.by_first_fits([Method(left), Method(there)], [start, start], [0, 1], [0.0, 0.1])
+    assert sorted((0, 1), key=lambda i: seen.get(i, np.inf)) == order
     assert asked == ([None, list("abcde")] if left == 0.3 else [None])
+    assert seen == ({0: pytest.approx(2 * np.log(left)), 1: pytest.approx(2 * np.log(there) + 0.1)} if left == 0.3 else {})
     asked.clear()
     far = 2.0 * np.log(pairs.WORSE) + 0.1
-    assert attribution.by_first_fits([Method(left), Method(there)], [start, start], [0, 1], [0.0, far]) == [0, 1] and not asked
+    assert attribution.by_first_fits([Method(left), Method(there)], [start, start], [0, 1], [0.0, far]) == {} and not asked
+
+
+@pytest.mark.parametrize(("there", "rounds_of"), [(0.5, [0, 1]), (0.9, [0])])
+def test_a_method_whose_first_fits_are_far_from_what_was_named_is_not_asked_further(there, rounds_of, monkeypatch):
+    bend = Line(clipped).candidates[0]
+    asked = []
+
+    class Method:
+        deadline = Deadline()
+
+        def __init__(self, n):
+            self.n = n
+
+        def is_noise(self, errors):
+            return False
+
+        def round(self, *_):
+            asked.append(self.n)
+            fit = Fit({"a": 1.0, "square.c": 1.0}, ("a", "square.c"), 1.0, np.zeros(1), 1, True)
+            t = Trial(bend, Stand(fit, None, np.full(2, 0.01)), 1.0)
+            return Round({}, np.ones(2), [t], t, [t], 0.01, None, np.full(2, 1e-4))
+
+    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
+    monkeypatch.setattr(attribution, "by_first_fits", lambda *_: {0: 2 * np.log(0.1), 1: 2 * np.log(there) + np.log(1.2)})
+    start = Stand(Fit({"a": 1.0}, ("a",), 1.0, np.zeros(1), 1, True), None, np.ones(2))
+    attribution.first_rounds([Method(0), Method(1)], [start, start])
+    assert asked == rounds_of
 
 
 def test_a_look_at_what_led_by_another_method_is_at_nothing_else():
