@@ -106,7 +106,7 @@ class Inference(Contests):
         super().__init__(problem, setting=setting, tell=tell, memo=memo, deadline=deadline)
         self.keep, self.draws, self.seed = keep, draws, seed
         self.seen: Look | None = None
-        """The last look at all candidates."""
+        """The last look for a first effect."""
 
     @property
     def unexplained(self) -> float:
@@ -196,7 +196,7 @@ class Inference(Contests):
         order = sorted(range(len(keys)), key=lambda i: score(ends[i]))
         led, least = [keys[i] for i in order], [ends[i] for i in order[:1]]
         look = Look(base, leaders, candidates, free, slopes, columns, chosen, best, other, led, least)
-        self.seen = self.seen if alone else look
+        self.seen = self.seen if alone or found else look
         return look
 
     def without_own(
