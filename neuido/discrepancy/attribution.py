@@ -164,7 +164,7 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
     order = sorted(range(len(tried)), key=lambda i: base[i])
-    seen = by_first_fits(tried, starts, order, base)
+    seen = by_first_fits(tried, starts, order, handicap)
     order = sorted(order, key=lambda i: seen.get(i, math.inf))
     firsts: dict[int, list[Round]] = {}
     for i in order:
@@ -196,25 +196,26 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     return chosen, firsts
 
 
-def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Sequence[int], base: Sequence[float]) -> dict[int, float]:
+def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Sequence[int], handicap: Sequence[float]) -> dict[int, float]:
     """Score of what the first fits of effects leave by each method, its handicap included.
 
     Asked where those of the first method in the order promise an effect and leave more than noise: what a method leaves of the declared
     model says little of how well it fits with the effect, and to refine by the wrong one takes long. Of no method else.
     """
     first, *others = order
-    others = [i for i in others if base[i] - base[first] <= 2.0 * math.log(WORSE)]
+    limit = score(starts[first].errors) + handicap[first] + 2.0 * math.log(WORSE)
+    others = [i for i in others if score(starts[i].errors) + handicap[i] <= limit]
     if not others:
         return {}
     look = tried[first].look(starts[first].fit, starts[first].floor)
     if not look.least or tried[first].is_noise(look.least[0]) or tried[first].gain(starts[first].errors, look.least[0]) < LEAST_GAIN:
         return {}
-    left = {first: score(look.least[0]) + base[first] - score(starts[first].errors)}
+    left = {first: score(look.least[0]) + handicap[first]}
     for i in others:
         if tried[i].deadline.skips("first fits by the other method"):
             break
         there = tried[i].look(starts[i].fit, starts[i].floor, leaders=look.led[:LED], alone=True)
-        left[i] = score(there.least[0]) + base[i] - score(starts[i].errors) if there.least else math.inf
+        left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
     return left
 
 

@@ -41,6 +41,8 @@ ALIKE = 0.3
 
 Start = tuple[Candidate, Point, np.ndarray | None]
 """A candidate, where a fit of it begins, and about the slopes there, if they are known."""
+Onset = tuple[Sequence[Parameter], Fit, Sequence[Point]]
+"""What is fitted, a fit of it, and where further ones begin."""
 
 
 def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candidate, Fit]]) -> dict[str, tuple[Candidate, Fit]]:
@@ -82,12 +84,11 @@ class Contests(Screening):
         A part that is many times as stiff as the rest moves the body in another way than the direction of a little stiffness says, and a
         fit that begins at a little comes down into the nearest valley.
         """
+        beside = [p for p in self.problem.declared if p.log and p.name in c.beside]
         begins: list[Point] = []
-        for start in places:
-            for size in (c.far, -c.far):
-                moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside.get(p.name, 0.0) * size / p.scale)
-                         for p in self.problem.declared if p.log and p.name in c.beside}  # fmt: skip
-                begins.append({**point, **start, c.apart: size, **moved})
+        for size in (c.far, -c.far):
+            moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside[p.name] * size / p.scale) for p in beside}
+            begins += [{**point, **start, c.apart: size, **moved} for start in places]
         self.tell(f"{len(begins)} places of {c.key} at full strength")
         costs = np.array(self.costs(begins, floor))
         best = (min((i for i, b in enumerate(begins) if b[c.apart] * sign > 0), key=lambda i: costs[i]) for sign in (1, -1))
@@ -103,8 +104,8 @@ class Contests(Screening):
     ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
         """The best fit of each candidate, fits that cannot catch up with the best one stop; and the leading one's of the other sign.
 
-        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all. So do
-        those that are not `hopeful` where the first ones leave noise alone, and each of the others begins once then.
+        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all. Where the
+        first ones leave noise alone, those of the others that are not `hopeful` get no fit, and the rest one each.
 
         Args:
             free: What is fitted beside a candidate's parameters.
@@ -205,8 +206,7 @@ class Contests(Screening):
         least: dict[str, float] = {}
         if other is not None and other[1].cost < IN_REACH * ranked[0][1].cost:
             top.append(other)
-        self.predicted([fit.point for _, fit in top], self.scored_recordings)
-        able = [(c, fit) for c, fit in top if self.runs(fit.point)]  # elsewhere there is no floor
+        able = self.able(top)  # elsewhere there is no floor
         entries = []
         for c, fit in able:
             starts = [fit.point, self.at_declared(fit.point)]
@@ -220,16 +220,20 @@ class Contests(Screening):
                 out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
         return out
 
-    def onward(self, entries: Sequence[tuple[Sequence[Parameter], Fit, Sequence[Point]]], floor: Floor) -> list[tuple[Fit, Floor]]:
+    def able(self, fits: Sequence[tuple[Candidate, Fit]]) -> list[tuple[Candidate, Fit]]:
+        """Those that end where every recording runs."""
+        return [entry for entry, ok in zip(fits, self.which_run([fit.point for _, fit in fits]), strict=True) if ok]
+
+    def onward(self, entries: Sequence[Onset], floor: Floor) -> list[tuple[Fit, Floor]]:
         """What `from_here` makes of each entry, and further from where that ends, up to `ONWARD` times."""
         ends = self.from_here(entries, floor)
         going = list(range(len(ends)))
         for _ in range(ONWARD):
             if self.deadline.over:
                 break
-            self.predicted([ends[i][0].point for i in going], self.scored_recordings)
+            run = self.which_run([ends[i][0].point for i in going])
             left = {i: self.mean_squares([ends[i][0].point], ends[i][1])[0] for i in going}
-            going = [i for i in going if not self.is_noise(left[i]) and self.runs(ends[i][0].point)]
+            going = [i for i, ok in zip(going, run, strict=True) if ok and not self.is_noise(left[i])]
             if not going:
                 break
             made = self.from_here([(entries[i][0], ends[i][0], [ends[i][0].point]) for i in going], floor)
@@ -246,14 +250,12 @@ class Contests(Screening):
         """The point with the declared parameters, and the problem's own, as the model states them; the effects as they are."""
         return {k: v for k, v in point.items() if "." in k} | self.as_declared
 
-    def from_here(self, entries: Sequence[tuple[Sequence[Parameter], Fit, Sequence[Point]]], like: Floor) -> list[tuple[Fit, Floor]]:
-        """Of each entry (what is fitted, a fit, starts) the best of the fit and of those from the starts; and the floor of all of them.
+    def from_here(self, entries: Sequence[Onset], like: Floor) -> list[tuple[Fit, Floor]]:
+        """Of each entry the best of its fit and of those from its starts, and the floor of all of them: that where the fit stands.
 
-        That is the floor where the fit stands. The fits of all entries run side by side.
+        The fits of all entries run side by side.
         """
-        with self.memo.during("discretisation"):  # all of them in one launch
-            here = [fit.point for _, fit, _ in entries]
-            self.predicted(here, list(like.noise), [self.setting, *self.problem.others(self.setting)])
+        self.foresee([fit.point for _, fit, _ in entries], like)
         owns, requests, of = [], [], []
         for k, (free, fit, starts) in enumerate(entries):
             (own, _), race = self.stand(fit.point, like=like), Race()
@@ -283,8 +285,7 @@ class Contests(Screening):
         order = sorted(range(len(points)), key=lambda i: score(found[i].errors))[:MEASURED]
         limit = score(found[order[0]].errors) + 2.0 * math.log(NEAR)
         leading = [i for i in order if score(found[i].errors) < limit and not self.is_noise(found[i].errors)]
-        with self.memo.during("discretisation"):  # all of them in one launch
-            self.predicted([points[i] for i in leading], list(floor.noise), [self.setting, *self.problem.others(self.setting)])
+        self.foresee([points[i] for i in leading], floor)
         for i in leading:
             if self.runs(points[i]):
                 there = Stand(found[i].fit, *self.stand(points[i], like=floor))
@@ -363,9 +364,7 @@ class Contests(Screening):
             return {}
         left = [score(squares) for squares in self.mean_squares([fit.point for _, fit in ended], floor)]
         out: dict[str, tuple[Candidate, Fit]] = {}
-        ends = [ended[i] for i in np.argsort(left)[:POLISHED]]
-        self.predicted([fit.point for _, fit in ends], self.scored_recordings)
-        ends = [(c, fit) for c, fit in ends if self.runs(fit.point)]
+        ends = self.able([ended[i] for i in np.argsort(left)[:POLISHED]])
         made = self.from_here([((*self.problem.declared, *c.parameters), fit, [fit.point]) for c, fit in ends], floor)
         for (c, _), (further, own) in zip(ends, made, strict=True):
             rival = (out.get(c.key) or best[c.key])[1]

@@ -193,6 +193,11 @@ class Laboratory:
         above = max(float(np.mean((errors - self.noise_squares)[self.fitted])), 0.0)
         return floor.weighed(min(UNSEEN, math.sqrt(above / max(float(spread), 1e-300))))
 
+    def foresee(self, points: Sequence[Point], floor: Floor) -> None:
+        """Run what `floor` and `stand` of several points will ask for, in one launch; the memo keeps it."""
+        with self.memo.during("discretisation"):
+            self.predicted(points, list(floor.noise), [self.setting, *self.problem.others(self.setting)])
+
     def stand(self, point: Point, *, like: Floor | None = None) -> tuple[Floor, np.ndarray]:
         """The floor at a point, sharpened by what is left there, and what that is, mean squares of the parts; `like` as for `floor`."""
         floor = self.floor(point, like=like)
@@ -202,8 +207,8 @@ class Laboratory:
     def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
         """A fit; options of `levenberg_marquardt`."""
         margin = functools.partial(self.problem.margin, setting=self.setting)
-        halt = lambda: self.deadline.over  # noqa: E731
-        return levenberg_marquardt(parameters, start, together=self.problem.together, margin=margin, halt=halt, **options)
+        together = self.problem.together
+        return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.deadline.over, **options)
 
     def base(self, starts: Sequence[Point], floor: Floor, **options: Any) -> Fit:
         """The declared parameters fitted from several starts; the best one after a few iterations goes on, with options of the fit."""
@@ -264,9 +269,11 @@ class Laboratory:
             begin = self.recentred(fit.point, floor) if turn else fit.point
             if turn >= AGAIN and begin == fit.point:
                 break
-            # a modulus may have made up for where the floor is; it is asked once
-            moved, asked = begin != fit.point and not asked, asked or begin != fit.point
-            fit = self.base([begin, {**begin, **self.as_declared}] if moved else [begin], floor)
+            begins = [begin]
+            if begin != fit.point and not asked:  # a modulus may have made up for where the floor is
+                begins.append({**begin, **self.as_declared})
+                asked = True
+            fit = self.base(begins, floor)
             if not self.runs(fit.point):
                 break
             floor, errors = self.stand(fit.point, like=floor)
@@ -292,8 +299,12 @@ class Laboratory:
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""
-        rows = self.predicted([point], self.scored_recordings)
-        return all(bool(np.isfinite(of).all()) for of in rows.values())
+        return self.which_run([point])[0]
+
+    def which_run(self, points: Sequence[Point]) -> list[bool]:
+        """`runs` of several points, in one launch."""
+        rows = self.predicted(points, self.scored_recordings)
+        return [all(bool(np.isfinite(of[i]).all()) for of in rows.values()) for i in range(len(points))]
 
     def typical(self, squares: np.ndarray) -> float:
         """The geometric mean over the parts of root mean squares, in the unit of the data."""

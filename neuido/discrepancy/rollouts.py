@@ -142,9 +142,9 @@ class BodyRollouts(Problem):
         if self.device != "cpu":
             size = next((n for n in SIZES if n >= most), most)
         simulator = self.simulator(tuple(n for _, n in runs), setting, size)
-        filled = [([*points, *[points[-1]] * (size - len(points))], n) for points, n in runs]
-        lifts = np.array([self._lift(point, n, setting) for points, n in filled for point in points])
-        full = [_against(self._full(point), lift) for point, lift in zip((p for points, _ in filled for p in points), lifts, strict=True)]
+        filled = [(point, n) for points, n in runs for point in [*points, *[points[-1]] * (size - len(points))]]
+        lifts = np.array([self._lift(point, n, setting) for point, n in filled])
+        full = [_against(self._full(point), lift) for (point, _), lift in zip(filled, lifts, strict=True)]
         elasticity, plasticity = self.laws(full)
         always = () if self.device == "cpu" or len(full) == 1 else [p.name for c in self.candidates for p in c.parameters]
         effects = self._effects(simulator, full, [n for _, n in runs], always)
@@ -172,6 +172,11 @@ class BodyRollouts(Problem):
     def _ups(self) -> list[np.ndarray]:
         return [_up(r) for r in self.measured]
 
+    @functools.cached_property
+    def _room(self) -> float:
+        """How far the bodies that may be lifted against their colliders begin from them [m]."""
+        return min((_gap(r) for r, up in zip(self.measured, self._ups, strict=True) if up.any()), default=0.0)
+
     @property
     def lifts(self) -> bool:
         """Whether colliders may be higher than they are declared in some recording."""
@@ -193,8 +198,8 @@ class BodyRollouts(Problem):
         moved = -sum(SETTINGS[s].lift * dx * a for s, a in zip(others, amounts, strict=True))
         if abs(moved) < LEAST_LIFT * dx:
             return point
-        room = min((_gap(r) for r, up in zip(self.measured, self._ups, strict=True) if up.any()), default=0.0)
-        return {**point, CONTACT_HEIGHT: float(np.clip(height + moved, -MOST_LIFT * dx, min(MOST_LIFT * dx, room - 0.5 * GAP * dx)))}
+        most = min(MOST_LIFT * dx, self._room - 0.5 * GAP * dx)
+        return {**point, CONTACT_HEIGHT: float(np.clip(height + moved, -MOST_LIFT * dx, most))}
 
     def _lift(self, point: Point, recording: int, setting: int) -> np.ndarray:
         """How much further along their normals the colliders are [m], (3,)."""
@@ -304,16 +309,20 @@ def _up(r: Measured) -> np.ndarray:
 
     Zero where there are none, where the body begins on one, and where it is clamped: it must not move along what holds it.
     """
-    normals = {tuple(v / math.hypot(*p.normal) for v in p.normal) for p in r.scene.colliders}
-    free = normals and not r.scene.clamps and _gap(r) > GAP * r.scene.dx
-    return np.sum(list(normals), axis=0) if free else np.zeros(3)
+    free = r.scene.colliders and not r.scene.clamps and _gap(r) > GAP * r.scene.dx
+    return np.unique(_normals(r), axis=0).sum(axis=0) if free else np.zeros(3)
+
+
+def _normals(r: Measured) -> list[np.ndarray]:
+    """Of the colliders of a recording, of length one."""
+    return [np.array(p.normal) / math.hypot(*p.normal) for p in r.scene.colliders]
 
 
 def _gap(r: Measured) -> float:
     """How far the body of a recording begins from the colliders [m]."""
     x = r.body.x.double().numpy()
-    normals = [np.array(p.normal) / math.hypot(*p.normal) for p in r.scene.colliders]
-    return min((float(((x - np.array(p.point)) @ n).min()) for p, n in zip(r.scene.colliders, normals, strict=True)), default=math.inf)
+    gaps = (float(((x - np.array(p.point)) @ n).min()) for p, n in zip(r.scene.colliders, _normals(r), strict=True))
+    return min(gaps, default=math.inf)
 
 
 def _against(point: dict[str, float], lift: np.ndarray) -> dict[str, float]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.contests import LEADERS, MANY, SMALL, SOME_GAIN, Contests
+from neuido.discrepancy.contests import LEADERS, MANY, SMALL, SOME_GAIN, Contests, Start
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
@@ -199,13 +199,7 @@ class Inference(Contests):
         self.seen = self.seen if alone or found else look
         return look
 
-    def without_own(
-        self,
-        point: Point,
-        starts: Sequence[tuple[Candidate, Point, np.ndarray | None]],
-        found: Sequence[Trial],
-        led: Sequence[str],
-    ) -> list[tuple[Candidate, Point, None]]:
+    def without_own(self, point: Point, starts: Sequence[Start], found: Sequence[Trial], led: Sequence[str]) -> list[Start]:
         """The starts once more without the problem's own parameters, where the base has some: what it needs them for may be an effect.
 
         Of the candidates that the screening or the fits with them (`led`, best first) put among the first.

@@ -69,6 +69,34 @@ def clipped(t):
     return np.minimum(3.0 * t, 1.6)
 
 
+class Method:
+    """A method of prediction as `first_rounds` asks it: nothing that it leaves is noise alone, and each of its rounds is `result`."""
+
+    def __init__(self, result=None):
+        self.result, self.deadline = result, Deadline()
+
+    def is_noise(self, errors):
+        return False
+
+    def look(self, fit, floor, leaders=None, alone=False):
+        return SimpleNamespace(least=[])
+
+    def round(self, *_):
+        return self.result
+
+
+def stood(errors, point=None):
+    """Where a fit stands that leaves these errors of two recordings."""
+    point = point or {"a": 1.0}
+    return Stand(Fit(point, tuple(point), 1.0, np.zeros(1), 1, True), None, np.broadcast_to(errors, 2) ** 2.0)
+
+
+def first_round(error, named, base=1.0):
+    """A round with one trial, which leaves `error` and is named or not."""
+    t = Trial(Line(clipped).candidates[0], stood(error, {"a": 1.0, "square.c": 1.0}), 1.0, "" if named else "it gains too little")
+    return Round({}, np.full(2, base**2), [t], t if named else None, [t] if named else [], 0.01, None, np.full(2, 1e-4))
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_a_small_candidate_that_the_screening_passes_over_is_fitted(together, monkeypatch):
     found = diagnose(Line(clipped, together=together), keep=1)
@@ -149,37 +177,10 @@ def test_a_held_out_recording_far_above_its_floor_is_unknown():
 
 @pytest.mark.parametrize(("left", "looks"), [(0.3, [0]), (0.05, [0, 1])])
 def test_a_method_that_leaves_more_than_what_another_named_is_not_looked_further_with(left, looks, monkeypatch):
-    bend = Line(clipped).candidates[0]
-
-    def trial(error):
-        fit = Fit({"a": 1.0, "square.c": 1.0}, ("a", "square.c"), 1.0, np.zeros(1), 1, True)
-        return Trial(bend, Stand(fit, None, np.full(2, error**2)), 1.0)
-
-    def found(error, named):
-        t = trial(error)
-        chosen, members = (t, [t]) if named else (None, [])
-        return Round({}, np.ones(2), [t], chosen, members, 0.01, None, np.full(2, 1e-4))
-
-    class Method:
-        def __init__(self, result):
-            self.result = result
-
-            self.deadline = Deadline()
-            self.look = lambda fit, floor: SimpleNamespace(least=[])
-
-        def is_settled(self, errors):
-            return False
-
-        is_noise = is_settled
-
-        def round(self, *_):
-            return self.result
-
-    methods = [Method(found(0.1, True)), Method(found(left, False))]
+    methods = [Method(first_round(0.1, True)), Method(first_round(left, False))]
     asked = []
     monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: asked.append(methods.index(inference)) or [first])
-    start = Stand(trial(1.0).fit, None, np.ones(2))
-    attribution.first_rounds(methods, [start, start])
+    attribution.first_rounds(methods, [stood(1.0)] * 2)
     assert asked == looks
 
 
@@ -725,39 +726,17 @@ def test_the_other_method_goes_on_from_where_the_chosen_one_has_come():
 @pytest.mark.parametrize(("left", "chosen"), [(0.8, 0), (0.5, 1)])
 def test_an_effect_by_the_worse_method_leaves_clearly_less_than_the_better_one_without_any(left, chosen, monkeypatch):
     """Else an effect stands for what another method gets wrong."""
-    bend = Line(clipped).candidates[0]
-
-    def stand(error):
-        return Stand(Fit({"a": 1.0}, ("a",), 1.0, np.zeros(1), 1, True), None, np.full(2, error**2))
-
-    class Method:
-        deadline = Deadline()
-        look = staticmethod(lambda fit, floor: SimpleNamespace(least=[]))
-
-        def __init__(self, base, error, named):
-            t = Trial(bend, stand(error), 1.0, "" if named else "it gains too little")
-            self.result = Round({}, np.full(2, base**2), [t], t if named else None, [t] if named else [], 0.01, None, np.full(2, 1e-4))
-
-        def is_noise(self, errors):
-            return False
-
-        def round(self, *_):
-            return self.result
-
     monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
-    methods = [Method(1.0, 0.95, False), Method(1.5, left, True)]
-    assert attribution.first_rounds(methods, [stand(1.0), stand(1.5)])[0] == chosen
+    methods = [Method(first_round(0.95, False, base=1.0)), Method(first_round(left, True, base=1.5))]
+    assert attribution.first_rounds(methods, [stood(1.0), stood(1.5)])[0] == chosen
 
 
 @pytest.mark.parametrize(("error", "moves"), [(0.8, False), (0.5, True)])
 def test_a_parameter_of_the_problems_own_leaves_its_place_for_clearly_less_alone(error, moves):
     inference = Inference(Line(clipped))
 
-    def stand(point, left):
-        return Stand(Fit(point, ("a",), 1.0, np.zeros(1), 1, True), None, np.array([left, 5.0]) ** 2)
-
-    still, moved = stand({"a": 2.0}, 1.0), stand({"a": 3.0, "height": 0.1}, error)
-    rough = stand({"a": 1.0}, 1.3)
+    still, moved = stood([1.0, 5.0], {"a": 2.0}), stood([error, 5.0], {"a": 3.0, "height": 0.1})
+    rough = stood([1.3, 5.0])
     assert inference.plainest([rough, still, moved]) is (moved if moves else still)
     assert inference.still == ({"a": 2.0} if moves else None)
 
@@ -843,12 +822,7 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, o
     """Unless those of the first one promise no effect, or leave noise alone."""
     asked = []
 
-    class Method:
-        deadline = Deadline()
-
-        def __init__(self, error):
-            self.error = error
-
+    class Looking(Method):
         def is_noise(self, errors):
             return bool(np.all(errors < 1.8 * NOISE**2))
 
@@ -857,42 +831,30 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, o
 
         def look(self, fit, floor, leaders=None, alone=False):
             asked.append(leaders)
-            return SimpleNamespace(least=[np.full(2, self.error**2)], led=list("abcdefg"))
+            return SimpleNamespace(least=[np.full(2, self.result**2)], led=list("abcdefg"))
 
-    start = Stand(Fit({"a": 1.0}, ("a",), 1.0, np.zeros(1), 1, True), None, np.ones(2))
-    seen = attribution.by_first_fits([Method(left), Method(there)], [start, start], [0, 1], [0.0, 0.1])
+    methods, starts = [Looking(left), Looking(there)], [stood(1.0)] * 2
+    seen = attribution.by_first_fits(methods, starts, [0, 1], [0.0, 0.1])
     assert sorted((0, 1), key=lambda i: seen.get(i, np.inf)) == order
     assert asked == ([None, list("abcde")] if left == 0.3 else [None])
     assert seen == ({0: pytest.approx(2 * np.log(left)), 1: pytest.approx(2 * np.log(there) + 0.1)} if left == 0.3 else {})
     asked.clear()
     far = 2.0 * np.log(pairs.WORSE) + 0.1
-    assert attribution.by_first_fits([Method(left), Method(there)], [start, start], [0, 1], [0.0, far]) == {} and not asked
+    assert attribution.by_first_fits(methods, starts, [0, 1], [0.0, far]) == {} and not asked
 
 
 @pytest.mark.parametrize(("there", "rounds_of"), [(0.5, [0, 1]), (0.9, [0])])
 def test_a_method_whose_first_fits_are_far_from_what_was_named_is_not_asked_further(there, rounds_of, monkeypatch):
-    bend = Line(clipped).candidates[0]
     asked = []
 
-    class Method:
-        deadline = Deadline()
-
-        def __init__(self, n):
-            self.n = n
-
-        def is_noise(self, errors):
-            return False
-
+    class Asked(Method):
         def round(self, *_):
-            asked.append(self.n)
-            fit = Fit({"a": 1.0, "square.c": 1.0}, ("a", "square.c"), 1.0, np.zeros(1), 1, True)
-            t = Trial(bend, Stand(fit, None, np.full(2, 0.01)), 1.0)
-            return Round({}, np.ones(2), [t], t, [t], 0.01, None, np.full(2, 1e-4))
+            asked.append(self.result)
+            return first_round(0.1, True)
 
     monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
     monkeypatch.setattr(attribution, "by_first_fits", lambda *_: {0: 2 * np.log(0.1), 1: 2 * np.log(there) + np.log(1.2)})
-    start = Stand(Fit({"a": 1.0}, ("a",), 1.0, np.zeros(1), 1, True), None, np.ones(2))
-    attribution.first_rounds([Method(0), Method(1)], [start, start])
+    attribution.first_rounds([Asked(0), Asked(1)], [stood(1.0)] * 2)
     assert asked == rounds_of
 
 
