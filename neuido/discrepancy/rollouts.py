@@ -33,6 +33,11 @@ KEPT = {"cpu": 24, "cuda": 96}
 SIZES = (1, 4, 12, 32, 96)
 """Parameter sets of a recording in a launch, filled up: each number of them has buffers and captured launches of its own."""
 
+STIFFENING = ("strain_stiffening.k", "second_invariant.c", "tension_compression.r")
+"""Effects that stiffen a body as it is strained, past what the inner steps of the finite elements are for."""
+FINER = (1, 2, 6)
+"""Times the inner steps that are tried for these, one after the other until the motion stays finite."""
+
 LEAST_LIFT, MOST_LIFT, GAP = 0.05, 0.8, 1.0
 """Suggested cells: what the contact height moves by, at the least; how far from where it is declared it may be; and how far from the
 colliders a body begins that may be lifted against them."""
@@ -149,16 +154,13 @@ class BodyRollouts(Problem):
         always = () if self.device == "cpu" or len(full) == 1 else [p.name for c in self.candidates for p in c.parameters]
         effects = self._effects(simulator, full, [n for _, n in runs], always)
         every, steps, exact = substeps(self.measured[runs[0][1]], simulator.scenes[0].dt)
+        given = {"state": self._start(simulator, full, [n for _, n in runs], lifts), "effects": effects}
+        given |= {"every": every, "segment": segment_of(steps, every)}
         with torch.no_grad():
-            out = simulator.rollout(
-                steps,
-                elasticity,
-                plasticity,
-                state=self._start(simulator, full, [n for _, n in runs], lifts),
-                every=every,
-                segment=segment_of(steps, every),
-                effects=effects,
-            )
+            if SETTINGS[setting].solver == "finite_elements" and len(full) == 1:
+                out = _finite(simulator, full[0], steps, elasticity, plasticity, **given)
+            else:
+                out = simulator.rollout(steps, elasticity, plasticity, **given)
         if lifts.any():
             out = out._replace(x=out.x + _of_particles(lifts, simulator))
         moved, offsets = [], simulator.particles.offsets[::size]
@@ -302,6 +304,21 @@ class BodyRollouts(Problem):
         size = float(x.norm(dim=1).max())
         straight, turned = float((x - y).abs().max()), float((x @ R.T - y).abs().max())
         return R if turned < 0.01 * size and turned < 0.5 * straight else eye
+
+
+def _finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -> ParticleState:
+    """A rollout of one scene, with finer inner steps where an effect that stiffens leads to a motion that is not finite.
+
+    Raises:
+        UserError: As the rollout, with the finest of them.
+    """
+    stiffens = any(point.get(name, 0.0) > 0.0 for name in STIFFENING)
+    for finer in FINER[:-1] if stiffens else ():
+        try:
+            return simulator.rollout(*args, **given, finer=finer)
+        except UserError:
+            continue
+    return simulator.rollout(*args, **given, finer=FINER[-1] if stiffens else 1)
 
 
 def _up(r: Measured) -> np.ndarray:

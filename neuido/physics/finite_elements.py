@@ -165,6 +165,7 @@ class FiniteElements:
         segment: int | None = None,
         check: bool = True,
         inner: int | None = None,
+        finer: int = 1,
     ) -> ParticleState:
         """Run `steps` steps of the scenes; arguments and result are those of `mpm.Simulator.rollout`, without gradients.
 
@@ -182,6 +183,7 @@ class FiniteElements:
             segment: Not read; there is no tape.
             check: Not read; the inner steps are always stable for the undeformed mesh.
             inner: Inner steps a step, in place of `inner_steps`.
+            finer: Times that many: those of `inner_steps` are stable for the body at rest, and a law may stiffen with strain.
 
         Returns:
             Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1: x and v interpolated in the element of
@@ -195,7 +197,7 @@ class FiniteElements:
             given = inputs.prepare(
                 self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
             )
-            return self._rollout(steps, elasticity, plasticity, given, every, inner)
+            return self._rollout(steps, elasticity, plasticity, given, every, inner, finer)
 
     def _rollout(
         self,
@@ -205,12 +207,14 @@ class FiniteElements:
         given: inputs.RolloutInputs,
         every: int,
         inner: int | None,
+        finer: int,
     ) -> ParticleState:
         state, effects, tables, viscosity, stiffness = given.state, given.effects, given.tables, given.viscosity, given.stiffness
         if inner is None:
             inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self))
         else:
             inner_of = [inner] * self.scene_count
+        inner_of = [n * finer for n in inner_of]
         frames = ParticleState(*(t.new_empty(steps // every + 1, *t.shape) for t in state))
 
         def one(assembly: Assembly) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from neuido.discrepancy import rollouts
 from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.rollouts import SETTINGS
 from neuido.errors import UserError
@@ -130,3 +131,19 @@ def body_refuses(problem, point) -> bool:
             if "above the limit" in str(error):
                 return True
     return False
+
+
+def test_finite_elements_take_finer_steps_where_an_effect_stiffens(tmp_path, monkeypatch):
+    """Inner steps are stable at rest; a body that stiffens as it is pressed leaves the finite otherwise."""
+    measured = made.experiment(tmp_path / "measured", {}, frames=16)
+    point, finite_elements = {"young": 1e5, "strain_stiffening.k": 40.0}, rollouts.SOLVERS[1]
+
+    def predicted(finer):
+        monkeypatch.setattr(rollouts, "FINER", finer)
+        return body_problem(measured).predict([{"young": 1e5}, point], 0, finite_elements)
+
+    once, fine, finest = predicted((1,)), predicted((1, 2)), predicted((8,))
+    assert np.isfinite(once[0]).all() and np.isnan(once[1]).all()
+    assert np.array_equal(fine[0], once[0]) and np.abs(finest[0] - once[0]).max() == 0.0
+    moved = np.abs(fine[1] - fine[0]).max()
+    assert np.isfinite(fine[1]).all() and np.abs(fine[1] - finest[1]).max() < 0.15 * moved
