@@ -16,7 +16,7 @@ from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.pairs import LOOKED_AHEAD, WORSE, beside_members, by_another_method, look_ahead
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import ALPHA, UNEXPLAINED, WITHIN, Inference
-from neuido.discrepancy.trials import LED, Round, Stand, Trial, score, times_over, unphysical
+from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
 from neuido.physics.effect_library import LIMITS
 
 __all__ = [
@@ -39,6 +39,8 @@ MOST = 3
 """Effects that a growth may add."""
 FURTHER = 1.5
 """Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
+CLEARLY = 1.5
+"""Times the error of another method's first fits at which those of the suggested one are refined first all the same."""
 CLOSE = 2.5
 """Times the error of a chosen effect up to which one with fewer parameters is weighed again once others were found."""
 
@@ -164,8 +166,10 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
     order = sorted(range(len(tried)), key=lambda i: base[i])
-    seen = by_first_fits(tried, starts, order, handicap)
-    order = sorted(order, key=lambda i: seen.get(i, math.inf))
+    # what is left of the declared model says little of the methods where an effect is missing: unless it is far worse, the suggested one
+    suggested = base[0] - base[order[0]] < 2.0 * math.log(WORSE)
+    seen = by_first_fits(tried, starts, sorted(order, key=lambda i: i > 0) if suggested else order, handicap)
+    order = sorted(order, key=lambda i: seen.get(i, math.inf) + 2.0 * math.log(CLEARLY) * (i > 0))
     firsts: dict[int, list[Round]] = {}
     for i in order:
         named = [rounds[0] for rounds in firsts.values() if rounds[0].chosen]
@@ -189,9 +193,8 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
         for i, rounds in firsts.items()
     }
     # by a method whose declared model is not the best one an effect must leave clearly less than that one does without any
-    sure = {
-        i: 2.0 * LEAST_GAIN * (i != order[0] and firsts[i][0].chosen is not None and firsts[order[0]][0].chosen is None) for i in firsts
-    }
+    bare = min(firsts, key=lambda i: base[i])
+    sure = {i: 2.0 * LEAST_GAIN * (i != bare and firsts[i][0].chosen is not None and firsts[bare][0].chosen is None) for i in firsts}
     chosen = min(firsts, key=lambda i: best[i] + handicap[i] + sure[i])
     return chosen, firsts
 
@@ -199,8 +202,9 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
 def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Sequence[int], handicap: Sequence[float]) -> dict[int, float]:
     """Score of what the first fits of effects leave by each method, its handicap included.
 
-    Asked where those of the first method in the order promise an effect and leave more than noise: what a method leaves of the declared
-    model says little of how well it fits with the effect, and to refine by the wrong one takes long. Of no method else.
+    Asked of another one where those of the first in the order promise an effect and leave more than noise: what a method leaves of the
+    declared model says little of how well it fits with the effect, and to refine by the wrong one takes long. Its fits begin where those of
+    the first one ended, too. Of none where the first one promises nothing.
     """
     first, *others = order
     limit = score(starts[first].errors) + handicap[first] + 2.0 * math.log(WORSE)
@@ -208,13 +212,17 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     if not others:
         return {}
     look = tried[first].look(starts[first].fit, starts[first].floor)
-    if not look.least or tried[first].is_noise(look.least[0]) or tried[first].gain(starts[first].errors, look.least[0]) < LEAST_GAIN:
+    if not look.least or tried[first].gain(starts[first].errors, look.least[0]) < LEAST_GAIN:
         return {}
     left = {first: score(look.least[0]) + handicap[first]}
+    if tried[first].is_noise(look.least[0]):
+        return left
     for i in others:
         if tried[i].deadline.skips("first fits by the other method"):
             break
-        there = tried[i].look(starts[i].fit, starts[i].floor, leaders=look.led[:LED], alone=True)
+        ends = {key: fit.point for key, (_, fit) in look.best.items()}
+        beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
+        there = tried[i].look(starts[i].fit, starts[i].floor, ends=ends, beyond=beyond)
         left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
     return left
 

@@ -12,6 +12,8 @@ from neuido.discrepancy.problem import Candidate, Parameter, Point
 from neuido.discrepancy.screening import Screening
 from neuido.discrepancy.trials import Round, Stand, score
 
+FIRST = 0.01
+"""Relative gain of an iteration that ends a candidate's first fit; the best of them are refined."""
 SMALL = 2
 """Parameters up to which a candidate gets a fit in the first round whatever its place in the screening: a direction says little of what a
 yield stress or a lossy floor does once it acts."""
@@ -25,6 +27,8 @@ POLISHED = 4
 """Candidates whose fits are refined from further starts."""
 IN_REACH = 4.0
 """Times the lowest cost up to which that of a fit is worth refining: twice its error."""
+NEARBY = 2.5
+"""Times the least error, that of what is held out too, up to which a fit is worth refining."""
 BEYOND = 8.0
 """Times the error of what another solver named beyond which fits are not refined: that has gained up to 7-fold."""
 MEASURED, NEAR = 6, 4.0
@@ -35,6 +39,8 @@ ONWARD = 3
 not come to its end."""
 SOME_GAIN = math.log(1.2)
 """Smaller gains are no reason to look further."""
+LED_FAR = 1.6
+"""Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
 ALIKE = 0.3
 """Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
 
@@ -89,10 +95,69 @@ class Contests(Screening):
         for size in (c.far, -c.far):
             moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside[p.name] * size / p.scale) for p in beside}
             begins += [{**point, **start, c.apart: size, **moved} for start in places]
+        if not begins:
+            return []
         self.tell(f"{len(begins)} places of {c.key} at full strength")
         costs = np.array(self.costs(begins, floor))
         best = (min((i for i, b in enumerate(begins) if b[c.apart] * sign > 0), key=lambda i: costs[i]) for sign in (1, -1))
         return [begins[i] for i in best if np.isfinite(costs[i])]
+
+    def secant(self, c: Candidate, point: Point, base: Point, slopes: Mapping[int, np.ndarray], floor: Floor) -> np.ndarray | None:
+        """About the slopes of a fit of a candidate of one size: those of the declared values at the base, and the secant from there.
+
+        None where the point has other declared values than the base, or shapes that are fitted too.
+        """
+        (p,) = c.size_parameters
+        same = all(point.get(name) == value for name, value in base.items())
+        if not same or len(c.parameters) > 1 or p.log or point[p.name] == p.value:
+            return None
+        whiten, step = floor.whitener(self.parts), p.coordinate(point[p.name]) - p.coordinate(p.value)
+        with self.memo.during("errors of fits"):
+            pairs = self.predicted([base, point], self.fitted_recordings)
+        parts = []
+        for n in self.fitted_recordings:
+            here, there = pairs[n, self.setting]
+            parts.append(np.stack([whiten(column, n) for column in (*slopes[n].T, (there - here) / step)], axis=1))
+        J = np.concatenate(parts)
+        return J if np.isfinite(J).all() else None
+
+    def sized(
+        self, starts: Sequence[Start], base: Fit, slopes: Mapping[int, np.ndarray], floor: Floor
+    ) -> tuple[list[Start], dict[str, float]]:
+        """The best starts of each candidate, and the least share of the base fit's misfit that one leaves as it is, by key.
+
+        Candidates of few parameters and one size get larger sizes as well, and where the base fit has gone far from the declared values
+        these too: how a large effect acts is not what the slope at none says, and the base fit may have made up for it. One simulation
+        each says which is best: that one is kept, and of the others the best one with the base fit's, or with the declared, values.
+        """
+        led_far = self.moved(base.point) > LED_FAR
+        places: list[list[Start]] = []
+        for c in {c.key: c for c, *_ in starts}.values():
+            own = [start for start in starts if start[0] is c]
+            if len(c.size_parameters) > 1 or len(c.parameters) > SMALL or c.apart:
+                continue
+            if c.linear:
+                (p,) = c.size_parameters
+                size, signs = abs(c.starts[0][p.name]), (1.0, -1.0) if p.lower < 0 else (1.0,)
+                begin = {**own[0][1], **{name: base.point.get(name, value) for name, value in self.as_declared.items()}}
+                near, far = ([min(max(sign * f * size, p.lower), p.upper) for sign in signs] for f in (1.0, FAR))
+                own += [(c, {**begin, p.name: value}, None) for value in (far if begin == own[0][1] else near + far)]
+                own += [(c, {**self.at_declared(begin), p.name: value}, None) for value in near + far] if led_far else []
+            places.append(own)
+        points = [point for own in places for _, point, _ in own]
+        self.tell(f"{len(points)} starts of {len(places)} effects")
+        before, *costs = self.costs([base.point, *points], floor)
+        out = [start for start in starts if all(start[0] is not own[0][0] for own in places)]
+        least: dict[str, float] = {}
+        for own in places:
+            left, costs = costs[: len(own)], costs[len(own) :]
+            order = sorted(range(len(own)), key=lambda i: left[i])
+            least[own[0][0].key] = left[order[0]] / before
+            declared = [self.at_declared(own[i][1]) == own[i][1] for i in range(len(own))]
+            other = [i for i in order if declared[i] != declared[order[0]] and left[i] < 2.0 * left[order[0]]]
+            for c, point, J in (own[i] for i in (order[0], *other[:1])):
+                out.append((c, point, self.secant(c, point, base.point, slopes, floor) if J is None and c.linear else J))
+        return out, least
 
     def contest(
         self,
@@ -101,6 +166,7 @@ class Contests(Screening):
         floor: Floor,
         hopeful: Collection[str] | None = None,
         then: Callable[[Sequence[str]], Sequence[Start]] = lambda led: (),
+        beyond: float = math.inf,
     ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
         """The best fit of each candidate, fits that cannot catch up with the best one stop; and the leading one's of the other sign.
 
@@ -113,6 +179,7 @@ class Contests(Screening):
             floor: What weighs the residuals.
             hopeful: Keys of candidates that could take something off by the screening; all where absent.
             then: Further starts, given the keys of the candidates in the order of their costs.
+            beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
         ended: list[tuple[Candidate, Fit]] = []
@@ -122,25 +189,27 @@ class Contests(Screening):
             requests = []
             for c, begin, J in own:
                 sizes = [p.name for p in c.size_parameters] if c.linear else []
-                requests.append(self.request((*free, *c.parameters), begin, race=race, slopes=J, sizes=sizes))
+                requests.append(self.request((*free, *c.parameters), begin, race=race, slopes=J, sizes=sizes, tolerance=FIRST))
             fits = list(zip((c for c, *_ in own), self.fits(requests, floor), strict=True))
             ended.extend(fits)
             best.update(better(fits, best))
 
-        def at_noise() -> bool:
+        def left() -> np.ndarray:
             leading = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
-            return self.is_noise(self.mean_squares([leading.point], floor)[0])
+            return self.mean_squares([leading.point], floor)[0]
 
         small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
         first = list(dict.fromkeys(small))[:LEADERS]
         waves: list[list[Start]] = [[], [], []]
         for entry in starts:
             key = entry[0].key
-            waves[0 if self.problem.together or key in first else 1 if key in small else 2].append(entry)
+            waves[0 if (self.problem.together and beyond == math.inf) or key in first else 1 if key in small else 2].append(entry)
         for own in waves:
             if best and own and self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}"):
                 break
-            if own and best and at_noise():
+            if own and best and score(left()) > beyond:
+                return best, None
+            if own and best and self.is_noise(left()):
                 if own is waves[2]:
                     break
                 if hopeful is not None:
@@ -194,6 +263,8 @@ class Contests(Screening):
         if not top:
             return {}
         before, *squares = self.mean_squares([base.point, *(fit.point for _, fit in top)], floor)
+        near = min(map(score, squares)) + 2.0 * math.log(NEARBY)
+        top, squares = zip(*((t, s) for t, s in zip(top, squares, strict=True) if t is top[0] or score(s) < near), strict=True)
         if rival is not None and rival.chosen is not None and min(map(score, squares)) > rival.chosen.score + 2.0 * math.log(BEYOND):
             return {}
         gains = max(self.gain(before, square) for square in squares)
@@ -205,7 +276,7 @@ class Contests(Screening):
         out: dict[str, tuple[Candidate, Fit]] = {}
         least: dict[str, float] = {}
         if other is not None and other[1].cost < IN_REACH * ranked[0][1].cost:
-            top.append(other)
+            top = (*top, other)
         able = self.able(top)  # elsewhere there is no floor
         entries = []
         for c, fit in able:
@@ -232,14 +303,14 @@ class Contests(Screening):
             if self.deadline.over:
                 break
             run = self.which_run([ends[i][0].point for i in going])
-            left = {i: self.mean_squares([ends[i][0].point], ends[i][1])[0] for i in going}
-            going = [i for i, ok in zip(going, run, strict=True) if ok and not self.is_noise(left[i])]
+            left = {i: self.mean_squares([ends[i][0].point], ends[i][1], fitted=True)[0] for i in going}
+            going = [i for i, ok in zip(going, run, strict=True) if ok and not self.is_noise(left[i], fitted=True)]
             if not going:
                 break
             made = self.from_here([(entries[i][0], ends[i][0], [ends[i][0].point]) for i in going], floor)
             further = []
             for i, (fit, there) in zip(going, made, strict=True):
-                gained = score(left[i][self.fitted]) - score(self.mean_squares([fit.point], there, fitted=True)[0])
+                gained = score(left[i]) - score(self.mean_squares([fit.point], there, fitted=True)[0])
                 if gained > 0:
                     ends[i] = (fit, there)
                     further += [i] * (not fit.converged or gained >= 2.0 * SOME_GAIN)
@@ -255,10 +326,10 @@ class Contests(Screening):
 
         The fits of all entries run side by side.
         """
-        self.foresee([fit.point for _, fit, _ in entries], like)
+        self.foresee([fit.point for _, fit, _ in entries], fitted=True)
         owns, requests, of = [], [], []
         for k, (free, fit, starts) in enumerate(entries):
-            (own, _), race = self.stand(fit.point, like=like), Race()
+            (own, _), race = self.stand(fit.point, like=like, fitted=True), Race()
             moved = self.recentred(fit.point, own)
             follow = {name: value for name, value in moved.items() if value != fit.point.get(name)}
             begins = [{**start, **follow} if set(start) == set(fit.point) else start for start in starts]
@@ -285,7 +356,7 @@ class Contests(Screening):
         order = sorted(range(len(points)), key=lambda i: score(found[i].errors))[:MEASURED]
         limit = score(found[order[0]].errors) + 2.0 * math.log(NEAR)
         leading = [i for i in order if score(found[i].errors) < limit and not self.is_noise(found[i].errors)]
-        self.foresee([points[i] for i in leading], floor)
+        self.foresee([points[i] for i in leading])
         for i in leading:
             if self.runs(points[i]):
                 there = Stand(found[i].fit, *self.stand(points[i], like=floor))
@@ -368,7 +439,7 @@ class Contests(Screening):
         made = self.from_here([((*self.problem.declared, *c.parameters), fit, [fit.point]) for c, fit in ends], floor)
         for (c, _), (further, own) in zip(ends, made, strict=True):
             rival = (out.get(c.key) or best[c.key])[1]
-            there = self.stand(rival.point, like=floor)[0]
+            there = self.stand(rival.point, like=floor, fitted=True)[0]
             pairs = ((further, own), (rival, there))
             mine, its = (score(self.mean_squares([end.point], f, fitted=True)[0]) for end, f in pairs)
             if mine < its:

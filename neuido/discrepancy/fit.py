@@ -26,8 +26,8 @@ BEHIND = 2.5
 """A fit that would end above so many times the lowest cost of a race, at the pace of its last step, is given up."""
 TRAILING = 5.0
 """What a fit multiplies its tolerance by while it is more than a tenth above the lowest cost of a race."""
-BEST_PACE = 0.6
-"""Lowest ratio of costs, of an iteration to the one before, that a fit is trusted to keep up."""
+KEPT_UP = 3
+"""Iterations over which a fit is trusted to keep up the pace of its last step; gains get smaller."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class Race:
             return False
         failed = costs[-1] == costs[-2]  # one step that fails says only that it was too bold
         pace = (costs[-1] / max(costs[-3], 1e-300)) ** 0.5 if failed else costs[-1] / costs[-2]
-        return costs[-1] * max(pace, BEST_PACE) ** left > BEHIND * self.best
+        return costs[-1] * pace ** (left if failed else min(left, KEPT_UP)) > BEHIND * self.best
 
 
 def levenberg_marquardt(

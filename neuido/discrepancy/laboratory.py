@@ -162,19 +162,20 @@ class Laboratory:
         r = self.problem.recordings[n]
         return r.noise if r.noise else max(1e-3 * float(np.std(r.y)), 1e-12)
 
-    def floor(self, point: Point, *, like: Floor | None = None) -> Floor:
+    def floor(self, point: Point, *, like: Floor | None = None, fitted: bool = False) -> Floor:
         """Noise and discretisation at a point: differences of the settings, and how large they are in the course of time.
 
-        `like`: a floor whose nuisances serve here too.
+        `like`: a floor whose nuisances serve here too. `fitted`: the differences of the fitted recordings alone, which is what fits read.
         """
         plain = self.noise()
         others = self.problem.others(self.setting)
         if not others:
             return replace(plain, nuisances=self.nuisances(point, list(plain.noise)))
+        wanted = self.fitted_recordings if fitted else list(plain.noise)
         with self.memo.during("discretisation"):
-            rows = self.predicted([point], list(plain.noise), (self.setting, *others))
+            rows = self.predicted([point], wanted, (self.setting, *others))
         differences, spread = {}, {}
-        for n in plain.noise:
+        for n in wanted:
             here, *there = (rows[n, s][0] for s in (self.setting, *others))
             able = [bool(np.isfinite(t).all()) for t in there]
             D = np.stack([t - here if ok else np.zeros_like(here) for t, ok in zip(there, able, strict=True)], axis=1)
@@ -182,7 +183,8 @@ class Laboratory:
             spread[n] = over_time(np.sqrt(np.sum(D**2, axis=1) / max(sum(able), 1)), self.problem.recordings[n].times)
             self.tell(f"discretisation of {self.problem.recordings[n].name}")
         nuisances = self.nuisances(point, list(plain.noise)) if like is None else like.nuisances
-        return Floor(plain.noise, plain.weight, differences, spread, nuisances).weighed(UNSEEN)
+        weight = {n: plain.weight[n] for n in wanted}
+        return Floor(plain.noise, weight, differences, spread, nuisances).weighed(UNSEEN)
 
     def sharpened(self, floor: Floor, errors: np.ndarray) -> Floor:
         """The floor for fits about where `errors`, mean squares of all parts, are left: no more than that is unseen."""
@@ -193,15 +195,20 @@ class Laboratory:
         above = max(float(np.mean((errors - self.noise_squares)[self.fitted])), 0.0)
         return floor.weighed(min(UNSEEN, math.sqrt(above / max(float(spread), 1e-300))))
 
-    def foresee(self, points: Sequence[Point], floor: Floor) -> None:
+    def foresee(self, points: Sequence[Point], *, fitted: bool = False) -> None:
         """Run what `floor` and `stand` of several points will ask for, in one launch; the memo keeps it."""
         with self.memo.during("discretisation"):
-            self.predicted(points, list(floor.noise), [self.setting, *self.problem.others(self.setting)])
+            wanted = self.fitted_recordings if fitted else list(range(len(self.problem.recordings)))
+            self.predicted(points, wanted, [self.setting, *self.problem.others(self.setting)])
 
-    def stand(self, point: Point, *, like: Floor | None = None) -> tuple[Floor, np.ndarray]:
-        """The floor at a point, sharpened by what is left there, and what that is, mean squares of the parts; `like` as for `floor`."""
-        floor = self.floor(point, like=like)
-        errors = self.mean_squares([point], floor)[0]
+    def stand(self, point: Point, *, like: Floor | None = None, fitted: bool = False) -> tuple[Floor, np.ndarray]:
+        """The floor at a point, sharpened by what is left there, and what that is, mean squares of the parts.
+
+        `like` and `fitted` as for `floor`; infinite for parts that were not asked for.
+        """
+        floor = self.floor(point, like=like, fitted=fitted)
+        errors = np.full(len(self.parts), np.inf)
+        errors[np.array(self.fitted) | (not fitted)] = self.mean_squares([point], floor, fitted=fitted)[0]
         return self.sharpened(floor, errors), errors
 
     def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
@@ -260,10 +267,11 @@ class Laboratory:
         fit = self.base([{}, near] if near else self.starts({}), self.noise(), iterations=6, tolerance=ROUGH)
         if near is not None and not self.runs(fit.point):
             return None
-        floor, errors = self.stand(fit.point)
         if self.problem.settings == 1:
+            floor = self.floor(fit.point)
             fit = self.base([fit.point], floor)
             return Stand(fit, floor, self.mean_squares([fit.point], floor)[0])
+        floor, errors = self.stand(fit.point, fitted=True)
         made, asked = [Stand(fit, floor, errors)], False
         for turn in range(MOST_AGAIN):
             begin = self.recentred(fit.point, floor) if turn else fit.point
@@ -276,9 +284,10 @@ class Laboratory:
             fit = self.base(begins, floor)
             if not self.runs(fit.point):
                 break
-            floor, errors = self.stand(fit.point, like=floor)
+            floor, errors = self.stand(fit.point, like=floor, fitted=True)
             made.append(Stand(fit, floor, errors))
-        return self.plainest(made)
+        best = self.plainest(made)
+        return Stand(best.fit, *self.stand(best.fit.point, like=best.floor))
 
     def plainest(self, made: Sequence[Stand]) -> Stand:
         """The stand that leaves least of the fitted parts: one whose point follows the amounts must leave clearly less than the others.
@@ -306,13 +315,18 @@ class Laboratory:
         rows = self.predicted(points, self.scored_recordings)
         return [all(bool(np.isfinite(of[i]).all()) for of in rows.values()) for i in range(len(points))]
 
+    def moved(self, point: Point) -> float:
+        """The largest ratio of a declared parameter to the value that the model states, or of this to that."""
+        ratios = [point[p.name] / p.value for p in self.problem.declared if p.log]
+        return max((max(r, 1.0 / r) for r in ratios), default=1.0)
+
     def typical(self, squares: np.ndarray) -> float:
         """The geometric mean over the parts of root mean squares, in the unit of the data."""
         return self.scale * math.exp(0.5 * score(squares))
 
-    def is_noise(self, errors: np.ndarray) -> bool:
-        """Whether nothing but noise is left in any part."""
-        return bool(np.all(errors < NOISE_ALONE * self.noise_squares))
+    def is_noise(self, errors: np.ndarray, *, fitted: bool = False) -> bool:
+        """Whether nothing but noise is left in any part, or in those of the fitted ones that are given."""
+        return bool(np.all(errors < NOISE_ALONE * (self.noise_squares[self.fitted] if fitted else self.noise_squares)))
 
     def is_settled(self, errors: np.ndarray) -> bool:
         """Whether no effect could be named any more: nothing is left but noise, or too little above it for any gain to be enough."""

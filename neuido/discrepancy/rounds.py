@@ -42,6 +42,9 @@ VAIN = 0.98
 """Share of the misfit that even such a candidate may leave, as the screening predicts it, if small sizes of it act in proportion."""
 HOPELESS = 0.75
 """Share of the misfit that a candidate beyond the first few may leave, as the screening predicts it, and still get a fit."""
+FAINT = 0.9
+"""Share of the misfit that a candidate of one size leaves at the least, predicted or by one simulation, from which on it gets no first fit
+where every point costs."""
 PLACES = 9
 """Starts of a candidate that are tried at full strength, the first of the screening."""
 ALSO_WITHOUT = 6
@@ -54,15 +57,12 @@ UNEXPLAINED = 2.0
 """Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
 UNEXPLAINED_EXACT = 3.0
 """The same where nothing is discretised: the noise that a folder states is an estimate."""
-LED_FAR = 1.6
-"""Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
 
 
 class Look(NamedTuple):
     """The first fits of a step."""
 
     base: Fit
-    leaders: Sequence[str] | None
     candidates: list[Candidate]
     free: tuple[Parameter, ...]
     slopes: dict[int, np.ndarray]
@@ -124,8 +124,9 @@ class Inference(Contests):
             most: Parameters that a candidate may have.
         """
         first, leaders = rival is None and not found, rival.leaders if rival is not None else None
-        seen = self.seen is not None and self.seen.base is base and self.seen.leaders == leaders and not found
-        look = self.seen if seen else self.look(base, floor, found, leaders, most=most)
+        seen = self.seen is not None and self.seen.base is base and not found
+        ends = {t.candidate.key: t.fit.point for t in rival.trials} if rival is not None else {}
+        look = self.seen if seen else self.look(base, floor, found, leaders, most=most, ends=ends)
         candidates, free, slopes, columns, chosen = look.candidates, look.free, look.slopes, look.columns, look.chosen
         best, other, errors = dict(look.best), look.other, self.mean_squares([base.point], floor)[0]
         if not self.deadline.skips("refining the best fits"):
@@ -137,8 +138,7 @@ class Inference(Contests):
         result = self.judge(empty, best, model, list(chosen))
         self.tell(self.verdict(result))
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
-        led_far = result.chosen is not None and not self.is_noise(result.chosen.errors) and self.moved(base.point) > LED_FAR
-        again = first and (led_far or (result.chosen is None and (promising or result.over > 1.0)))
+        again = first and result.chosen is None and (promising or result.over > 1.0)
         if again and not self.deadline.skips("fits from elsewhere"):
             best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
             result = self.judge(empty, best, model, list(chosen))
@@ -153,15 +153,59 @@ class Inference(Contests):
         leaders: Sequence[str] | None = None,
         *,
         most: float = math.inf,
-        alone: bool = False,
+        ends: Mapping[str, Point] | None = None,
+        beyond: float = math.inf,
     ) -> Look:
         """Screen the candidates, and fit the best; arguments as those of `round`.
 
-        `leaders`: what led by another method; `alone`: and nothing else.
+        `leaders`: what led by another method, and little else gets a fit; `ends`: where its fits of effects ended, by key;
+        `beyond`: score of the first fits beyond which there are no others.
         """
-        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most, leaders if alone else None)
+        ends = ends or {}
+        first = leaders is None and not found
+        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most)
+        chosen, begun = self.begin(base, floor, found, leaders, candidates, free, slopes, ranked, columns)
+        starts = [(c, self.with_effect(base.point, c, ends[c.key]), None) for c in candidates if c.key in chosen and c.key in ends] + begun
+        promise = {c.key: stays for stays, c, *_ in reversed(ranked)}
+        if first:
+            starts, least = self.sized(starts, base, slopes, floor)
+            promise |= {key: min(share, promise.get(key, math.inf)) for key, share in least.items()}
+            starts.sort(key=lambda start: promise.get(start[0].key, math.inf))
+            if not self.problem.together:
+                runs, ahead = {c.key for _, c, *_ in ranked}, list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS]
+                able = [c for c, *_ in starts if c.linear and c.key in runs and c.key in least and c.key not in ahead]
+                faint = {c.key for c in able if promise[c.key] > FAINT}
+                starts = [start for start in starts if start[0].key not in faint]
+                chosen = {key: i for key, i in chosen.items() if key not in faint}
+        hopeful = {c.key for c in candidates if promise.get(c.key, math.inf) < HOPELESS or not c.linear}
+        self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
+
+        def without(led: Sequence[str]) -> list[Start]:
+            return self.without_own(base.point, starts, found, led)
+
+        best, other = self.contest(free, starts, floor, hopeful, without, beyond=beyond)
+        keys, left = list(best), self.mean_squares([fit.point for _, fit in best.values()], floor)
+        order = sorted(range(len(keys)), key=lambda i: score(left[i]))
+        led, leaves = [keys[i] for i in order], [left[i] for i in order[:1]]
+        look = Look(base, candidates, free, slopes, columns, chosen, best, other, led, leaves)
+        self.seen = self.seen if found else look
+        return look
+
+    def begin(
+        self,
+        base: Fit,
+        floor: Floor,
+        found: Sequence[Trial],
+        leaders: Sequence[str] | None,
+        candidates: Sequence[Candidate],
+        free: Sequence[Parameter],
+        slopes: Mapping[int, np.ndarray],
+        ranked: Sequence[tuple[float, Candidate, int, Point]],
+        columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
+    ) -> tuple[dict[str, int], list[Start]]:
+        """Which candidates get a fit by the screening, with the start of each that it put first, and where their fits could begin."""
         chosen: dict[str, int] = {}
-        starts = []
+        starts: list[Start] = []
         # what many parameters could fit says little of how near the others are
         near = min(2.0 * min((stays for stays, c, *_ in ranked if len(c.parameters) <= MANY), default=0.0), HOPELESS)
         keep = self.keep if leaders is None else min(self.keep, OWN)
@@ -189,15 +233,11 @@ class Inference(Contests):
         for c in (c for c in candidates if first and c.far and c.key in chosen):
             places = [c.starts[i] for _, other, i, _ in ranked if other is c][:PLACES]
             starts += [(c, begin, None) for begin in self.strong(c, places, base.point, floor)]
-        hopeful = {c.key for stays, c, *_ in ranked if stays < HOPELESS or not c.linear}
-        self.tell(f"fitting {', '.join(chosen)}")
-        best, other = self.contest(free, starts, floor, hopeful, lambda led: self.without_own(base.point, starts, found, led))
-        keys, ends = list(best), self.mean_squares([fit.point for _, fit in best.values()], floor)
-        order = sorted(range(len(keys)), key=lambda i: score(ends[i]))
-        led, least = [keys[i] for i in order], [ends[i] for i in order[:1]]
-        look = Look(base, leaders, candidates, free, slopes, columns, chosen, best, other, led, least)
-        self.seen = self.seen if alone or found else look
-        return look
+        return chosen, starts
+
+    def with_effect(self, point: Point, c: Candidate, end: Point) -> Point:
+        """A point with a candidate's parameters, and the declared ones, of the end of another fit of it."""
+        return {**point, **{name: value for name, value in end.items() if name in self.as_declared or name.startswith(f"{c.name}.")}}
 
     def without_own(self, point: Point, starts: Sequence[Start], found: Sequence[Trial], led: Sequence[str]) -> list[Start]:
         """The starts once more without the problem's own parameters, where the base has some: what it needs them for may be an effect.
@@ -212,12 +252,10 @@ class Inference(Contests):
         keys = {*list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS], *led[:ALSO_WITHOUT]}
         return [(c, plain | {k: v for k, v in b.items() if k.startswith(f"{c.name}.")}, None) for c, b, _ in starts if c.key in keys]
 
-    def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float, keys: Sequence[str] | None = None):
-        """The candidates beside effects that were found (of these `keys`), the free parameters and their slopes, and what `screen` says."""
+    def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float):
+        """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says."""
         taken = {t.candidate.name for t in found}
-        candidates = [
-            c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most and (keys is None or c.key in keys)
-        ]
+        candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
         free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
         slopes = self.slopes(free, point, self.scored_recordings)
         return candidates, free, slopes, *self.screen(point, candidates, floor, slopes)
@@ -270,11 +308,6 @@ class Inference(Contests):
         alone = self.mean_squares([t.fit.point], t.stand.floor, plain=True)[0]
         sure = EXACT + 3.0 * np.sqrt([2.0 / int(p.rows.sum()) for p in self.parts])
         return bool(np.all(alone < sure * self.noise_squares))
-
-    def moved(self, point: Point) -> float:
-        """The largest ratio of a declared parameter to the value that the model states, or of this to that."""
-        ratios = [point[p.name] / p.value for p in self.problem.declared if p.log]
-        return max((max(r, 1.0 / r) for r in ratios), default=1.0)
 
     def verdict(self, r: Round) -> str:
         """A line about what a round found."""

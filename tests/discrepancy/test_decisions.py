@@ -35,7 +35,7 @@ from tests.discrepancy import made
 class SmallestError(Inference):
     """The inference with its decision replaced."""
 
-    def is_noise(self, errors: np.ndarray) -> bool:
+    def is_noise(self, errors: np.ndarray, *, fitted: bool = False) -> bool:
         return False
 
     is_settled = is_noise
@@ -94,7 +94,7 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "flight": Case({"gravity.g": 5.0}, FLIES, FREE, "gravity,uniform_acceleration", 1, 17, "flight"),
+    "flight": Case({"gravity.g": 5.0}, FLIES, FREE, "gravity,uniform_acceleration,time_force", 1, 17, "flight"),
     "rotation": Case({"drag_linear.k": 6.0}, SPINS, WEIGHTLESS, "drag_linear,viscosity_shear,stiffness_change", stage="rotation"),
     "internal modes": Case(
         {"viscosity_shear.eta": 200.0}, RINGS, FREE, "viscosity_shear,drag_linear,stiffness_change", 2, 13, "internal modes"

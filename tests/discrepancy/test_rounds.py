@@ -78,7 +78,7 @@ class Method:
     def is_noise(self, errors):
         return False
 
-    def look(self, fit, floor, leaders=None, alone=False):
+    def look(self, fit, floor, ends=None, beyond=np.inf):
         return SimpleNamespace(least=[])
 
     def round(self, *_):
@@ -478,19 +478,6 @@ def test_a_size_of_the_other_sign_is_found_from_elsewhere(monkeypatch):
     assert not diagnose(problem).effects
 
 
-@pytest.mark.parametrize(("declared", "left", "again"), [(1.0, 0.1, True), (2.5, 0.1, False), (1.0, 0.0, False)])
-def test_candidates_are_fitted_from_the_declared_values_where_the_base_went_far(declared, left, again, monkeypatch):
-    problem = Tones(lambda t: 3.0 * t + 0.5 * np.sin(40 * t) + left * np.sin(110 * t), "low")
-    problem.__dict__["declared"] = (Parameter("a", "1", declared, 0.3, 0.01, 20.0, log=True),)
-    calls = []
-    monkeypatch.setattr(Inference, "elsewhere", lambda self, best, *_: calls.append(len(best)) or {})
-    inference = Inference(problem)
-    start = inference.start()
-    assert start.fit.point["a"] == pytest.approx(3.0, rel=0.1)
-    assert inference.round(start.fit, start.floor, []).chosen.candidate.name == "low"
-    assert bool(calls) is again
-
-
 def test_what_an_effect_leaves_within_the_floor_is_searched_no_further(monkeypatch):
     def searches(y):
         lines = []
@@ -565,7 +552,7 @@ def test_a_fit_goes_on_until_it_has_come_to_its_end(converged, monkeypatch):
         return [(replace(fit, point={"a": 3.0, "square.c": next(ends)}, converged=converged), like)]
 
     monkeypatch.setattr(Inference, "from_here", from_here)
-    monkeypatch.setattr(Inference, "is_noise", lambda self, errors: False)
+    monkeypatch.setattr(Inference, "is_noise", lambda *_, **__: False)
     out = inference.polish(inference.problem.declared, {"square": (square, fit)}, start.fit, start.floor)
     assert len(asked) == (2 if converged else 1 + contests.ONWARD)
     assert out["square"][1].point["square.c"] == (1.66 if converged else 1.762)
@@ -773,7 +760,7 @@ def test_candidates_are_fitted_without_the_problems_own_parameters_too(found, mo
     moved = replace(base, fit=replace(base.fit, point={**beside, "height": 0.1}))
     asked = []
 
-    def contest(self, free, starts, floor, hopeful, then):
+    def contest(self, free, starts, floor, hopeful, then, beyond):
         asked.extend([*starts, *then(["square"])])
         return {}, None
 
@@ -829,18 +816,57 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, o
         def gain(self, before, after):
             return 0.5 * float(np.log(before.mean() / after.mean()))
 
-        def look(self, fit, floor, leaders=None, alone=False):
-            asked.append(leaders)
-            return SimpleNamespace(least=[np.full(2, self.result**2)], led=list("abcdefg"))
+        def look(self, fit, floor, ends=None, beyond=np.inf):
+            asked.append(ends)
+            best = {"square": (None, SimpleNamespace(point={"square.c": self.result}))}
+            return SimpleNamespace(least=[np.full(2, self.result**2)], best=best)
 
     methods, starts = [Looking(left), Looking(there)], [stood(1.0)] * 2
     seen = attribution.by_first_fits(methods, starts, [0, 1], [0.0, 0.1])
     assert sorted((0, 1), key=lambda i: seen.get(i, np.inf)) == order
-    assert asked == ([None, list("abcde")] if left == 0.3 else [None])
-    assert seen == ({0: pytest.approx(2 * np.log(left)), 1: pytest.approx(2 * np.log(there) + 0.1)} if left == 0.3 else {})
+    assert asked == ([None, {"square": {"square.c": left}}] if left == 0.3 else [None])
+    both = {0: pytest.approx(2 * np.log(left)), 1: pytest.approx(2 * np.log(there) + 0.1)}
+    assert seen == ({} if left == 0.9 else both if left == 0.3 else {0: both[0]})
     asked.clear()
     far = 2.0 * np.log(pairs.WORSE) + 0.1
     assert attribution.by_first_fits(methods, starts, [0, 1], [0.0, far]) == {} and not asked
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_there_are_no_further_fits_where_another_method_does_far_better(together, monkeypatch):
+    monkeypatch.setattr(contests, "LEADERS", 1)
+    inference = Inference(Line(lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t), wiggle=0.0, together=together))
+    base = inference.start()
+    starts = [(c, {**base.fit.point, **c.starts[-1]}, None) for c in inference.problem.candidates if c.key in ("square", "cube", "clip")]
+    first, _ = inference.contest(inference.problem.declared, starts[:1], base.floor)
+    left = rounds.score(inference.mean_squares([first["square"][1].point], base.floor)[0])
+    for beyond, fitted in ((left - 0.1, {"square"}), (left + 0.1, {"square", "cube", "clip"})):
+        assert set(inference.contest(inference.problem.declared, starts, base.floor, beyond=beyond)[0]) == fitted
+
+
+def test_what_leaves_far_more_than_the_best_is_not_refined(monkeypatch):
+    """However near its cost: what is held out tells them apart."""
+    inference = Inference(Line(lambda t: 3.0 * t + 2.0 * t**2, wiggle=0.0))
+    base = inference.start()
+    by_key = {c.key: c for c in inference.problem.candidates}
+    best = {key: (by_key[key], replace(base.fit, point={"a": 3.0, "square.c": c}, cost=1.0)) for key, c in (("square", 1.8), ("cube", 0.9))}
+    asked = []
+    monkeypatch.setattr(Inference, "onward", lambda self, entries, floor: asked.extend(entries) or [(f, floor) for _, f, _ in entries])
+    inference.polish(inference.problem.declared, best, base.fit, base.floor)
+    assert [fit.point["square.c"] for _, fit, _ in asked] == [1.8]
+    monkeypatch.setattr(contests, "NEARBY", 10.0)
+    inference.polish(inference.problem.declared, best, base.fit, base.floor)
+    assert [fit.point["square.c"] for _, fit, _ in asked] == [1.8, 1.8, 0.9]
+
+
+@pytest.mark.parametrize(("suggested", "first"), [(2.5, 0), (3.5, 1)])
+def test_the_suggested_method_is_looked_at_first_unless_it_is_far_worse(suggested, first, monkeypatch):
+    orders = []
+    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
+    monkeypatch.setattr(attribution, "by_first_fits", lambda tried, starts, order, _: orders.append(order) or {})
+    result = first_round(0.1, True)
+    attribution.first_rounds([Method(result), Method(result)], [stood(suggested), stood(1.0)])
+    assert orders == [[first, 1 - first]]
 
 
 @pytest.mark.parametrize(("there", "rounds_of"), [(0.5, [0, 1]), (0.9, [0])])
@@ -858,14 +884,42 @@ def test_a_method_whose_first_fits_are_far_from_what_was_named_is_not_asked_furt
     assert asked == rounds_of
 
 
-def test_a_look_at_what_led_by_another_method_is_at_nothing_else():
+def test_fits_begin_where_those_of_another_method_ended_too(monkeypatch):
+    """With the declared values and the effect of that end, and the problem's own values of this method."""
     inference = Inference(Line(clipped))
     base = inference.start()
+    begun = []
+    contest = Inference.contest
+
+    def seen(self, free, starts, *args, **options):
+        begun.extend(starts)
+        return contest(self, free, starts, *args, **options)
+
+    monkeypatch.setattr(Inference, "contest", seen)
+    end = {"a": 3.1, "height": 7.0, "clip.inverse": 1.0 / 1.61}
+    look = inference.look(base.fit, base.floor, ends={"clip": end})
+    (begin,) = [begin for c, begin, _ in begun if c.key == "clip" and begin["clip.inverse"] == end["clip.inverse"]]
+    assert begin == {**base.fit.point, "a": 3.1, "clip.inverse": end["clip.inverse"]}
+    assert look.led[0] == "clip" and inference.seen is look
     asked = inference.memo.simulations
-    look = inference.look(base.fit, base.floor, leaders=["cube", "square"], alone=True)
-    few = inference.memo.simulations - asked
-    assert sorted(look.led) == sorted(look.chosen) == ["cube", "square"] and inference.seen is None
-    full = inference.look(base.fit, base.floor)
-    assert {"cube", "square", "clip"} < set(full.chosen) and inference.seen is full
-    assert inference.memo.simulations - asked > 2 * few
-    assert inference.round(base.fit, base.floor, []).trials[0].candidate.key == full.led[0] == "clip"
+    first = inference.round(base.fit, base.floor, [])
+    assert first.trials[0].candidate.key == "clip" and inference.memo.simulations - asked < 100  # nothing is screened again
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_fits_begin_at_the_size_that_leaves_least(together):
+    """A slope at nothing says little of what a large effect does, and what the base fit made up for is no place to begin at."""
+    problem = Line(clipped, together=together)
+    inference = Inference(problem)
+    base = inference.start()
+    by_key = {c.key: c for c in problem.candidates}
+    slopes = inference.slopes(problem.declared, base.fit.point, inference.scored_recordings)
+    clip, cube = by_key["clip"], by_key["cube"]
+    starts = [(clip, {**base.fit.point, **start}, None) for start in clip.starts] + [(cube, {**base.fit.point, **cube.starts[0]}, None)]
+    kept, least = inference.sized(starts, base.fit, slopes, base.floor)
+    assert [c.key for c, *_ in kept].count("clip") == 1
+    costs = dict(zip((c.key for c, *_ in kept), inference.costs([begin for _, begin, _ in kept], base.floor), strict=False))
+    tried = inference.costs([begin for c, begin, _ in starts if c is clip], base.floor)
+    assert costs["clip"] == min(tried)
+    before = inference.costs([base.fit.point], base.floor)[0]
+    assert least["clip"] == pytest.approx(min(tried) / before) and least["cube"] <= costs["cube"] / before

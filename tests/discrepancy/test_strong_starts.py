@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from neuido.discrepancy.attribution import diagnose
+from neuido.discrepancy.contests import LED_FAR
+from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import Inference
 
@@ -75,3 +77,34 @@ def test_fits_begin_there(monkeypatch):
     begun.clear()
     diagnose(Bar(TRUTH, far=0.0), draws=39)
     assert not any(p.get("part.log_ratio") == pytest.approx(math.log(8.0)) for p in begun)
+
+
+def test_large_sizes_and_the_declared_values_are_tried_where_the_base_fit_went_far():
+    """A large slope changes the mean stretch too, for which the declared model's fit takes another modulus."""
+    problem = Bar({"young": 1.0, "slope.k": 2.4})
+    inference = Inference(problem)
+    base = inference.start()
+    slope = problem.candidates[1]
+    slopes = inference.slopes(problem.declared, base.fit.point, inference.scored_recordings)
+    begin = (slope, {**base.fit.point, "slope.k": 0.3}, None)
+    assert inference.moved(base.fit.point) > LED_FAR
+    kept, least = inference.sized([begin], base.fit, slopes, base.floor)
+    assert kept[0][1] == {"young": 1.0, "slope.k": pytest.approx(6 * 0.3)} and least["slope"] < 0.3
+    near = Fit({"young": 1.0}, ("young",), 1.0, np.zeros(1), 1, True)  # where it did not go far these are the base's
+    kept, _ = inference.sized([(slope, {"young": 1.0, "slope.k": 0.3}, None)], near, slopes, base.floor)
+    assert [place for _, place, _ in kept] == [{"young": 1.0, "slope.k": pytest.approx(1.8)}]
+
+
+def test_the_secant_to_a_size_is_its_slope():
+    problem = Bar({"young": 1.0, "slope.k": 0.5})
+    inference = Inference(problem)
+    base = inference.start()
+    slope, part = problem.candidates[1], problem.candidates[0]
+    slopes = inference.slopes(problem.declared, base.fit.point, inference.scored_recordings)
+    point = {**base.fit.point, "slope.k": 0.01}
+    J = inference.secant(slope, point, base.fit.point, slopes, base.floor)
+    p = slope.parameters[0]
+    exact = -S * stretch(base.fit.point) * p.scale
+    assert J[:, 1] == pytest.approx(base.floor.whitener(inference.parts)(exact, 0), rel=0.02, abs=0.02 * np.abs(J[:, 1]).max())
+    assert inference.secant(slope, {**point, "young": 3.0}, base.fit.point, slopes, base.floor) is None
+    assert inference.secant(part, {**base.fit.point, **part.starts[0]}, base.fit.point, slopes, base.floor) is None
