@@ -122,17 +122,23 @@ def diagnose(
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
     at = start
     found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
+    hurried = False
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
         found.append(step)
+        settled = len(found) == most or inference.is_settled(step.errors)
+        hurried = deadline.over
+        if hurried:  # what is left of the time is for the last fit
+            settled = settled or deadline.skips("a further effect")
+            deadline.conclude()
         at = inference.finished(step.stand)
-        if len(found) == most or inference.is_settled(step.errors) or deadline.skips("a further effect"):
+        if settled or hurried:
             break
         free = [problem.parameter(name) for name in at.fit.names]
         if problem.settings > 1 and times_over(at.errors, inference.floors(at.fit.point, free, at.floor)) < FURTHER:
             break
         rounds.append(inference.round(at.fit, at.floor, found))
-    if len(found) == 1:
+    if len(found) == 1 and not hurried:
         pair = beside_members(inference, rounds, at)
         others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
         # beside what lies within its floor nothing was looked for

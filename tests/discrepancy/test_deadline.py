@@ -66,6 +66,32 @@ def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypa
         assert all(np.isfinite(found.intervals[name]).all() for name in found.intervals)
 
 
+@pytest.mark.parametrize("settled", [True, False])
+def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
+    """When the search ends with an effect named, that is fitted to its end, and nothing is looked for beside it."""
+    clock, over, asked = Clock(0.0), [], []
+    monkeypatch.setattr(attribution, "Deadline", lambda seconds: Deadline(seconds, clock=clock))
+    sought, finished = attribution.Inference.round, attribution.Inference.finished
+
+    def late(self, *args, **options):
+        found = sought(self, *args, **options)
+        clock.now = 0.9 * 60.0
+        return found
+
+    def seen(self, stand):
+        over.append(self.deadline.over)
+        return finished(self, stand)
+
+    monkeypatch.setattr(attribution.Inference, "round", late)
+    monkeypatch.setattr(attribution.Inference, "finished", seen)
+    monkeypatch.setattr(attribution.Inference, "is_settled", lambda self, errors: settled and len(self.memo.work) > 5)
+    monkeypatch.setattr(attribution, "beside_members", lambda *args: asked.append(args) or [])
+    found = diagnose(restricted(body_problem(block), "drag_linear,viscosity_shear"), draws=39, most=2, seconds=60.0)
+    assert over == [False] and not asked
+    assert found.after["drag_linear.k"] == pytest.approx(3.0, rel=0.02)
+    assert list(found.left_out) == ([] if settled else ["a further effect"])
+
+
 def test_more_minutes_go_on_from_there(block, tmp_path, capsys):
     out = tmp_path / "out"
     asked = ["diagnose", block.folder, "--out", out, "--draws", "19", "--device", "cpu", "--progress", "false"]
