@@ -41,6 +41,8 @@ FURTHER = 1.5
 """Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 CLEARLY = 1.5
 """Times the error of another method's first fits at which those of the suggested one are refined first all the same."""
+HALF = 0.5
+"""Share of the time for the search that is left for first fits by another method."""
 CLOSE = 2.5
 """Times the error of a chosen effect up to which one with fewer parameters is weighed again once others were found."""
 
@@ -217,7 +219,7 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     others = [i for i in others if score(starts[i].errors) + handicap[i] <= limit]
     if not others:
         return {}
-    look = tried[first].look(starts[first].fit, starts[first].floor)
+    look = tried[first].look(starts[first].fit, starts[first].floor, until=HALF)
     if not look.least or tried[first].gain(starts[first].errors, look.least[0]) < LEAST_GAIN:
         return {}
     left = {first: score(look.least[0]) + handicap[first]}

@@ -12,8 +12,6 @@ from neuido.discrepancy.problem import Candidate, Parameter, Point
 from neuido.discrepancy.screening import Screening
 from neuido.discrepancy.trials import Round, Stand, score
 
-FIRST = 0.01
-"""Relative gain of an iteration that ends a candidate's first fit; the best of them are refined."""
 SMALL = 2
 """Parameters up to which a candidate gets a fit in the first round whatever its place in the screening: a direction says little of what a
 yield stress or a lossy floor does once it acts."""
@@ -167,6 +165,7 @@ class Contests(Screening):
         hopeful: Collection[str] | None = None,
         then: Callable[[Sequence[str]], Sequence[Start]] = lambda led: (),
         beyond: float = math.inf,
+        until: float = 1.0,
     ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
         """The best fit of each candidate, fits that cannot catch up with the best one stop; and the leading one's of the other sign.
 
@@ -180,6 +179,7 @@ class Contests(Screening):
             hopeful: Keys of candidates that could take something off by the screening; all where absent.
             then: Further starts, given the keys of the candidates in the order of their costs.
             beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
+            until: Share of the time for the search after which there are no others: the rest is another method's.
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
         ended: list[tuple[Candidate, Fit]] = []
@@ -189,7 +189,7 @@ class Contests(Screening):
             requests = []
             for c, begin, J in own:
                 sizes = [p.name for p in c.size_parameters] if c.linear else []
-                requests.append(self.request((*free, *c.parameters), begin, race=race, slopes=J, sizes=sizes, tolerance=FIRST))
+                requests.append(self.request((*free, *c.parameters), begin, race=race, slopes=J, sizes=sizes))
             fits = list(zip((c for c, *_ in own), self.fits(requests, floor), strict=True))
             ended.extend(fits)
             best.update(better(fits, best))
@@ -205,7 +205,7 @@ class Contests(Screening):
             key = entry[0].key
             waves[0 if (self.problem.together and beyond == math.inf) or key in first else 1 if key in small else 2].append(entry)
         for own in waves:
-            if best and own and self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}"):
+            if best and own and self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}", until):
                 break
             if own and best and score(left()) > beyond:
                 return best, None

@@ -29,9 +29,9 @@ class Deadline:
         """Whether the time for the search is up, or all of it once the diagnosis concludes."""
         return self.clock() - self.begun > self.share * self.seconds
 
-    def skips(self, what: str) -> bool:
-        """Whether there is no time left for a step, which is noted then."""
-        if not self.over:
+    def skips(self, what: str, until: float = 1.0) -> bool:
+        """Whether there is no time left for a step, or it is past this share of it; which is noted then."""
+        if not self.clock() - self.begun > until * self.share * self.seconds:
             return False
         if what not in self.left_out:
             self.left_out.append(what)

@@ -155,11 +155,12 @@ class Inference(Contests):
         most: float = math.inf,
         ends: Mapping[str, Point] | None = None,
         beyond: float = math.inf,
+        until: float = 1.0,
     ) -> Look:
         """Screen the candidates, and fit the best; arguments as those of `round`.
 
         `leaders`: what led by another method, and little else gets a fit; `ends`: where its fits of effects ended, by key;
-        `beyond`: score of the first fits beyond which there are no others.
+        `beyond`: score of the first fits beyond which there are no others; `until`: share of the search's time past which there are none.
         """
         ends = ends or {}
         first = leaders is None and not found
@@ -183,7 +184,7 @@ class Inference(Contests):
         def without(led: Sequence[str]) -> list[Start]:
             return self.without_own(base.point, starts, found, led)
 
-        best, other = self.contest(free, starts, floor, hopeful, without, beyond=beyond)
+        best, other = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
         keys, left = list(best), self.mean_squares([fit.point for _, fit in best.values()], floor)
         order = sorted(range(len(keys)), key=lambda i: score(left[i]))
         led, leaves = [keys[i] for i in order], [left[i] for i in order[:1]]

@@ -31,6 +31,8 @@ def test_the_search_has_a_share_and_the_end_the_rest():
     limit = Deadline(100.0, clock=clock)
     clock.now = 100.0 * SEARCH
     assert not limit.over and not limit.skips("this") and limit.left_out == []
+    assert Deadline(100.0, clock=Clock(0.0)).skips("first", 0.5) is False
+    assert limit.skips("first", 0.5) and limit.left_out.pop() == "first"
     clock.now += 1.0
     assert limit.over and limit.skips("this") and limit.skips("that") and limit.skips("this")
     assert limit.left_out == ["this", "that"]

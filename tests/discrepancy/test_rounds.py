@@ -78,7 +78,7 @@ class Method:
     def is_noise(self, errors):
         return False
 
-    def look(self, fit, floor, ends=None, beyond=np.inf):
+    def look(self, fit, floor, ends=None, beyond=np.inf, until=1.0):
         return SimpleNamespace(least=[])
 
     def round(self, *_):
@@ -760,7 +760,7 @@ def test_candidates_are_fitted_without_the_problems_own_parameters_too(found, mo
     moved = replace(base, fit=replace(base.fit, point={**beside, "height": 0.1}))
     asked = []
 
-    def contest(self, free, starts, floor, hopeful, then, beyond):
+    def contest(self, free, starts, floor, hopeful, then, beyond, until):
         asked.extend([*starts, *then(["square"])])
         return {}, None
 
@@ -816,7 +816,7 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, o
         def gain(self, before, after):
             return 0.5 * float(np.log(before.mean() / after.mean()))
 
-        def look(self, fit, floor, ends=None, beyond=np.inf):
+        def look(self, fit, floor, ends=None, beyond=np.inf, until=1.0):
             asked.append(ends)
             best = {"square": (None, SimpleNamespace(point={"square.c": self.result}))}
             return SimpleNamespace(least=[np.full(2, self.result**2)], best=best)
