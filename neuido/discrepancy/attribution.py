@@ -130,8 +130,9 @@ def diagnose(
         found.append(step)
         settled = len(found) == most or inference.is_settled(step.errors)
         hurried = deadline.over
+        if hurried and not settled:
+            deadline.skips("a further effect")
         if hurried:  # what is left of the time is for the last fit
-            settled = settled or deadline.skips("a further effect")
             deadline.conclude()
         at = inference.finished(step.stand)
         if settled or hurried:
@@ -225,10 +226,10 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     left = {first: score(look.least[0]) + handicap[first]}
     if tried[first].is_noise(look.least[0]):
         return left
+    ends = {key: fit.point for key, (_, fit) in look.best.items()}
     for i in others:
         if tried[i].deadline.skips("first fits by the other method"):
             break
-        ends = {key: fit.point for key, (_, fit) in look.best.items()}
         beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
         there = tried[i].look(starts[i].fit, starts[i].floor, ends=ends, beyond=beyond)
         left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf

@@ -37,6 +37,8 @@ ONWARD = 3
 not come to its end."""
 SOME_GAIN = math.log(1.2)
 """Smaller gains are no reason to look further."""
+BESIDE = 2.0
+"""Times the cost of a candidate's best start up to which one with the other declared values is kept beside it."""
 LED_FAR = 1.6
 """Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
 ALIKE = 0.3
@@ -74,12 +76,13 @@ class Contests(Screening):
         """What the screening says of the slopes of a candidate's fit; none where it probed only sizes, or they do not act in proportion."""
         if not c.linear or c.size_parameters != c.parameters or any(p.log for p in c.parameters):
             return None
-        whiten, coordinates = floor.whitener(self.parts), [p.coordinate(c.starts[start][p.name]) for p in c.parameters]
-        parts = []
-        for n in self.fitted_recordings:
-            both = (*slopes[n].T, *(columns[c.key, start][n] / coordinates).T)
-            parts.append(np.stack([whiten(column, n) for column in both], axis=1))
-        J = np.concatenate(parts)
+        coordinates = [p.coordinate(c.starts[start][p.name]) for p in c.parameters]
+        return self.whitened(slopes, {n: columns[c.key, start][n] / coordinates for n in self.fitted_recordings}, floor)
+
+    def whitened(self, slopes: Mapping[int, np.ndarray], own: Mapping[int, np.ndarray], floor: Floor) -> np.ndarray | None:
+        """Slopes of the declared and of a candidate's parameters, {recording: (n, k)}, as fits take them; none where not all are finite."""
+        whiten = floor.whitener(self.parts)
+        J = np.concatenate([whiten(np.concatenate([slopes[n], own[n]], axis=1), n) for n in self.fitted_recordings])
         return J if np.isfinite(J).all() else None
 
     def strong(self, c: Candidate, places: Sequence[Point], point: Point, floor: Floor) -> list[Point]:
@@ -109,15 +112,10 @@ class Contests(Screening):
         same = all(point.get(name) == value for name, value in base.items())
         if not same or len(c.parameters) > 1 or p.log or point[p.name] == p.value:
             return None
-        whiten, step = floor.whitener(self.parts), p.coordinate(point[p.name]) - p.coordinate(p.value)
+        step = p.coordinate(point[p.name]) - p.coordinate(p.value)
         with self.memo.during("errors of fits"):
             pairs = self.predicted([base, point], self.fitted_recordings)
-        parts = []
-        for n in self.fitted_recordings:
-            here, there = pairs[n, self.setting]
-            parts.append(np.stack([whiten(column, n) for column in (*slopes[n].T, (there - here) / step)], axis=1))
-        J = np.concatenate(parts)
-        return J if np.isfinite(J).all() else None
+        return self.whitened(slopes, {n: (there - here)[:, None] / step for (n, _), (here, there) in pairs.items()}, floor)
 
     def sized(
         self, starts: Sequence[Start], base: Fit, slopes: Mapping[int, np.ndarray], floor: Floor
@@ -152,7 +150,7 @@ class Contests(Screening):
             order = sorted(range(len(own)), key=lambda i: left[i])
             least[own[0][0].key] = left[order[0]] / before
             declared = [self.at_declared(own[i][1]) == own[i][1] for i in range(len(own))]
-            other = [i for i in order if declared[i] != declared[order[0]] and left[i] < 2.0 * left[order[0]]]
+            other = [i for i in order if declared[i] != declared[order[0]] and left[i] < BESIDE * left[order[0]]]
             for c, point, J in (own[i] for i in (order[0], *other[:1])):
                 out.append((c, point, self.secant(c, point, base.point, slopes, floor) if J is None and c.linear else J))
         return out, least

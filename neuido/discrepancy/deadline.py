@@ -27,11 +27,15 @@ class Deadline:
     @property
     def over(self) -> bool:
         """Whether the time for the search is up, or all of it once the diagnosis concludes."""
-        return self.clock() - self.begun > self.share * self.seconds
+        return self.past(1.0)
+
+    def past(self, share: float) -> bool:
+        """Whether this share of the time that counts is over."""
+        return self.clock() - self.begun > share * self.share * self.seconds
 
     def skips(self, what: str, until: float = 1.0) -> bool:
         """Whether there is no time left for a step, or it is past this share of it; which is noted then."""
-        if not self.clock() - self.begun > until * self.share * self.seconds:
+        if not self.past(until):
             return False
         if what not in self.left_out:
             self.left_out.append(what)

@@ -71,10 +71,8 @@ class Look(NamedTuple):
     """The start of each candidate that was fitted."""
     best: dict[str, tuple[Candidate, Fit]]
     other: tuple[Candidate, Fit] | None
-    led: list[str]
-    """Keys of the candidates, what leaves least first."""
     least: list[np.ndarray]
-    """What that one leaves, mean squares of the parts; empty where nothing runs."""
+    """What the best of them leaves, mean squares of the parts; empty where nothing runs."""
 
 
 class Inference(Contests):
@@ -185,10 +183,8 @@ class Inference(Contests):
             return self.without_own(base.point, starts, found, led)
 
         best, other = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
-        keys, left = list(best), self.mean_squares([fit.point for _, fit in best.values()], floor)
-        order = sorted(range(len(keys)), key=lambda i: score(left[i]))
-        led, leaves = [keys[i] for i in order], [left[i] for i in order[:1]]
-        look = Look(base, candidates, free, slopes, columns, chosen, best, other, led, leaves)
+        left = sorted(self.mean_squares([fit.point for _, fit in best.values()], floor), key=score)
+        look = Look(base, candidates, free, slopes, columns, chosen, best, other, left[:1])
         self.seen = self.seen if found else look
         return look
 

@@ -900,7 +900,7 @@ def test_fits_begin_where_those_of_another_method_ended_too(monkeypatch):
     look = inference.look(base.fit, base.floor, ends={"clip": end})
     (begin,) = [begin for c, begin, _ in begun if c.key == "clip" and begin["clip.inverse"] == end["clip.inverse"]]
     assert begin == {**base.fit.point, "a": 3.1, "clip.inverse": end["clip.inverse"]}
-    assert look.led[0] == "clip" and inference.seen is look
+    assert inference.seen is look and look.best["clip"][1].cost == min(fit.cost for _, fit in look.best.values())
     asked = inference.memo.simulations
     first = inference.round(base.fit, base.floor, [])
     assert first.trials[0].candidate.key == "clip" and inference.memo.simulations - asked < 100  # nothing is screened again
