@@ -154,9 +154,10 @@ def rejected(d: Diagnosis) -> list[dict[str, str]]:
             name = t.candidate.name
             if name not in kept and name not in reasons and t.reason:
                 reasons[name] = t.reason
-        for name in (key.partition(":")[0] for key in r.needless):
+        for key, reason in r.unfitted.items():
+            name = key.partition(":")[0]
             if name not in kept:
-                reasons.setdefault(name, "an effect of fewer parameters leaves nothing but noise")
+                reasons.setdefault(name, reason)
     for c in d.problem.candidates:
         if c.name not in kept and c.name not in reasons:
             reasons[c.name] = behind if any(r.trials for r in d.rounds) else near

@@ -226,7 +226,7 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     left = {first: score(look.least[0]) + handicap[first]}
     if tried[first].is_noise(look.least[0]):
         return left
-    ends = {key: fit.point for key, (_, fit) in look.best.items()}
+    ends = {key: fit.point for key, (_, fit) in look.contest.best.items()}
     for i in others:
         if tried[i].deadline.skips("first fits by the other method"):
             break

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,10 +46,26 @@ ALIKE = 0.3
 """Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
 
 
+NO_TIME = "there was no time for its fit"
+FAR_BEHIND = "by the method that fits best it was not fitted, by the other one the first few fits leave far more"
+FEWER_DO = "an effect of fewer parameters leaves nothing but noise"
+OTHERS_DO = "another effect leaves nothing but noise, and its direction in the data promises little"
+
 Start = tuple[Candidate, Point, np.ndarray | None]
 """A candidate, where a fit of it begins, and about the slopes there, if they are known."""
 Onset = tuple[Sequence[Parameter], Fit, Sequence[Point]]
 """What is fitted, a fit of it, and where further ones begin."""
+
+
+class Contest(NamedTuple):
+    """What fits of candidates came to."""
+
+    best: dict[str, tuple[Candidate, Fit]]
+    """Of each candidate, by its key."""
+    other: tuple[Candidate, Fit] | None
+    """The leading candidate's of the other sign."""
+    unfitted: dict[str, str]
+    """Why a candidate got no fit, by its key."""
 
 
 def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candidate, Fit]]) -> dict[str, tuple[Candidate, Fit]]:
@@ -161,11 +178,11 @@ class Contests(Screening):
         starts: Sequence[Start],
         floor: Floor,
         hopeful: Collection[str] | None = None,
-        then: Callable[[Sequence[str]], Sequence[Start]] = lambda led: (),
+        then: Callable[[Sequence[tuple[Candidate, Fit]]], Sequence[Start]] = lambda led: (),
         beyond: float = math.inf,
         until: float = 1.0,
-    ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
-        """The best fit of each candidate, fits that cannot catch up with the best one stop; and the leading one's of the other sign.
+    ) -> Contest:
+        """Fit the candidates side by side; fits that cannot catch up with the best one stop.
 
         Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all. Where the
         first ones leave noise alone, those of the others that are not `hopeful` get no fit, and the rest one each.
@@ -175,12 +192,13 @@ class Contests(Screening):
             starts: Of the fits.
             floor: What weighs the residuals.
             hopeful: Keys of candidates that could take something off by the screening; all where absent.
-            then: Further starts, given the keys of the candidates in the order of their costs.
+            then: Further starts, given the best fit of each candidate in the order of their costs.
             beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
             until: Share of the time for the search after which there are no others: the rest is another method's.
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
         ended: list[tuple[Candidate, Fit]] = []
+        unfitted: dict[str, str] = {}
         race = Race()
 
         def fitted(own: Sequence[Start]) -> None:
@@ -202,24 +220,27 @@ class Contests(Screening):
         for entry in starts:
             key = entry[0].key
             waves[0 if (self.problem.together and beyond == math.inf) or key in first else 1 if key in small else 2].append(entry)
-        for own in waves:
+        for i, own in enumerate(waves):
             if best and own and self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}", until):
+                unfitted |= {c.key: NO_TIME for wave in waves[i:] for c, *_ in wave}
                 break
             if own and best and score(left()) > beyond:
-                return best, None
+                return Contest(best, None, {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave})
             if own and best and self.is_noise(left()):
                 if own is waves[2]:
+                    unfitted |= {c.key: FEWER_DO for c, *_ in own}
                     break
                 if hopeful is not None:
+                    unfitted |= {c.key: OTHERS_DO for c, *_ in own if c.key not in hopeful}
                     once = {entry[0].key: entry for entry in reversed(own) if entry[0].key in hopeful}
                     own = [entry for entry in own if once.get(entry[0].key) is entry]
             fitted(own)
-        if further := then([key for key, _ in sorted(best.items(), key=lambda item: item[1][1].cost)]):
+        if further := then(sorted(best.values(), key=lambda entry: entry[1].cost)):
             fitted(further)
         other = self.other_sign(free, best, ended, floor)
         if other is not None and other[1].cost < best[other[0].key][1].cost:
             best[other[0].key], other = other, best[other[0].key]
-        return best, other
+        return Contest(best, other, unfitted)
 
     def other_sign(
         self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], ended: Sequence[tuple[Candidate, Fit]], floor: Floor

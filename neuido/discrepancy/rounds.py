@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.contests import LEADERS, MANY, SMALL, SOME_GAIN, Contests, Start
+from neuido.discrepancy.contests import LEADERS, MANY, SMALL, SOME_GAIN, Contest, Contests, Start
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
@@ -69,8 +69,7 @@ class Look(NamedTuple):
     columns: dict[tuple[str, int], dict[int, np.ndarray]]
     chosen: dict[str, int]
     """The start of each candidate that was fitted."""
-    best: dict[str, tuple[Candidate, Fit]]
-    other: tuple[Candidate, Fit] | None
+    contest: Contest
     least: list[np.ndarray]
     """What the best of them leaves, mean squares of the parts; empty where nothing runs."""
 
@@ -126,20 +125,21 @@ class Inference(Contests):
         ends = {t.candidate.key: t.fit.point for t in rival.trials} if rival is not None else {}
         look = self.seen if seen else self.look(base, floor, found, leaders, most=most, ends=ends)
         candidates, free, slopes, columns, chosen = look.candidates, look.free, look.slopes, look.columns, look.chosen
-        best, other, errors = dict(look.best), look.other, self.mean_squares([base.point], floor)[0]
+        best, other, errors = dict(look.contest.best), look.contest.other, self.mean_squares([base.point], floor)[0]
         if not self.deadline.skips("refining the best fits"):
             best |= self.polish(free, best, base, floor, rival, other)
             best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
         floors = self.floors(base.point, free, floor)
         model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)
-        empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=model.null(errors, self.draws))
-        result = self.judge(empty, best, model, list(chosen))
+        null, unfitted = model.null(errors, self.draws), look.contest.unfitted
+        empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=null, unfitted=unfitted)
+        result = self.judge(empty, best, model)
         self.tell(self.verdict(result))
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
         again = first and result.chosen is None and (promising or result.over > 1.0)
         if again and not self.deadline.skips("fits from elsewhere"):
             best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
-            result = self.judge(empty, best, model, list(chosen))
+            result = self.judge(empty, best, model)
             self.tell(self.verdict(result))
         return result
 
@@ -179,12 +179,12 @@ class Inference(Contests):
         hopeful = {c.key for c in candidates if promise.get(c.key, math.inf) < HOPELESS or not c.linear}
         self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
 
-        def without(led: Sequence[str]) -> list[Start]:
+        def without(led: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
             return self.without_own(base.point, starts, found, led)
 
-        best, other = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
-        left = sorted(self.mean_squares([fit.point for _, fit in best.values()], floor), key=score)
-        look = Look(base, candidates, free, slopes, columns, chosen, best, other, left[:1])
+        contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
+        left = sorted(self.mean_squares([fit.point for _, fit in contest.best.values()], floor), key=score)
+        look = Look(base, candidates, free, slopes, columns, chosen, contest, left[:1])
         self.seen = self.seen if found else look
         return look
 
@@ -236,18 +236,21 @@ class Inference(Contests):
         """A point with a candidate's parameters, and the declared ones, of the end of another fit of it."""
         return {**point, **{name: value for name, value in end.items() if name in self.as_declared or name.startswith(f"{c.name}.")}}
 
-    def without_own(self, point: Point, starts: Sequence[Start], found: Sequence[Trial], led: Sequence[str]) -> list[Start]:
+    def without_own(
+        self, point: Point, starts: Sequence[Start], found: Sequence[Trial], led: Sequence[tuple[Candidate, Fit]]
+    ) -> list[Start]:
         """The starts once more without the problem's own parameters, where the base has some: what it needs them for may be an effect.
 
-        Of the candidates that the screening or the fits with them (`led`, best first) put among the first.
+        Of the candidates that the screening or the fits with them (`led`, best first) put among the first; and where these fits ended.
         """
         plain = {k: v for k, v in point.items() if "." in k or k in self.as_declared}
         if plain == dict(point):
             return []
         if not found and self.still is not None:
             plain = dict(self.still)
-        keys = {*list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS], *led[:ALSO_WITHOUT]}
-        return [(c, plain | {k: v for k, v in b.items() if k.startswith(f"{c.name}.")}, None) for c, b, _ in starts if c.key in keys]
+        keys = {*list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS], *(c.key for c, _ in led[:ALSO_WITHOUT])}
+        begun = [(c, plain | {k: v for k, v in b.items() if k.startswith(f"{c.name}.")}, None) for c, b, _ in starts if c.key in keys]
+        return begun + [(c, self.with_effect(plain, c, fit.point), None) for c, fit in led[:ALSO_WITHOUT]]
 
     def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float):
         """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says."""
@@ -262,8 +265,8 @@ class Inference(Contests):
         *_, ranked, _ = self.screened(at.fit.point, at.floor, [beside], MANY)
         return min((stays for stays, *_ in ranked), default=1.0)
 
-    def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel, asked: Sequence[str]) -> Round:
-        """A round with the trials that fits make, and what is chosen of them; `asked` are the keys that were to be fitted."""
+    def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel) -> Round:
+        """A round with the trials that fits make, and what is chosen of them."""
         errors = empty.errors
         trials = []
         for (c, fit), stand in zip(best.values(), self.measured(best, empty.floor), strict=True):
@@ -274,7 +277,8 @@ class Inference(Contests):
         good = [t for t in trials if not t.reason]
         top = min(good, key=lambda t: t.penalised) if good else None
         p = float((1 + np.sum(empty.null >= top.gain)) / (1 + len(empty.null))) if top else 1.0
-        result = replace(empty, trials=trials, p_value=p, cosines={}, needless=[key for key in asked if key not in best])
+        unfitted = {key: why for key, why in empty.unfitted.items() if key not in best}
+        result = replace(empty, trials=trials, p_value=p, cosines={}, unfitted=unfitted)
         if top is None:
             return result
         for t in trials:

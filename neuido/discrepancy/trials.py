@@ -72,8 +72,8 @@ class Round:
     """What noise and discretisation would leave after a refit, mean squares of each part."""
     cosines: dict[str, float] = field(default_factory=dict)
     null: np.ndarray = field(default_factory=lambda: np.empty(0))
-    needless: list[str] = field(default_factory=list)
-    """Keys of candidates of many parameters that were not fitted, since one of few leaves noise alone."""
+    unfitted: dict[str, str] = field(default_factory=dict)
+    """Why a candidate got no fit, by its key."""
 
     @property
     def over(self) -> float:

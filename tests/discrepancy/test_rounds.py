@@ -108,14 +108,14 @@ def test_a_small_candidate_that_the_screening_passes_over_is_fitted(together, mo
 
 def test_many_parameters_are_not_fitted_where_one_leaves_noise_alone():
     found = diagnose(Line(clipped), keep=6)
-    asked, fitted = set(found.rounds[0].needless), {t.candidate.key for t in found.rounds[0].trials}
+    asked, fitted = set(found.rounds[0].unfitted), {t.candidate.key for t in found.rounds[0].trials}
     assert asked and asked <= {"wave0", "wave1", "wave2"}
     assert not asked & fitted
     reasons = {r["name"]: r["reason"] for r in rejected(found)}
     assert all("fewer parameters" in reasons[name] for name in asked)
     # where none does, they are
     other = diagnose(Line(lambda t: t + 0.3 * np.sin(9 * t)), keep=6)
-    assert not other.rounds[0].needless
+    assert not other.rounds[0].unfitted
     assert any(t.candidate.key.startswith("wave") for t in other.rounds[0].trials)
 
 
@@ -580,14 +580,14 @@ def test_the_other_sign_of_the_leading_candidate_is_followed_to_its_end(monkeypa
     inference = Inference(Folded(lambda t: 3.0 * t + 1.5 * t**3))
     start, fold, free = inference.start(), inference.problem.fold, inference.problem.declared
     starts = [(fold, {"a": 2.5, "fold.c": 2.1}, None), (fold, {"a": 3.5, "fold.c": -0.1}, None)]
-    best, other = inference.contest(free, starts, start.floor)
+    best, other, _ = inference.contest(free, starts, start.floor)
     # the one that leads while the other has hardly begun gives its place up to it
     assert other[1].point["fold.c"] > 0
     assert best["fold"][1].point["fold.c"] == pytest.approx(-1.5, abs=0.05)
     assert best["fold"][1].cost < 0.5 * other[1].cost
     refined = inference.polish(free, {"fold": other}, start.fit, start.floor, other=best["fold"])
     assert refined["fold"][1].point["fold.c"] == pytest.approx(-1.5, abs=0.05)
-    (alone, none) = inference.contest(free, starts[:1], start.floor)
+    alone, none, _ = inference.contest(free, starts[:1], start.floor)
     assert alone["fold"][1].point["fold.c"] > 0 and none is None
 
 
@@ -754,26 +754,29 @@ def test_ends_from_elsewhere_are_weighed_by_the_floor_where_they_stand():
 def test_candidates_are_fitted_without_the_problems_own_parameters_too(found, monkeypatch):
     inference = Inference(Line(clipped))
     base = inference.start()
-    cube = next(c for c in inference.problem.candidates if c.name == "cube")
+    square, cube = (next(c for c in inference.problem.candidates if c.name == name) for name in ("square", "cube"))
     inference.still = {"a": 2.5}
     beside = {"a": 2.0, "cube.c": 0.4} if found else {"a": 2.0}
     moved = replace(base, fit=replace(base.fit, point={**beside, "height": 0.1}))
+    ended = replace(moved.fit, point={**moved.fit.point, "a": 2.2, "square.c": 0.7})
     asked = []
 
     def contest(self, free, starts, floor, hopeful, then, beyond, until):
-        asked.extend([*starts, *then(["square"])])
-        return {}, None
+        asked.extend([*starts, *then([(square, ended)])])
+        return contests.Contest({}, None, {})
 
     monkeypatch.setattr(rounds.Inference, "contest", contest)
     inference.round(moved.fit, moved.floor, [Trial(cube, moved, 1.0)] if found else [])
     own = [{k: v for k, v in begin.items() if not k.startswith("square.")} for c, begin, _ in asked if c.name == "square"]
-    assert own == [{**beside, "height": 0.1}, beside if found else {"a": 2.5}]
+    still = beside if found else {"a": 2.5}
+    assert own == [{**beside, "height": 0.1}, still, {**still, "a": 2.2}]  # the last one where the fit with it ended
+    assert asked[-1][1]["square.c"] == 0.7
     monkeypatch.setattr(rounds, "LEADERS", 0)
     asked.clear()
     inference.seen = None
     inference.round(moved.fit, moved.floor, [Trial(cube, moved, 1.0)] if found else [])
     again = [c.key for c, begin, _ in asked if c.linear and "height" not in begin]
-    assert again == ["square"]
+    assert again == ["square"] * 2
     asked.clear()
     inference.round(base.fit, base.floor, [])
     assert all("height" not in begin for _, begin, _ in asked) and len({c.key for c, *_ in asked}) < len(asked) + 1
@@ -796,12 +799,13 @@ def test_where_the_first_fits_leave_noise_alone_only_the_hopeful_are_fitted(monk
             return request(self, parameters, start, **options)
 
         monkeypatch.setattr(Inference, "request", seen)
-        best, _ = inference.contest(
+        best, _, unfitted = inference.contest(
             inference.problem.declared, starts, base.floor, {"square", "cube"}, lambda led, starts=starts: starts[:1]
         )
         monkeypatch.setattr(Inference, "request", request)
         assert inference.is_noise(inference.mean_squares([best["square"][1].point], base.floor)[0]) is leaves_noise
         assert begun == ["square", "cube"] * leaves_noise + keys * (not leaves_noise) + ["square"]
+        assert unfitted == ({"clip": contests.OTHERS_DO} if leaves_noise else {})
 
 
 @pytest.mark.parametrize(("left", "there", "order"), [(0.3, 0.2, [1, 0]), (0.3, 0.4, [0, 1]), (0.9, 0.2, [0, 1]), (0.011, 0.005, [0, 1])])
@@ -819,7 +823,7 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, o
         def look(self, fit, floor, ends=None, beyond=np.inf, until=1.0):
             asked.append(ends)
             best = {"square": (None, SimpleNamespace(point={"square.c": self.result}))}
-            return SimpleNamespace(least=[np.full(2, self.result**2)], best=best)
+            return SimpleNamespace(least=[np.full(2, self.result**2)], contest=SimpleNamespace(best=best))
 
     methods, starts = [Looking(left), Looking(there)], [stood(1.0)] * 2
     seen = attribution.by_first_fits(methods, starts, [0, 1], [0.0, 0.1])
@@ -838,10 +842,12 @@ def test_there_are_no_further_fits_where_another_method_does_far_better(together
     inference = Inference(Line(lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t), wiggle=0.0, together=together))
     base = inference.start()
     starts = [(c, {**base.fit.point, **c.starts[-1]}, None) for c in inference.problem.candidates if c.key in ("square", "cube", "clip")]
-    first, _ = inference.contest(inference.problem.declared, starts[:1], base.floor)
+    first, *_ = inference.contest(inference.problem.declared, starts[:1], base.floor)
     left = rounds.score(inference.mean_squares([first["square"][1].point], base.floor)[0])
     for beyond, fitted in ((left - 0.1, {"square"}), (left + 0.1, {"square", "cube", "clip"})):
-        assert set(inference.contest(inference.problem.declared, starts, base.floor, beyond=beyond)[0]) == fitted
+        contest = inference.contest(inference.problem.declared, starts, base.floor, beyond=beyond)
+        assert set(contest.best) == fitted
+        assert contest.unfitted == dict.fromkeys({"square", "cube", "clip"} - fitted, contests.FAR_BEHIND)
 
 
 def test_what_leaves_far_more_than_the_best_is_not_refined(monkeypatch):
@@ -900,7 +906,7 @@ def test_fits_begin_where_those_of_another_method_ended_too(monkeypatch):
     look = inference.look(base.fit, base.floor, ends={"clip": end})
     (begin,) = [begin for c, begin, _ in begun if c.key == "clip" and begin["clip.inverse"] == end["clip.inverse"]]
     assert begin == {**base.fit.point, "a": 3.1, "clip.inverse": end["clip.inverse"]}
-    assert inference.seen is look and look.best["clip"][1].cost == min(fit.cost for _, fit in look.best.values())
+    assert inference.seen is look and look.contest.best["clip"][1].cost == min(fit.cost for _, fit in look.contest.best.values())
     asked = inference.memo.simulations
     first = inference.round(base.fit, base.floor, [])
     assert first.trials[0].candidate.key == "clip" and inference.memo.simulations - asked < 100  # nothing is screened again
@@ -923,3 +929,15 @@ def test_fits_begin_at_the_size_that_leaves_least(together):
     assert costs["clip"] == min(tried)
     before = inference.costs([base.fit.point], base.floor)[0]
     assert least["clip"] == pytest.approx(min(tried) / before) and least["cube"] <= costs["cube"] / before
+
+
+def test_what_got_no_fit_for_want_of_time_is_said_to():
+    clock = [0.0]
+    deadline = Deadline(100.0, clock=lambda: clock[0])
+    inference = Inference(Line(lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t), wiggle=0.0), deadline=deadline)
+    base = inference.start()
+    clock[0] = 60.0
+    look = inference.look(base.fit, base.floor, until=0.5)
+    assert look.contest.best and set(look.contest.unfitted.values()) == {contests.NO_TIME}
+    first = inference.round(base.fit, base.floor, [])
+    assert first.unfitted and not set(first.unfitted) & {t.candidate.key for t in first.trials}
