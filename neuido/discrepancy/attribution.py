@@ -16,7 +16,7 @@ from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.pairs import LOOKED_AHEAD, WORSE, beside_members, by_another_method, look_ahead
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import ALPHA, UNEXPLAINED, WITHIN, Inference
-from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
+from neuido.discrepancy.trials import Round, Stand, Trial, score, unphysical
 from neuido.physics.effect_library import LIMITS
 
 __all__ = [
@@ -41,8 +41,10 @@ FURTHER = 1.5
 """Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 CLEARLY = 1.5
 """Times the error of another method's first fits at which those of the suggested one are refined first all the same."""
-HALF = 0.5
-"""Share of the time for the search that is left for first fits by another method."""
+LOOKS = (0.5, 0.75)
+"""Shares of the time for the search at which the first fits by the first method end, and those by others: the rest is for refining."""
+NEARLY = 2.5
+"""Times the noise up to which what the first fits leave is refined before another method is asked: it may be noise then."""
 CLOSE = 2.5
 """Times the error of a chosen effect up to which one with fewer parameters is weighed again once others were found."""
 
@@ -137,8 +139,7 @@ def diagnose(
         at = inference.finished(step.stand)
         if settled or hurried:
             break
-        free = [problem.parameter(name) for name in at.fit.names]
-        if problem.settings > 1 and times_over(at.errors, inference.floors(at.fit.point, free, at.floor)) < FURTHER:
+        if problem.settings > 1 and inference.over(at) < FURTHER:
             break
         rounds.append(inference.round(at.fit, at.floor, found))
     if len(found) == 1 and not hurried:
@@ -211,27 +212,28 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
 def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Sequence[int], handicap: Sequence[float]) -> dict[int, float]:
     """Score of what the first fits of effects leave by each method, its handicap included.
 
-    Asked of another one where those of the first in the order promise an effect and leave more than noise: what a method leaves of the
-    declared model says little of how well it fits with the effect, and to refine by the wrong one takes long. Its fits begin where those of
-    the first one ended, too. Of none where the first one promises nothing.
+    Asked of another one where the first in the order promises an effect, or its residual is above the floor, and its fits leave more than
+    what may be noise once it is refined: what a method leaves of the declared model says little of how well it fits with the effect, and
+    to refine by the wrong one takes long. The fits by another one begin where those of the first one ended, too.
     """
     first, *others = order
     limit = score(starts[first].errors) + handicap[first] + 2.0 * math.log(WORSE)
     others = [i for i in others if score(starts[i].errors) + handicap[i] <= limit]
     if not others:
         return {}
-    look = tried[first].look(starts[first].fit, starts[first].floor, until=HALF)
-    if not look.least or tried[first].gain(starts[first].errors, look.least[0]) < LEAST_GAIN:
+    look = tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0])
+    least = min([*look.least, starts[first].errors], key=score)
+    if tried[first].gain(starts[first].errors, least) < LEAST_GAIN and tried[first].over(starts[first]) < 1.0:
         return {}
-    left = {first: score(look.least[0]) + handicap[first]}
-    if tried[first].is_noise(look.least[0]):
+    left = {first: score(least) + handicap[first]}
+    if tried[first].is_noise(least / NEARLY**2):
         return left
     ends = {key: fit.point for key, (_, fit) in look.contest.best.items()}
     for i in others:
         if tried[i].deadline.skips("first fits by the other method"):
             break
         beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
-        there = tried[i].look(starts[i].fit, starts[i].floor, ends=ends, beyond=beyond)
+        there = tried[i].look(starts[i].fit, starts[i].floor, ends=ends, beyond=beyond, until=LOOKS[1])
         left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
     return left
 

@@ -18,6 +18,10 @@ SMALL = 2
 yield stress or a lossy floor does once it acts."""
 MANY = 5
 """Parameters above which a candidate is fitted after the others, and not at all where one of those leaves noise alone."""
+SIZED = 3
+"""Parameters up to which a candidate of one size is tried at several sizes before it is fitted."""
+SHAPES = 4
+"""Shapes of a candidate of more than `SMALL` parameters that are fitted: from 17 degrees beside a fibre a fit comes to it, from 47 not."""
 LEADERS = 4
 """Candidates that are fitted before the others."""
 FAR = 6.0
@@ -139,24 +143,17 @@ class Contests(Screening):
     ) -> tuple[list[Start], dict[str, float]]:
         """The best starts of each candidate, and the least share of the base fit's misfit that one leaves as it is, by key.
 
-        Candidates of few parameters and one size get larger sizes as well, and where the base fit has gone far from the declared values
-        these too: how a large effect acts is not what the slope at none says, and the base fit may have made up for it. One simulation
-        each says which is best: that one is kept, and of the others the best one with the base fit's, or with the declared, values.
+        Candidates of few parameters and one size are tried at the sizes and in the shapes of `tried`, one simulation each. The best one is
+        kept, and of the others the best one with the base fit's, or with the declared, values. A direction has several valleys: of such
+        candidates the best start of each of some shapes is kept.
         """
         led_far = self.moved(base.point) > LED_FAR
         places: list[list[Start]] = []
         for c in {c.key: c for c, *_ in starts}.values():
             own = [start for start in starts if start[0] is c]
-            if len(c.size_parameters) > 1 or len(c.parameters) > SMALL or c.apart:
+            if len(c.size_parameters) > 1 or len(c.parameters) > SIZED or c.apart:
                 continue
-            if c.linear:
-                (p,) = c.size_parameters
-                size, signs = abs(c.starts[0][p.name]), (1.0, -1.0) if p.lower < 0 else (1.0,)
-                begin = {**own[0][1], **{name: base.point.get(name, value) for name, value in self.as_declared.items()}}
-                near, far = ([min(max(sign * f * size, p.lower), p.upper) for sign in signs] for f in (1.0, FAR))
-                own += [(c, {**begin, p.name: value}, None) for value in (far if begin == own[0][1] else near + far)]
-                own += [(c, {**self.at_declared(begin), p.name: value}, None) for value in near + far] if led_far else []
-            places.append(own)
+            places.append(own + self.tried(own[0], base, led_far=led_far) if c.linear else own)
         points = [point for own in places for _, point, _ in own]
         self.tell(f"{len(points)} starts of {len(places)} effects")
         before, *costs = self.costs([base.point, *points], floor)
@@ -165,12 +162,34 @@ class Contests(Screening):
         for own in places:
             left, costs = costs[: len(own)], costs[len(own) :]
             order = sorted(range(len(own)), key=lambda i: left[i])
-            least[own[0][0].key] = left[order[0]] / before
-            declared = [self.at_declared(own[i][1]) == own[i][1] for i in range(len(own))]
+            c = own[0][0]
+            least[c.key] = left[order[0]] / before
+            declared = [self.at_declared(begin) == begin for _, begin, _ in own]
             other = [i for i in order if declared[i] != declared[order[0]] and left[i] < BESIDE * left[order[0]]]
-            for c, point, J in (own[i] for i in (order[0], *other[:1])):
+            by_shape = {c.shape(own[i][1]): i for i in reversed(order)} if len(c.parameters) > SMALL else {}
+            further = sorted(by_shape.values(), key=lambda i: left[i])[:SHAPES]
+            for i in dict.fromkeys([order[0], *other[:1], *further]):
+                _, point, J = own[i]
                 out.append((c, point, self.secant(c, point, base.point, slopes, floor) if J is None and c.linear else J))
         return out, least
+
+    def tried(self, start: Start, base: Fit, *, led_far: bool) -> list[Start]:
+        """Further starts of a candidate of one size: at larger sizes, and in the other shapes that it is screened in.
+
+        How a large effect acts is not what the slope at none says. Where the base fit has gone far from the declared values (`led_far`)
+        these too, for it may have made up for the effect.
+        """
+        c, begun, _ = start
+        (p,) = c.size_parameters
+        size, signs = abs(c.starts[0][p.name]), (1.0, -1.0) if p.lower < 0 else (1.0,)
+        begin = {**begun, **{name: base.point.get(name, value) for name, value in self.as_declared.items()}}
+        near, middle, far = ([{p.name: min(max(sign * f * size, p.lower), p.upper)} for sign in signs] for f in (1.0, math.sqrt(FAR), FAR))
+        made = [{**begin, **value} for value in (far if begin == begun else near + far)]
+        if led_far:
+            made += [{**self.at_declared(begin), **value} for value in near + far]
+        others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
+        made += [{**other, **value} for other in others for value in middle + far]
+        return [(c, point, None) for point in made]
 
     def contest(
         self,
@@ -194,7 +213,7 @@ class Contests(Screening):
             hopeful: Keys of candidates that could take something off by the screening; all where absent.
             then: Further starts, given the best fit of each candidate in the order of their costs.
             beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
-            until: Share of the time for the search after which there are no others: the rest is another method's.
+            until: Share of the time for the search at which fits end where they are and no others begin: the rest is for other steps.
         """
         best: dict[str, tuple[Candidate, Fit]] = {}
         ended: list[tuple[Candidate, Fit]] = []
@@ -205,7 +224,7 @@ class Contests(Screening):
             requests = []
             for c, begin, J in own:
                 sizes = [p.name for p in c.size_parameters] if c.linear else []
-                requests.append(self.request((*free, *c.parameters), begin, race=race, slopes=J, sizes=sizes))
+                requests.append(self.request((*free, *c.parameters), begin, until=until, race=race, slopes=J, sizes=sizes))
             fits = list(zip((c for c, *_ in own), self.fits(requests, floor), strict=True))
             ended.extend(fits)
             best.update(better(fits, best))

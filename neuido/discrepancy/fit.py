@@ -150,7 +150,7 @@ def levenberg_marquardt(
             if r is not None:
                 break
     cost = np.inf if r is None else float(r @ r)
-    converged, costs, n = r is not None, [cost], 0
+    converged, costs, n = r is not None and not names, [cost], 0
     J, fresh = None if slopes is None or together or r is None else _with_prior_rows(slopes, parameters), False
     while n < iterations and r is not None and names and not halt():
         converged = False

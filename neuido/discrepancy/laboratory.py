@@ -211,11 +211,11 @@ class Laboratory:
         errors[np.array(self.fitted) | (not fitted)] = self.mean_squares([point], floor, fitted=fitted)[0]
         return self.sharpened(floor, errors), errors
 
-    def request(self, parameters: Sequence[Parameter], start: Point, **options: Any) -> Request:
-        """A fit; options of `levenberg_marquardt`."""
+    def request(self, parameters: Sequence[Parameter], start: Point, *, until: float = 1.0, **options: Any) -> Request:
+        """A fit, which ends where it is when this share of the time for the search is over; options of `levenberg_marquardt`."""
         margin = functools.partial(self.problem.margin, setting=self.setting)
         together = self.problem.together
-        return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.deadline.over, **options)
+        return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.deadline.past(until), **options)
 
     def base(self, starts: Sequence[Point], floor: Floor, **options: Any) -> Fit:
         """The declared parameters fitted from several starts; the best one after a few iterations goes on, with options of the fit."""

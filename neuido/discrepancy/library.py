@@ -175,9 +175,11 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     return tuple(out)
 
 
+_UP = math.atan(math.sqrt(0.5))
 DIRECTIONS = ((0.0, 0.0), (0.0, math.pi / 2), (math.pi / 2, 0.0), (0.0, math.pi / 4), (0.0, -math.pi / 4), (math.pi / 2, math.pi / 4),
-              (math.pi / 2, -math.pi / 4), (math.pi / 4, 0.0), (-math.pi / 4, 0.0))  # fmt: skip
-"""Azimuth and elevation of the fibre directions that are probed: axes and diagonals."""
+              (math.pi / 2, -math.pi / 4), (math.pi / 4, 0.0), (-math.pi / 4, 0.0), (math.pi / 4, _UP), (math.pi / 4, -_UP),
+              (-math.pi / 4, _UP), (-math.pi / 4, -_UP))  # fmt: skip
+"""Azimuth and elevation of the fibre directions that are probed: axes, and diagonals of the faces and of the body."""
 
 
 def _places(experiment: Experiment, length: float) -> list[dict[str, float]]:

@@ -82,6 +82,10 @@ class Candidate:
         """The parameters that vanish with the effect."""
         return tuple(p for p in self.parameters if not self.sizes or p.name in self.sizes)
 
+    def shape(self, point: Point) -> tuple[float, ...]:
+        """What a point has of the other parameters."""
+        return tuple(point.get(p.name, p.value) for p in self.parameters if p not in self.size_parameters)
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:

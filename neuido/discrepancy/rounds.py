@@ -260,6 +260,11 @@ class Inference(Contests):
         slopes = self.slopes(free, point, self.scored_recordings)
         return candidates, free, slopes, *self.screen(point, candidates, floor, slopes)
 
+    def over(self, at: Stand) -> float:
+        """How far the residual there is above what noise and discretisation would leave after a refit: a ratio of errors."""
+        free = [self.problem.parameter(name) for name in at.fit.names]
+        return times_over(at.errors, self.floors(at.fit.point, free, at.floor))
+
     def promised(self, at: Stand, beside: Trial) -> float:
         """The least share of the misfit there that an effect of few parameters would leave, as the screening predicts it."""
         *_, ranked, _ = self.screened(at.fit.point, at.floor, [beside], MANY)

@@ -81,6 +81,12 @@ class Method:
     def look(self, fit, floor, ends=None, beyond=np.inf, until=1.0):
         return SimpleNamespace(least=[])
 
+    def gain(self, before, after):
+        return 0.5 * float(np.log(before.mean() / after.mean()))
+
+    def over(self, at):
+        return 0.5
+
     def round(self, *_):
         return self.result
 
@@ -808,17 +814,27 @@ def test_where_the_first_fits_leave_noise_alone_only_the_hopeful_are_fitted(monk
         assert unfitted == ({"clip": contests.OTHERS_DO} if leaves_noise else {})
 
 
-@pytest.mark.parametrize(("left", "there", "order"), [(0.3, 0.2, [1, 0]), (0.3, 0.4, [0, 1]), (0.9, 0.2, [0, 1]), (0.011, 0.005, [0, 1])])
-def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, order):
-    """Unless those of the first one promise no effect, or leave noise alone."""
+@pytest.mark.parametrize(
+    ("left", "over", "there", "order"),
+    [
+        (0.3, 0.5, 0.2, [1, 0]),
+        (0.3, 0.5, 0.4, [0, 1]),
+        (0.9, 0.5, 0.2, [0, 1]),  # no effect is promised, and there is no need of one
+        (0.9, 1.5, 0.2, [1, 0]),
+        (1.2, 1.5, 0.9, [1, 0]),  # what they leave is no more than without any
+        (0.03, 1.5, 0.005, [0, 1]),  # it may be noise
+    ],
+)
+def test_the_method_whose_first_fits_leave_least_is_refined_first(left, over, there, order):
+    """Unless those of the first one promise no effect within its floor, or leave little more than noise."""
     asked = []
 
     class Looking(Method):
         def is_noise(self, errors):
             return bool(np.all(errors < 1.8 * NOISE**2))
 
-        def gain(self, before, after):
-            return 0.5 * float(np.log(before.mean() / after.mean()))
+        def over(self, at):
+            return over
 
         def look(self, fit, floor, ends=None, beyond=np.inf, until=1.0):
             asked.append(ends)
@@ -828,9 +844,10 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, there, o
     methods, starts = [Looking(left), Looking(there)], [stood(1.0)] * 2
     seen = attribution.by_first_fits(methods, starts, [0, 1], [0.0, 0.1])
     assert sorted((0, 1), key=lambda i: seen.get(i, np.inf)) == order
-    assert asked == ([None, {"square": {"square.c": left}}] if left == 0.3 else [None])
-    both = {0: pytest.approx(2 * np.log(left)), 1: pytest.approx(2 * np.log(there) + 0.1)}
-    assert seen == ({} if left == 0.9 else both if left == 0.3 else {0: both[0]})
+    both = left > 0.03 and not (left == 0.9 and over < 1.0)
+    assert asked == ([None, {"square": {"square.c": left}}] if both else [None])
+    first = {0: pytest.approx(2 * np.log(min(left, 1.0)))}
+    assert seen == (first | {1: pytest.approx(2 * np.log(there) + 0.1)} if both else {} if left == 0.9 else first)
     asked.clear()
     far = 2.0 * np.log(pairs.WORSE) + 0.1
     assert attribution.by_first_fits(methods, starts, [0, 1], [0.0, far]) == {} and not asked
@@ -939,5 +956,36 @@ def test_what_got_no_fit_for_want_of_time_is_said_to():
     clock[0] = 60.0
     look = inference.look(base.fit, base.floor, until=0.5)
     assert look.contest.best and set(look.contest.unfitted.values()) == {contests.NO_TIME}
+    assert all(fit.evaluations == 1 and not fit.converged for _, fit in look.contest.best.values())  # those that began end at once
     first = inference.round(base.fit, base.floor, [])
     assert first.unfitted and not set(first.unfitted) & {t.candidate.key for t in first.trials}
+
+
+class Turned(Line):
+    """What is added goes as the time or as its square, by a shape which no slope at the one that is screened first tells of."""
+
+    def __init__(self, *idle):
+        super().__init__(lambda t: 3.0 * t + 6.0 * t**3, wiggle=0.0)
+        size = Parameter("turned.c", "1", 0.0, 0.3, 0.0, 30.0)
+        shape = [Parameter(f"turned.{name}", "rad", 0.0, 0.2, -7.0, 7.0) for name in ("angle", *idle)]
+        starts = tuple({"turned.c": 1.0, "turned.angle": a} | {f"turned.{name}": 0.0 for name in idle} for a in (0.0, 2.0, 4.0))
+        self.__dict__["candidates"] = (Candidate("turned", (size, *shape), starts, "flight", sizes=("turned.c",)),)
+
+    def predict(self, points, recording, setting=0):
+        c, at = (np.array([[p.get(f"turned.{name}", 0.0)] for p in points]) for name in ("c", "angle"))
+        return super().predict(points, recording, setting) + c * (T**3 * np.cos(at - 4.0) + T**2 * np.sin(at - 4.0))
+
+
+@pytest.mark.parametrize(("idle", "shapes", "kept"), [([], 4, 1), (["tilt"], 4, 3), (["tilt"], 2, 2)])
+def test_sizes_are_tried_in_every_shape(idle, shapes, kept, monkeypatch):
+    """One start of a candidate of few parameters, and one in each of so many shapes of one with more, the best first."""
+    monkeypatch.setattr(contests, "SHAPES", shapes)
+    inference = Inference(Turned(*idle))
+    base, (turned,) = inference.start(), inference.problem.candidates
+    slopes = inference.slopes(inference.problem.declared, base.fit.point, inference.scored_recordings)
+    begun, least = inference.sized([(turned, {**base.fit.point, **turned.starts[0]}, None)], base.fit, slopes, base.floor)
+    angles = [begin["turned.angle"] for _, begin, _ in begun]
+    assert len(set(angles)) == len(angles) == kept
+    assert angles[0] == 4.0 and begun[0][1]["turned.c"] == contests.FAR
+    costs = inference.costs([begin for _, begin, _ in begun], base.floor)
+    assert costs == sorted(costs) and least["turned"] == pytest.approx(costs[0] / inference.costs([base.fit.point], base.floor)[0])
