@@ -41,7 +41,7 @@ FURTHER = 1.5
 """Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 CLEARLY = 1.5
 """Times the error of another method's first fits at which those of the suggested one are refined first all the same."""
-LOOKS = (0.5, 0.75)
+LOOKS = (0.4, 0.8)
 """Shares of the time for the search at which the first fits by the first method end, and those by others: the rest is for refining."""
 NEARLY = 2.5
 """Times the noise up to which what the first fits leave is refined before another method is asked: it may be noise then."""
@@ -230,7 +230,7 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
         return left
     ends = {key: fit.point for key, (_, fit) in look.contest.best.items()}
     for i in others:
-        if tried[i].deadline.skips("first fits by the other method"):
+        if tried[i].deadline.skips("first fits by the other method", LOOKS[1]):
             break
         beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
         there = tried[i].look(starts[i].fit, starts[i].floor, ends=ends, beyond=beyond, until=LOOKS[1])

@@ -163,10 +163,11 @@ class Inference(Contests):
         ends = ends or {}
         first = leaders is None and not found
         candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most)
-        chosen, begun = self.begin(base, floor, found, leaders, candidates, free, slopes, ranked, columns)
+        hurried = self.deadline.past(until)
+        chosen, begun = self.begin(base, floor, found, leaders, candidates, free, slopes, ranked, columns, hurried=hurried)
         starts = [(c, self.with_effect(base.point, c, ends[c.key]), None) for c in candidates if c.key in chosen and c.key in ends] + begun
         promise = {c.key: stays for stays, c, *_ in reversed(ranked)}
-        if first:
+        if first and not hurried:
             starts, least = self.sized(starts, base, slopes, floor)
             promise |= {key: min(share, promise.get(key, math.inf)) for key, share in least.items()}
             starts.sort(key=lambda start: promise.get(start[0].key, math.inf))
@@ -199,8 +200,13 @@ class Inference(Contests):
         slopes: Mapping[int, np.ndarray],
         ranked: Sequence[tuple[float, Candidate, int, Point]],
         columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
+        *,
+        hurried: bool = False,
     ) -> tuple[dict[str, int], list[Start]]:
-        """Which candidates get a fit by the screening, with the start of each that it put first, and where their fits could begin."""
+        """Which candidates get a fit by the screening, with the start of each that it put first, and where their fits could begin.
+
+        `hurried`: without trying any place at full strength.
+        """
         chosen: dict[str, int] = {}
         starts: list[Start] = []
         # what many parameters could fit says little of how near the others are
@@ -227,7 +233,7 @@ class Inference(Contests):
             if small and c.key not in chosen:
                 chosen[c.key] = 0
                 starts.append((c, self.at_declared(base.point) | dict(c.starts[0]), None))
-        for c in (c for c in candidates if first and c.far and c.key in chosen):
+        for c in (c for c in candidates if first and not hurried and c.far and c.key in chosen):
             places = [c.starts[i] for _, other, i, _ in ranked if other is c][:PLACES]
             starts += [(c, begin, None) for begin in self.strong(c, places, base.point, floor)]
         return chosen, starts

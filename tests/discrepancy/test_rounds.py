@@ -948,12 +948,14 @@ def test_fits_begin_at_the_size_that_leaves_least(together):
     assert least["clip"] == pytest.approx(min(tried) / before) and least["cube"] <= costs["cube"] / before
 
 
-def test_what_got_no_fit_for_want_of_time_is_said_to():
+def test_what_got_no_fit_for_want_of_time_is_said_to(monkeypatch):
+    """Past its share of the time a look tries no sizes, and ends the fits that it begins."""
     clock = [0.0]
     deadline = Deadline(100.0, clock=lambda: clock[0])
     inference = Inference(Line(lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t), wiggle=0.0), deadline=deadline)
     base = inference.start()
     clock[0] = 60.0
+    monkeypatch.setattr(Inference, "sized", None)
     look = inference.look(base.fit, base.floor, until=0.5)
     assert look.contest.best and set(look.contest.unfitted.values()) == {contests.NO_TIME}
     assert all(fit.evaluations == 1 and not fit.converged for _, fit in look.contest.best.values())  # those that began end at once
