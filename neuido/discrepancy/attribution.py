@@ -41,7 +41,7 @@ FURTHER = 1.5
 """Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 CLEARLY = 1.5
 """Times the error of another method's first fits at which those of the suggested one are refined first all the same."""
-LOOKS = (0.4, 0.8)
+LOOKS = (0.5, 0.8)
 """Shares of the time for the search at which the first fits by the first method end, and those by others: the rest is for refining."""
 NEARLY = 2.5
 """Times the noise up to which what the first fits leave is refined before another method is asked: it may be noise then."""
