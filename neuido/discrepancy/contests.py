@@ -43,7 +43,8 @@ not come to its end."""
 SOME_GAIN = math.log(1.2)
 """Smaller gains are no reason to look further."""
 BESIDE = 2.0
-"""Times the cost of a candidate's best start up to which one with the other declared values is kept beside it."""
+"""Times the cost of a candidate's best start up to which one with the other declared values is kept beside it. By as much one as declared
+is taken to leave less, where the base fit made up for the effect: what does as well as that with the stated modulus does better between."""
 LED_FAR = 1.6
 """Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
 ALIKE = 0.3
@@ -163,8 +164,8 @@ class Contests(Screening):
             left, costs = costs[: len(own)], costs[len(own) :]
             order = sorted(range(len(own)), key=lambda i: left[i])
             c = own[0][0]
-            least[c.key] = left[order[0]] / before
             declared = [self.at_declared(begin) == begin for _, begin, _ in own]
+            least[c.key] = min(v / before / (BESIDE if d and led_far else 1.0) for v, d in zip(left, declared, strict=True))
             other = [i for i in order if declared[i] != declared[order[0]] and left[i] < BESIDE * left[order[0]]]
             by_shape = {c.shape(own[i][1]): i for i in reversed(order)} if len(c.parameters) > SMALL else {}
             further = sorted(by_shape.values(), key=lambda i: left[i])[:SHAPES]

@@ -978,6 +978,19 @@ class Turned(Line):
         return super().predict(points, recording, setting) + c * (T**3 * np.cos(at - 4.0) + T**2 * np.sin(at - 4.0))
 
 
+def test_what_the_base_fit_made_up_for_is_no_faint_promise(monkeypatch):
+    """A start with the declared values that leaves no more than the base fit, which went far from these, promises twice as much."""
+    inference = Inference(Line(clipped))
+    base, square = inference.start(), inference.problem.candidates[0]
+    slopes = inference.slopes(inference.problem.declared, base.fit.point, inference.scored_recordings)
+    least, begun = {}, [(square, {**base.fit.point, **square.starts[0]}, None)]
+    for far in (contests.LED_FAR + 0.1, contests.LED_FAR - 0.1):
+        monkeypatch.setattr(Inference, "moved", lambda self, point, far=far: far)
+        monkeypatch.setattr(Inference, "costs", lambda self, points, floor: [1.0] + [1.2 + (self.at_declared(p) != p) for p in points[1:]])
+        least[far > contests.LED_FAR] = inference.sized(begun, base.fit, slopes, base.floor)[1]["square"]
+    assert least == {True: pytest.approx(1.2 / contests.BESIDE), False: 2.2}
+
+
 @pytest.mark.parametrize(("idle", "shapes", "kept"), [([], 4, 1), (["tilt"], 4, 3), (["tilt"], 2, 2)])
 def test_sizes_are_tried_in_every_shape(idle, shapes, kept, monkeypatch):
     """One start of a candidate of few parameters, and one in each of so many shapes of one with more, the best first."""
