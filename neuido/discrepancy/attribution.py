@@ -121,7 +121,8 @@ def diagnose(
             tried.append(inference)
             starts.append(start)
     chosen, firsts = first_rounds(tried, starts)
-    inference, start, rounds = tried[chosen], starts[chosen], firsts[chosen]
+    inference, rounds = tried[chosen], firsts[chosen]
+    start = rounds[0].plain or starts[chosen]
     if len(tried) > 1:
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
     at = start
@@ -148,7 +149,7 @@ def diagnose(
         # beside what lies within its floor nothing was looked for
         if len(rounds) > 1 and (elsewhere := by_another_method(others, inference, pair[-1].chosen.stand if pair else at)):
             inference, pair = elsewhere
-            start = starts[tried.index(inference)]
+            start = pair[0].plain or starts[tried.index(inference)]
         if pair:
             rounds = pair
             found = [r.chosen for r in pair]
@@ -203,9 +204,14 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
         for i, rounds in firsts.items()
     }
     # by a method whose declared model is not the best one an effect must leave clearly less than that one does without any
-    bare = min(firsts, key=lambda i: base[i])
-    sure = {i: 2.0 * LEAST_GAIN * (i != bare and firsts[i][0].chosen is not None and firsts[bare][0].chosen is None) for i in firsts}
+    bare = min(range(len(tried)), key=lambda i: base[i])
+    alone = bare not in firsts or firsts[bare][0].chosen is None
+    sure = {i: 2.0 * LEAST_GAIN * (i != bare and firsts[i][0].chosen is not None and alone) for i in firsts}
     chosen = min(firsts, key=lambda i: best[i] + handicap[i] + sure[i])
+    if bare not in firsts and firsts[chosen][0].chosen is not None and best[chosen] + handicap[chosen] + sure[chosen] > base[bare]:
+        start, there = starts[bare], tried[bare]  # it was not asked, and no effect does better than that
+        floors = there.floors(start.fit.point, there.problem.declared, start.floor)
+        chosen, firsts[bare] = bare, [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]
     return chosen, firsts
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.contests import LEADERS, MANY, SMALL, SOME_GAIN, Contest, Contests, Start
+from neuido.discrepancy.contests import LEADERS, MANY, MEASURED, NEAR, SMALL, SOME_GAIN, Contest, Contests, Start
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
@@ -53,6 +53,9 @@ OWN = 3
 """Candidates that the screening of a second solver may add to those that led with the first one."""
 WITHIN = 0.5
 """Share of the floor within which a residual that no effect explains is no reason to look further."""
+PLAIN, AS_WELL = 2, 1.2
+"""Places where fits with an effect ended at which the model is weighed without it, and times the error of the base fit in the fitted
+recordings up to which it stands there instead."""
 UNEXPLAINED = 2.0
 """Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
 UNEXPLAINED_EXACT = 3.0
@@ -141,7 +144,33 @@ class Inference(Contests):
             best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
             result = self.judge(empty, best, model)
             self.tell(self.verdict(result))
+        plain = self.without_effect(result, base, floor)
+        if plain is not None:
+            result = self.judge(replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain), best, model)
+            self.tell(self.verdict(result))
         return result
+
+    def without_effect(self, result: Round, base: Fit, floor: Floor) -> Stand | None:
+        """The model without the effect of a round, where fits with one ended, if it does better there than where it was fitted.
+
+        Where the settings' differences can do much, the fitted recordings say little of a modulus, and each fit with an effect ends at
+        another one: what that alone does to the held-out recordings is no effect's. It must fit the fitted ones about as well.
+        """
+        if result.chosen is None or self.problem.settings == 1:
+            return None
+        limit = result.chosen.score + 2.0 * math.log(NEAR)
+        close = [t for t in result.trials if t.score < limit and np.isfinite(t.errors).all()][:MEASURED]
+        places = [{k: v for k, v in t.fit.point.items() if not k.startswith(f"{t.candidate.name}.")} for t in close]
+        left = self.mean_squares(places, floor)
+        order = sorted(range(len(places)), key=lambda i: score(left[i]))[:PLAIN]
+        able = [places[i] for i in order if np.isfinite(left[i]).all() and score(left[i]) < score(result.errors)]
+        if not able:
+            return None
+        self.foresee(able)
+        stands = [Stand(replace(base, point=place), *self.stand(place, like=floor)) for place in able]
+        as_well = score(result.errors[self.fitted]) + 2.0 * math.log(AS_WELL)
+        found = [s for s in stands if score(s.errors) < score(result.errors) and score(s.errors[self.fitted]) < as_well]
+        return min(found, key=lambda s: score(s.errors), default=None)
 
     def look(
         self,
