@@ -178,7 +178,7 @@ class Contests(Screening):
         """Further starts of a candidate of one size: at larger sizes, and in the other shapes that it is screened in.
 
         How a large effect acts is not what the slope at none says. Where the base fit has gone far from the declared values (`led_far`)
-        these too, for it may have made up for the effect.
+        from these too and from between, for it may have made up for the effect.
         """
         c, begun, _ = start
         (p,) = c.size_parameters
@@ -188,6 +188,7 @@ class Contests(Screening):
         made = [{**begin, **value} for value in (far if begin == begun else near + far)]
         if led_far:
             made += [{**self.at_declared(begin), **value} for value in near + far]
+            made += [{**self.between(begin), **value} for value in middle + far]
         others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
         made += [{**other, **value} for other in others for value in middle + far]
         return [(c, point, None) for point in made]
@@ -359,6 +360,11 @@ class Contests(Screening):
     def at_declared(self, point: Point) -> Point:
         """The point with the declared parameters, and the problem's own, as the model states them; the effects as they are."""
         return {k: v for k, v in point.items() if "." in k} | self.as_declared
+
+    def between(self, point: Point) -> Point:
+        """The point with the declared parameters half way from there to what the model states, in the coordinates that are fitted."""
+        half = {p.name: p.physical(0.5 * (p.coordinate(point.get(p.name, p.value)) + p.coordinate(p.value))) for p in self.problem.declared}
+        return {**point, **half}
 
     def from_here(self, entries: Sequence[Onset], like: Floor) -> list[tuple[Fit, Floor]]:
         """Of each entry the best of its fit and of those from its starts, and the floor of all of them: that where the fit stands.
