@@ -724,6 +724,58 @@ def test_an_effect_by_the_worse_method_leaves_clearly_less_than_the_better_one_w
     assert attribution.first_rounds(methods, [stood(1.0), stood(1.5)])[0] == chosen
 
 
+@pytest.mark.parametrize(("left", "answered"), [(0.5, False), (0.1, True)])
+def test_an_effect_leaves_less_than_a_method_that_was_not_asked_does_without_any(left, answered, monkeypatch):
+    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
+    monkeypatch.setattr(attribution, "by_first_fits", lambda *_: {0: 0.0})
+    asked, late = Method(first_round(left, named=True)), Method()
+    asked.result.chosen.gain = np.log(10.0)
+    late.deadline, late.problem = Deadline(0.0), SimpleNamespace(declared=())
+    late.floors = lambda point, free, floor: np.full(2, 1e-4)
+    chosen, firsts = attribution.first_rounds([asked, late], [stood(1.0), stood(0.4)])
+    assert (firsts[chosen][0].chosen is not None) is answered
+    assert firsts[chosen][0].errors[0] == pytest.approx(1.0 if answered else 0.16)
+
+
+@pytest.mark.parametrize(("gain", "late", "named"), [(2.6, True, False), (3.5, True, True), (2.6, False, True)])
+def test_an_effect_gains_much_where_there_was_no_time_for_another_method(gain, late, named, monkeypatch):
+    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
+    monkeypatch.setattr(attribution, "by_first_fits", lambda *_: {0: 0.0})
+    first = first_round(0.2, named=True)
+    first.chosen.gain = np.log(gain)
+    other = Method(first_round(1.0, named=False))
+    other.deadline = Deadline(0.0 if late else np.inf)
+    chosen, firsts = attribution.first_rounds([Method(first), other], [stood(1.0), stood(1.1)])
+    assert chosen == 0 and (firsts[0][0].chosen is not None) is named
+    assert bool(first.trials[0].reason) is not named
+    assert named or "no time for the other method" in first.trials[0].reason
+
+
+@pytest.mark.parametrize(("bend", "found"), [(0.0, True), (1.0, False)])
+def test_a_model_is_weighed_without_an_effect_where_the_fit_with_it_ended(bend, found):
+    inference = Inference(Line(lambda t: 3.0 * t + bend * t**2))
+    start = inference.start()
+    end = stood(NOISE, {"a": 3.0, "square.c": bend})
+    t = Trial(inference.problem.candidates[0], replace(end, floor=start.floor), 1.0)
+    # the base is as good in the fitted recording and twenty times the noise off in the other one
+    r = Round(start.fit.point, np.array([1.0, 400.0]) * NOISE**2, [t], t, [t], 0.01, start.floor, np.full(2, NOISE**2))
+    plain = inference.without_effect(r, start.fit, start.floor)
+    assert (plain is not None) is found
+    if plain is not None:
+        assert plain.fit.point == {"a": 3.0}
+        assert np.all(plain.errors < 4 * NOISE**2)
+
+
+def test_what_another_modulus_does_as_well_is_no_effect(monkeypatch):
+    def as_good(inference, result, base, floor):
+        return result.chosen and Stand(replace(base, point={"a": 2.0}), floor, 1.02 * result.chosen.errors)
+
+    assert diagnose(Line(clipped)).answer == "effect"
+    monkeypatch.setattr(Inference, "without_effect", as_good)
+    found = diagnose(Line(clipped))
+    assert (found.answer, found.effects, found.before) == ("none", [], {"a": 2.0})
+
+
 @pytest.mark.parametrize(("error", "moves"), [(0.8, False), (0.5, True)])
 def test_a_parameter_of_the_problems_own_leaves_its_place_for_clearly_less_alone(error, moves):
     inference = Inference(Line(clipped))
@@ -989,6 +1041,17 @@ def test_what_the_base_fit_made_up_for_is_no_faint_promise(monkeypatch):
         monkeypatch.setattr(Inference, "costs", lambda self, points, floor: [1.0] + [1.2 + (self.at_declared(p) != p) for p in points[1:]])
         least[far > contests.LED_FAR] = inference.sized(begun, base.fit, slopes, base.floor)[1]["square"]
     assert least == {True: pytest.approx(1.2 / contests.BESIDE), False: 2.2}
+
+
+def test_fits_begin_half_way_to_what_is_stated_where_the_base_fit_went_far_from_it():
+    inference = Inference(Line(clipped))
+    square, point = inference.problem.candidates[0], {"a": 3.0}
+    base, size = Fit(point, ("a",), 1.0, np.zeros(1), 1, True), 0.3 * contests.FAR
+    for far in (True, False):
+        made = inference.tried((square, {**point, **square.starts[0]}, None), base, led_far=far)
+        half = sorted(p["square.c"] for _, p, _ in made if p["a"] == pytest.approx(2.0))
+        small = size / np.sqrt(contests.FAR)
+        assert half == pytest.approx([-size, -small, small, size] if far else [])
 
 
 @pytest.mark.parametrize(("idle", "shapes", "kept"), [([], 4, 1), (["tilt"], 4, 3), (["tilt"], 2, 2)])
