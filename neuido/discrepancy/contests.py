@@ -188,7 +188,7 @@ class Contests(Screening):
         made = [{**begin, **value} for value in (far if begin == begun else near + far)]
         if led_far:
             made += [{**self.at_declared(begin), **value} for value in near + far]
-            made += [{**self.between(begin), **value} for value in middle + far]
+            made += [{**self.between(begin), **value} for value in far]
         others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
         made += [{**other, **value} for other in others for value in middle + far]
         return [(c, point, None) for point in made]
