@@ -174,8 +174,7 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     settled = [i for i, start in enumerate(starts) if tried[i].is_noise(start.errors)]
     if settled:
         chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
-        start = starts[chosen]
-        return chosen, {chosen: [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, tried[chosen].noise_squares)]}
+        return chosen, {chosen: [unsearched(starts[chosen], tried[chosen].noise_squares)]}
     # another method must do clearly better before it takes the place of the suggested one
     handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
@@ -212,18 +211,23 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     bare = min(range(len(tried)), key=lambda i: base[i])
     alone = bare not in firsts or firsts[bare][0].chosen is None
     sure = {i: 2.0 * LEAST_GAIN * (i != bare and firsts[i][0].chosen is not None and alone) for i in firsts}
-    chosen = min(firsts, key=lambda i: best[i] + handicap[i] + sure[i])
-    if bare not in firsts and firsts[chosen][0].chosen is not None and best[chosen] + handicap[chosen] + sure[chosen] > base[bare]:
+    weighed = {i: best[i] + handicap[i] + sure[i] for i in firsts}
+    chosen = min(firsts, key=lambda i: weighed[i])
+    if bare not in firsts and firsts[chosen][0].chosen is not None and weighed[chosen] > base[bare]:
         start, there = starts[bare], tried[bare]  # it was not asked, and no effect does better than that
         floors = there.floors(start.fit.point, there.problem.declared, start.floor)
-        chosen, firsts[bare] = bare, [Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)]
+        chosen, firsts[bare] = bare, [unsearched(start, floors)]
     first = firsts[chosen][0]
     if unasked and len(firsts[chosen]) == 1 and first.chosen is not None and first.chosen.gain < UNASKED:
-        least = f"with no time for the other method it takes {math.exp(UNASKED):.0f}-fold"
         for t in first.members:
-            t.reason = f"lowers the error {math.exp(t.gain):.2f}-fold; {least}"
+            t.reason = t.too_little(UNASKED, "with no time for the other method")
         firsts[chosen] = [replace(first, chosen=None, members=[])]
     return chosen, firsts
+
+
+def unsearched(start: Stand, floors: np.ndarray) -> Round:
+    """The round of a declared model beside which no effect was looked for."""
+    return Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)
 
 
 def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Sequence[int], handicap: Sequence[float]) -> dict[int, float]:
@@ -306,7 +310,7 @@ def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> t
         if not rest:
             break
         extra = tuple(p for t in rest for p in t.candidate.parameters)
-        start = {k: v for k, v in base.point.items() if k.split(".")[0] != trial.candidate.name}
+        start = trial.candidate.without(base.point)
         (fit,) = inference.fits([inference.request((*inference.problem.declared, *extra), start)], floor)
         without, with_it = inference.mean_squares([fit.point, base.point], floor)
         if inference.gain(without, with_it) < LEAST_GAIN / 2:

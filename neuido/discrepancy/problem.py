@@ -86,6 +86,14 @@ class Candidate:
         """What a point has of the other parameters."""
         return tuple(point.get(p.name, p.value) for p in self.parameters if p not in self.size_parameters)
 
+    def own(self, point: Point) -> dict[str, float]:
+        """What a point has of this effect."""
+        return {name: value for name, value in point.items() if name.startswith(f"{self.name}.")}
+
+    def without(self, point: Point) -> dict[str, float]:
+        """What a point has beside this effect."""
+        return {name: value for name, value in point.items() if not name.startswith(f"{self.name}.")}
+
 
 @dataclass(frozen=True, eq=False)
 class Recording:

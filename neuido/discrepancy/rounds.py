@@ -159,17 +159,15 @@ class Inference(Contests):
         if result.chosen is None or self.problem.settings == 1:
             return None
         limit = result.chosen.score + 2.0 * math.log(NEAR)
-        close = [t for t in result.trials if t.score < limit and np.isfinite(t.errors).all()][:MEASURED]
-        places = [{k: v for k, v in t.fit.point.items() if not k.startswith(f"{t.candidate.name}.")} for t in close]
-        left = self.mean_squares(places, floor)
-        order = sorted(range(len(places)), key=lambda i: score(left[i]))[:PLAIN]
-        able = [places[i] for i in order if np.isfinite(left[i]).all() and score(left[i]) < score(result.errors)]
-        if not able:
+        places = [t.candidate.without(t.fit.point) for t in result.trials if t.score < limit][:MEASURED]
+        left = [score(squares) for squares in self.mean_squares(places, floor)]
+        here, as_well = score(result.errors), score(result.errors[self.fitted]) + 2.0 * math.log(AS_WELL)
+        better = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < here]
+        if not better:
             return None
-        self.foresee(able)
-        stands = [Stand(replace(base, point=place), *self.stand(place, like=floor)) for place in able]
-        as_well = score(result.errors[self.fitted]) + 2.0 * math.log(AS_WELL)
-        found = [s for s in stands if score(s.errors) < score(result.errors) and score(s.errors[self.fitted]) < as_well]
+        self.foresee(better)
+        stands = [Stand(replace(base, point=place), *self.stand(place, like=floor)) for place in better]
+        found = [s for s in stands if score(s.errors) < here and score(s.errors[self.fitted]) < as_well]
         return min(found, key=lambda s: score(s.errors), default=None)
 
     def look(
@@ -269,7 +267,7 @@ class Inference(Contests):
 
     def with_effect(self, point: Point, c: Candidate, end: Point) -> Point:
         """A point with a candidate's parameters, and the declared ones, of the end of another fit of it."""
-        return {**point, **{name: value for name, value in end.items() if name in self.as_declared or name.startswith(f"{c.name}.")}}
+        return {**point, **{name: value for name, value in end.items() if name in self.as_declared}, **c.own(end)}
 
     def without_own(
         self, point: Point, starts: Sequence[Start], found: Sequence[Trial], led: Sequence[tuple[Candidate, Fit]]
@@ -284,7 +282,7 @@ class Inference(Contests):
         if not found and self.still is not None:
             plain = dict(self.still)
         keys = {*list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS], *(c.key for c, _ in led[:ALSO_WITHOUT])}
-        begun = [(c, plain | {k: v for k, v in b.items() if k.startswith(f"{c.name}.")}, None) for c, b, _ in starts if c.key in keys]
+        begun = [(c, plain | c.own(b), None) for c, b, _ in starts if c.key in keys]
         return begun + [(c, self.with_effect(plain, c, fit.point), None) for c, fit in led[:ALSO_WITHOUT]]
 
     def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float):
@@ -387,7 +385,7 @@ class Inference(Contests):
     def _why(self, t: Trial, top: Trial, result: Round) -> str:
         if result.chosen is None:
             at_least = max(result.by_chance(ALPHA), self.least_gain(result.errors, result.floors, t.errors))
-            return f"lowers the error {math.exp(t.gain):.2f}-fold; with nuisances and discretisation it takes {math.exp(at_least):.2f}-fold"
+            return t.too_little(at_least, "with nuisances and discretisation")
         return f"leaves {math.exp(0.5 * (t.score - top.score)):.1f} times the error of {top.candidate.name}"
 
     def _linear(self, point, floor, left, slopes, columns, chosen, candidates) -> evidence.LinearModel:

@@ -56,6 +56,10 @@ class Trial:
         """The score, made worse for each parameter."""
         return self.score + PARSIMONY * len(self.candidate.size_parameters)
 
+    def too_little(self, at_least: float, why: str) -> str:
+        """The reason for one whose gain is below the one that it takes."""
+        return f"lowers the error {math.exp(self.gain):.2f}-fold; {why} it takes {math.exp(at_least):.2f}-fold"
+
 
 @dataclass(eq=False)
 class Round:
