@@ -58,6 +58,8 @@ class Setting:
     """`material_points` or `finite_elements`."""
     elements: float = 1.0
     """Finite elements a particle."""
+    tetrahedra: int = 5
+    """Finite elements that a cell of the mesh's lattice is cut into."""
     lift: float = 0.0
     """Suggested cells by which the colliders and the grid are higher; see `CONTACT_HEIGHT`."""
 
@@ -65,6 +67,7 @@ class Setting:
     def name(self) -> str:
         """For the report."""
         parts = ["finite elements"] * (self.solver == "finite_elements") + [f"{self.elements:g} a particle"] * (self.elements != 1.0)
+        parts += [f"{self.tetrahedra} a cell"] * (self.tetrahedra != 5)
         parts += [f"{self.cells:g} times the cells"] * (self.cells != 1.0) + [f"{self.dt:g} of the step"] * (self.dt != 1.0)
         parts += [f"colliders {self.lift:g} cells higher"] * (self.lift != 0.0)
         return ", ".join(parts) or "suggested"
@@ -78,6 +81,7 @@ SETTINGS = (
     Setting(1.0, 1.0, lift=0.5),
     Setting(1.0, 1.0, "finite_elements"),
     Setting(1.0, 1.0, "finite_elements", elements=0.6),
+    Setting(1.0, 1.0, "finite_elements", tetrahedra=6),
 )
 SOLVERS = tuple(next(i for i, s in enumerate(SETTINGS) if s.solver == name) for name in ("material_points", "finite_elements"))
 """The settings that are methods of their own."""
@@ -99,7 +103,7 @@ class BodyRollouts(Problem):
     _simulators: dict[Any, Simulator | FiniteElements] = field(default_factory=dict, repr=False)
     _still: dict[int, Simulator] = field(default_factory=dict, repr=False)
     """By setting, one scene a recording, on the CPU: what is asked for its step alone."""
-    _meshes: dict[tuple[int, float], Mesh] = field(default_factory=dict, repr=False)
+    _meshes: dict[tuple[int, float, int], Mesh] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
 
     def effort(self, recording: int, setting: int = 0) -> float:
@@ -187,13 +191,14 @@ class BodyRollouts(Problem):
     def others(self, setting: int) -> list[int]:
         """Of material points a finer step and grid and, where the body meets something, a lift of that, else a coarser grid.
 
-        Of finite elements, which meet a plane where it is, another mesh and the grids: what a mesh gets wrong no mesh knows alone.
+        Of finite elements, which meet a plane where it is, other meshes: coarser, and cut in another way. Grids would lend them the
+        dissipation of material points, and with it an effect that is not there.
         """
-        able = [i for i, s in enumerate(SETTINGS[: self.settings]) if i != setting]
+        own = [i for i, s in enumerate(SETTINGS[: self.settings]) if i != setting and s.solver == SETTINGS[setting].solver]
         if SETTINGS[setting].solver == "finite_elements":
-            return [i for i in able if not SETTINGS[i].lift]
+            return own
         without = (lambda s: s.cells < 1.0) if self.lifts else (lambda s: s.lift > 0.0)
-        return [i for i in able if SETTINGS[i].solver == "material_points" and not without(SETTINGS[i])]
+        return [i for i in own if not without(SETTINGS[i])]
 
     def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
         others, height, dx = self.others(setting), point.get(CONTACT_HEIGHT, 0.0), self.measured[0].scene.dx
@@ -249,19 +254,20 @@ class BodyRollouts(Problem):
             r = self.measured[n]
             scenes += [replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)] * count
             bodies += [r.body] * count
-            meshes += [self._mesh(n, s.elements)] * count if s.solver == "finite_elements" else []
+            meshes += [self._mesh(n, s.elements, s.tetrahedra)] * count if s.solver == "finite_elements" else []
         density = self.experiment.model["density"]
         if meshes:
             return FiniteElements(scenes, bodies, density=density, device=device, meshes=meshes)
         return Simulator(scenes, bodies, density=density, device=device)
 
-    def _mesh(self, recording: int, elements: float) -> Mesh:
+    def _mesh(self, recording: int, elements: float, tetrahedra: int) -> Mesh:
         """The body of a recording as finite elements have it; seconds of work, so that all simulators share it."""
-        if (recording, elements) not in self._meshes:
+        key = recording, elements, tetrahedra
+        if key not in self._meshes:
             body = self.measured[recording].body
             wanted = None if elements == 1.0 else round(elements * len(body.x))
-            self._meshes[recording, elements] = mesh_body(body.x, body.volume, elements=wanted)
-        return self._meshes[recording, elements]
+            self._meshes[key] = mesh_body(body.x, body.volume, elements=wanted, kind=tetrahedra)
+        return self._meshes[key]
 
     def _start(self, simulator: Simulator, points: Sequence[Point], recordings: Sequence[int], lifts: np.ndarray) -> ParticleState:
         """The start with the velocities and spins of each point and below the lifts (S, 3), those of the first recording first."""
