@@ -235,7 +235,8 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
 
     Asked of another one where the first in the order promises an effect, or its residual is above the floor, and its fits leave more than
     what may be noise once it is refined: what a method leaves of the declared model says little of how well it fits with the effect, and
-    to refine by the wrong one takes long. The fits by another one begin where those of the first one ended, too.
+    to refine by the wrong one takes long. By another one those are fitted that led by the first, from where their fits ended too, and the
+    few that its own directions add.
     """
     first, *others = order
     limit = score(starts[first].errors) + handicap[first] + 2.0 * math.log(WORSE)
@@ -249,12 +250,11 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     left = {first: score(least) + handicap[first]}
     if tried[first].is_noise(least / NEARLY**2):
         return left
-    ends = {key: fit.point for key, (_, fit) in look.contest.best.items()}
     for i in others:
         if tried[i].deadline.skips("first fits by the other method", LOOKS[1]):
             break
         beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
-        there = tried[i].look(starts[i].fit, starts[i].floor, ends=ends, beyond=beyond, until=LOOKS[1])
+        there = tried[i].look(starts[i].fit, starts[i].floor, led=look, beyond=beyond, until=LOOKS[1])
         left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
     return left
 

@@ -1,7 +1,7 @@
 """Full fits of candidates side by side: who is fitted from where, who is given up, and whose fit is tried again from elsewhere."""
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,6 +20,8 @@ MANY = 5
 """Parameters above which a candidate is fitted after the others, and not at all where one of those leaves noise alone."""
 SIZED = 3
 """Parameters up to which a candidate of one size is tried at several sizes before it is fitted."""
+TRIED_AT_ONCE = 48
+"""Starts, at the least, that are tried in one go where points run together: between two goes the time is looked at."""
 SHAPES = 4
 """Shapes of a candidate of more than `SMALL` parameters that are fitted: from 17 degrees beside a fibre a fit comes to it, from 47 not."""
 LEADERS = 4
@@ -83,6 +85,18 @@ def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candi
     return out
 
 
+def _in_goes(places: Sequence[tuple[list[Start], list[Start]]], count: int) -> Iterator[list[tuple[list[Start], list[Start]]]]:
+    """Candidates with their starts, so many starts together at the least."""
+    chunk: list[tuple[list[Start], list[Start]]] = []
+    for place in places:
+        chunk.append(place)
+        if sum(len(made) for _, made in chunk) >= count:
+            yield chunk
+            chunk = []
+    if chunk:
+        yield chunk
+
+
 class Contests(Screening):
     """The fits of a step of a diagnosis."""
 
@@ -140,38 +154,41 @@ class Contests(Screening):
         return self.whitened(slopes, {n: (there - here)[:, None] / step for (n, _), (here, there) in pairs.items()}, floor)
 
     def sized(
-        self, starts: Sequence[Start], base: Fit, slopes: Mapping[int, np.ndarray], floor: Floor
+        self, starts: Sequence[Start], base: Fit, slopes: Mapping[int, np.ndarray], floor: Floor, *, until: float = 1.0
     ) -> tuple[list[Start], dict[str, float]]:
         """The best starts of each candidate, and the least share of the base fit's misfit that one leaves as it is, by key.
 
         Candidates of few parameters and one size are tried at the sizes and in the shapes of `tried`, one simulation each. The best one is
         kept, and of the others the best one with the base fit's, or with the declared, values. A direction has several valleys: of such
-        candidates the best start of each of some shapes is kept.
+        candidates the best start of each of some shapes is kept. Past the share `until` of the time the rest keep their starts.
         """
         led_far = self.moved(base.point) > LED_FAR
-        places: list[list[Start]] = []
+        places: list[tuple[list[Start], list[Start]]] = []
         for c in {c.key: c for c, *_ in starts}.values():
             own = [start for start in starts if start[0] is c]
             if len(c.size_parameters) > 1 or len(c.parameters) > SIZED or c.apart:
                 continue
-            places.append(own + self.tried(own[0], base, led_far=led_far) if c.linear else own)
-        points = [point for own in places for _, point, _ in own]
-        self.tell(f"{len(points)} starts of {len(places)} effects")
-        before, *costs = self.costs([base.point, *points], floor)
-        out = [start for start in starts if all(start[0] is not own[0][0] for own in places)]
+            places.append((own, own + self.tried(own[0], base, led_far=led_far) if c.linear else own))
+        out = [start for start in starts if all(start[0] is not own[0][0] for own, _ in places)]
         least: dict[str, float] = {}
-        for own in places:
-            left, costs = costs[: len(own)], costs[len(own) :]
-            order = sorted(range(len(own)), key=lambda i: left[i])
-            c = own[0][0]
-            declared = [self.at_declared(begin) == begin for _, begin, _ in own]
-            least[c.key] = min(v / before / (BESIDE if d and led_far else 1.0) for v, d in zip(left, declared, strict=True))
-            other = [i for i in order if declared[i] != declared[order[0]] and left[i] < BESIDE * left[order[0]]]
-            by_shape = {c.shape(own[i][1]): i for i in reversed(order)} if len(c.parameters) > SMALL else {}
-            further = sorted(by_shape.values(), key=lambda i: left[i])[:SHAPES]
-            for i in dict.fromkeys([order[0], *other[:1], *further]):
-                _, point, J = own[i]
-                out.append((c, point, self.secant(c, point, base.point, slopes, floor) if J is None and c.linear else J))
+        self.tell(f"{sum(len(made) for _, made in places)} starts of {len(places)} effects")
+        for chunk in _in_goes(places, TRIED_AT_ONCE if self.problem.together else 1):
+            if self.deadline.past(until):
+                out += [start for own, _ in chunk for start in own]
+                continue
+            before, *costs = self.costs([base.point, *(point for _, made in chunk for _, point, _ in made)], floor)
+            for _, own in chunk:
+                left, costs = costs[: len(own)], costs[len(own) :]
+                order = sorted(range(len(own)), key=lambda i: left[i])
+                c = own[0][0]
+                declared = [self.at_declared(begin) == begin for _, begin, _ in own]
+                least[c.key] = min(v / before / (BESIDE if d and led_far else 1.0) for v, d in zip(left, declared, strict=True))
+                other = [i for i in order if declared[i] != declared[order[0]] and left[i] < BESIDE * left[order[0]]]
+                by_shape = {c.shape(own[i][1]): i for i in reversed(order)} if len(c.parameters) > SMALL else {}
+                further = sorted(by_shape.values(), key=lambda i: left[i])[:SHAPES]
+                for i in dict.fromkeys([order[0], *other[:1], *further]):
+                    _, point, J = own[i]
+                    out.append((c, point, self.secant(c, point, base.point, slopes, floor) if J is None and c.linear else J))
         return out, least
 
     def tried(self, start: Start, base: Fit, *, led_far: bool) -> list[Start]:

@@ -16,6 +16,8 @@ WORSE = 3.0
 """Times the error of the better method at which the other one is not asked any more: where that found nothing, and for two effects."""
 LOOKED_AHEAD = 2
 """Effects that are tried with a second one, where none gains enough alone, or in the place of one with more parameters."""
+FAR_ABOVE = 4.0
+"""Times its floor above which the best few effects are tried with a second one, however little each gains alone."""
 BLIND_GAIN = 2.0 * LEAST_GAIN
 """What an effect must gain in the fitted recordings to be tried with a second one although it foretells nothing of those held out."""
 PROMISED = 0.6
@@ -31,7 +33,9 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
     """
     if first.chosen is not None or not first.trials:
         return [first]
-    good = [t for t in first.trials if t.gain > inference.by_chance(first) and not unphysical(t.candidate, t.fit.point)]
+    by_chance = inference.by_chance(first)
+    at_least = by_chance if first.over < FAR_ABOVE else 0.0
+    good = [t for t in first.trials if t.gain > at_least and not unphysical(t.candidate, t.fit.point)]
     if first.over < inference.unexplained:  # it may all be the discretisation
         good = [t for t in good if t.gain > LEAST_GAIN]
     bases = sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]
@@ -42,7 +46,8 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
         second = inference.round(t.fit, inference.stand(t.fit.point)[0], [t], most=MANY)
         if second.chosen is None or inference.gain(first.errors, second.chosen.errors) < 2.0 * LEAST_GAIN:
             continue
-        if t in blind and times_over(second.chosen.errors, first.floors) > inference.unexplained:
+        little = t in blind or t.gain <= by_chance  # what the two leave must be near the floor then
+        if little and times_over(second.chosen.errors, first.floors) > inference.unexplained:
             continue
         t.reason = ""
         members = [t, *(other for other in good if other is not t and inference.is_rival(other, t))]

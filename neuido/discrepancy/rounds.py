@@ -6,7 +6,7 @@ recordings that were held out against a parametric bootstrap of the largest gain
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -49,8 +49,8 @@ PLACES = 9
 """Starts of a candidate that are tried at full strength, the first of the screening."""
 ALSO_WITHOUT = 6
 """Candidates of the least costs that are fitted without the problem's own parameters too."""
-OWN = 3
-"""Candidates that the screening of a second solver may add to those that led with the first one."""
+OWN, LED_BY = 3, 8
+"""Candidates that the screening of a second solver may add to those that led with the first one, and how many of its first fits lead."""
 WITHIN = 0.5
 """Share of the floor within which a residual that no effect explains is no reason to look further."""
 PLAIN, AS_WELL = 2, 1.2
@@ -179,23 +179,28 @@ class Inference(Contests):
         *,
         most: float = math.inf,
         ends: Mapping[str, Point] | None = None,
+        led: Look | None = None,
         beyond: float = math.inf,
         until: float = 1.0,
     ) -> Look:
         """Screen the candidates, and fit the best; arguments as those of `round`.
 
-        `leaders`: what led by another method, and little else gets a fit; `ends`: where its fits of effects ended, by key;
-        `beyond`: score of the first fits beyond which there are no others; `until`: share of the search's time past which there are none.
+        `leaders`: what led by another method, and little else gets a fit; `ends`: where its fits of effects ended, by key; `led`: its
+        look, which says both, and in which one shape those that did not lead are screened; `beyond`: score of the first fits beyond
+        which there are no others; `until`: share of the search's time past which there are none.
         """
+        if led is not None:
+            fits = sorted(led.contest.best.values(), key=lambda entry: entry[1].cost)
+            leaders, ends = [c.key for c, _ in fits[:LED_BY]], {c.key: fit.point for c, fit in fits}
         ends = ends or {}
-        first = leaders is None and not found
-        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most)
+        first = not found and (leaders is None or led is not None)
+        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most, led, leaders or ())
         hurried = self.deadline.past(until)
         chosen, begun = self.begin(base, floor, found, leaders, candidates, free, slopes, ranked, columns, hurried=hurried)
         starts = [(c, self.with_effect(base.point, c, ends[c.key]), None) for c in candidates if c.key in chosen and c.key in ends] + begun
         promise = {c.key: stays for stays, c, *_ in reversed(ranked)}
         if first and not hurried:
-            starts, least = self.sized(starts, base, slopes, floor)
+            starts, least = self.sized(starts, base, slopes, floor, until=until)
             promise |= {key: min(share, promise.get(key, math.inf)) for key, share in least.items()}
             starts.sort(key=lambda start: promise.get(start[0].key, math.inf))
             if not self.problem.together:
@@ -244,7 +249,7 @@ class Inference(Contests):
             led = leaders is not None and c.key in leaders
             small = first and len(c.parameters) <= SMALL and (stays < VAIN or not c.linear)
             if c.key not in chosen and (keep > 0 or led or small or (leaders is None and stays < near)):
-                keep -= not small
+                keep -= not (small or led)
                 chosen[c.key] = i
                 starts.append((c, begin, self.first_slopes(c, i, free, slopes, columns, floor)))
                 if not c.linear:
@@ -254,10 +259,10 @@ class Inference(Contests):
             elif c.apart and c.key in chosen and all(begin[c.apart] * s[1][c.apart] < 0 for s in starts if s[0].key == c.key):
                 starts.append((c, begin, None))
         finite = {c.key for _, c, *_ in ranked}
-        for c in candidates if first else ():
+        for c in candidates:
             # what cannot run where the base fit went, or does nothing there, may do so where the model was declared
             small = len(c.parameters) <= MANY if c.key not in finite else c.linear and len(c.parameters) <= SMALL
-            if small and c.key not in chosen:
+            if c.key not in chosen and ((first and small) or (leaders is not None and c.key in leaders)):
                 chosen[c.key] = 0
                 starts.append((c, self.at_declared(base.point) | dict(c.starts[0]), None))
         for c in (c for c in candidates if first and not hurried and c.far and c.key in chosen):
@@ -285,10 +290,17 @@ class Inference(Contests):
         begun = [(c, plain | c.own(b), None) for c, b, _ in starts if c.key in keys]
         return begun + [(c, self.with_effect(plain, c, fit.point), None) for c, fit in led[:ALSO_WITHOUT]]
 
-    def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float):
-        """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says."""
+    def screened(
+        self, point: Point, floor: Floor, found: Sequence[Trial], most: float, led: Look | None = None, leaders: Collection[str] = ()
+    ):
+        """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says.
+
+        `led`: the look of another method; what is not among its `leaders` has the one start here that it was fitted from there.
+        """
         taken = {t.candidate.name for t in found}
         candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
+        if led is not None:
+            candidates = [c if c.key in leaders else replace(c, starts=(c.starts[led.chosen.get(c.key, 0)],)) for c in candidates]
         free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
         slopes = self.slopes(free, point, self.scored_recordings)
         return candidates, free, slopes, *self.screen(point, candidates, floor, slopes)

@@ -14,7 +14,7 @@ from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit, Race, levenberg_marquardt, run
 from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
-from neuido.discrepancy.rounds import GAIN_IN_FLOOR, GAIN_TO_NOISE, LEAST_GAIN, Inference
+from neuido.discrepancy.rounds import GAIN_IN_FLOOR, GAIN_TO_NOISE, LEAST_GAIN, Inference, Look
 from neuido.discrepancy.trials import Round, Stand, Trial
 
 T = np.linspace(0.0, 1.0, 120)
@@ -78,7 +78,7 @@ class Method:
     def is_noise(self, errors):
         return False
 
-    def look(self, fit, floor, ends=None, beyond=np.inf, until=1.0):
+    def look(self, fit, floor, led=None, beyond=np.inf, until=1.0):
         return SimpleNamespace(least=[])
 
     def gain(self, before, after):
@@ -630,6 +630,8 @@ def test_what_fits_alone_and_foretells_nothing_is_tried_with_a_second_effect(mon
     # what the two leave together must be near the floor
     assert diagnose(Mixed(shapes, {"low": 0.5, "high": 0.5}, rest=0.1 * np.sin(75 * T))).answer == "unknown"
     monkeypatch.setattr(pairs, "BLIND_GAIN", np.inf)
+    assert diagnose(problem).answer == "effect"  # far above its floor what gains little alone is tried too
+    monkeypatch.setattr(pairs, "FAR_ABOVE", np.inf)
     assert diagnose(problem).answer == "unknown"
 
 
@@ -888,16 +890,15 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, over, th
         def over(self, at):
             return over
 
-        def look(self, fit, floor, ends=None, beyond=np.inf, until=1.0):
-            asked.append(ends)
-            best = {"square": (None, SimpleNamespace(point={"square.c": self.result}))}
-            return SimpleNamespace(least=[np.full(2, self.result**2)], contest=SimpleNamespace(best=best))
+        def look(self, fit, floor, led=None, beyond=np.inf, until=1.0):
+            asked.append(led and led.least[0][0])
+            return SimpleNamespace(least=[np.full(2, self.result**2)])
 
     methods, starts = [Looking(left), Looking(there)], [stood(1.0)] * 2
     seen = attribution.by_first_fits(methods, starts, [0, 1], [0.0, 0.1])
     assert sorted((0, 1), key=lambda i: seen.get(i, np.inf)) == order
     both = left > 0.03 and not (left == 0.9 and over < 1.0)
-    assert asked == ([None, {"square": {"square.c": left}}] if both else [None])
+    assert asked == ([None, left**2] if both else [None])
     first = {0: pytest.approx(2 * np.log(min(left, 1.0)))}
     assert seen == (first | {1: pytest.approx(2 * np.log(there) + 0.1)} if both else {} if left == 0.9 else first)
     asked.clear()
@@ -962,6 +963,7 @@ def test_a_method_whose_first_fits_are_far_from_what_was_named_is_not_asked_furt
 def test_fits_begin_where_those_of_another_method_ended_too(monkeypatch):
     """With the declared values and the effect of that end, and the problem's own values of this method."""
     inference = Inference(Line(clipped))
+    by_key = {c.key: c for c in inference.problem.candidates}
     base = inference.start()
     begun = []
     contest = Inference.contest
@@ -972,13 +974,43 @@ def test_fits_begin_where_those_of_another_method_ended_too(monkeypatch):
 
     monkeypatch.setattr(Inference, "contest", seen)
     end = {"a": 3.1, "height": 7.0, "clip.inverse": 1.0 / 1.61}
-    look = inference.look(base.fit, base.floor, ends={"clip": end})
+    look = inference.look(base.fit, base.floor, led=looked({"clip": (by_key["clip"], replace(base.fit, point=end))}))
     (begin,) = [begin for c, begin, _ in begun if c.key == "clip" and begin["clip.inverse"] == end["clip.inverse"]]
     assert begin == {**base.fit.point, "a": 3.1, "clip.inverse": end["clip.inverse"]}
     assert inference.seen is look and look.contest.best["clip"][1].cost == min(fit.cost for _, fit in look.contest.best.values())
     asked = inference.memo.simulations
     first = inference.round(base.fit, base.floor, [])
     assert first.trials[0].candidate.key == "clip" and inference.memo.simulations - asked < 100  # nothing is screened again
+
+
+def looked(best, **chosen):
+    """A look of another method, with the best fit of each candidate and the start that it was given."""
+    return Look(None, [], (), {}, {}, chosen, contests.Contest(best, None, {}), [])
+
+
+def test_by_another_method_those_are_fitted_that_led_by_the_first(monkeypatch):
+    """The others are screened in the shape that they were fitted in, and the first of them alone are fitted."""
+    monkeypatch.setattr(rounds, "OWN", 1)
+    monkeypatch.setattr(rounds, "LED_BY", 1)
+    screen = Inference.screen
+    screened = []
+    monkeypatch.setattr(
+        Inference, "screen", lambda self, at, candidates, *rest: screened.append(candidates) or screen(self, at, candidates, *rest)
+    )
+    inference = Inference(Line(clipped), keep=1)
+    by_key = {c.key: c for c in inference.problem.candidates}
+    clip = by_key["clip"]
+    assert len(clip.starts) > 1
+    base = inference.start()
+    ends = {
+        key: (by_key[key], replace(base.fit, point=base.fit.point | by_key[key].starts[0], cost=cost))
+        for key, cost in (("cube", 1.0), ("clip", 2.0))
+    }
+    inference.look(base.fit, base.floor)
+    whole = inference.look(base.fit, base.floor, led=looked(ends, clip=1))
+    shapes = {c.key: c.starts for c in screened[1]}
+    assert shapes["clip"] == clip.starts[1:2] and shapes["cube"] == by_key["cube"].starts and set(shapes) == set(by_key)
+    assert len(whole.contest.best) == 2 and "cube" in whole.contest.best
 
 
 @pytest.mark.parametrize("together", [True, False])
@@ -1066,3 +1098,26 @@ def test_sizes_are_tried_in_every_shape(idle, shapes, kept, monkeypatch):
     assert angles[0] == 4.0 and begun[0][1]["turned.c"] == contests.FAR
     costs = inference.costs([begin for _, begin, _ in begun], base.floor)
     assert costs == sorted(costs) and least["turned"] == pytest.approx(costs[0] / inference.costs([base.fit.point], base.floor)[0])
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_look_that_is_late_tries_no_further_sizes(together, monkeypatch):
+    """A batch may take long; what was not tried keeps its starts, and says nothing of what it leaves."""
+    monkeypatch.setattr(contests, "TRIED_AT_ONCE", 1)
+    clock = [0.0]
+    inference = Inference(Line(clipped, together=together), deadline=Deadline(100.0, clock=lambda: clock[0]))
+    base = inference.start()
+    by_key = {c.key: c for c in inference.problem.candidates}
+    slopes = inference.slopes(inference.problem.declared, base.fit.point, inference.scored_recordings)
+    starts = [(by_key[key], {**base.fit.point, **by_key[key].starts[0]}, None) for key in ("clip", "cube")]
+    costs = Inference.costs
+
+    def slow(self, points, floor):
+        clock[0] += 30.0
+        return costs(self, points, floor)
+
+    monkeypatch.setattr(Inference, "costs", slow)
+    kept, least = inference.sized(starts, base.fit, slopes, base.floor, until=0.2)
+    assert set(least) == {"clip"} and [entry for entry in kept if entry[0] is by_key["cube"]] == starts[1:]
+    clock[0] = 0.0
+    assert set(inference.sized(starts, base.fit, slopes, base.floor, until=0.9)[1]) == {"clip", "cube"}
