@@ -221,7 +221,7 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     if unasked and len(firsts[chosen]) == 1 and first.chosen is not None and first.chosen.gain < UNASKED:
         for t in first.members:
             t.reason = t.too_little(UNASKED, "with no time for the other method")
-        firsts[chosen] = [replace(first, chosen=None, members=[])]
+        firsts[chosen] = [replace(first, chosen=None, members=[], unsure=True)]
     return chosen, firsts
 
 
@@ -326,7 +326,9 @@ def conclude(inference: Inference, before: Stand, after: Stand, found: list[Tria
     if found:
         classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
         answer = "class" if max(classes) > 1 else "effect"
-    elif first.over > inference.unexplained or (inference.problem.settings > 1 and first.held_out_over(inference.fitted) > UNEXPLAINED):
+    elif first.unsure or first.over > inference.unexplained:
+        answer = "unknown"
+    elif inference.problem.settings > 1 and first.held_out_over(inference.fitted) > UNEXPLAINED:
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"

@@ -78,6 +78,8 @@ class Round:
     null: np.ndarray = field(default_factory=lambda: np.empty(0))
     unfitted: dict[str, str] = field(default_factory=dict)
     """Why a candidate got no fit, by its key."""
+    unsure: bool = False
+    """Whether an effect gained enough, had there been time for the other method."""
     plain: Stand | None = None
     """The model without a further effect, where it does better than at the base that was looked from."""
 

@@ -748,9 +748,21 @@ def test_an_effect_gains_much_where_there_was_no_time_for_another_method(gain, l
     other = Method(first_round(1.0, named=False))
     other.deadline = Deadline(0.0 if late else np.inf)
     chosen, firsts = attribution.first_rounds([Method(first), other], [stood(1.0), stood(1.1)])
-    assert chosen == 0 and (firsts[0][0].chosen is not None) is named
+    assert chosen == 0 and (firsts[0][0].chosen is not None) is named and firsts[0][0].unsure is not named
     assert bool(first.trials[0].reason) is not named
     assert named or "no time for the other method" in first.trials[0].reason
+
+
+def test_what_there_was_no_time_to_be_sure_of_is_unknown_and_not_none(monkeypatch):
+    assert diagnose(Line(lambda t: 3.0 * t)).answer == "none"
+    real = attribution.first_rounds
+
+    def unsure(tried, starts):
+        chosen, firsts = real(tried, starts)
+        return chosen, {i: [replace(r, unsure=True) for r in own] for i, own in firsts.items()}
+
+    monkeypatch.setattr(attribution, "first_rounds", unsure)
+    assert diagnose(Line(lambda t: 3.0 * t)).answer == "unknown"
 
 
 @pytest.mark.parametrize(("bend", "found"), [(0.0, True), (1.0, False)])
