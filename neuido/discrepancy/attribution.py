@@ -326,9 +326,7 @@ def conclude(inference: Inference, before: Stand, after: Stand, found: list[Tria
     if found:
         classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
         answer = "class" if max(classes) > 1 else "effect"
-    elif first.unsure or first.over > inference.unexplained:
-        answer = "unknown"
-    elif inference.problem.settings > 1 and first.held_out_over(inference.fitted) > UNEXPLAINED:
+    elif first.unsure or inference.is_unexplained(first):
         answer = "unknown"
     else:
         answer = "none" if enough(inference) else "insufficient"

@@ -154,21 +154,36 @@ class Inference(Contests):
         """The model without the effect of a round, where fits with one ended, if it does better there than where it was fitted.
 
         Where the settings' differences can do much, the fitted recordings say little of a modulus, and each fit with an effect ends at
-        another one: what that alone does to the held-out recordings is no effect's. It must fit the fitted ones about as well.
+        another one: what that alone does to the held-out recordings is no effect's. It must fit the fitted ones about as well. Where no
+        effect explains what is left, it is fitted from there: the base may stand in a side valley.
         """
-        if result.chosen is None or self.problem.settings == 1:
+        if self.problem.settings == 1 or not result.trials:
             return None
-        limit = result.chosen.score + 2.0 * math.log(NEAR)
+        lost = result.chosen is None
+        if lost and not self.is_unexplained(result):
+            return None
+        limit = (result.chosen or result.trials[0]).score + 2.0 * math.log(NEAR)
         places = [t.candidate.without(t.fit.point) for t in result.trials if t.score < limit][:MEASURED]
         left = [score(squares) for squares in self.mean_squares(places, floor)]
         here, as_well = score(result.errors), score(result.errors[self.fitted]) + 2.0 * math.log(AS_WELL)
-        better = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < here]
+        better = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < (math.inf if lost else here)]
         if not better:
             return None
         self.foresee(better)
         stands = [Stand(replace(base, point=place), *self.stand(place, like=floor)) for place in better]
+        if lost and not self.deadline.skips("the declared model again from where effects were fitted"):
+            free = [self.problem.parameter(name) for name in base.names]
+            able = [(s.fit.point, s.floor) for s, runs in zip(stands, self.which_run(better), strict=True) if runs]
+            fits = self.fits([self.request(free, point) for point, _ in able], [own for _, own in able])
+            ends = [fit.point for fit in fits]
+            stands += [Stand(f, *self.stand(f.point, like=floor)) for f, ok in zip(fits, self.which_run(ends), strict=True) if ok]
         found = [s for s in stands if score(s.errors) < here and score(s.errors[self.fitted]) < as_well]
         return min(found, key=lambda s: score(s.errors), default=None)
+
+    def is_unexplained(self, r: Round) -> bool:
+        """Whether the residual of a round's base is above what noise and discretisation would leave, by so much that it is not none."""
+        held_out = r.held_out_over(self.fitted) if self.problem.settings > 1 else 0.0
+        return r.over > self.unexplained or held_out > UNEXPLAINED
 
     def look(
         self,

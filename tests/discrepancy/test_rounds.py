@@ -780,6 +780,28 @@ def test_a_model_is_weighed_without_an_effect_where_the_fit_with_it_ended(bend, 
         assert np.all(plain.errors < 4 * NOISE**2)
 
 
+@pytest.mark.parametrize(("bend", "found"), [(0.0, True), (1.0, False)])
+def test_a_residual_that_no_effect_explains_has_the_model_fitted_from_where_those_ended(bend, found, monkeypatch):
+    inference = Inference(Line(lambda t: 3.0 * t + bend * t**2))
+    start = inference.start()
+    t = Trial(
+        inference.problem.candidates[0], replace(stood(8 * NOISE, {"a": 3.6, "square.c": -0.7}), floor=start.floor), 0.1, "too little"
+    )
+    errors = np.array([1.0, 400.0]) * NOISE**2
+    fits, begun = Inference.fits, []
+    monkeypatch.setattr(
+        Inference, "fits", lambda self, requests, *rest, **options: begun.append(len(requests)) or fits(self, requests, *rest, **options)
+    )
+    plain = inference.without_effect(
+        Round(start.fit.point, errors, [t], None, [], 0.5, start.floor, np.full(2, NOISE**2)), start.fit, start.floor
+    )
+    assert (plain is not None) is found
+    if plain is not None:
+        assert set(plain.fit.point) == {"a"} and np.all(plain.errors < 4 * NOISE**2)
+    within = Round(start.fit.point, errors, [t], None, [], 0.5, start.floor, errors)
+    assert inference.without_effect(within, start.fit, start.floor) is None and begun == [1]
+
+
 def test_what_another_modulus_does_as_well_is_no_effect(monkeypatch):
     def as_good(inference, result, base, floor):
         return result.chosen and Stand(replace(base, point={"a": 2.0}), floor, 1.02 * result.chosen.errors)
