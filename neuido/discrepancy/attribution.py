@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -76,8 +76,13 @@ class Diagnosis:
     setting: int
     work: Mapping[str, Work]
     """What each step ran."""
-    left_out: Sequence[str] = ()
-    """What the search had no time for."""
+    deadline: Deadline = field(default_factory=Deadline)
+    """When it has to come to its end."""
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """What there was no time for."""
+        return tuple(self.deadline.left_out)
 
     @property
     def evaluations(self) -> int:
@@ -111,6 +116,7 @@ def diagnose(
         seconds: After which it comes to its end; see `Deadline`.
     """
     memo, deadline = Memo(problem), Deadline(seconds)
+    deadline.pace = lambda: memo.pace
     tried: list[Inference] = []
     starts: list[Stand] = []
     for n in problem.solvers:
@@ -357,7 +363,7 @@ def conclude(inference: Inference, before: Stand, after: Stand, found: list[Tria
         declared,
         inference.setting,
         inference.memo.work,
-        tuple(inference.deadline.left_out),
+        inference.deadline,
     )
 
 

@@ -5,7 +5,11 @@ import time
 from collections.abc import Callable
 
 SEARCH = 0.8
-"""Share of the time for the search; the rest is for the last fit, the intervals and the report."""
+"""Share of the time for the search at the most; the rest is for the last fit, the intervals and the report."""
+LEAST = 0.6
+"""The same at the least."""
+AFTER = 200
+"""Simulations that follow it: what was begun is weighed, the best is fitted to its end, and its intervals are taken."""
 
 
 class Deadline:
@@ -14,15 +18,25 @@ class Deadline:
     Args:
         seconds: From now on; infinite: as long as it takes.
         clock: Seconds on a clock that never goes back.
+        pace: Seconds that a simulation has taken so far; where one is slow the search ends earlier.
 
     Attributes:
         left_out: What the search has not done, in words.
     """
 
-    def __init__(self, seconds: float = math.inf, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self.clock, self.begun, self.seconds = clock, clock(), seconds
-        self.share = SEARCH
+    def __init__(
+        self, seconds: float = math.inf, *, clock: Callable[[], float] = time.monotonic, pace: Callable[[], float] = lambda: 0.0
+    ) -> None:
+        self.clock, self.begun, self.seconds, self.pace = clock, clock(), seconds, pace
+        self.concluding = False
         self.left_out: list[str] = []
+
+    @property
+    def share(self) -> float:
+        """Share of the time that counts: that of the search, or all of it."""
+        if self.concluding or math.isinf(self.seconds):
+            return 1.0
+        return min(max(1.0 - AFTER * self.pace() / max(self.seconds, 1e-9), LEAST), SEARCH)
 
     @property
     def over(self) -> bool:
@@ -43,4 +57,4 @@ class Deadline:
 
     def conclude(self) -> None:
         """From here on the whole time counts."""
-        self.share = 1.0
+        self.concluding = True

@@ -54,6 +54,11 @@ class Memo:
         """Points times recordings that were run so far."""
         return sum(w.simulations for w in self.work.values())
 
+    @property
+    def pace(self) -> float:
+        """Seconds that a run has taken so far, mean."""
+        return sum(w.seconds for w in self.work.values()) / max(self.simulations, 1)
+
     @contextmanager
     def during(self, step: str) -> Iterator[None]:
         """Runs count for this step while it is open, unless an outer one is open already."""

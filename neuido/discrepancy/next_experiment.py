@@ -37,7 +37,7 @@ class Rival(NamedTuple):
 
 
 def propose(d: Diagnosis) -> dict[str, Any] | None:
-    """The best change for the last class of several members; None where there is nothing to tell apart or no change runs.
+    """The best change for the last class of several members; None where there is nothing to tell apart, no change runs or the time is up.
 
     Returns:
         `change`, `tells_apart` (the two nearest rivals), `expected_log_odds` (natural), and `others`, the runners-up.
@@ -54,12 +54,16 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
         catalogue = _tracks(inner)
     first = []
     for name, problem, sigma in catalogue:
+        if d.deadline.skips("the next experiment"):
+            return None
         rows = problem.predict([r.point for r in rivals], 0, d.setting)
         if np.isfinite(rows).all():
             first.append((*_nearest(rows, [np.empty((rows.shape[1], 0))] * len(rows), sigma(rows)), name, problem, sigma, rows))
     first.sort(key=lambda entry: -entry[0])
     final = []
     for _, _, name, problem, sigma, rows in first[:FINALISTS]:
+        if d.deadline.skips("the next experiment"):
+            return None
         slopes = [_slopes(d, problem, rival) for rival in rivals]
         odds, pair = _nearest(rows, slopes, sigma(rows))
         final.append((odds, pair, name))

@@ -416,10 +416,13 @@ class Inference(Contests):
         return f"leaves {math.exp(0.5 * (t.score - top.score)):.1f} times the error of {top.candidate.name}"
 
     def _linear(self, point, floor, left, slopes, columns, chosen, candidates) -> evidence.LinearModel:
-        """The linear model of the fits; `left` is what the discretisation leaves after a refit, mean squares of the parts."""
+        """The linear model of the fits; `left` is what the discretisation leaves after a refit, mean squares of the parts.
+
+        Of all candidates, or once the time for the search is over of those that got a fit.
+        """
         held = [p.recording for p in self.parts if not p.fitted]
         by_key = {c.key: c for c in candidates}
-        best = {c.key: 0 for c in candidates} | chosen
+        best = dict(chosen) if chosen and self.deadline.over else {c.key: 0 for c in candidates} | chosen
         one = [replace(by_key[key], starts=(by_key[key].starts[i],)) for key, i in best.items()]
         new = [n for n in held if n not in self.fitted_recordings]
         there = self.columns(point, one, new) if new else {}

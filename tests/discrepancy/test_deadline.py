@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from neuido.discrepancy import attribution
+from neuido.discrepancy import attribution, next_experiment
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.command import restricted
-from neuido.discrepancy.deadline import SEARCH, Deadline
+from neuido.discrepancy.deadline import AFTER, LEAST, SEARCH, Deadline
 from tests import command
 from tests.discrepancy import made
 
@@ -40,6 +40,27 @@ def test_the_search_has_a_share_and_the_end_the_rest():
     assert not limit.over
     clock.now = 101.0
     assert limit.over
+
+
+def test_where_a_simulation_is_slow_the_search_ends_earlier():
+    """So that what follows it has the time that it takes there."""
+    clock = Clock(0.0)
+    for pace, share in ((0.01, SEARCH), (0.15, 1.0 - AFTER * 0.15 / 100.0), (1.0, LEAST)):
+        limit = Deadline(100.0, clock=clock, pace=lambda pace=pace: pace)
+        assert limit.share == pytest.approx(share)
+        limit.conclude()
+        assert limit.share == 1.0
+
+
+def test_what_takes_long_after_the_search_is_left_out_too(block, monkeypatch):
+    """A class whose next experiment would be simulated past the end."""
+    clock = Clock(0.0)
+    monkeypatch.setattr(attribution, "Deadline", lambda seconds: Deadline(seconds, clock=clock))
+    found = diagnose(restricted(body_problem(block), "drag_linear,drag_quadratic"), draws=39, most=1, seconds=60.0)
+    found.rounds[0].members = found.rounds[0].trials[:2]
+    assert next_experiment.propose(found) is not None and found.left_out == ()
+    clock.now = 61.0
+    assert next_experiment.propose(found) is None and found.left_out == ("the next experiment",)
 
 
 def test_without_a_limit_nothing_is_left_out():
