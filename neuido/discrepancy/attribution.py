@@ -260,7 +260,7 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
         if tried[i].deadline.skips("first fits by the other method", LOOKS[1]):
             break
         beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
-        there = tried[i].look(starts[i].fit, starts[i].floor, led=look, beyond=beyond, until=LOOKS[1])
+        there = tried[i].look(starts[i].fit, starts[i].floor, led=look.led, beyond=beyond, until=LOOKS[1])
         left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
     return left
 

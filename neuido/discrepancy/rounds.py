@@ -6,7 +6,7 @@ recordings that were held out against a parametric bootstrap of the largest gain
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
-from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
+from neuido.discrepancy.trials import Led, Round, Stand, Trial, score, times_over, unphysical
 
 ALPHA = 0.05
 """Family-wise level of a named effect."""
@@ -76,6 +76,12 @@ class Look(NamedTuple):
     least: list[np.ndarray]
     """What the best of them leaves, mean squares of the parts; empty where nothing runs."""
 
+    @property
+    def led(self) -> Led:
+        """The candidates of the least costs."""
+        fits = sorted(self.contest.best.values(), key=lambda entry: entry[1].cost)
+        return Led([c.key for c, _ in fits[:LED_BY]], {c.key: fit.point for c, fit in fits}, self.chosen)
+
 
 class Inference(Contests):
     """The steps of a diagnosis on one problem.
@@ -123,10 +129,9 @@ class Inference(Contests):
             rival: That of another solver which named an effect: what led there and the first of the screening get a fit.
             most: Parameters that a candidate may have.
         """
-        first, leaders = rival is None and not found, rival.leaders if rival is not None else None
+        first = rival is None and not found
         seen = self.seen is not None and self.seen.base is base and not found
-        ends = {t.candidate.key: t.fit.point for t in rival.trials} if rival is not None else {}
-        look = self.seen if seen else self.look(base, floor, found, leaders, most=most, ends=ends)
+        look = self.seen if seen else self.look(base, floor, found, rival.led if rival is not None else None, most=most)
         candidates, free, slopes, columns, chosen = look.candidates, look.free, look.slopes, look.columns, look.chosen
         best, other, errors = dict(look.contest.best), look.contest.other, self.mean_squares([base.point], floor)[0]
         if not self.deadline.skips("refining the best fits"):
@@ -190,28 +195,22 @@ class Inference(Contests):
         base: Fit,
         floor: Floor,
         found: Sequence[Trial] = (),
-        leaders: Sequence[str] | None = None,
+        led: Led | None = None,
         *,
         most: float = math.inf,
-        ends: Mapping[str, Point] | None = None,
-        led: Look | None = None,
         beyond: float = math.inf,
         until: float = 1.0,
     ) -> Look:
         """Screen the candidates, and fit the best; arguments as those of `round`.
 
-        `leaders`: what led by another method, and little else gets a fit; `ends`: where its fits of effects ended, by key; `led`: its
-        look, which says both, and in which one shape those that did not lead are screened; `beyond`: score of the first fits beyond
+        `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
         which there are no others; `until`: share of the search's time past which there are none.
         """
-        if led is not None:
-            fits = sorted(led.contest.best.values(), key=lambda entry: entry[1].cost)
-            leaders, ends = [c.key for c, _ in fits[:LED_BY]], {c.key: fit.point for c, fit in fits}
-        ends = ends or {}
-        first = not found and (leaders is None or led is not None)
-        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most, led, leaders or ())
+        ends = led.ends if led is not None else {}
+        first = not found and (led is None or led.chosen is not None)
+        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most, led)
         hurried = self.deadline.past(until)
-        chosen, begun = self.begin(base, floor, found, leaders, candidates, free, slopes, ranked, columns, hurried=hurried)
+        chosen, begun = self.begin(base, floor, found, led, candidates, free, slopes, ranked, columns, hurried=hurried)
         starts = [(c, self.with_effect(base.point, c, ends[c.key]), None) for c in candidates if c.key in chosen and c.key in ends] + begun
         promise = {c.key: stays for stays, c, *_ in reversed(ranked)}
         if first and not hurried:
@@ -227,8 +226,8 @@ class Inference(Contests):
         hopeful = {c.key for c in candidates if promise.get(c.key, math.inf) < HOPELESS or not c.linear}
         self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
 
-        def without(led: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
-            return self.without_own(base.point, starts, found, led)
+        def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
+            return self.without_own(base.point, starts, found, ended)
 
         contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
         left = sorted(self.mean_squares([fit.point for _, fit in contest.best.values()], floor), key=score)
@@ -241,7 +240,7 @@ class Inference(Contests):
         base: Fit,
         floor: Floor,
         found: Sequence[Trial],
-        leaders: Sequence[str] | None,
+        led: Led | None,
         candidates: Sequence[Candidate],
         free: Sequence[Parameter],
         slopes: Mapping[int, np.ndarray],
@@ -258,13 +257,13 @@ class Inference(Contests):
         starts: list[Start] = []
         # what many parameters could fit says little of how near the others are
         near = min(2.0 * min((stays for stays, c, *_ in ranked if len(c.parameters) <= MANY), default=0.0), HOPELESS)
-        keep = self.keep if leaders is None else min(self.keep, OWN)
-        first = leaders is None and not found
+        keep, leaders = (self.keep, ()) if led is None else (min(self.keep, OWN), led.keys)
+        first = led is None and not found
         for stays, c, i, begin in ranked:
-            led = leaders is not None and c.key in leaders
+            leads = c.key in leaders
             small = first and len(c.parameters) <= SMALL and (stays < VAIN or not c.linear)
-            if c.key not in chosen and (keep > 0 or led or small or (leaders is None and stays < near)):
-                keep -= not (small or led)
+            if c.key not in chosen and (keep > 0 or leads or small or (led is None and stays < near)):
+                keep -= not (small or leads)
                 chosen[c.key] = i
                 starts.append((c, begin, self.first_slopes(c, i, free, slopes, columns, floor)))
                 if not c.linear:
@@ -277,7 +276,7 @@ class Inference(Contests):
         for c in candidates:
             # what cannot run where the base fit went, or does nothing there, may do so where the model was declared
             small = len(c.parameters) <= MANY if c.key not in finite else c.linear and len(c.parameters) <= SMALL
-            if c.key not in chosen and ((first and small) or (leaders is not None and c.key in leaders)):
+            if c.key not in chosen and ((first and small) or c.key in leaders):
                 chosen[c.key] = 0
                 starts.append((c, self.at_declared(base.point) | dict(c.starts[0]), None))
         for c in (c for c in candidates if first and not hurried and c.far and c.key in chosen):
@@ -290,32 +289,31 @@ class Inference(Contests):
         return {**point, **{name: value for name, value in end.items() if name in self.as_declared}, **c.own(end)}
 
     def without_own(
-        self, point: Point, starts: Sequence[Start], found: Sequence[Trial], led: Sequence[tuple[Candidate, Fit]]
+        self, point: Point, starts: Sequence[Start], found: Sequence[Trial], ended: Sequence[tuple[Candidate, Fit]]
     ) -> list[Start]:
         """The starts once more without the problem's own parameters, where the base has some: what it needs them for may be an effect.
 
-        Of the candidates that the screening or the fits with them (`led`, best first) put among the first; and where these fits ended.
+        Of the candidates that the screening or the fits with them (`ended`, best first) put among the first; and where these fits ended.
         """
         plain = {k: v for k, v in point.items() if "." in k or k in self.as_declared}
         if plain == dict(point):
             return []
         if not found and self.still is not None:
             plain = dict(self.still)
-        keys = {*list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS], *(c.key for c, _ in led[:ALSO_WITHOUT])}
+        keys = {*list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS], *(c.key for c, _ in ended[:ALSO_WITHOUT])}
         begun = [(c, plain | c.own(b), None) for c, b, _ in starts if c.key in keys]
-        return begun + [(c, self.with_effect(plain, c, fit.point), None) for c, fit in led[:ALSO_WITHOUT]]
+        return begun + [(c, self.with_effect(plain, c, fit.point), None) for c, fit in ended[:ALSO_WITHOUT]]
 
-    def screened(
-        self, point: Point, floor: Floor, found: Sequence[Trial], most: float, led: Look | None = None, leaders: Collection[str] = ()
-    ):
+    def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float, led: Led | None = None):
         """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says.
 
-        `led`: the look of another method; what is not among its `leaders` has the one start here that it was fitted from there.
+        What did not lead among another method's first fits has the one start here that it was given there.
         """
         taken = {t.candidate.name for t in found}
         candidates = [c for c in self.problem.candidates if c.name not in taken and len(c.parameters) <= most]
-        if led is not None:
-            candidates = [c if c.key in leaders else replace(c, starts=(c.starts[led.chosen.get(c.key, 0)],)) for c in candidates]
+        if led is not None and led.chosen is not None:
+            at = led.chosen
+            candidates = [c if c.key in led.keys else replace(c, starts=(c.starts[at.get(c.key, 0)],)) for c in candidates]
         free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
         slopes = self.slopes(free, point, self.scored_recordings)
         return candidates, free, slopes, *self.screen(point, candidates, floor, slopes)

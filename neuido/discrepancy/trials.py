@@ -1,8 +1,9 @@
 """What the steps of a diagnosis leave: the declared model fitted, candidates fitted in full, and what one step of the growth found."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,6 +62,17 @@ class Trial:
         return f"lowers the error {math.exp(self.gain):.2f}-fold; {why} it takes {math.exp(at_least):.2f}-fold"
 
 
+class Led(NamedTuple):
+    """What led by another method."""
+
+    keys: Sequence[str]
+    """Of the candidates."""
+    ends: Mapping[str, Point]
+    """Where its fits ended, by key."""
+    chosen: Mapping[str, int] | None = None
+    """Where these were first fits, the start that each was given, by key."""
+
+
 @dataclass(eq=False)
 class Round:
     """One step of the growth."""
@@ -98,9 +110,10 @@ class Round:
         return float(np.quantile(self.null, 1 - level)) if len(self.null) else 0.0
 
     @property
-    def leaders(self) -> list[str]:
-        """Keys of the candidates that the chosen one could be mistaken for, and of the next best."""
-        return list(dict.fromkeys(t.candidate.key for t in (*self.members, *self.trials[:LED])))
+    def led(self) -> Led:
+        """The candidates that the chosen one could be mistaken for, and the next best."""
+        keys = list(dict.fromkeys(t.candidate.key for t in (*self.members, *self.trials[:LED])))
+        return Led(keys, {t.candidate.key: t.fit.point for t in self.trials})
 
 
 def score(errors: np.ndarray) -> float:

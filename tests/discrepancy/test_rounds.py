@@ -925,14 +925,14 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, over, th
             return over
 
         def look(self, fit, floor, led=None, beyond=np.inf, until=1.0):
-            asked.append(led and led.least[0][0])
-            return SimpleNamespace(least=[np.full(2, self.result**2)])
+            asked.append(led)
+            return SimpleNamespace(least=[np.full(2, self.result**2)], led=self.result)
 
     methods, starts = [Looking(left), Looking(there)], [stood(1.0)] * 2
     seen = attribution.by_first_fits(methods, starts, [0, 1], [0.0, 0.1])
     assert sorted((0, 1), key=lambda i: seen.get(i, np.inf)) == order
     both = left > 0.03 and not (left == 0.9 and over < 1.0)
-    assert asked == ([None, left**2] if both else [None])
+    assert asked == ([None, left] if both else [None])
     first = {0: pytest.approx(2 * np.log(min(left, 1.0)))}
     assert seen == (first | {1: pytest.approx(2 * np.log(there) + 0.1)} if both else {} if left == 0.9 else first)
     asked.clear()
@@ -1008,7 +1008,7 @@ def test_fits_begin_where_those_of_another_method_ended_too(monkeypatch):
 
     monkeypatch.setattr(Inference, "contest", seen)
     end = {"a": 3.1, "height": 7.0, "clip.inverse": 1.0 / 1.61}
-    look = inference.look(base.fit, base.floor, led=looked({"clip": (by_key["clip"], replace(base.fit, point=end))}))
+    look = inference.look(base.fit, base.floor, led=looked({"clip": (by_key["clip"], replace(base.fit, point=end))}).led)
     (begin,) = [begin for c, begin, _ in begun if c.key == "clip" and begin["clip.inverse"] == end["clip.inverse"]]
     assert begin == {**base.fit.point, "a": 3.1, "clip.inverse": end["clip.inverse"]}
     assert inference.seen is look and look.contest.best["clip"][1].cost == min(fit.cost for _, fit in look.contest.best.values())
@@ -1041,7 +1041,7 @@ def test_by_another_method_those_are_fitted_that_led_by_the_first(monkeypatch):
         for key, cost in (("cube", 1.0), ("clip", 2.0))
     }
     inference.look(base.fit, base.floor)
-    whole = inference.look(base.fit, base.floor, led=looked(ends, clip=1))
+    whole = inference.look(base.fit, base.floor, led=looked(ends, clip=1).led)
     shapes = {c.key: c.starts for c in screened[1]}
     assert shapes["clip"] == clip.starts[1:2] and shapes["cube"] == by_key["cube"].starts and set(shapes) == set(by_key)
     assert len(whole.contest.best) == 2 and "cube" in whole.contest.best
