@@ -191,14 +191,14 @@ class BodyRollouts(Problem):
     def others(self, setting: int) -> list[int]:
         """Of material points a finer step and grid and, where the body meets something, a lift of that, else a coarser grid.
 
-        Of finite elements, which meet a plane where it is, other meshes: coarser, and cut in another way. Grids would lend them the
-        dissipation of material points, and with it an effect that is not there.
+        Of finite elements, which meet a plane where it is, other meshes, coarser and cut in another way, and the grids: what a mesh gets
+        wrong no mesh knows alone.
         """
-        own = [i for i, s in enumerate(SETTINGS[: self.settings]) if i != setting and s.solver == SETTINGS[setting].solver]
+        able = [i for i, s in enumerate(SETTINGS[: self.settings]) if i != setting]
         if SETTINGS[setting].solver == "finite_elements":
-            return own
+            return [i for i in able if not SETTINGS[i].lift]
         without = (lambda s: s.cells < 1.0) if self.lifts else (lambda s: s.lift > 0.0)
-        return [i for i in own if not without(SETTINGS[i])]
+        return [i for i in able if SETTINGS[i].solver == "material_points" and not without(SETTINGS[i])]
 
     def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
         others, height, dx = self.others(setting), point.get(CONTACT_HEIGHT, 0.0), self.measured[0].scene.dx

@@ -58,7 +58,9 @@ def test_which_settings_are_directions(experiment, problem):
     names = [SETTINGS[s].name for s in problem.others(0)]
     assert names == ["0.5 of the step", "1.2 times the cells, 0.5 of the step", "colliders 0.5 cells higher"]
     elements = problem.solvers[1]
-    assert [SETTINGS[s].name for s in problem.others(elements)] == ["finite elements, 0.6 a particle", "finite elements, 6 a cell"]
+    names = [SETTINGS[s].name for s in problem.others(elements)]
+    assert len(names) == 6 and names[4:] == ["finite elements, 0.6 a particle", "finite elements, 6 a cell"]
+    assert not any(SETTINGS[s].lift for s in problem.others(elements))
 
     def changed(**parts):
         recordings = tuple(replace(r, scene=replace(r.scene, **parts)) for r in experiment.recordings)
