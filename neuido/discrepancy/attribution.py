@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from neuido.discrepancy.contests import BEYOND
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
@@ -15,6 +14,7 @@ from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.pairs import LOOKED_AHEAD, WORSE, beside_members, by_another_method, look_ahead
 from neuido.discrepancy.problem import Point, Problem
+from neuido.discrepancy.refining import BEYOND
 from neuido.discrepancy.rounds import ALPHA, UNEXPLAINED, WITHIN, Inference
 from neuido.discrepancy.trials import Round, Stand, Trial, score, unphysical
 from neuido.physics.effect_library import LIMITS
@@ -115,8 +115,8 @@ def diagnose(
         tell: Called with a line of progress.
         seconds: After which it comes to its end; see `Deadline`.
     """
-    memo, deadline = Memo(problem), Deadline(seconds)
-    deadline.pace = lambda: memo.pace
+    memo = Memo(problem)
+    deadline = Deadline(seconds, pace=lambda: memo.pace)
     tried: list[Inference] = []
     starts: list[Stand] = []
     for n in problem.solvers:

@@ -13,13 +13,15 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.contests import LEADERS, MANY, MEASURED, NEAR, SMALL, SOME_GAIN, Contest, Contests, Start
+from neuido.discrepancy.contests import LEADERS, MANY, Contest
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem
+from neuido.discrepancy.refining import MEASURED, NEAR, SOME_GAIN, Refining
+from neuido.discrepancy.starting import SMALL, Start
 from neuido.discrepancy.trials import Led, Round, Stand, Trial, score, times_over, unphysical
 
 ALPHA = 0.05
@@ -83,7 +85,7 @@ class Look(NamedTuple):
         return Led([c.key for c, _ in fits[:LED_BY]], {c.key: fit.point for c, fit in fits}, self.chosen)
 
 
-class Inference(Contests):
+class Inference(Refining):
     """The steps of a diagnosis on one problem.
 
     Args:

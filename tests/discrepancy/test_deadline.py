@@ -55,7 +55,7 @@ def test_where_a_simulation_is_slow_the_search_ends_earlier():
 def test_what_takes_long_after_the_search_is_left_out_too(block, monkeypatch):
     """A class whose next experiment would be simulated past the end."""
     clock = Clock(0.0)
-    monkeypatch.setattr(attribution, "Deadline", lambda seconds: Deadline(seconds, clock=clock))
+    monkeypatch.setattr(attribution, "Deadline", lambda seconds, **options: Deadline(seconds, clock=clock, **options))
     found = diagnose(restricted(body_problem(block), "drag_linear,drag_quadratic"), draws=39, most=1, seconds=60.0)
     found.rounds[0].members = found.rounds[0].trials[:2]
     assert next_experiment.propose(found) is not None and found.left_out == ()
@@ -76,7 +76,7 @@ def block(tmp_path_factory):
 @pytest.mark.parametrize("step", [0.0, 1e6])
 def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypatch):
     """The direction of a drag is all but exact, so that even the start of its fit is worth naming; nothing is refined, and it is told."""
-    monkeypatch.setattr(attribution, "Deadline", lambda seconds: Deadline(seconds, clock=Clock(step)))
+    monkeypatch.setattr(attribution, "Deadline", lambda seconds, **options: Deadline(seconds, clock=Clock(step), **options))
     problem = restricted(body_problem(block), "drag_linear,viscosity_shear,time_force")
     found = diagnose(problem, draws=39, most=2, seconds=60.0)
     assert math.isfinite(found.errors["after"]["drop"]) and found.evaluations > 0
@@ -93,7 +93,7 @@ def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypa
 def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
     """When the search ends with an effect named, that is fitted to its end, and nothing is looked for beside it."""
     clock, over, asked = Clock(0.0), [], []
-    monkeypatch.setattr(attribution, "Deadline", lambda seconds: Deadline(seconds, clock=clock))
+    monkeypatch.setattr(attribution, "Deadline", lambda seconds, **options: Deadline(seconds, clock=clock, **options))
     sought, finished = attribution.Inference.round, attribution.Inference.finished
 
     def late(self, *args, **options):

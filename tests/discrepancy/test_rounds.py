@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from neuido.discrepancy import attribution, contests, pairs, rounds
+from neuido.discrepancy import attribution, contests, pairs, refining, rounds, starting
 from neuido.discrepancy.answer import rejected, trace
 from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
 from neuido.discrepancy.deadline import Deadline
@@ -458,7 +458,8 @@ def test_a_size_behind_a_ridge_is_found_from_elsewhere(monkeypatch):
     found = diagnose(problem, keep=12)
     assert sorted(t.candidate.name for t in found.effects) == ["square", "step"]
     assert found.after["step.c"] == pytest.approx(1.026, abs=0.01)
-    monkeypatch.setattr(contests, "FAR", 1.0)
+    monkeypatch.setattr(starting, "FAR", 1.0)
+    monkeypatch.setattr(refining, "FAR", 1.0)
     assert "step" not in [t.candidate.name for t in diagnose(problem, keep=12).effects]
 
 
@@ -480,7 +481,8 @@ def test_a_size_of_the_other_sign_is_found_from_elsewhere(monkeypatch):
     found = diagnose(problem)
     assert [t.candidate.name for t in found.effects] == ["step"]
     assert found.after["step.c"] == pytest.approx(-5.106, abs=0.01)
-    monkeypatch.setattr(contests, "FAR", 1.0)
+    monkeypatch.setattr(starting, "FAR", 1.0)
+    monkeypatch.setattr(refining, "FAR", 1.0)
     assert not diagnose(problem).effects
 
 
@@ -560,7 +562,7 @@ def test_a_fit_goes_on_until_it_has_come_to_its_end(converged, monkeypatch):
     monkeypatch.setattr(Inference, "from_here", from_here)
     monkeypatch.setattr(Inference, "is_noise", lambda *_, **__: False)
     out = inference.polish(inference.problem.declared, {"square": (square, fit)}, start.fit, start.floor)
-    assert len(asked) == (2 if converged else 1 + contests.ONWARD)
+    assert len(asked) == (2 if converged else 1 + refining.ONWARD)
     assert out["square"][1].point["square.c"] == (1.66 if converged else 1.762)
 
 
@@ -964,7 +966,7 @@ def test_what_leaves_far_more_than_the_best_is_not_refined(monkeypatch):
     monkeypatch.setattr(Inference, "onward", lambda self, entries, floor: asked.extend(entries) or [(f, floor) for _, f, _ in entries])
     inference.polish(inference.problem.declared, best, base.fit, base.floor)
     assert [fit.point["square.c"] for _, fit, _ in asked] == [1.8]
-    monkeypatch.setattr(contests, "NEARBY", 10.0)
+    monkeypatch.setattr(refining, "NEARBY", 10.0)
     inference.polish(inference.problem.declared, best, base.fit, base.floor)
     assert [fit.point["square.c"] for _, fit, _ in asked] == [1.8, 1.8, 0.9]
 
@@ -1102,17 +1104,17 @@ def test_what_the_base_fit_made_up_for_is_no_faint_promise(monkeypatch):
     base, square = inference.start(), inference.problem.candidates[0]
     slopes = inference.slopes(inference.problem.declared, base.fit.point, inference.scored_recordings)
     least, begun = {}, [(square, {**base.fit.point, **square.starts[0]}, None)]
-    for far in (contests.LED_FAR + 0.1, contests.LED_FAR - 0.1):
+    for far in (starting.LED_FAR + 0.1, starting.LED_FAR - 0.1):
         monkeypatch.setattr(Inference, "moved", lambda self, point, far=far: far)
         monkeypatch.setattr(Inference, "costs", lambda self, points, floor: [1.0] + [1.2 + (self.at_declared(p) != p) for p in points[1:]])
-        least[far > contests.LED_FAR] = inference.sized(begun, base.fit, slopes, base.floor)[1]["square"]
-    assert least == {True: pytest.approx(1.2 / contests.BESIDE), False: 2.2}
+        least[far > starting.LED_FAR] = inference.sized(begun, base.fit, slopes, base.floor)[1]["square"]
+    assert least == {True: pytest.approx(1.2 / starting.BESIDE), False: 2.2}
 
 
 def test_fits_begin_half_way_to_what_is_stated_where_the_base_fit_went_far_from_it():
     inference = Inference(Line(clipped))
     square, point = inference.problem.candidates[0], {"a": 3.0}
-    base, size = Fit(point, ("a",), 1.0, np.zeros(1), 1, True), 0.3 * contests.FAR
+    base, size = Fit(point, ("a",), 1.0, np.zeros(1), 1, True), 0.3 * starting.FAR
     for far in (True, False):
         made = inference.tried((square, {**point, **square.starts[0]}, None), base, led_far=far)
         half = sorted(p["square.c"] for _, p, _ in made if p["a"] == pytest.approx(2.0))
@@ -1122,14 +1124,14 @@ def test_fits_begin_half_way_to_what_is_stated_where_the_base_fit_went_far_from_
 @pytest.mark.parametrize(("idle", "shapes", "kept"), [([], 4, 1), (["tilt"], 4, 3), (["tilt"], 2, 2)])
 def test_sizes_are_tried_in_every_shape(idle, shapes, kept, monkeypatch):
     """One start of a candidate of few parameters, and one in each of so many shapes of one with more, the best first."""
-    monkeypatch.setattr(contests, "SHAPES", shapes)
+    monkeypatch.setattr(starting, "SHAPES", shapes)
     inference = Inference(Turned(*idle))
     base, (turned,) = inference.start(), inference.problem.candidates
     slopes = inference.slopes(inference.problem.declared, base.fit.point, inference.scored_recordings)
     begun, least = inference.sized([(turned, {**base.fit.point, **turned.starts[0]}, None)], base.fit, slopes, base.floor)
     angles = [begin["turned.angle"] for _, begin, _ in begun]
     assert len(set(angles)) == len(angles) == kept
-    assert angles[0] == 4.0 and begun[0][1]["turned.c"] == contests.FAR
+    assert angles[0] == 4.0 and begun[0][1]["turned.c"] == starting.FAR
     costs = inference.costs([begin for _, begin, _ in begun], base.floor)
     assert costs == sorted(costs) and least["turned"] == pytest.approx(costs[0] / inference.costs([base.fit.point], base.floor)[0])
 
@@ -1137,7 +1139,7 @@ def test_sizes_are_tried_in_every_shape(idle, shapes, kept, monkeypatch):
 @pytest.mark.parametrize("together", [True, False])
 def test_a_look_that_is_late_tries_no_further_sizes(together, monkeypatch):
     """A batch may take long; what was not tried keeps its starts, and says nothing of what it leaves."""
-    monkeypatch.setattr(contests, "TRIED_AT_ONCE", 1)
+    monkeypatch.setattr(starting, "TRIED_AT_ONCE", 1)
     clock = [0.0]
     inference = Inference(Line(clipped, together=together), deadline=Deadline(100.0, clock=lambda: clock[0]))
     base = inference.start()

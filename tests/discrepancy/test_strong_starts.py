@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from neuido.discrepancy.attribution import diagnose
-from neuido.discrepancy.contests import LED_FAR
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import Inference
+from neuido.discrepancy.starting import LED_FAR
 
 S = np.linspace(-1.0, 1.0, 200)
 NOISE = 0.01

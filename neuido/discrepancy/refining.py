@@ -1,0 +1,241 @@
+"""The best fits once more: with the floor where they stand, from where another one stands, and from further away."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from neuido.discrepancy.contests import MANY, Contests, better
+from neuido.discrepancy.fit import Fit, Race
+from neuido.discrepancy.floors import Floor
+from neuido.discrepancy.problem import Candidate, Parameter, Point
+from neuido.discrepancy.starting import FAR, SMALL
+from neuido.discrepancy.trials import Round, Stand, score
+
+POLISHED = 4
+"""Candidates whose fits are refined from further starts."""
+IN_REACH = 4.0
+"""Times the lowest cost up to which that of a fit is worth refining: twice its error."""
+NEARBY = 2.5
+"""Times the least error, that of what is held out too, up to which a fit is worth refining."""
+BEYOND = 8.0
+"""Times the error of what another solver named beyond which fits are not refined: that has gained up to 7-fold."""
+MEASURED, NEAR = 6, 4.0
+"""Fits whose errors are measured with the differences of the settings where they end: so many of the best, within this factor of their
+errors."""
+ONWARD = 3
+"""Further fits of a candidate, each with the differences of the settings where the last one ended: while each gains `SOME_GAIN` or has
+not come to its end."""
+SOME_GAIN = math.log(1.2)
+"""Smaller gains are no reason to look further."""
+ALIKE = 0.3
+"""Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
+
+Onset = tuple[Sequence[Parameter], Fit, Sequence[Point]]
+"""What is fitted, a fit of it, and where further ones begin."""
+
+
+class Refining(Contests):
+    """The further fits of a step of a diagnosis."""
+
+    def polish(
+        self,
+        free: Sequence[Parameter],
+        best: Mapping[str, tuple[Candidate, Fit]],
+        base: Fit,
+        floor: Floor,
+        rival: Round | None = None,
+        other: tuple[Candidate, Fit] | None = None,
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """The best fits once more, from where they ended, from the declared values, and from those of the very best one.
+
+        The base fit may have led all of them astray, and its weights too, for the settings differ most where the model is wrong: each is
+        weighed by the floor where it stands. Which end is the best one is said by the errors, for weights differ. Where `rival`, the round
+        of another solver, named an effect that leaves far less than any of them, none is refined. `other`, the leading candidate's fit of
+        the other sign, is refined beside it.
+        """
+        ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
+        within = [entry for entry in ranked if entry[1].cost < IN_REACH * ranked[0][1].cost]
+        top = [entry for entry in within if len(entry[0].parameters) <= MANY][:POLISHED]
+        if not top:
+            return {}
+        before, *squares = self.mean_squares([base.point, *(fit.point for _, fit in top)], floor)
+        near = min(map(score, squares)) + 2.0 * math.log(NEARBY)
+        top, squares = zip(*((t, s) for t, s in zip(top, squares, strict=True) if t is top[0] or score(s) < near), strict=True)
+        if rival is not None and rival.chosen is not None and min(map(score, squares)) > rival.chosen.score + 2.0 * math.log(BEYOND):
+            return {}
+        gains = max(self.gain(before, square) for square in squares)
+        if (top[0][1].cost > 0.7 * self.costs([base.point], floor)[0] and gains < SOME_GAIN) or self.is_noise(squares[0]):
+            return {}
+        ends = (f"{c.key} ({self.typical(square):.3g})" for (c, _), square in zip(top, squares, strict=True))
+        self.tell(f"refining {', '.join(ends)} of {self.typical(before):.3g} {self.problem.unit}")
+        leading = ranked[0][1].point
+        out: dict[str, tuple[Candidate, Fit]] = {}
+        least: dict[str, float] = {}
+        if other is not None and other[1].cost < IN_REACH * ranked[0][1].cost:
+            top = (*top, other)
+        able = self.able(top)  # elsewhere there is no floor
+        entries = []
+        for c, fit in able:
+            starts = [fit.point, self.at_declared(fit.point)]
+            if fit is not ranked[0][1]:
+                starts.append({**fit.point, **{name: leading[name] for name in self.as_declared}})
+            entries.append(((*free, *c.parameters), fit, starts))
+        for (c, _), (found, own) in zip(able, self.onward(entries, floor), strict=True):
+            left = score(self.mean_squares([found.point], own, fitted=True)[0])
+            if left < least.get(c.key, math.inf):
+                least[c.key] = left
+                out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
+        return out
+
+    def able(self, fits: Sequence[tuple[Candidate, Fit]]) -> list[tuple[Candidate, Fit]]:
+        """Those that end where every recording runs."""
+        return [entry for entry, ok in zip(fits, self.which_run([fit.point for _, fit in fits]), strict=True) if ok]
+
+    def onward(self, entries: Sequence[Onset], floor: Floor) -> list[tuple[Fit, Floor]]:
+        """What `from_here` makes of each entry, and further from where that ends, up to `ONWARD` times."""
+        ends = self.from_here(entries, floor)
+        going = list(range(len(ends)))
+        for _ in range(ONWARD):
+            if self.deadline.over:
+                break
+            run = self.which_run([ends[i][0].point for i in going])
+            left = {i: self.mean_squares([ends[i][0].point], ends[i][1], fitted=True)[0] for i in going}
+            going = [i for i, ok in zip(going, run, strict=True) if ok and not self.is_noise(left[i], fitted=True)]
+            if not going:
+                break
+            made = self.from_here([(entries[i][0], ends[i][0], [ends[i][0].point]) for i in going], floor)
+            further = []
+            for i, (fit, there) in zip(going, made, strict=True):
+                gained = score(left[i]) - score(self.mean_squares([fit.point], there, fitted=True)[0])
+                if gained > 0:
+                    ends[i] = (fit, there)
+                    further += [i] * (not fit.converged or gained >= 2.0 * SOME_GAIN)
+            going = further
+        return ends
+
+    def from_here(self, entries: Sequence[Onset], like: Floor) -> list[tuple[Fit, Floor]]:
+        """Of each entry the best of its fit and of those from its starts, and the floor of all of them: that where the fit stands.
+
+        The fits of all entries run side by side.
+        """
+        self.foresee([fit.point for _, fit, _ in entries], fitted=True)
+        owns, requests, of = [], [], []
+        for k, (free, fit, starts) in enumerate(entries):
+            (own, _), race = self.stand(fit.point, like=like, fitted=True), Race()
+            moved = self.recentred(fit.point, own)
+            follow = {name: value for name, value in moved.items() if value != fit.point.get(name)}
+            begins = [{**start, **follow} if set(start) == set(fit.point) else start for start in starts]
+            requests += [self.request(free, begin, race=race) for begin in begins]
+            of += [k] * len(begins)
+            owns.append(own)
+        made = self.fits(requests, [owns[k] for k in of])
+        out = []
+        for k, (_, fit, _) in enumerate(entries):
+            ends = [fit, *(end for end, its in zip(made, of, strict=True) if its == k)]
+            left = [score(squares) for squares in self.mean_squares([end.point for end in ends], owns[k], fitted=True)]
+            out.append((ends[int(np.argmin(left))], owns[k]))
+        return out
+
+    def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[Stand]:
+        """Each fit, in their order, with what it leaves by `floor`, or for the leading ones by that where they end, if it leaves less.
+
+        What another grid does moves with the law: the differences at the base say little of it where a fit has gone far.
+        """
+        points = [fit.point for _, fit in best.values()]
+        found = [Stand(fit, floor, squares) for (_, fit), squares in zip(best.values(), self.mean_squares(points, floor), strict=True)]
+        if self.problem.settings == 1 or not points:
+            return found
+        order = sorted(range(len(points)), key=lambda i: score(found[i].errors))[:MEASURED]
+        limit = score(found[order[0]].errors) + 2.0 * math.log(NEAR)
+        leading = [i for i in order if score(found[i].errors) < limit and not self.is_noise(found[i].errors)]
+        self.foresee([points[i] for i in leading])
+        for i in leading:
+            if self.runs(points[i]):
+                there = Stand(found[i].fit, *self.stand(points[i], like=floor))
+                found[i] = min(found[i], there, key=lambda stand: score(stand.errors))
+        return found
+
+    def alike(
+        self,
+        free: Sequence[Parameter],
+        best: Mapping[str, tuple[Candidate, Fit]],
+        candidates: Sequence[Candidate],
+        chosen: Mapping[str, int],
+        columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
+        slopes: Mapping[int, np.ndarray],
+        floor: Floor,
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of the candidates that act on the data as the leading one does, from its fit, with the sizes that do as much.
+
+        A fit that started far from there may have been given up, and a class would lack one of its members.
+        """
+        small = [entry for entry in best.values() if len(entry[0].parameters) <= MANY]
+        if not small:
+            return {}
+        lead, fit = min(small, key=lambda entry: entry[1].cost)
+        if not lead.linear or lead.size_parameters != lead.parameters:
+            return {}
+        past, start = self.past(slopes, floor), lead.starts[chosen[lead.key]]
+        does = past(columns[lead.key, chosen[lead.key]]) @ np.array([fit.point[p.name] / start[p.name] for p in lead.parameters])
+        if not np.isfinite(does).all():
+            return {}
+        requests, of = [], []
+        without = {k: v for k, v in fit.point.items() if k not in start}
+        for c in candidates:
+            if c is lead or not c.linear or len(c.parameters) > MANY or (c.key in best and best[c.key][1].cost < 1.5 * fit.cost):
+                continue
+            for i, shape in enumerate(c.starts):
+                A = past(columns[c.key, i])
+                if not np.isfinite(A).all():
+                    continue
+                amount = np.linalg.lstsq(A, does, rcond=1e-6)[0]
+                if np.sum((does - A @ amount) ** 2) < ALIKE * np.sum(does**2):
+                    sizes = {p.name: min(max(shape[p.name] * f, p.lower), p.upper) for p, f in zip(c.size_parameters, amount, strict=True)}
+                    requests.append(self.request((*free, *c.parameters), without | dict(shape) | sizes, race=Race(fit.cost)))
+                    of.append(c)
+                    break
+        return better(zip(of, self.fits(requests, floor), strict=True), best)
+
+    def elsewhere(
+        self, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of one size once more, from the declared values and a larger size: the slope at zero may have led into a side valley."""
+        requests, of, race = [], [], Race(min((fit.cost for _, fit in best.values()), default=np.inf))
+        for key, (c, fit) in best.items():
+            if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
+                continue
+            (p,) = c.size_parameters
+            for sign in (1.0, -1.0) if p.lower < 0 else (1.0,):
+                size = min(max(sign * FAR * abs(starts[key][p.name]), p.lower), p.upper)
+                begin = dict(fit.point) | self.as_declared | {p.name: size}
+                requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
+                of.append(c)
+        self.tell(f"again from elsewhere: {', '.join(dict.fromkeys(c.key for c in of))}")
+        ended = list(zip(of, self.fits(requests, floor), strict=True))
+        found = better(ended, best)
+        return found | self.ahead(ended, {**best, **found}, floor)
+
+    def ahead(
+        self, ended: Sequence[tuple[Candidate, Fit]], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Ends of fits once more with the floor where they stand, those that leave least: candidates that then leave less than their best.
+
+        What another grid does there may be another thing than at the base, and by the weights of that the truth stays behind.
+        """
+        ended = [entry for entry in ended if np.isfinite(entry[1].cost)]
+        if self.problem.settings == 1 or not ended or self.deadline.over:
+            return {}
+        left = [score(squares) for squares in self.mean_squares([fit.point for _, fit in ended], floor)]
+        out: dict[str, tuple[Candidate, Fit]] = {}
+        ends = self.able([ended[i] for i in np.argsort(left)[:POLISHED]])
+        made = self.from_here([((*self.problem.declared, *c.parameters), fit, [fit.point]) for c, fit in ends], floor)
+        for (c, _), (further, own) in zip(ends, made, strict=True):
+            rival = (out.get(c.key) or best[c.key])[1]
+            there = self.stand(rival.point, like=floor, fitted=True)[0]
+            pairs = ((further, own), (rival, there))
+            mine, its = (score(self.mean_squares([end.point], f, fitted=True)[0]) for end, f in pairs)
+            if mine < its:
+                out[c.key] = (c, replace(further, cost=self.costs([further.point], floor)[0]))
+        return out
