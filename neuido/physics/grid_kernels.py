@@ -212,20 +212,27 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         chunk: int,
         grid: wp.array(dtype=vec4),
         velocity: wp.array(dtype=vec4),
+        clear: bool,
     ):
-        """(momentum, mass) -> (velocity, 0) of each node; an empty node gets zero."""
+        """(momentum, mass) -> (velocity, 0) of each node; an empty node gets zero.
+
+        `clear` empties the nodes for the next scatter, and leaves what an empty one has: no particle gives it weight.
+        """
         first = wp.tid() * chunk
         for node in range(first, first + chunk):
             g = grid[node]
             out = vec3(real(0.0), real(0.0), real(0.0))
             if g[3] > real(0.0):
+                if clear:
+                    grid[node] = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
                 s = index[node][3]
                 x = place(index[node], origin[s], dx[s])
                 if not clamped(x, s, lower, upper):
                     v0 = vec3(g[0], g[1], g[2]) / g[3]
                     u = push(v0, x, dt[s], gravity[s], force, s)
                     out = collide(u, x, s, kind.shape[1], plane, kind, friction, dt[s], force)
-            velocity[node] = vec4(out[0], out[1], out[2], real(0.0))
+            if g[3] > real(0.0) or not clear:
+                velocity[node] = vec4(out[0], out[1], out[2], real(0.0))
 
     @adjoint_kernel
     def update_grid_adjoint(

@@ -21,7 +21,7 @@ import warp as wp
 
 from neuido.physics import grid_kernels
 from neuido.physics.device import start_warp
-from neuido.physics.reductions import ADD4, ARRANGE, RUN
+from neuido.physics.reductions import ADD4, ARRANGE, GATHER, RUN, SPREAD
 
 PAD = 2
 """Nodes added on each side of the domain."""
@@ -45,10 +45,20 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
     name = f"neuido.mpm.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
     func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
     adjoint_kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+
+    @func
+    def velocity_of(q: vec4):
+        return vec3(q[0], q[1], q[2])
+
+    @func
+    def first_moment(w: vec3):
+        """Weights times the node's number in the stencil, 0, 1 or 2."""
+        return vec3(real(0.0), w[1], real(2.0) * w[2])
 
     if real is wp.float32 and not enable_backward:
 
@@ -60,6 +70,15 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
 
         @wp.func_native(ADD4)
         def add4(grid: wp.array(dtype=vec4), node: int, value: vec4, run: int): ...
+
+        @wp.func_native(SPREAD)
+        def spread(
+            grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3,
+            b: vec3, ax: vec3, ay: vec3, az: vec3, mass: real, run: int,
+        ): ...  # fmt: skip
+
+        @wp.func_native(GATHER)
+        def moments(velocity: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3) -> mat43: ...
 
     else:
 
@@ -75,6 +94,53 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         def add4(grid: wp.array(dtype=vec4), node: int, value: vec4, run: int):
             wp.atomic_add(grid, node, value)
 
+        @func
+        def spread(
+            grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3,
+            b: vec3, ax: vec3, ay: vec3, az: vec3, mass: real, run: int,
+        ):  # fmt: skip
+            bi = b
+            for i in range(3):
+                bj = bi
+                for j in range(3):
+                    bk = bj
+                    wij = wx[i] * wy[j]
+                    row = node + (i * ny + j) * nz
+                    for k in range(3):
+                        w = wij * wz[k]
+                        wp.atomic_add(grid, row + k, vec4(w * bk[0], w * bk[1], w * bk[2], w * mass))
+                        bk = bk + az
+                    bj = bj + ay
+                bi = bi + ax
+
+        @func
+        def moments(velocity: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3):
+            ix = first_moment(wx)
+            iy = first_moment(wy)
+            iz = first_moment(wz)
+            v = vec3(real(0.0), real(0.0), real(0.0))
+            vx = v
+            vy = v
+            vz = v
+            for i in range(3):
+                ui = vec3(real(0.0), real(0.0), real(0.0))
+                uiy = ui
+                uiz = ui
+                for j in range(3):
+                    row = node + (i * ny + j) * nz
+                    u0 = velocity_of(velocity[row])
+                    u1 = velocity_of(velocity[row + 1])
+                    u2 = velocity_of(velocity[row + 2])
+                    uj = wz[0] * u0 + wz[1] * u1 + wz[2] * u2
+                    ui += wy[j] * uj
+                    uiy += iy[j] * uj
+                    uiz += wy[j] * (iz[1] * u1 + iz[2] * u2)
+                v += wx[i] * ui
+                vx += ix[i] * ui
+                vy += wx[i] * uiy
+                vz += wx[i] * uiz
+            return mat43(v[0], v[1], v[2], vx[0], vx[1], vx[2], vy[0], vy[1], vy[2], vz[0], vz[1], vz[2])
+
     @func
     def spline(f: real):
         """Quadratic B-spline weights of the three nodes; f in [0.5, 1.5) is the distance to the first one in cells."""
@@ -87,11 +153,6 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     def spline_slope(f: real):
         """Their derivative with respect to the position in cells."""
         return vec3(f - real(1.5), real(-2.0) * (f - real(1.0)), f - real(0.5))
-
-    @func
-    def first_moment(w: vec3):
-        """Weights times the node's number in the stencil, 0, 1 or 2."""
-        return vec3(real(0.0), w[1], real(2.0) * w[2])
 
     @func
     def first_node(cells: vec3, nodes: wp.vec3i):
@@ -114,10 +175,6 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     def within(cells: vec3, base: wp.vec3i):
         """Distance to the first node of the stencil, in cells."""
         return vec3(cells[0] - real(base[0]), cells[1] - real(base[1]), cells[2] - real(base[2]))
-
-    @func
-    def velocity_of(q: vec4):
-        return vec3(q[0], q[1], q[2])
 
     @func
     def column(A: mat33, c: int):
@@ -169,19 +226,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         az = column(hA, 2)
         bi = m * v[p] - hA * f
         node = flat(s, base, nodes)
-        run = run_of(node)
-        for i in range(3):
-            bj = bi
-            for j in range(3):
-                bk = bj
-                wij = wx[i] * wy[j]
-                row = node + (i * nodes[1] + j) * nodes[2]
-                for k in range(3):
-                    w = wij * wz[k]
-                    add4(grid, row + k, vec4(w * bk[0], w * bk[1], w * bk[2], w * m), run)
-                    bk = bk + az
-                bj = bj + ay
-            bi = bi + ax
+        spread(grid, node, nodes[1], nodes[2], wx, wy, wz, bi, ax, ay, az, m, run_of(node))
 
     @adjoint_kernel
     def particles_to_grid_adjoint(
@@ -300,14 +345,21 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         F_trial: wp.array(dtype=mat33),
         step: int,
         status: wp.array(dtype=wp.int32),
+        span: wp.array(dtype=real),
     ):
-        """Gather; a particle that is lost, too fast or not finite leaves its code, index and step in `status`."""
+        """Gather; a particle that is lost, too fast or not finite leaves its code, index and step in `status`.
+
+        Where `span` has room for two figures, it is widened to the x of all particles.
+        """
         p = wp.tid()
         s = scene[p]
         h = dx[s]
         zero = vec3(real(0.0), real(0.0), real(0.0))
         if held[p] == wp.uint8(1):
             x_next[p] = x[p]
+            if span.shape[0] > 0:
+                wp.atomic_min(span, 0, x[p][0])
+                wp.atomic_max(span, 1, x[p][0])
             v_next[p] = zero
             C_next[p] = wp.outer(zero, zero)
             F_trial[p] = F[p]
@@ -318,34 +370,18 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
-        ix = first_moment(wx)
-        iy = first_moment(wy)
-        iz = first_moment(wz)
         node = flat(s, base, nodes)
-        v = zero
-        vx = zero
-        vy = zero
-        vz = zero
-        for i in range(3):
-            ui = zero
-            uiy = zero
-            uiz = zero
-            for j in range(3):
-                row = node + (i * nodes[1] + j) * nodes[2]
-                u0 = velocity_of(velocity[row])
-                u1 = velocity_of(velocity[row + 1])
-                u2 = velocity_of(velocity[row + 2])
-                uj = wz[0] * u0 + wz[1] * u1 + wz[2] * u2
-                ui += wy[j] * uj
-                uiy += iy[j] * uj
-                uiz += wy[j] * (iz[1] * u1 + iz[2] * u2)
-            v += wx[i] * ui
-            vx += ix[i] * ui
-            vy += wx[i] * uiy
-            vz += wx[i] * uiz
+        m = moments(velocity, node, nodes[1], nodes[2], wx, wy, wz)
+        v = vec3(m[0, 0], m[0, 1], m[0, 2])
+        vx = vec3(m[1, 0], m[1, 1], m[1, 2])
+        vy = vec3(m[2, 0], m[2, 1], m[2, 2])
+        vz = vec3(m[3, 0], m[3, 1], m[3, 2])
         C = (real(4.0) / h) * wp.matrix_from_cols(vx - f[0] * v, vy - f[1] * v, vz - f[2] * v)
         y = x[p] + dt[s] * v
         x_next[p] = y
+        if span.shape[0] > 0:
+            wp.atomic_min(span, 0, y[0])
+            wp.atomic_max(span, 1, y[0])
         v_next[p] = v
         C_next[p] = C
         F_trial[p] = F[p] + dt[s] * (C * F[p])

@@ -123,6 +123,10 @@ class Simulator:
         scene, *axes = (torch.arange(n, dtype=torch.int32) for n in self.grid_shape)
         s, i, j, k = torch.meshgrid(scene, *axes, indexing="ij")
         self.node_index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(self.device)
+        watched = self.device.type == "cpu" and len(self.scenes) == 1
+        self.span = torch.empty(2 if watched else 0, dtype=self.dtype, device=self.device)
+        """Least and greatest x [m] of the particles after a substep, of one scene on the CPU."""
+        self.ends = self.span.numpy() if watched else None
         self._sort()
         self.keep_grid = keep == "all" or (keep == "auto" and self.node_count <= 4 * len(self.mass))
         self.cache = RolloutCache(graphs and self.device.type == "cuda")

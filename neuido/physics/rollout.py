@@ -177,6 +177,9 @@ class Plan:
         spare = [tuple(torch.empty_like(t) for t in now) for _ in range(2)] if stride > 1 else []
         scratch, other = torch.empty_like(now[3]), torch.empty_like(now[3])
         copies = sim.device.type == "cpu"
+        clears = copies and tape.grid is None  # what the nodes held goes as they are read, instead of in a pass of its own
+        for name in ("grid", "velocity") if clears else ():
+            sim.scratch(name).zero_()
         stretches = Stretches()
         steady = all(len(t) <= 1 for t in (pull, inputs[STATES + 6]))  # neither pull nor growth has a row for each substep
         tape.status.zero_()
@@ -187,16 +190,17 @@ class Plan:
                 # on the CPU a frame is a copy: launches whose tensors always lie in the same places are repeated as they were
                 then = spare[n % 2] if frame is None or (spare and copies) else frame
                 same = n % 2 if spare and copies and steady and n else None
-                reach = self.reach(now[0]) if tape.grid is None else slice(None)
+                reach = self.reach(now[0] if n == 0 else None) if tape.grid is None else slice(None)
                 tau = scratch if tape.tau is None else tape.tau[n]
                 trial = other if tape.trial is None else tape.trial[n]
                 grid = sim.scratch("grid") if tape.grid is None else tape.grid[n]
                 velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
                 if n == 0 or not steady:
                     material, pull_now = self.material(inputs, n), at_step(pull, n)
-                grid[reach].zero_()
+                if not clears:
+                    grid.zero_()
                 scatter = partial(self.scatter, inputs, now, material, elastic, tau, grid)
-                update = partial(self.on_grid, grid, pull_now, force, friction, velocity, reach)
+                update = partial(self.on_grid, grid, pull_now, force, friction, velocity, reach, clears)
                 gather = partial(self.gather, n, now, then, material, plastic, velocity, trial, tape.status)
                 if same is None:
                     scatter()
@@ -235,7 +239,7 @@ class Plan:
         x, _, _, F, history = now
         self.launch(sim.kernels.grid_to_particles, len(x),
                     [sim.particles.scene, sim.sorted_held, sim.origin, sim.dx, sim.dt, sim.nodes, velocity, x, F, *then[:3],
-                     trial if self.corrects else then[3], n, status], self.block)  # fmt: skip
+                     trial if self.corrects else then[3], n, status, sim.span], self.block)  # fmt: skip
         if plastic is not None:
             plastic.forward(trial, then[3])
         if material is not None:
@@ -269,17 +273,20 @@ class Plan:
         if self.layout.e_max:
             self.launch(k.remember, len(F), [F, self.layout.at_e_max, history, history_next])
 
-    def reach(self, x: Tensor) -> slice:
-        """The nodes that particles at x touch, as a range: on the CPU the planes between the first and the last one, with one to spare."""
+    def reach(self, x: Tensor | None) -> slice:
+        """The nodes that particles touch, as a range: on the CPU the planes between the first and the last one, with one to spare.
+
+        The particles are at x, or, if None, where the last `gather` left them.
+        """
         sim = self.simulator
-        if sim.device.type != "cpu" or sim.scene_count > 1:
+        if not len(sim.span):
             return slice(None)
-        low, high = (float(t) for t in torch.aminmax(x[:, 0]))
+        low, high = sim.ends.tolist() if x is None else [float(t) for t in torch.aminmax(x[:, 0])]
+        sim.ends[:] = math.inf, -math.inf
         if not math.isfinite(high - low):
             return slice(None)
-        planes, plane = sim.grid_shape[1], sim.node_count // sim.grid_shape[1]
-        dx = sim.scenes[0].dx
-        edge = sim.scenes[0].lower[0] - kernels.PAD * dx
+        planes, dx = sim.grid_shape[1], sim.scenes[0].dx
+        edge, plane = sim.scenes[0].lower[0] - kernels.PAD * dx, sim.node_count // planes
         first, last = (min(max(int((at - edge) / dx - 0.5), 0), planes - 3) for at in (low, high))
         return slice(max(first - 1, 0) * plane, min(last + 4, planes) * plane)
 
@@ -294,9 +301,19 @@ class Plan:
         arguments = [sim.particles.scene, sim.origin, sim.dx, sim.dt, sim.nodes, mass, sim.sorted_volume, x, v, C, tau, grid]
         self.launch(sim.kernels.particles_to_grid, len(x), arguments, self.block)
 
-    def on_grid(self, grid: Tensor, pull: Tensor, force: Tensor, friction: Tensor, velocity: Tensor, reach: slice = slice(None)) -> None:
+    def on_grid(
+        self,
+        grid: Tensor,
+        pull: Tensor,
+        force: Tensor,
+        friction: Tensor,
+        velocity: Tensor,
+        reach: slice = slice(None),
+        clear: bool = False,
+    ) -> None:
+        """Velocities of the nodes within reach; `clear` empties them for the next scatter."""
         sim = self.simulator
-        inputs = [*self.grid_inputs(pull, force, friction, reach), grid[reach], velocity[reach]]
+        inputs = [*self.grid_inputs(pull, force, friction, reach), grid[reach], velocity[reach], clear]
         self.launch(sim.kernels.update_grid, len(grid[reach]) // sim.chunk, inputs)
 
     def grid_inputs(self, pull: Tensor, force: Tensor, friction: Tensor, reach: slice = slice(None)) -> list:

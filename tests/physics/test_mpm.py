@@ -125,7 +125,7 @@ def kernel_cases(stage: Stage):
     walls = {"plane": table.plane, "kind": table.kind, "lower": sim.clamp_lower, "upper": sim.clamp_upper}
     grid = stage.grid()
     velocity = torch.zeros_like(grid)
-    moving = {"held": sim.held, "step": 0, "status": torch.zeros(3, dtype=torch.int32, device=DEVICE)}
+    moving = {"held": sim.held, "step": 0, "status": torch.zeros(3, dtype=torch.int32, device=DEVICE), "span": x.new_zeros(0)}
     next_C = torch.zeros_like(C)
     field = 0.5 * stage.random(velocity)
     return {
@@ -142,7 +142,7 @@ def kernel_cases(stage: Stage):
         "update_grid": (
             {**{k: place[k] for k in ("origin", "dx", "dt")}, "index": sim.node_index,
              "chunk": sim.chunk, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
-             "friction": table.friction.clone(), "grid": grid},
+             "friction": table.friction.clone(), "grid": grid, "clear": False},
             ["gravity", "force", "friction", "grid"],
             {"velocity": velocity},
         ),
@@ -278,6 +278,42 @@ def test_float32_follows_float64():
     runs = [Simulator(scenes, bodies, dtype=dtype, device=DEVICE).rollout(20, law, every=20) for dtype in (torch.float32, torch.float64)]
     for name, a, b in zip("xvCF", *runs):
         assert float((a.double() - b).abs().max() / b.abs().max()) < 2e-4, name
+
+
+@pytest.mark.parametrize("name", ["particles_to_grid", "grid_to_particles"])
+def test_sums_over_lanes_equal_the_plain_ones(name):
+    """The transfers in float32 have source of their own; those in float64 are Warp's."""
+    stage = Stage()
+    inputs, _, outputs = kernel_cases(stage)[name]
+    plain = {key: t.clone() for key, t in outputs.items()}
+    launch(stage, getattr(stage.sim.kernels, name), dict(inputs) | plain)
+
+    def single(values):
+        return {k: t.float() if isinstance(t, torch.Tensor) and t.is_floating_point() else t for k, t in values.items()}
+
+    lanes = single(outputs)
+    launch(stage, getattr(kernels.build(wp.float32), name), single(inputs) | lanes)
+    for key, expected in plain.items():
+        assert float(expected.abs().max()) > 0
+        assert float((lanes[key].double() - expected).abs().max() / expected.abs().max()) < 1e-5, key
+
+
+def test_nodes_that_a_substep_empties_are_as_good_as_new():
+    """Without a tape the nodes in reach are emptied as they are read; with one each substep has nodes of its own."""
+    scene = Scene(cells=16, dt=1e-3, gravity=(0.0, 0.0, 0.0), walls=Walls("slip", 0.0))
+    sim = Simulator(scene, block((0.25, 0.375, 0.375), (0.5, 0.625, 0.625), (4, 4, 4), velocity=(3.0, 0.5, 0.0)), device=DEVICE,
+                    keep="all")  # fmt: skip
+    law = FixedCorotated(2e4, 0.3)
+    young = torch.tensor(2e4, requires_grad=True)
+    taped = [t.detach() for t in sim.rollout(160, FixedCorotated(young, 0.3), every=20)]
+    assert float(taped[0][-1, :, 0].min() - taped[0][0, :, 0].max()) > 2 * scene.dx  # far from where it began
+    beside = sim.state.x + torch.tensor([scene.dx, 0.0, 0.0], device=DEVICE)  # in nodes to which the body begins with a weight of zero
+    bad = sim.state._replace(x=beside, v=sim.state.v * torch.nan)
+    with torch.no_grad():
+        for _ in range(2):
+            assert all(same(a, b) for a, b in zip(taped, sim.rollout(160, law, every=20)))
+            with pytest.raises(UserError):  # leaves nodes that are not finite
+                sim.rollout(20, law, state=bad, every=20, check=False)
 
 
 @pytest.mark.parametrize(
