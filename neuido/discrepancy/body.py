@@ -27,7 +27,7 @@ from neuido.physics import effect_kernels, law_kernels
 from neuido.physics.device import real_of
 from neuido.physics.effect_library import KNOTS
 from neuido.physics.meshing import follow
-from neuido.physics.threads import _one_thread_each, pool
+from neuido.physics.threads import one_thread_each, pool
 
 POISSON = 0.0, 0.495
 """What the simulators take: waves grow without bound towards 0.5."""
@@ -93,7 +93,7 @@ class BodyProblem(BodyRollouts):
     def _side_by_side(self, runs: Sequence[Run]) -> Iterator[np.ndarray]:
         """Every motion by itself, as many at a time as there are cores."""
         waiting: list[list[Future]] = []
-        with _one_thread_each():
+        with one_thread_each():
             try:
                 for run in runs:
                     waiting.append([_workers().submit(self._predict, [run._replace(groups=[group])]) for group in run.groups])

@@ -20,7 +20,7 @@ from neuido.physics.effects import Effects
 from neuido.physics.law import ElasticLaw, PlasticLaw
 from neuido.physics.meshing import Mesh, mesh_body
 from neuido.physics.mpm import Simulator
-from neuido.physics.threads import _one_thread_each, pool
+from neuido.physics.threads import one_thread_each, pool
 from neuido.types import Body, ParticleState, Scene
 
 SAFETY = 0.5
@@ -241,7 +241,7 @@ class FiniteElements:
             for assembly in self.assemblies:
                 one(assembly)
         else:
-            with _one_thread_each():
+            with one_thread_each():
                 list(self.pool.map(one, self.assemblies))
         self._check(frames, steps, every, inner_of)
         return frames

@@ -18,7 +18,7 @@ FRICTION = 8
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
+def one_thread_each() -> Iterator[None]:
     """torch's own threads would crowd those of the scenes."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -79,7 +79,7 @@ class Scenes:
     def each(self, function: Callable[[int], T]) -> list[T]:
         """The function of every scene's number, as many at a time as there are cores; the first error is raised."""
         pool = self.whole.simulator.pool
-        with _one_thread_each():
+        with one_thread_each():
             return list(pool.map(function, range(len(self.plans))))
 
 
