@@ -38,20 +38,16 @@ def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "
     if not chosen:
         raise UserError(f"parts = {parts!r} names none: choose from {', '.join(PARTS)}")
 
-    import torch
+    from neuido.physics.threads import one_thread_each
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # for matrices this small a second thread costs more than it brings
     folder, sections = Path(out), []
-    try:
+    with one_thread_each():
         for part in (part for part in PARTS if part in chosen):
             begun = time.monotonic()
             body = {"laws": _laws, "video": _video, "loop": _loop}[part](folder, settings)
             spent = time.monotonic() - begun
             print(f"{part}: {spent:.0f} s\n", flush=True)
             sections.append(f'{body}<p class="note">{spent:.0f} s.</p>')
-    finally:
-        torch.set_num_threads(threads)
     target = folder / "report.html"
     _write(target, "\n".join(sections))
     print(f"report: {target}")

@@ -149,7 +149,7 @@ def _block(count: int) -> Tensor:
     return (at - 0.5).abs() < BLOCK / 2
 
 
-@one_thread_each()  # with matrices this small threads wait for each other
+@one_thread_each()
 def _fit(x: Tensor, y: Tensor, w: Tensor, own: Tensor, aside: Tensor, generator: torch.Generator) -> tuple[nn.Module, int]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))

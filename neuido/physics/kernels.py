@@ -139,7 +139,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                 vx += ix[i] * ui
                 vy += wx[i] * uiy
                 vz += wx[i] * uiz
-            return mat43(v[0], v[1], v[2], vx[0], vx[1], vx[2], vy[0], vy[1], vy[2], vz[0], vz[1], vz[2])
+            return wp.matrix_from_rows(v, vx, vy, vz)
 
     @func
     def spline(f: real):
@@ -179,6 +179,13 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     @func
     def column(A: mat33, c: int):
         return vec3(A[0, c], A[1, c], A[2, c])
+
+    @func
+    def widen(span: wp.array(dtype=real), at: real):
+        """Take a figure into the least and the greatest one, where there is room for them."""
+        if span.shape[0] > 0:
+            wp.atomic_min(span, 0, at)
+            wp.atomic_max(span, 1, at)
 
     @func
     def cell_of(y: vec3, origin: vec3, h: real, nodes: wp.vec3i):
@@ -357,9 +364,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         zero = vec3(real(0.0), real(0.0), real(0.0))
         if held[p] == wp.uint8(1):
             x_next[p] = x[p]
-            if span.shape[0] > 0:
-                wp.atomic_min(span, 0, x[p][0])
-                wp.atomic_max(span, 1, x[p][0])
+            widen(span, x[p][0])
             v_next[p] = zero
             C_next[p] = wp.outer(zero, zero)
             F_trial[p] = F[p]
@@ -372,16 +377,11 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         wz = spline(f[2])
         node = flat(s, base, nodes)
         m = moments(velocity, node, nodes[1], nodes[2], wx, wy, wz)
-        v = vec3(m[0, 0], m[0, 1], m[0, 2])
-        vx = vec3(m[1, 0], m[1, 1], m[1, 2])
-        vy = vec3(m[2, 0], m[2, 1], m[2, 2])
-        vz = vec3(m[3, 0], m[3, 1], m[3, 2])
-        C = (real(4.0) / h) * wp.matrix_from_cols(vx - f[0] * v, vy - f[1] * v, vz - f[2] * v)
+        v = m[0]
+        C = (real(4.0) / h) * wp.matrix_from_cols(m[1] - f[0] * v, m[2] - f[1] * v, m[3] - f[2] * v)
         y = x[p] + dt[s] * v
         x_next[p] = y
-        if span.shape[0] > 0:
-            wp.atomic_min(span, 0, y[0])
-            wp.atomic_max(span, 1, y[0])
+        widen(span, y[0])
         v_next[p] = v
         C_next[p] = C
         F_trial[p] = F[p] + dt[s] * (C * F[p])

@@ -19,7 +19,7 @@ FRICTION = 8
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """torch's own threads would crowd those of the scenes."""
+    """torch's own threads would crowd those of the scenes, and cost more than they bring where matrices are small."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
