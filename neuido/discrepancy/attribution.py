@@ -268,7 +268,8 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
 def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:
     """Weigh each class of effects again beside all others that were found: the best one of each stays, with those near it.
 
-    So are simpler candidates that came close: before the others were found a force of many parameters may have stood for two effects.
+    So are simpler candidates that came close: before the others were found a force of many parameters may have stood for two effects. And
+    where all of them together leave more than noise, the others that came close: a neighbour of the true one may have led alone.
     """
     for r in rounds:
         if r.chosen not in found:
@@ -277,7 +278,10 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
         beside = tuple(p for t in rest for p in t.candidate.parameters)
         own = {p.name for p in r.chosen.candidate.parameters}
         without = {k: v for k, v in base.point.items() if k not in own}
-        members = [t for t in (*r.members, *simpler(r, r.chosen)) if t.candidate.name not in {o.candidate.name for o in rest}]
+        left = inference.mean_squares([base.point], floor)[0]
+        rivals = simpler(r, r.chosen) + ([] if inference.is_settled(left) else neighbours(r, r.chosen))
+        taken = {o.candidate.name for o in rest}
+        members = [t for t in dict.fromkeys((*r.members, *rivals)) if t.candidate.name not in taken]
         if len(members) == 1:
             continue
         requests = []
@@ -307,6 +311,14 @@ def simpler(r: Round, chosen: Trial) -> list[Trial]:
     narrower = [t for t in others if t.candidate.name in LIMITS.get(chosen.candidate.name, ())]
     fewer = [t for t in others if t not in narrower and len(t.candidate.size_parameters) < sizes and t.score < limit]
     return narrower + sorted(fewer, key=lambda t: t.penalised)[:LOOKED_AHEAD]
+
+
+def neighbours(r: Round, chosen: Trial) -> list[Trial]:
+    """The best trials of no more parameters than the chosen one that came close to it."""
+    most, limit = len(chosen.candidate.parameters), chosen.score + 2.0 * math.log(CLOSE)
+    others = [t for t in r.trials if t not in r.members and not unphysical(t.candidate, t.fit.point)]
+    close = [t for t in others if len(t.candidate.parameters) <= most and t.score < limit]
+    return sorted(close, key=lambda t: t.penalised)[:LOOKED_AHEAD]
 
 
 def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:

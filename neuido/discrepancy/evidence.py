@@ -6,7 +6,6 @@ out of every recording, as in the errors of a diagnosis. Reference: Westfall and
 maximum over candidates).
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -86,7 +85,8 @@ class LinearModel:
 def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: np.ndarray, *, data: np.ndarray | None = None) -> float:
     """Logarithm of the ratio of errors, before over after: the smaller of those of the fitted and of the held-out recordings.
 
-    Of the held-out ones alone where the fitted ones are at the noise before and after: the declared parameters have taken the effect in
+    Each is the geometric mean over its recordings, as in the score: where one is far off whatever the effect, the others still count. Of
+    the held-out ones alone where the fitted ones are at the noise before and after: the declared parameters have taken the effect in
     there, and what they predict of the others says so. All arguments but `fitted` are mean squares of the parts.
 
     Args:
@@ -99,7 +99,7 @@ def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: n
     fitted = np.array(fitted)
 
     def ratio(group: np.ndarray) -> float:
-        return 0.5 * math.log(min(max(before[group].mean(), 1e-300), 1e300) / min(max(after[group].mean(), 1e-300), 1e300))
+        return 0.5 * float(np.mean(np.log(np.clip(before[group], 1e-300, 1e300)) - np.log(np.clip(after[group], 1e-300, 1e300))))
 
     if not (~fitted).any():
         return ratio(fitted)

@@ -20,8 +20,8 @@ FAR_ABOVE = 4.0
 """Times its floor above which the best few effects are tried with a second one, however little each gains alone."""
 BLIND_GAIN = 2.0 * LEAST_GAIN
 """What an effect must gain in the fitted recordings to be tried with a second one although it foretells nothing of those held out."""
-PROMISED = 0.6
-"""Share of the misfit that a second effect may leave, as the screening beside a member of a class predicts it, to be fitted there."""
+PROMISED = 0.9
+"""Share of the misfit that a second effect may leave beside a first one, predicted or by one simulation, to be fitted there."""
 BESIDE = 3
 """Members of a class beside which a second effect is looked for."""
 
@@ -74,14 +74,15 @@ def fits_alone(inference: Inference, first: Round, others: Sequence[Trial]) -> l
 
 
 def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> list[Round]:
-    """Where a class was found and leaves more than noise: a member beside which a second effect is named, and the round of that one.
+    """Where one effect was found and leaves more than noise: a member of its class beside which a second one is named, and that round.
 
-    Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two.
+    Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two. Nor was a
+    second one looked for beside what lies within its floor.
     """
     first = rounds[0]
-    if len(first.members) < 2 or inference.is_settled(at.errors):
-        return []
     grown = first.chosen if len(rounds) > 1 else None
+    if inference.is_settled(at.errors):
+        return []
     return second_beside(inference, first, [t for t in first.members if t is not grown], at.errors, at=at)
 
 

@@ -6,7 +6,7 @@ recordings that were held out against a parametric bootstrap of the largest gain
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -83,6 +83,20 @@ class Look(NamedTuple):
         """The candidates of the least costs."""
         fits = sorted(self.contest.best.values(), key=lambda entry: entry[1].cost)
         return Led([c.key for c, _ in fits[:LED_BY]], {c.key: fit.point for c, fit in fits}, self.chosen)
+
+
+class Promising(NamedTuple):
+    """Which candidates are to be fitted, and where their fits begin."""
+
+    candidates: list[Candidate]
+    free: tuple[Parameter, ...]
+    slopes: dict[int, np.ndarray]
+    columns: dict[tuple[str, int], dict[int, np.ndarray]]
+    chosen: dict[str, int]
+    """The start of each candidate that the screening put first."""
+    starts: list[Start]
+    promise: dict[str, float]
+    """The least share of the misfit that a candidate leaves, predicted by the screening or by one simulation."""
 
 
 class Inference(Refining):
@@ -208,23 +222,7 @@ class Inference(Refining):
         `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
         which there are no others; `until`: share of the search's time past which there are none.
         """
-        ends = led.ends if led is not None else {}
-        first = not found and (led is None or led.chosen is not None)
-        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most, led)
-        hurried = self.deadline.past(until)
-        chosen, begun = self.begin(base, floor, found, led, candidates, free, slopes, ranked, columns, hurried=hurried)
-        starts = [(c, self.with_effect(base.point, c, ends[c.key]), None) for c in candidates if c.key in chosen and c.key in ends] + begun
-        promise = {c.key: stays for stays, c, *_ in reversed(ranked)}
-        if first and not hurried:
-            starts, least = self.sized(starts, base, slopes, floor, until=until)
-            promise |= {key: min(share, promise.get(key, math.inf)) for key, share in least.items()}
-            starts.sort(key=lambda start: promise.get(start[0].key, math.inf))
-            if not self.problem.together:
-                runs, ahead = {c.key for _, c, *_ in ranked}, list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS]
-                able = [c for c, *_ in starts if c.linear and c.key in runs and c.key in least and c.key not in ahead]
-                faint = {c.key for c in able if promise[c.key] > FAINT}
-                starts = [start for start in starts if start[0].key not in faint]
-                chosen = {key: i for key, i in chosen.items() if key not in faint}
+        candidates, free, slopes, columns, chosen, starts, promise = self.promising(base, floor, found, led, most=most, until=until)
         hopeful = {c.key for c in candidates if promise.get(c.key, math.inf) < HOPELESS or not c.linear}
         self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
 
@@ -236,6 +234,41 @@ class Inference(Refining):
         look = Look(base, candidates, free, slopes, columns, chosen, contest, left[:1])
         self.seen = self.seen if found else look
         return look
+
+    def promising(
+        self,
+        base: Fit,
+        floor: Floor,
+        found: Sequence[Trial] = (),
+        led: Led | None = None,
+        *,
+        most: float = math.inf,
+        until: float = 1.0,
+    ) -> Promising:
+        """Screen the candidates, and say which are to be fitted and where their fits begin; arguments as those of `look`."""
+        ends = led.ends if led is not None else {}
+        first = not found and (led is None or led.chosen is not None)
+        candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most, led)
+        hurried = self.deadline.past(until)
+        chosen, begun = self.begin(base, floor, found, led, candidates, free, slopes, ranked, columns, hurried=hurried)
+        starts = [(c, self.with_effect(base.point, c, ends[c.key]), None) for c in candidates if c.key in chosen and c.key in ends] + begun
+        promise = {c.key: stays for stays, c, *_ in reversed(ranked)}
+        if (first or found) and not hurried:
+            starts, least = self.sized(starts, base, slopes, floor, until=until)
+            promise |= {key: min(share, promise.get(key, math.inf)) for key, share in least.items()}
+            starts.sort(key=lambda start: promise.get(start[0].key, math.inf))
+            keys = list(dict.fromkeys(c.key for c, *_ in starts))
+            out: set[str] = set()
+            if found:
+                near = _near(promise[c.key] for c, *_ in starts if len(c.parameters) <= MANY)
+                out = {key for key in keys[self.keep :] if promise.get(key, math.inf) >= near}
+            elif not self.problem.together:
+                runs = {c.key for _, c, *_ in ranked}
+                able = {c.key for c, *_ in starts if c.linear and c.key in runs and c.key in least}
+                out = {key for key in keys[LEADERS:] if key in able and promise[key] > FAINT}
+            starts = [start for start in starts if start[0].key not in out]
+            chosen = {key: i for key, i in chosen.items() if key not in out}
+        return Promising(candidates, free, slopes, columns, chosen, starts, promise)
 
     def begin(
         self,
@@ -258,12 +291,13 @@ class Inference(Refining):
         chosen: dict[str, int] = {}
         starts: list[Start] = []
         # what many parameters could fit says little of how near the others are
-        near = min(2.0 * min((stays for stays, c, *_ in ranked if len(c.parameters) <= MANY), default=0.0), HOPELESS)
+        near = _near(stays for stays, c, *_ in ranked if len(c.parameters) <= MANY)
         keep, leaders = (self.keep, ()) if led is None else (min(self.keep, OWN), led.keys)
         first = led is None and not found
         for stays, c, i, begin in ranked:
             leads = c.key in leaders
-            small = first and len(c.parameters) <= SMALL and (stays < VAIN or not c.linear)
+            # beside an effect they are tried at larger sizes before any is chosen
+            small = ((found and not hurried) or (first and (stays < VAIN or not c.linear))) and len(c.parameters) <= SMALL
             if c.key not in chosen and (keep > 0 or leads or small or (led is None and stays < near)):
                 keep -= not (small or leads)
                 chosen[c.key] = i
@@ -326,9 +360,8 @@ class Inference(Refining):
         return times_over(at.errors, self.floors(at.fit.point, free, at.floor))
 
     def promised(self, at: Stand, beside: Trial) -> float:
-        """The least share of the misfit there that an effect of few parameters would leave, as the screening predicts it."""
-        *_, ranked, _ = self.screened(at.fit.point, at.floor, [beside], MANY)
-        return min((stays for stays, *_ in ranked), default=1.0)
+        """The least share of the misfit there that an effect of few parameters would leave, predicted or by one simulation."""
+        return min(self.promising(at.fit, at.floor, [beside], most=MANY).promise.values(), default=1.0)
 
     def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel) -> Round:
         """A round with the trials that fits make, and what is chosen of them."""
@@ -444,3 +477,8 @@ class Inference(Refining):
         made = [replace(c, candidates={k: v for k, v in c.candidates.items() if k in common}) for c in made]
         return evidence.LinearModel([c for c, p in zip(made, self.parts, strict=True) if p.fitted],
                                     [c for c, p in zip(made, self.parts, strict=True) if not p.fitted], seed=self.seed)  # fmt: skip
+
+
+def _near(promises: Iterable[float]) -> float:
+    """Share of the misfit below which a candidate beyond the first few may promise as much as they do."""
+    return min(2.0 * min(promises, default=0.0), HOPELESS)

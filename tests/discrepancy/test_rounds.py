@@ -486,7 +486,7 @@ def test_a_size_of_the_other_sign_is_found_from_elsewhere(monkeypatch):
     assert not diagnose(problem).effects
 
 
-def test_what_an_effect_leaves_within_the_floor_is_searched_no_further(monkeypatch):
+def test_what_an_effect_leaves_within_the_floor_is_searched_only_where_another_one_promises_much(monkeypatch):
     def searches(y):
         lines = []
         found = diagnose(Tones(y, "low", "high"), tell=lines.append)
@@ -497,10 +497,10 @@ def test_what_an_effect_leaves_within_the_floor_is_searched_no_further(monkeypat
 
     both, more = searches(lambda t: low(t) + 0.25 * np.sin(62 * t))
     assert both == ["high", "low"] and more == 2
+    assert searches(lambda t: low(t) + 0.25 * np.sin(90 * t)) == (["low"], 2)
     monkeypatch.setattr(Inference, "floors", lambda self, point, free, floor: np.full(2, 0.15**2))
-    assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t)) == (["low"], 1)
-    monkeypatch.setattr("neuido.discrepancy.attribution.FURTHER", 0.0)
-    assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t))[1] == 2
+    assert searches(lambda t: low(t) + 0.25 * np.sin(90 * t)) == (["low"], 1)
+    assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t)) == (["high", "low"], 2)  # unless one promises much
 
 
 def test_a_fit_that_goes_astray_where_it_is_finished_is_not_taken(monkeypatch):
@@ -650,6 +650,42 @@ def test_a_second_effect_is_looked_for_beside_each_member_of_a_class(monkeypatch
     assert all(e == pytest.approx(NOISE, rel=0.2) for e in found.errors["after"].values())
     monkeypatch.setattr(pairs, "PROMISED", 0.0)
     assert names(diagnose(problem)) == ["mix"]
+
+
+def test_a_neighbour_takes_the_place_of_an_effect_once_the_other_one_was_found(monkeypatch):
+    """`mix` comes nearest alone, by far, and beside it the second effect leaves more than noise."""
+    one, two, three = (np.sin(w * T) for w in (40, 62, 87))
+    shapes = {"low": one, "high": two, "mix": one + 0.3 * two + 0.06 * three}
+    problem = Mixed({name: (shape, shape) for name, shape in shapes.items()}, {"low": 0.9, "high": 0.5})
+    start = (inference := Inference(problem)).start()
+    alone = inference.round(start.fit, start.floor, [])
+    assert [t.candidate.name for t in alone.members] == ["mix"]
+    assert names(diagnose(problem, most=2)) == ["high", "low"]
+    monkeypatch.setattr(attribution, "neighbours", lambda r, chosen: [])
+    assert names(diagnose(problem, most=2)) == ["high", "mix"]
+
+
+class Late(Tones):
+    """What the candidate `late` does begins at a size of one."""
+
+    def __init__(self, y):
+        super().__init__(y, "low")
+        late = Candidate("late", (Parameter("late.c", "1", 0.0, 0.3, -9.0, 9.0),), ({"late.c": 0.3},), "flight")
+        self.__dict__["candidates"] = (*self.candidates, late)
+
+    def predict(self, points, recording, setting=0):
+        late = np.array([max(p.get("late.c", 0.0) - 1.0, 0.0) for p in points])
+        return super().predict(points, recording, setting) + late[:, None] * np.sin(62 * T)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_second_effect_is_tried_at_larger_sizes(together, monkeypatch):
+    problem = Late(lambda t: 3.0 * t + 2.0 * np.sin(40 * t) + 0.5 * np.sin(62 * t))
+    problem.__dict__["_together"] = together
+    found = diagnose(problem)
+    assert names(found) == ["late", "low"] and found.after["late.c"] == pytest.approx(1.5, abs=0.01)
+    monkeypatch.setattr(Inference, "sized", lambda self, starts, *_, **__: (list(starts), {}))
+    assert names(diagnose(problem)) == ["low"]
 
 
 class Apart(Mixed):

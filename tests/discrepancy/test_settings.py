@@ -71,6 +71,9 @@ def test_gain_is_the_held_out_one_where_the_fitted_recordings_are_noise():
     assert gain(draw, noise, fitted, noise, data=np.array([9.0, 16.0]) * noise) == pytest.approx(0.5 * np.log(1.3))
     assert gain(draw, noise, fitted, noise, data=draw) == pytest.approx(np.log(4.0))
     assert gain(np.array([4.0]), np.array([1.0]), [True], np.ones(1)) == pytest.approx(np.log(2.0))
+    # one recording that stays far off does not hide what the other one shows
+    before, after = np.array([16.0, 16.0, 400.0]), np.array([1.0, 1.0, 400.0])
+    assert gain(before, after, [True, False, False], 0.1 * np.ones(3)) == pytest.approx(np.log(2.0))
 
 
 def test_a_fit_is_weighed_by_no_more_than_is_left():
