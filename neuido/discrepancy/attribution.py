@@ -279,7 +279,7 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
         own = {p.name for p in r.chosen.candidate.parameters}
         without = {k: v for k, v in base.point.items() if k not in own}
         left = inference.mean_squares([base.point], floor)[0]
-        rivals = simpler(r, r.chosen) + ([] if inference.is_settled(left) else neighbours(r, r.chosen))
+        rivals = simpler(r, r.chosen) + ([] if inference.is_noise(left) else neighbours(r, r.chosen))
         taken = {o.candidate.name for o in rest}
         members = [t for t in dict.fromkeys((*r.members, *rivals)) if t.candidate.name not in taken]
         if len(members) == 1:

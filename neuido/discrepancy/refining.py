@@ -12,6 +12,7 @@ from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.problem import Candidate, Parameter, Point
 from neuido.discrepancy.starting import FAR, SMALL
 from neuido.discrepancy.trials import Round, Stand, score
+from neuido.physics.effect_library import LIMITS
 
 POLISHED = 4
 """Candidates whose fits are refined from further starts."""
@@ -197,6 +198,33 @@ class Refining(Contests):
                     of.append(c)
                     break
         return better(zip(of, self.fits(requests, floor), strict=True), best)
+
+    def limits(
+        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], candidates: Sequence[Candidate], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of what the leading candidate is in a limit, from its declared values and with sizes that do about as much.
+
+        The base fit may have led theirs astray.
+        """
+        if not best:
+            return {}
+        lead, fit = min(best.values(), key=lambda entry: entry[1].cost)
+        own = [
+            c for c in candidates if c.name in LIMITS.get(lead.name, ()) and not (c.key in best and best[c.key][1].cost < 1.5 * fit.cost)
+        ]
+        if not own:
+            return {}
+        begin, wanted = lead.without(fit.point), self.fitted_recordings
+        moved = [there - here for here, there in self.predicted([begin, fit.point], wanted).values()]
+        columns = self.columns(begin, own, wanted)
+        requests = []
+        for c in own:
+            A, does = np.concatenate([columns[c.key, 0][n] for n in wanted]), np.concatenate(moved)
+            amount = np.linalg.lstsq(A, does, rcond=1e-6)[0] if np.isfinite(A).all() and np.isfinite(does).all() else np.ones(A.shape[1])
+            start = c.starts[0]
+            sizes = {p.name: min(max(start[p.name] * f, p.lower), p.upper) for p, f in zip(c.size_parameters, amount, strict=True)}
+            requests.append(self.request((*free, *c.parameters), begin | dict(start) | sizes))
+        return better(zip(own, self.fits(requests, floor), strict=True), best)
 
     def elsewhere(
         self, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor

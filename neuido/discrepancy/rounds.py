@@ -151,6 +151,7 @@ class Inference(Refining):
         candidates, free, slopes, columns, chosen = look.candidates, look.free, look.slopes, look.columns, look.chosen
         best, other, errors = dict(look.contest.best), look.contest.other, self.mean_squares([base.point], floor)[0]
         if not self.deadline.skips("refining the best fits"):
+            best |= self.limits(free, best, candidates, floor)
             best |= self.polish(free, best, base, floor, rival, other)
             best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
         floors = self.floors(base.point, free, floor)

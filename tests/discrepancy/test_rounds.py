@@ -341,6 +341,21 @@ def test_a_limit_of_an_effect_takes_its_place_however_far_it_was_alone(monkeypat
     assert sorted(t.candidate.name for t in diagnose(standing_for_two()).effects) == ["high", "low"]
 
 
+def test_a_limit_of_the_leading_candidate_is_fitted_from_its_declared_values(monkeypatch):
+    inference = Inference(standing_for_two())
+    by_key = {c.key: c for c in inference.problem.candidates}
+    start, free = inference.start(), inference.problem.declared
+    far = Fit({"a": -3.0, "low.c": 0.0}, ("a", "low.c"), 1e9, np.zeros(1), 1, True)
+    (chord,) = inference.fits([inference.request((*free, *by_key["chord"].parameters), start.fit.point)], start.floor)
+    best = {"chord": (by_key["chord"], chord), "low": (by_key["low"], far)}
+    assert not inference.limits(free, best, inference.problem.candidates, start.floor)
+    monkeypatch.setitem(refining.LIMITS, "chord", ("low",))
+    ((key, (_, fit)),) = inference.limits(free, best, inference.problem.candidates, start.floor).items()
+    assert key == "low" and fit.point["low.c"] == pytest.approx(0.5, abs=0.02) and "chord.c" not in fit.point
+    near = replace(far, cost=1.2 * chord.cost)  # it is as good already
+    assert not inference.limits(free, best | {"low": (by_key["low"], near)}, inference.problem.candidates, start.floor)
+
+
 @pytest.mark.parametrize("apart", ["pull.k", ""])
 def test_a_size_whose_sign_no_fit_changes_is_fitted_from_either_side(apart):
     """k (c f - g), which has a place: the best linear start has the wrong k, and on the way to the other sign c would pass infinity."""
