@@ -118,9 +118,10 @@ class BodyProblem(BodyRollouts):
         for key, run in zip(keys, runs, strict=True):
             together = shared.pop(key, [])  # those that were asked for with an earlier one are there
             size = max((self.batch or TOGETHER) // max(len(together), 1), 1)
-            for at in range(0, max((len(one.groups) for one in together), default=0), size):
-                parts = [one._replace(groups=one.groups[at : at + size]) for one in together]
-                self._predict([part for part in parts if part.groups])
+            with one_thread_each():  # what the host prepares is small: its threads would wait for one another
+                for at in range(0, max((len(one.groups) for one in together), default=0), size):
+                    parts = [one._replace(groups=one.groups[at : at + size]) for one in together]
+                    self._predict([part for part in parts if part.groups])
             yield run.out
 
     def _alike(self, points: Sequence[Point], recording: int) -> list[list[int]]:
