@@ -306,19 +306,27 @@ def simpler(r: Round, chosen: Trial) -> list[Trial]:
 
     A limit need not come close: what the force of many parameters gained beyond it may be the other effect's.
     """
-    sizes, limit = len(chosen.candidate.size_parameters), chosen.score + 2.0 * math.log(CLOSE)
-    others = [t for t in r.trials if t not in r.members and not unphysical(t.candidate, t.fit.point)]
-    narrower = [t for t in others if t.candidate.name in LIMITS.get(chosen.candidate.name, ())]
-    fewer = [t for t in others if t not in narrower and len(t.candidate.size_parameters) < sizes and t.score < limit]
-    return narrower + sorted(fewer, key=lambda t: t.penalised)[:LOOKED_AHEAD]
+    sizes = len(chosen.candidate.size_parameters)
+    narrower = [t for t in others(r) if t.candidate.name in LIMITS.get(chosen.candidate.name, ())]
+    fewer = [t for t in close_to(r, chosen) if t not in narrower and len(t.candidate.size_parameters) < sizes]
+    return narrower + fewer[:LOOKED_AHEAD]
 
 
 def neighbours(r: Round, chosen: Trial) -> list[Trial]:
     """The best trials of no more parameters than the chosen one that came close to it."""
-    most, limit = len(chosen.candidate.parameters), chosen.score + 2.0 * math.log(CLOSE)
-    others = [t for t in r.trials if t not in r.members and not unphysical(t.candidate, t.fit.point)]
-    close = [t for t in others if len(t.candidate.parameters) <= most and t.score < limit]
-    return sorted(close, key=lambda t: t.penalised)[:LOOKED_AHEAD]
+    most = len(chosen.candidate.parameters)
+    return [t for t in close_to(r, chosen) if len(t.candidate.parameters) <= most][:LOOKED_AHEAD]
+
+
+def others(r: Round) -> list[Trial]:
+    """The trials of a round that can be, but for those of the class that was named."""
+    return [t for t in r.trials if t not in r.members and not unphysical(t.candidate, t.fit.point)]
+
+
+def close_to(r: Round, chosen: Trial) -> list[Trial]:
+    """Those of `others` that came close to the chosen one, best first."""
+    limit = chosen.score + 2.0 * math.log(CLOSE)
+    return sorted((t for t in others(r) if t.score < limit), key=lambda t: t.penalised)
 
 
 def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:

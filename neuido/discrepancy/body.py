@@ -85,7 +85,8 @@ class BodyProblem(BodyRollouts):
         return rows
 
     def predict_several(self, asks: Sequence[Ask]) -> Rows:
-        yield from (self._side_by_side if self.device == "cpu" else self._in_one_launch)(self._runs(asks))
+        with one_thread_each():  # what the host prepares for a launch is small too
+            yield from (self._side_by_side if self.device == "cpu" else self._in_one_launch)(self._runs(asks))
 
     def _runs(self, asks: Sequence[Ask]) -> list[Run]:
         return [Run(points, self._alike(points, n), n, s, np.empty((len(points), len(self.recordings[n].y)))) for points, n, s in asks]
@@ -93,18 +94,17 @@ class BodyProblem(BodyRollouts):
     def _side_by_side(self, runs: Sequence[Run]) -> Iterator[np.ndarray]:
         """Every motion by itself, as many at a time as there are cores."""
         waiting: list[list[Future]] = []
-        with one_thread_each():
-            try:
-                for run in runs:
-                    waiting.append([_workers().submit(self._predict, [run._replace(groups=[group])]) for group in run.groups])
-                for run, own in zip(runs, waiting, strict=True):
-                    for one in own:
-                        one.result()
-                    yield run.out
-            finally:
-                for own in waiting:
-                    for one in own:
-                        one.cancel()
+        try:
+            for run in runs:
+                waiting.append([_workers().submit(self._predict, [run._replace(groups=[group])]) for group in run.groups])
+            for run, own in zip(runs, waiting, strict=True):
+                for one in own:
+                    one.result()
+                yield run.out
+        finally:
+            for own in waiting:
+                for one in own:
+                    one.cancel()
 
     def _in_one_launch(self, runs: Sequence[Run]) -> Iterator[np.ndarray]:
         """The recordings of a setting in launches that they share, where their frames are the same substeps."""
@@ -118,10 +118,9 @@ class BodyProblem(BodyRollouts):
         for key, run in zip(keys, runs, strict=True):
             together = shared.pop(key, [])  # those that were asked for with an earlier one are there
             size = max((self.batch or TOGETHER) // max(len(together), 1), 1)
-            with one_thread_each():  # what the host prepares is small: its threads would wait for one another
-                for at in range(0, max((len(one.groups) for one in together), default=0), size):
-                    parts = [one._replace(groups=one.groups[at : at + size]) for one in together]
-                    self._predict([part for part in parts if part.groups])
+            for at in range(0, max((len(one.groups) for one in together), default=0), size):
+                parts = [one._replace(groups=one.groups[at : at + size]) for one in together]
+                self._predict([part for part in parts if part.groups])
             yield run.out
 
     def _alike(self, points: Sequence[Point], recording: int) -> list[list[int]]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neuido.discrepancy.floors import past_nuisances
+from neuido.discrepancy.trials import score
 
 NOISE_ALONE = 1.8
 """Mean squares up to so many times that of the noise are noise."""
@@ -99,7 +100,7 @@ def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: n
     fitted = np.array(fitted)
 
     def ratio(group: np.ndarray) -> float:
-        return 0.5 * float(np.mean(np.log(np.clip(before[group], 1e-300, 1e300)) - np.log(np.clip(after[group], 1e-300, 1e300))))
+        return 0.5 * (score(np.minimum(before[group], 1e300)) - score(np.minimum(after[group], 1e300)))
 
     if not (~fitted).any():
         return ratio(fitted)

@@ -255,7 +255,7 @@ class Laboratory:
         for p in self.problem.declared:
             if p.log:
                 value = point.get(p.name, p.value)
-                out += [dict(point) | {p.name: min(max(value * f, p.lower), p.upper)} for f in (0.5, 2.0)]
+                out += [dict(point) | {p.name: p.within(value * f)} for f in (0.5, 2.0)]
         return out
 
     def start(self, near: Point | None = None) -> Stand | None:

@@ -79,10 +79,10 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
     Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two. Nor was a
     second one looked for beside what lies within its floor.
     """
-    first = rounds[0]
-    grown = first.chosen if len(rounds) > 1 else None
     if inference.is_settled(at.errors):
         return []
+    first = rounds[0]
+    grown = first.chosen if len(rounds) > 1 else None
     return second_beside(inference, first, [t for t in first.members if t is not grown], at.errors, at=at)
 
 

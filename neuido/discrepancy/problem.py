@@ -44,7 +44,10 @@ class Parameter:
 
     def physical(self, coordinate: float) -> float:
         """The inverse of `coordinate`, clipped to the range."""
-        value = float(np.exp(coordinate * self.scale) if self.log else coordinate * self.scale)
+        return self.within(float(np.exp(coordinate * self.scale) if self.log else coordinate * self.scale))
+
+    def within(self, value: float) -> float:
+        """The value, clipped to the range."""
         return min(max(value, self.lower), self.upper)
 
 
@@ -85,6 +88,11 @@ class Candidate:
     def shape(self, point: Point) -> tuple[float, ...]:
         """What a point has of the other parameters."""
         return tuple(point.get(p.name, p.value) for p in self.parameters if p not in self.size_parameters)
+
+    def times(self, start: Mapping[str, float], factors: Sequence[float]) -> dict[str, float]:
+        """A start with its sizes times factors, clipped to their ranges."""
+        sizes = {p.name: p.within(start[p.name] * f) for p, f in zip(self.size_parameters, factors, strict=True)}
+        return dict(start) | sizes
 
     def own(self, point: Point) -> dict[str, float]:
         """What a point has of this effect."""

@@ -193,8 +193,7 @@ class Refining(Contests):
                     continue
                 amount = np.linalg.lstsq(A, does, rcond=1e-6)[0]
                 if np.sum((does - A @ amount) ** 2) < ALIKE * np.sum(does**2):
-                    sizes = {p.name: min(max(shape[p.name] * f, p.lower), p.upper) for p, f in zip(c.size_parameters, amount, strict=True)}
-                    requests.append(self.request((*free, *c.parameters), without | dict(shape) | sizes, race=Race(fit.cost)))
+                    requests.append(self.request((*free, *c.parameters), without | c.times(shape, amount), race=Race(fit.cost)))
                     of.append(c)
                     break
         return better(zip(of, self.fits(requests, floor), strict=True), best)
@@ -215,15 +214,13 @@ class Refining(Contests):
         if not own:
             return {}
         begin, wanted = lead.without(fit.point), self.fitted_recordings
-        moved = [there - here for here, there in self.predicted([begin, fit.point], wanted).values()]
+        does = np.concatenate([there - here for here, there in self.predicted([begin, fit.point], wanted).values()])
         columns = self.columns(begin, own, wanted)
         requests = []
         for c in own:
-            A, does = np.concatenate([columns[c.key, 0][n] for n in wanted]), np.concatenate(moved)
+            A = np.concatenate([columns[c.key, 0][n] for n in wanted])
             amount = np.linalg.lstsq(A, does, rcond=1e-6)[0] if np.isfinite(A).all() and np.isfinite(does).all() else np.ones(A.shape[1])
-            start = c.starts[0]
-            sizes = {p.name: min(max(start[p.name] * f, p.lower), p.upper) for p, f in zip(c.size_parameters, amount, strict=True)}
-            requests.append(self.request((*free, *c.parameters), begin | dict(start) | sizes))
+            requests.append(self.request((*free, *c.parameters), begin | c.times(c.starts[0], amount)))
         return better(zip(own, self.fits(requests, floor), strict=True), best)
 
     def elsewhere(
@@ -236,7 +233,7 @@ class Refining(Contests):
                 continue
             (p,) = c.size_parameters
             for sign in (1.0, -1.0) if p.lower < 0 else (1.0,):
-                size = min(max(sign * FAR * abs(starts[key][p.name]), p.lower), p.upper)
+                size = p.within(sign * FAR * abs(starts[key][p.name]))
                 begin = dict(fit.point) | self.as_declared | {p.name: size}
                 requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
                 of.append(c)

@@ -64,27 +64,6 @@ UNEXPLAINED_EXACT = 3.0
 """The same where nothing is discretised: the noise that a folder states is an estimate."""
 
 
-class Look(NamedTuple):
-    """The first fits of a step."""
-
-    base: Fit
-    candidates: list[Candidate]
-    free: tuple[Parameter, ...]
-    slopes: dict[int, np.ndarray]
-    columns: dict[tuple[str, int], dict[int, np.ndarray]]
-    chosen: dict[str, int]
-    """The start of each candidate that was fitted."""
-    contest: Contest
-    least: list[np.ndarray]
-    """What the best of them leaves, mean squares of the parts; empty where nothing runs."""
-
-    @property
-    def led(self) -> Led:
-        """The candidates of the least costs."""
-        fits = sorted(self.contest.best.values(), key=lambda entry: entry[1].cost)
-        return Led([c.key for c, _ in fits[:LED_BY]], {c.key: fit.point for c, fit in fits}, self.chosen)
-
-
 class Promising(NamedTuple):
     """Which candidates are to be fitted, and where their fits begin."""
 
@@ -93,10 +72,26 @@ class Promising(NamedTuple):
     slopes: dict[int, np.ndarray]
     columns: dict[tuple[str, int], dict[int, np.ndarray]]
     chosen: dict[str, int]
-    """The start of each candidate that the screening put first."""
+    """The start of each candidate that gets a fit which the screening put first."""
     starts: list[Start]
     promise: dict[str, float]
     """The least share of the misfit that a candidate leaves, predicted by the screening or by one simulation."""
+
+
+class Look(NamedTuple):
+    """The first fits of a step."""
+
+    base: Fit
+    asked: Promising
+    contest: Contest
+    least: list[np.ndarray]
+    """What the best of them leaves, mean squares of the parts; empty where nothing runs."""
+
+    @property
+    def led(self) -> Led:
+        """The candidates of the least costs."""
+        fits = sorted(self.contest.best.values(), key=lambda entry: entry[1].cost)
+        return Led([c.key for c, _ in fits[:LED_BY]], {c.key: fit.point for c, fit in fits}, self.asked.chosen)
 
 
 class Inference(Refining):
@@ -148,7 +143,7 @@ class Inference(Refining):
         first = rival is None and not found
         seen = self.seen is not None and self.seen.base is base and not found
         look = self.seen if seen else self.look(base, floor, found, rival.led if rival is not None else None, most=most)
-        candidates, free, slopes, columns, chosen = look.candidates, look.free, look.slopes, look.columns, look.chosen
+        candidates, free, slopes, columns, chosen, *_ = look.asked
         best, other, errors = dict(look.contest.best), look.contest.other, self.mean_squares([base.point], floor)[0]
         if not self.deadline.skips("refining the best fits"):
             best |= self.limits(free, best, candidates, floor)
@@ -223,7 +218,8 @@ class Inference(Refining):
         `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
         which there are no others; `until`: share of the search's time past which there are none.
         """
-        candidates, free, slopes, columns, chosen, starts, promise = self.promising(base, floor, found, led, most=most, until=until)
+        asked = self.promising(base, floor, found, led, most=most, until=until)
+        candidates, free, *_, starts, promise = asked
         hopeful = {c.key for c in candidates if promise.get(c.key, math.inf) < HOPELESS or not c.linear}
         self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
 
@@ -232,7 +228,7 @@ class Inference(Refining):
 
         contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
         left = sorted(self.mean_squares([fit.point for _, fit in contest.best.values()], floor), key=score)
-        look = Look(base, candidates, free, slopes, columns, chosen, contest, left[:1])
+        look = Look(base, asked, contest, left[:1])
         self.seen = self.seen if found else look
         return look
 
@@ -295,10 +291,10 @@ class Inference(Refining):
         near = _near(stays for stays, c, *_ in ranked if len(c.parameters) <= MANY)
         keep, leaders = (self.keep, ()) if led is None else (min(self.keep, OWN), led.keys)
         first = led is None and not found
+        every = bool(found) and not hurried  # beside an effect they are tried at larger sizes before any is chosen
         for stays, c, i, begin in ranked:
             leads = c.key in leaders
-            # beside an effect they are tried at larger sizes before any is chosen
-            small = ((found and not hurried) or (first and (stays < VAIN or not c.linear))) and len(c.parameters) <= SMALL
+            small = len(c.parameters) <= SMALL and (every or (first and (stays < VAIN or not c.linear)))
             if c.key not in chosen and (keep > 0 or leads or small or (led is None and stays < near)):
                 keep -= not (small or leads)
                 chosen[c.key] = i

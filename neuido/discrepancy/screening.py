@@ -81,10 +81,7 @@ class Screening(Laboratory):
                     factor = np.where(np.abs(factor) < 0.2, np.where(factor < 0, -0.2, 0.2), factor)
                 else:
                     factor = np.ones(len(sizes))
-                begin = dict(point) | dict(start)
-                for p, f in zip(sizes, factor, strict=True):
-                    begin[p.name] = min(max(start[p.name] * f, p.lower), p.upper)
-                ranked.append((stays, c, i, begin))
+                ranked.append((stays, c, i, dict(point) | c.times(start, factor)))
         ranked.sort(key=lambda entry: entry[0])
         return ranked, columns
 

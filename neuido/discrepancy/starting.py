@@ -147,7 +147,7 @@ class Starting(Screening):
         (p,) = c.size_parameters
         size, signs = abs(c.starts[0][p.name]), (1.0, -1.0) if p.lower < 0 else (1.0,)
         begin = {**begun, **{name: base.point.get(name, value) for name, value in self.as_declared.items()}}
-        near, middle, far = ([{p.name: min(max(sign * f * size, p.lower), p.upper)} for sign in signs] for f in (1.0, math.sqrt(FAR), FAR))
+        near, middle, far = ([{p.name: p.within(sign * f * size)} for sign in signs] for f in (1.0, math.sqrt(FAR), FAR))
         made = [{**begin, **value} for value in (far if begin == begun else near + far)]
         if led_far:
             made += [{**self.at_declared(begin), **value} for value in near + far]

@@ -14,7 +14,7 @@ from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit, Race, levenberg_marquardt, run
 from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
-from neuido.discrepancy.rounds import GAIN_IN_FLOOR, GAIN_TO_NOISE, LEAST_GAIN, Inference, Look
+from neuido.discrepancy.rounds import GAIN_IN_FLOOR, GAIN_TO_NOISE, LEAST_GAIN, Inference, Look, Promising
 from neuido.discrepancy.trials import Round, Stand, Trial
 
 T = np.linspace(0.0, 1.0, 120)
@@ -516,6 +516,8 @@ def test_what_an_effect_leaves_within_the_floor_is_searched_only_where_another_o
     monkeypatch.setattr(Inference, "floors", lambda self, point, free, floor: np.full(2, 0.15**2))
     assert searches(lambda t: low(t) + 0.25 * np.sin(90 * t)) == (["low"], 1)
     assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t)) == (["high", "low"], 2)  # unless one promises much
+    monkeypatch.setattr("neuido.discrepancy.attribution.FURTHER", 0.0)
+    assert searches(lambda t: low(t) + 0.25 * np.sin(90 * t))[1] == 2
 
 
 def test_a_fit_that_goes_astray_where_it_is_finished_is_not_taken(monkeypatch):
@@ -1072,7 +1074,7 @@ def test_fits_begin_where_those_of_another_method_ended_too(monkeypatch):
 
 def looked(best, **chosen):
     """A look of another method, with the best fit of each candidate and the start that it was given."""
-    return Look(None, [], (), {}, {}, chosen, contests.Contest(best, None, {}), [])
+    return Look(None, Promising([], (), {}, {}, chosen, [], {}), contests.Contest(best, None, {}), [])
 
 
 def test_by_another_method_those_are_fitted_that_led_by_the_first(monkeypatch):
