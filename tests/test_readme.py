@@ -171,3 +171,21 @@ def test_rollout_table_is_the_measured_one():
 def test_render_table_is_the_measured_one():
     measured = printed("render.md")[2:]
     assert rows("Rendering speed")[: len(measured)] == measured
+
+
+def test_blind_table_is_the_measured_one():
+    with (ROOT / "benchmarks" / "results" / "blind-seed-13.csv").open() as file:
+        measured = [row for row in csv.DictReader(file) if row["measured"] == "body"]
+    quoted = {label: cells for label, *cells in rows("Closed loop: blind cases")}
+    columns = {"none": 0, "no-discretisation": 1, "plain-bic": 2, "no-unknown": 3, "take-smallest-error": 4}
+    for ablation, column in columns.items():
+        of = [row for row in measured if row["ablation"] == ablation]
+        nulls, single, pairs = ([r for r in of if r["group"] in groups] for groups in (("null", "nuisance"), ("one",), ("two",)))
+        alarms = sum(r["answer"] in ("effect", "class") for r in nulls)
+        in_class = sum(r["in_class"] == "True" for r in single + pairs)
+        assert quoted["false alarms on nulls (goal 5 %)"][column] == f"{alarms} of {len(nulls)}"
+        assert quoted["effects in class (goal 90 %)"][column] == f"{in_class} of {len(single) + len(pairs)}"
+        assert quoted["two effects, both in class"][column] == f"{sum(r['in_class'] == 'True' for r in pairs)} of {len(pairs)}"
+    answered = [row for row in measured if row["ablation"] == "none"]
+    covered, intervals = (sum(int(row[name]) for row in answered) for name in ("covered", "intervals"))
+    assert quoted["90 % intervals that cover (goal 80 to 97 %)"][0] == f"{covered} of {intervals}"
