@@ -11,6 +11,7 @@ from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Point
 from neuido.discrepancy.rounds import Inference
 from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
+from neuido.physics.effect_library import LIMITS
 
 WORSE = 3.0
 """Times the error of the better method at which the other one is not asked any more: where that found nothing, and for two effects."""
@@ -24,6 +25,8 @@ PROMISED = 0.9
 """Share of the misfit that a second effect may leave beside a first one, predicted or by one simulation, to be fitted there."""
 BESIDE = 3
 """Members of a class beside which a second effect is looked for."""
+CLOSE = 2.5
+"""Times the error of a chosen effect up to which one with fewer parameters is weighed again once others were found."""
 
 
 def look_ahead(inference: Inference, first: Round) -> list[Round]:
@@ -77,13 +80,20 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
     """Where one effect was found and leaves more than noise: a member of its class beside which a second one is named, and that round.
 
     Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two. Nor was a
-    second one looked for beside what lies within its floor.
+    second one looked for beside what lies within its floor. One of many parameters may stand for both: what is simpler is tried instead.
     """
     if inference.is_settled(at.errors):
         return []
     first = rounds[0]
     grown = first.chosen if len(rounds) > 1 else None
-    return second_beside(inference, first, [t for t in first.members if t is not grown], at.errors, at=at)
+    instead = simpler(first, first.chosen) if len(first.chosen.candidate.parameters) > MANY else []
+    pair = second_beside(inference, first, [t for t in (*first.members, *instead) if t is not grown], at.errors, at=at)
+    if pair and pair[0].chosen in instead:
+        for t in first.members:
+            t.reason = f"leaves {math.exp(0.5 * (score(at.errors) - pair[1].chosen.score)):.1f} times the error of two effects"
+        pair[0].chosen.reason = ""
+        pair[0] = replace(pair[0], members=[pair[0].chosen])
+    return pair
 
 
 def by_another_method(others: Mapping[Inference, Round], inference: Inference, at: Stand) -> tuple[Inference, list[Round]] | None:
@@ -145,3 +155,31 @@ def second_beside(
             if inference.is_noise(second.chosen.errors):
                 break
     return min(pairs, key=lambda pair: pair[1].chosen.score, default=[])
+
+
+def simpler(r: Round, chosen: Trial) -> list[Trial]:
+    """What may take the chosen one's place: the best trials with fewer parameters that came close to it, and what it is in a limit.
+
+    A limit need not come close: what the force of many parameters gained beyond it may be the other effect's.
+    """
+    sizes = len(chosen.candidate.size_parameters)
+    narrower = [t for t in others(r) if t.candidate.name in LIMITS.get(chosen.candidate.name, ())]
+    fewer = [t for t in close_to(r, chosen) if t not in narrower and len(t.candidate.size_parameters) < sizes]
+    return narrower + fewer[:LOOKED_AHEAD]
+
+
+def neighbours(r: Round, chosen: Trial) -> list[Trial]:
+    """The best trials of no more parameters than the chosen one that came close to it."""
+    most = len(chosen.candidate.parameters)
+    return [t for t in close_to(r, chosen) if len(t.candidate.parameters) <= most][:LOOKED_AHEAD]
+
+
+def others(r: Round) -> list[Trial]:
+    """The trials of a round that can be, but for those of the class that was named."""
+    return [t for t in r.trials if t not in r.members and not unphysical(t.candidate, t.fit.point)]
+
+
+def close_to(r: Round, chosen: Trial) -> list[Trial]:
+    """Those of `others` that came close to the chosen one, best first."""
+    limit = chosen.score + 2.0 * math.log(CLOSE)
+    return sorted((t for t in others(r) if t.score < limit), key=lambda t: t.penalised)

@@ -334,10 +334,25 @@ def test_a_simpler_effect_takes_the_place_of_one_that_stood_for_two():
     assert found.rounds[0].trials[0].candidate.name == "chord"  # the best one alone
 
 
+def test_beside_what_is_simpler_than_an_effect_of_many_parameters_a_second_one_is_looked_for(monkeypatch):
+    monkeypatch.setattr(pairs, "MANY", 1)  # `chord` has two
+    start = (inference := Inference(standing_for_two())).start()
+    first = inference.round(start.fit, start.floor, [])
+    at = first.chosen.stand
+    assert [t.candidate.name for t in first.members] == ["chord"] and not inference.is_settled(at.errors)
+    low, high = pairs.beside_members(inference, [first], at)
+    assert sorted(r.chosen.candidate.name for r in (low, high)) == ["high", "low"]
+    assert low.members == [low.chosen] and not low.chosen.reason and inference.is_noise(high.chosen.errors)
+    (reason,) = (t.reason for t in low.trials if t.candidate.name == "chord")
+    assert reason.endswith("times the error of two effects")
+    monkeypatch.setattr(pairs, "simpler", lambda r, chosen: [])
+    assert not pairs.beside_members(inference, [first], at)
+
+
 def test_a_limit_of_an_effect_takes_its_place_however_far_it_was_alone(monkeypatch):
-    monkeypatch.setattr(attribution, "CLOSE", 1.0)  # nothing else is close
+    monkeypatch.setattr(pairs, "CLOSE", 1.0)  # nothing else is close
     assert "chord" in [t.candidate.name for t in diagnose(standing_for_two()).effects]
-    monkeypatch.setitem(attribution.LIMITS, "chord", ("low",))
+    monkeypatch.setitem(pairs.LIMITS, "chord", ("low",))
     assert sorted(t.candidate.name for t in diagnose(standing_for_two()).effects) == ["high", "low"]
 
 
@@ -1045,6 +1060,23 @@ def test_a_method_whose_first_fits_are_far_from_what_was_named_is_not_asked_furt
 
     monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
     monkeypatch.setattr(attribution, "by_first_fits", lambda *_: {0: 2 * np.log(0.1), 1: 2 * np.log(there) + np.log(1.2)})
+    attribution.first_rounds([Asked(0), Asked(1)], [stood(1.0)] * 2)
+    assert asked == rounds_of
+
+
+@pytest.mark.parametrize(("noise", "rounds_of"), [(0.06, [0]), (0.04, [0, 1])])
+def test_no_other_method_is_asked_where_a_named_effect_leaves_little_more_than_noise(noise, rounds_of, monkeypatch):
+    asked = []
+
+    class Asked(Method):
+        def round(self, *_):
+            asked.append(self.result)
+            return first_round(0.1, True)
+
+        def is_noise(self, errors):
+            return bool(np.all(errors < noise**2))
+
+    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
     attribution.first_rounds([Asked(0), Asked(1)], [stood(1.0)] * 2)
     assert asked == rounds_of
 
