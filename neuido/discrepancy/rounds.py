@@ -53,6 +53,9 @@ ALSO_WITHOUT = 6
 """Candidates of the least costs that are fitted without the problem's own parameters too."""
 OWN, LED_BY = 3, 8
 """Candidates that the screening of a second solver may add to those that led with the first one, and how many of its first fits lead."""
+CONFIRMED = 0.8
+"""Share of the time for the search at which the first fits of a method end that is asked after another one named an effect: what is left is
+for a second one."""
 WITHIN = 0.5
 """Share of the floor within which a residual that no effect explains is no reason to look further."""
 PLAIN, AS_WELL = 2, 1.2
@@ -142,7 +145,8 @@ class Inference(Refining):
         """
         first = rival is None and not found
         seen = self.seen is not None and self.seen.base is base and not found
-        look = self.seen if seen else self.look(base, floor, found, rival.led if rival is not None else None, most=most)
+        led, until = (None, 1.0) if rival is None else (rival.led, CONFIRMED)
+        look = self.seen if seen else self.look(base, floor, found, led, most=most, until=until)
         candidates, free, slopes, columns, chosen, *_ = look.asked
         best, other, errors = dict(look.contest.best), look.contest.other, self.mean_squares([base.point], floor)[0]
         if not self.deadline.skips("refining the best fits"):

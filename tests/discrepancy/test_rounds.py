@@ -566,6 +566,19 @@ def test_what_leaves_far_more_than_another_method_named_is_not_refined(times, re
     assert any(line.startswith("refining ") for line in lines) is refined
 
 
+@pytest.mark.parametrize("asked_after", [True, False])
+def test_past_its_share_of_the_time_a_method_halts_its_fits_where_another_one_named_an_effect(asked_after, monkeypatch):
+    monkeypatch.setattr(contests, "LEADERS", 1)
+    inference = Inference(Line(lambda t: 3.0 * t + 2.0 * t**2 + 0.3 * np.sin(33 * t)))
+    start = inference.start()
+    alone = inference.round(start.fit, start.floor, [])
+    inference.seen = None
+    late = rounds.CONFIRMED + 0.01
+    monkeypatch.setattr(inference.deadline, "past", lambda share: late > share)
+    again = inference.round(start.fit, start.floor, [], alone if asked_after else None)
+    assert any(why == contests.NO_TIME for why in again.unfitted.values()) is asked_after
+
+
 def test_what_is_reported_as_before_is_what_the_effects_were_weighed_against():
     for law in (lambda t: 3.0 * t, lambda t: 3.0 * t + 2.0 * t**2):
         found = diagnose(Line(law, turns=True), draws=19)
