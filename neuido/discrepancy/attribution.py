@@ -47,6 +47,8 @@ NEARLY = 2.5
 AS_SURE = 2.0
 """Times the noise up to which what a named effect leaves is no reason to ask another method: in five blind seeds none of eight that were
 asked there took its place, of three that left 2.3 to 2.4 times as much all."""
+EARLY = 1.5
+"""Times its floor above which what the suggested method leaves is searched before another method has its declared model fitted."""
 UNASKED = math.log(3.0)
 """Gain from which an effect is named although there was no time to refine by another method: of the searches of a blind seed that were cut
 off there a false alarm gained 2.4, half of a pair 2.7, what was right or near 3.3 to 9."""
@@ -119,17 +121,20 @@ def diagnose(
     deadline = Deadline(seconds, pace=lambda: memo.pace)
     tried: list[Inference] = []
     starts: list[Stand] = []
+    asked: dict[int, Round] = {}
     for n in problem.solvers:
         inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo, deadline=deadline)
         if starts and (tried[-1].is_settled(starts[-1].errors) or deadline.skips(problem.setting_name(n))):
             continue
+        if len(starts) == 1 and told_exactly(tried[0], starts[0], asked):
+            break
         # the problem's own parameters are about the other method
         near = {name: starts[0].fit.point[name] for name in inference.as_declared} if starts else None
         start = inference.start(near)
         if start is not None:
             tried.append(inference)
             starts.append(start)
-    chosen, firsts = first_rounds(tried, starts)
+    chosen, firsts = first_rounds(tried, starts, asked)
     inference, rounds = tried[chosen], firsts[chosen]
     start = rounds[0].plain or starts[chosen]
     if len(tried) > 1:
@@ -172,10 +177,29 @@ def diagnose(
     return conclude(inference, start, at, found, rounds)
 
 
-def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[int, dict[int, list[Round]]]:
+def told_exactly(inference: Inference, start: Stand, asked: dict[int, Round]) -> bool:
+    """Whether a method names an effect with which one simulation leaves nothing but noise: no other one is asked then.
+
+    Looked for where the residual is above the floor, and the first fits come down to noise; the round that it took goes into `asked`.
+    """
+    if inference.problem.settings == 1 or inference.over(start) < EARLY:
+        return False
+    look = inference.look(start.fit, start.floor, until=LOOKS[0])
+    if not look.least or not inference.is_noise(look.least[0]):
+        return False
+    first = asked[0] = inference.round(start.fit, start.floor, [])
+    if first.chosen is None or inference.deadline.over:
+        return False
+    return inference.is_exact(replace(first.chosen, stand=inference.finished(first.chosen.stand)))
+
+
+def first_rounds(
+    tried: Sequence[Inference], starts: Sequence[Stand], asked: Mapping[int, Round] | None = None
+) -> tuple[int, dict[int, list[Round]]]:
     """Which of the methods goes on, and the first round of each that was asked, or two where it takes two effects to gain enough.
 
-    The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for.
+    The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for. `asked`: rounds of methods
+    that were asked before.
     """
     settled = [i for i, start in enumerate(starts) if tried[i].is_noise(start.errors)]
     if settled:
@@ -200,7 +224,8 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
         if firsts and tried[i].deadline.skips("effects by the other method"):
             unasked = True
             continue
-        first = tried[i].round(starts[i].fit, starts[i].floor, [], named[0] if named else None)
+        begun = (asked or {}).get(i)
+        first = begun or tried[i].round(starts[i].fit, starts[i].floor, [], named[0] if named else None)
         least = min((t.score for t in first.trials), default=math.inf)
         beaten = any(r.chosen and r.chosen.score <= least for r in named)
         firsts[i] = [first] if beaten else look_ahead(tried[i], first)
@@ -251,7 +276,9 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     others = [i for i in others if score(starts[i].errors) + handicap[i] <= limit]
     if not others:
         return {}
-    look = tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0])
+    seen = tried[first].seen
+    begun = seen is not None and seen.base is starts[first].fit
+    look = seen if begun else tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0])
     least = min([*look.least, starts[first].errors], key=score)
     if tried[first].gain(starts[first].errors, least) < LEAST_GAIN and tried[first].over(starts[first]) < 1.0:
         return {}

@@ -21,7 +21,7 @@ from neuido.discrepancy.believed import CLASSICAL, classical
 from neuido.discrepancy.declared import declared
 from neuido.discrepancy.library import body_candidates, present
 from neuido.discrepancy.problem import Ask, Parameter, Point, Recording, Rows
-from neuido.discrepancy.rollouts import SETTINGS, SOLVERS, BodyRollouts, Motions, substeps
+from neuido.discrepancy.rollouts import EVERY, SETTINGS, SOLVERS, BodyRollouts, Motions, substeps
 from neuido.errors import UserError
 from neuido.physics import effect_kernels, law_kernels
 from neuido.physics.device import real_of
@@ -112,7 +112,7 @@ class BodyProblem(BodyRollouts):
         keys, times = [], Counter()
         for run in runs:
             r, of = self.measured[run.recording], (run.setting, run.recording)
-            keys.append((run.setting, times[of], *substeps(r, r.scene.dt * SETTINGS[run.setting].dt)))
+            keys.append((run.setting, times[of], *substeps(r, r.scene.dt * EVERY[run.setting].dt)))
             times[of] += 1
             shared.setdefault(keys[-1], []).append(run)
         for key, run in zip(keys, runs, strict=True):

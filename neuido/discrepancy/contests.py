@@ -16,6 +16,12 @@ MANY = 5
 """Parameters above which a candidate is fitted after the others, and not at all where one of those leaves noise alone."""
 LEADERS = 4
 """Candidates that are fitted before the others."""
+IN_REACH = 4.0
+"""Times the lowest cost up to which that of a fit is worth refining: twice its error."""
+CLOSELY = 8
+"""Quick fits, at the most, that are made once more under the own setting."""
+AT_MOST = 6
+"""Iterations of these."""
 
 NO_TIME = "there was no time for its fit"
 FAR_BEHIND = "by the method that fits best it was not fitted, by the other one the first few fits leave far more"
@@ -24,7 +30,7 @@ OTHERS_DO = "another effect leaves nothing but noise, and its direction in the d
 
 
 class Contest(NamedTuple):
-    """What fits of candidates came to."""
+    """What fits of candidates came to; those that came close ended under the own setting, others may be quick ones (`Fit.setting`)."""
 
     best: dict[str, tuple[Candidate, Fit]]
     """Of each candidate, by its key."""
@@ -62,6 +68,8 @@ class Contests(Starting):
         Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all. Where the
         first ones leave noise alone, those of the others that are not `hopeful` get no fit, and the rest one each.
 
+        All of it quickly; what came close goes on under the own setting.
+
         Args:
             free: What is fitted beside a candidate's parameters.
             starts: Of the fits.
@@ -86,8 +94,10 @@ class Contests(Starting):
             best.update(better(fits, best))
 
         def left() -> np.ndarray:
-            leading = min((fit for _, fit in best.values()), key=lambda fit: fit.cost)
-            return self.mean_squares([leading.point], floor)[0]
+            c, fit = min(best.values(), key=lambda entry: entry[1].cost)
+            near, _ = self.closely(free, {c.key: (c, fit)}, None, floor, until)
+            with self.under(self.own):
+                return self.mean_squares([near[c.key][1].point], floor)[0]
 
         small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
         first = list(dict.fromkeys(small))[:LEADERS]
@@ -100,7 +110,8 @@ class Contests(Starting):
                 unfitted |= {c.key: NO_TIME for wave in waves[i:] for c, *_ in wave}
                 break
             if own and best and score(left()) > beyond:
-                return Contest(best, None, {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave})
+                unfitted = {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave}
+                return Contest(*self.closely(free, best, None, floor, until), unfitted)
             if own and best and self.is_noise(left()):
                 if own is waves[2]:
                     unfitted |= {c.key: FEWER_DO for c, *_ in own}
@@ -115,7 +126,28 @@ class Contests(Starting):
         other = self.other_sign(free, best, ended, floor)
         if other is not None and other[1].cost < best[other[0].key][1].cost:
             best[other[0].key], other = other, best[other[0].key]
-        return Contest(best, other, unfitted)
+        return Contest(*self.closely(free, best, other, floor, until), unfitted)
+
+    def closely(
+        self,
+        free: Sequence[Parameter],
+        best: Mapping[str, tuple[Candidate, Fit]],
+        other: tuple[Candidate, Fit] | None,
+        floor: Floor,
+        until: float,
+    ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
+        """Quick fits that came close once more under the own setting, from where they ended; the best first, and not all of many."""
+        fits = sorted(best.values(), key=lambda entry: entry[1].cost)
+        if self.setting == self.own or not fits:
+            return dict(best), other
+        near = [entry for entry in fits if entry[1].cost < IN_REACH * fits[0][1].cost][:CLOSELY]
+        entries = near if other is None else [*near, other]
+        with self.under(self.own):
+            options = {"until": until, "iterations": AT_MOST}  # without a race: who is in a class is said by where they end
+            requests = [self.request((*free, *c.parameters), fit.point, slopes=fit.slopes, **options) for c, fit in entries]
+            made = list(zip((c for c, _ in entries), self.fits(requests, floor), strict=True))
+        again = made.pop() if other is not None else None
+        return dict(best) | {c.key: (c, fit) for c, fit in made if np.isfinite(fit.cost)}, again
 
     def other_sign(
         self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], ended: Sequence[tuple[Candidate, Fit]], floor: Floor

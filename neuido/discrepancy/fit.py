@@ -1,7 +1,7 @@
 """Least squares through a simulator: a covariance of few directions, and Levenberg-Marquardt fits that share their launches."""
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,6 +67,10 @@ class Fit:
     """Whitened, (n,), priors included; empty where the model runs nowhere."""
     evaluations: int
     converged: bool
+    slopes: np.ndarray | None = None
+    """About the derivatives of the whitened residuals by the coordinates where it ended, (n, p), without priors; none where not known."""
+    setting: int = 0
+    """Of the discretisation that it was made with."""
 
 
 Whiten = Callable[[np.ndarray, int], np.ndarray]
@@ -201,7 +205,8 @@ def levenberg_marquardt(
         costs.append(cost)
         if converged or (race is not None and race.lost(costs, iterations - n)):
             break
-    return Fit(point_at(q), names, cost, np.empty(0) if r is None else r, count, converged)
+    known = None if J is None or r is None else J[: len(J) - sum(p.prior is not None for p in parameters)]
+    return Fit(point_at(q), names, cost, np.empty(0) if r is None else r, count, converged, known)
 
 
 def _scaled(q: np.ndarray, parameters: Sequence[Parameter], names: Sequence[str], factor: float) -> np.ndarray:
@@ -310,7 +315,7 @@ def run(
             try:
                 after[i] = requests[i].send(part)
             except StopIteration as end:
-                results[i] = end.value
+                results[i] = replace(end.value, setting=setting)
         wanted = after
     return results  # type: ignore[return-value]
 

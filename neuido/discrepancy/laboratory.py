@@ -2,7 +2,8 @@
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -28,6 +29,8 @@ UNSEEN = 0.1
 AGAIN, MOST_AGAIN = 2, 4
 """Fits of the declared model with the differences of the settings, each with those of where the last one ended: the least, and the most
 while a parameter of the problem's own follows the amounts."""
+ALIKE = 0.3
+"""Share of what is left that a quick setting may differ by, so that a search there is for what is left."""
 ASTRAY = 1.05
 """Times the error of the fitted parts from which on the end of a fit is not taken for a better one."""
 
@@ -54,7 +57,7 @@ class Laboratory:
         memo: Memo | None = None,
         deadline: Deadline | None = None,
     ) -> None:
-        self.problem, self.setting, self.deadline = problem, setting, deadline or Deadline()
+        self.problem, self.own, self.setting, self.deadline = problem, setting, setting, deadline or Deadline()
         self.tell = tell or (lambda line: None)
         self.memo = memo or Memo(problem)
         self.parts = split(problem)
@@ -69,6 +72,35 @@ class Laboratory:
         """Mean squares of the noise of each part."""
         self.scale = problem.error(np.ones(1), 0)
         """What a root mean square of one is as an error of the problem."""
+
+    @contextmanager
+    def under(self, setting: int) -> Iterator[None]:
+        """While it is open, this setting predicts."""
+        before, self.setting = self.setting, setting
+        try:
+            yield
+        finally:
+            self.setting = before
+
+    def quickly(self, at: Point | None = None, floor: Floor | None = None) -> AbstractContextManager[None]:
+        """While it is open, what moves about as the own setting does, for less, predicts in its place (`Problem.quick`).
+
+        At a point that is given, unless that differs there by as much as is to be explained.
+        """
+        quick = self.problem.quick(self.own)
+        return self.under(quick if at is None or floor is None or self.about_alike(at, floor, quick) else self.own)
+
+    def about_alike(self, point: Point, floor: Floor, setting: int) -> bool:
+        """Whether a setting differs from the own one by a small part of what is left, past what the differences of the settings take up."""
+        with self.memo.during("discretisation"):
+            rows = self.predicted([point], self.fitted_recordings, (self.own, setting))
+        off = {n: rows[n, setting][0] - rows[n, self.own][0] for n in self.fitted_recordings}
+        if not all(np.isfinite(row).all() for row in off.values()):
+            return False
+        squares = self.left(off, floor, floor.amounts(off, self.parts))[self.fitted]
+        with self.under(self.own):
+            (here,) = self.mean_squares([point], floor, fitted=True)
+        return score(squares) < score(here) + 2.0 * math.log(ALIKE)
 
     def fits(
         self,
@@ -264,7 +296,11 @@ class Laboratory:
         None: given `near`, the fit ends where not every recording can be predicted.
         """
         # the first fit only says where the floor is to be found
-        fit = self.base([{}, near] if near else self.starts({}), self.noise(), iterations=6, tolerance=ROUGH)
+        begins = [{}, near] if near else self.starts({})
+        with self.quickly():
+            fit = self.base(begins, self.noise(), iterations=6, tolerance=ROUGH)
+        if not self.runs(fit.point):
+            fit = self.base(begins, self.noise(), iterations=6, tolerance=ROUGH)
         if near is not None and not self.runs(fit.point):
             return None
         if self.problem.settings == 1:
@@ -374,7 +410,7 @@ class Laboratory:
         for n in recordings:
             own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{self.problem.recordings[n].name}")]
             moved = [dict(point) | {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + p.prior)} for p in own]
-            asks.append(([point, *moved], n, self.setting))
+            asks.append(([point, *moved], n, self.problem.quick(self.own)))
         with self.memo.during("nuisances"):
             predicted = self.memo.predict_several(asks)
         out = {}

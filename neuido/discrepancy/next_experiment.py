@@ -45,9 +45,9 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
     rivals = rivals_of(d)
     if len(rivals) < 2:
         return None
-    inner = getattr(d.problem, "problem", d.problem)
+    inner, setting = getattr(d.problem, "problem", d.problem), d.problem.quick(d.setting)
     if hasattr(inner, "motion"):
-        catalogue = _bodies(inner if inner.tracked else inner.as_tracked(), rivals[0].point, d.setting)
+        catalogue = _bodies(inner if inner.tracked else inner.as_tracked(), rivals[0].point, setting)
     elif hasattr(inner, "tests"):
         catalogue = _materials(inner)
     else:
@@ -56,7 +56,7 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
     for name, problem, sigma in catalogue:
         if d.deadline.skips("the next experiment"):
             return None
-        rows = problem.predict([r.point for r in rivals], 0, d.setting)
+        rows = problem.predict([r.point for r in rivals], 0, setting)
         if np.isfinite(rows).all():
             first.append((*_nearest(rows, [np.empty((rows.shape[1], 0))] * len(rows), sigma(rows)), name, problem, sigma, rows))
     first.sort(key=lambda entry: -entry[0])
@@ -64,7 +64,7 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
     for _, _, name, problem, sigma, rows in first[:FINALISTS]:
         if d.deadline.skips("the next experiment"):
             return None
-        slopes = [_slopes(d, problem, rival) for rival in rivals]
+        slopes = [_slopes(d, problem, rival, setting) for rival in rivals]
         odds, pair = _nearest(rows, slopes, sigma(rows))
         final.append((odds, pair, name))
     if not final:
@@ -107,7 +107,7 @@ def _nearest(rows: np.ndarray, slopes: Sequence[np.ndarray], sigma: np.ndarray) 
     return best
 
 
-def _slopes(d: Diagnosis, problem: Problem, rival: Rival) -> np.ndarray:
+def _slopes(d: Diagnosis, problem: Problem, rival: Rival, setting: int) -> np.ndarray:
     """Changes of the data by one standard deviation of each parameter of a rival, (n, p)."""
     asked, here = [], dict(rival.point)
     for name in rival.names:
@@ -116,7 +116,7 @@ def _slopes(d: Diagnosis, problem: Problem, rival: Rival) -> np.ndarray:
         q = p.coordinate(here.get(name, p.value))
         sd = (p.coordinate(high) - p.coordinate(low)) / 3.29 if low is not None and low < high else 1.0
         asked.append(here | {name: p.physical(q + sd)})
-    rows = problem.predict([here, *asked], 0, d.setting)
+    rows = problem.predict([here, *asked], 0, setting)
     change = (rows[1:] - rows[0]).T
     return np.where(np.isfinite(change), change, 0.0)
 

@@ -174,6 +174,10 @@ class Problem:
         """The other settings whose differences to one are directions that the data may lie in, whatever the law."""
         return [s for s in range(self.settings) if s != setting]
 
+    def quick(self, setting: int) -> int:
+        """A setting that moves about as one does for less, which stands in for it while a search has far to go; itself if there is none."""
+        return setting
+
     def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
         """The point moved to where amounts of the differences to `others` lead, as far as a parameter of the problem's own can go there."""
         return point

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neuido.discrepancy.contests import MANY, Contests, better
+from neuido.discrepancy.contests import IN_REACH, MANY, Contests, better
 from neuido.discrepancy.fit import Fit, Race
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.problem import Candidate, Parameter, Point
@@ -16,8 +16,6 @@ from neuido.physics.effect_library import LIMITS
 
 POLISHED = 4
 """Candidates whose fits are refined from further starts."""
-IN_REACH = 4.0
-"""Times the lowest cost up to which that of a fit is worth refining: twice its error."""
 NEARBY = 2.5
 """Times the least error, that of what is held out too, up to which a fit is worth refining."""
 BEYOND = 8.0
@@ -144,8 +142,13 @@ class Refining(Contests):
 
         What another grid does moves with the law: the differences at the base say little of it where a fit has gone far.
         """
-        points = [fit.point for _, fit in best.values()]
-        found = [Stand(fit, floor, squares) for (_, fit), squares in zip(best.values(), self.mean_squares(points, floor), strict=True)]
+        fits, points = [fit for _, fit in best.values()], [fit.point for _, fit in best.values()]
+        squares: dict[int, np.ndarray] = {}
+        for setting in {fit.setting for fit in fits}:  # those that came close have the own one
+            own = [i for i, fit in enumerate(fits) if fit.setting == setting]
+            with self.under(setting):
+                squares |= zip(own, self.mean_squares([points[i] for i in own], floor), strict=True)
+        found = [Stand(fit, floor, squares[i]) for i, fit in enumerate(fits)]
         if self.problem.settings == 1 or not points:
             return found
         order = sorted(range(len(points)), key=lambda i: score(found[i].errors))[:MEASURED]
@@ -178,8 +181,9 @@ class Refining(Contests):
         lead, fit = min(small, key=lambda entry: entry[1].cost)
         if not lead.linear or lead.size_parameters != lead.parameters:
             return {}
-        past, start = self.past(slopes, floor), lead.starts[chosen[lead.key]]
-        does = past(columns[lead.key, chosen[lead.key]]) @ np.array([fit.point[p.name] / start[p.name] for p in lead.parameters])
+        at = chosen.get(lead.key, 0)  # what is a limit of another one may lead without a place in the screening
+        past, start = self.past(slopes, floor), lead.starts[at]
+        does = past(columns[lead.key, at]) @ np.array([fit.point[p.name] / start[p.name] for p in lead.parameters])
         if not np.isfinite(does).all():
             return {}
         requests, of = [], []
@@ -224,22 +228,23 @@ class Refining(Contests):
         return better(zip(own, self.fits(requests, floor), strict=True), best)
 
     def elsewhere(
-        self, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
+        self, base: Fit, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
     ) -> dict[str, tuple[Candidate, Fit]]:
         """Fits of one size once more, from the declared values and a larger size: the slope at zero may have led into a side valley."""
-        requests, of, race = [], [], Race(min((fit.cost for _, fit in best.values()), default=np.inf))
+        begins: list[tuple[Candidate, Point]] = []
         for key, (c, fit) in best.items():
             if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
                 continue
             (p,) = c.size_parameters
             for sign in (1.0, -1.0) if p.lower < 0 else (1.0,):
                 size = p.within(sign * FAR * abs(starts[key][p.name]))
-                begin = dict(fit.point) | self.as_declared | {p.name: size}
-                requests.append(self.request((*self.problem.declared, *c.parameters), begin, race=race))
-                of.append(c)
-        self.tell(f"again from elsewhere: {', '.join(dict.fromkeys(c.key for c in of))}")
-        ended = list(zip(of, self.fits(requests, floor), strict=True))
-        found = better(ended, best)
+                begins.append((c, dict(fit.point) | self.as_declared | {p.name: size}))
+        self.tell(f"again from elsewhere: {', '.join(dict.fromkeys(c.key for c, _ in begins))}")
+        with self.quickly(base.point, floor):
+            race = Race(min((fit.cost for _, fit in best.values() if fit.setting == self.setting), default=np.inf))
+            requests = [self.request((*self.problem.declared, *c.parameters), begin, race=race) for c, begin in begins]
+            ended = list(zip((c for c, _ in begins), self.fits(requests, floor), strict=True))
+        found = better((entry for entry in ended if entry[1].setting == self.own), best)  # the costs of quick ones are of another motion
         return found | self.ahead(ended, {**best, **found}, floor)
 
     def ahead(
@@ -252,7 +257,8 @@ class Refining(Contests):
         ended = [entry for entry in ended if np.isfinite(entry[1].cost)]
         if self.problem.settings == 1 or not ended or self.deadline.over:
             return {}
-        left = [score(squares) for squares in self.mean_squares([fit.point for _, fit in ended], floor)]
+        with self.under(ended[0][1].setting):
+            left = [score(squares) for squares in self.mean_squares([fit.point for _, fit in ended], floor)]
         out: dict[str, tuple[Candidate, Fit]] = {}
         ends = self.able([ended[i] for i in np.argsort(left)[:POLISHED]])
         made = self.from_here([((*self.problem.declared, *c.parameters), fit, [fit.point]) for c, fit in ends], floor)

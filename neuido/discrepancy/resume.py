@@ -72,6 +72,9 @@ class CachedProblem(Problem):
     def others(self, setting: int) -> list[int]:
         return self.problem.others(setting)
 
+    def quick(self, setting: int) -> int:
+        return self.problem.quick(setting)
+
     def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
         return self.problem.recentred(point, setting, amounts)
 

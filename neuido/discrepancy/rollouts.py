@@ -83,8 +83,17 @@ SETTINGS = (
     Setting(1.0, 1.0, "finite_elements", elements=0.6),
     Setting(1.0, 1.0, "finite_elements", tetrahedra=6),
 )
+LONGER = (4.0, 2.0)
+"""Times the suggested step that a search moves material points with: the longest that leaves a margin."""
+STEADY = 1.8
+"""Margin that a longer step leaves where the model is declared, at the least, as a ratio: a step takes a wave through half a cell then."""
+QUICK = tuple(Setting(cells, dt, lift=lift) for dt in LONGER for cells, lift in ((1.0, 0.0), (0.85, 0.0), (1.2, 0.0), (1.0, 0.5)))
+EVERY = SETTINGS + QUICK
+"""The settings by their numbers: those whose differences are measured, and those of a search."""
 SOLVERS = tuple(next(i for i, s in enumerate(SETTINGS) if s.solver == name) for name in ("material_points", "finite_elements"))
 """The settings that are methods of their own."""
+COARSE = SETTINGS.index(Setting(1.0, 1.0, "finite_elements", elements=0.6))
+"""What finite elements are searched with."""
 CONTACT_HEIGHT = "contact_height"
 """Name in a point: how much higher [m] than they are declared the colliders are, with the grid.
 
@@ -109,11 +118,11 @@ class BodyRollouts(Problem):
     def effort(self, recording: int, setting: int = 0) -> float:
         """Particle-substeps; inner steps of the finite elements count as one."""
         r = self.measured[recording]
-        return float(len(r.body.x) * substeps(r, r.scene.dt * SETTINGS[setting].dt)[1])
+        return float(len(r.body.x) * substeps(r, r.scene.dt * EVERY[setting].dt)[1])
 
     def margin(self, point: Point, setting: int = 0) -> float:
         """Of the explicit step, in the recording that bears least; finite elements shorten theirs as they need."""
-        if SETTINGS[setting].solver == "finite_elements":
+        if EVERY[setting].solver == "finite_elements":
             return math.inf
         recordings = range(len(self.measured))
         full = [self._full(point)] * len(recordings)
@@ -130,7 +139,7 @@ class BodyRollouts(Problem):
         return math.log(ratio)
 
     def setting_name(self, setting: int) -> str:
-        return SETTINGS[setting].name
+        return EVERY[setting].name
 
     @property
     def duration(self) -> float:
@@ -161,7 +170,7 @@ class BodyRollouts(Problem):
         given = {"state": self._start(simulator, full, [n for _, n in runs], lifts), "effects": effects}
         given |= {"every": every, "segment": segment_of(steps, every)}
         with torch.no_grad():
-            if SETTINGS[setting].solver == "finite_elements" and len(full) == 1:
+            if EVERY[setting].solver == "finite_elements" and len(full) == 1:
                 out = _finite(simulator, full[0], steps, elasticity, plasticity, **given)
             else:
                 out = simulator.rollout(steps, elasticity, plasticity, **given)
@@ -171,7 +180,7 @@ class BodyRollouts(Problem):
         for (points, n), a, b in zip(runs, offsets[:-1], offsets[1:], strict=True):
             frames = ParticleState(*(t[:, a:b].unflatten(1, (size, -1))[:, : len(points)] for t in out))
             r = self.measured[n]
-            moved.append(frames if exact else _at_times(frames, every * r.scene.dt * SETTINGS[setting].dt, r.t.to(out.x)))
+            moved.append(frames if exact else _at_times(frames, every * r.scene.dt * EVERY[setting].dt, r.t.to(out.x)))
         return moved
 
     @functools.cached_property
@@ -195,14 +204,36 @@ class BodyRollouts(Problem):
         wrong no mesh knows alone.
         """
         able = [i for i, s in enumerate(SETTINGS[: self.settings]) if i != setting]
-        if SETTINGS[setting].solver == "finite_elements":
-            return [i for i in able if not SETTINGS[i].lift]
+        if setting == COARSE:
+            able = [i for i in able if SETTINGS[i].solver == "finite_elements"] + [self.quick(0)]
+        if EVERY[setting].solver == "finite_elements":
+            return [i for i in able if not EVERY[i].lift]
+        if EVERY[setting] in QUICK:
+            able = [0, *(i for i, s in enumerate(EVERY) if s.dt == EVERY[setting].dt and i != setting)]
         without = (lambda s: s.cells < 1.0) if self.lifts else (lambda s: s.lift > 0.0)
-        return [i for i in able if SETTINGS[i].solver == "material_points" and not without(SETTINGS[i])]
+        return [i for i in able if EVERY[i].solver == "material_points" and not without(EVERY[i])]
+
+    def quick(self, setting: int) -> int:
+        """Material points with a longer step, finite elements with a coarser mesh."""
+        if self.settings == 1 or setting not in SOLVERS:
+            return setting
+        if SETTINGS[setting].solver == "finite_elements":
+            return COARSE
+        return EVERY.index(Setting(1.0, self._longer)) if self._longer > 1.0 else setting
+
+    @functools.cached_property
+    def _longer(self) -> float:
+        """Times the suggested step that leaves a margin where the model is declared, and the frames where they are."""
+
+        def fits(factor: float) -> bool:
+            return all(substeps(r, r.scene.dt)[2] == substeps(r, r.scene.dt * factor)[2] for r in self.measured)
+
+        bears = math.exp(min(self.margin({}), 700.0)) / STEADY
+        return next((factor for factor in LONGER if factor <= bears and fits(factor)), 1.0)
 
     def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
         others, height, dx = self.others(setting), point.get(CONTACT_HEIGHT, 0.0), self.measured[0].scene.dx
-        moved = -sum(SETTINGS[s].lift * dx * a for s, a in zip(others, amounts, strict=True))
+        moved = -sum(EVERY[s].lift * dx * a for s, a in zip(others, amounts, strict=True))
         if abs(moved) < LEAST_LIFT * dx:
             return point
         most = min(MOST_LIFT * dx, self._room - 0.5 * GAP * dx)
@@ -210,7 +241,7 @@ class BodyRollouts(Problem):
 
     def _lift(self, point: Point, recording: int, setting: int) -> np.ndarray:
         """How much further along their normals the colliders are [m], (3,)."""
-        return (point.get(CONTACT_HEIGHT, 0.0) + SETTINGS[setting].lift * self.measured[recording].scene.dx) * self._ups[recording]
+        return (point.get(CONTACT_HEIGHT, 0.0) + EVERY[setting].lift * self.measured[recording].scene.dx) * self._ups[recording]
 
     def _full(self, point: Point) -> dict[str, float]:
         """With what is declared beside it."""
@@ -248,7 +279,7 @@ class BodyRollouts(Problem):
         return found
 
     def _made(self, recordings: Sequence[int], setting: int, count: int, device: str) -> Simulator | FiniteElements:
-        s = SETTINGS[setting]
+        s = EVERY[setting]
         scenes, bodies, meshes = [], [], []
         for n in recordings:
             r = self.measured[n]

@@ -162,7 +162,7 @@ class Inference(Refining):
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
         again = first and result.chosen is None and (promising or result.over > 1.0)
         if again and not self.deadline.skips("fits from elsewhere"):
-            best |= self.elsewhere(best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
+            best |= self.elsewhere(base, best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
             result = self.judge(empty, best, model)
             self.tell(self.verdict(result))
         plain = self.without_effect(result, base, floor)
@@ -222,6 +222,10 @@ class Inference(Refining):
         `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
         which there are no others; `until`: share of the search's time past which there are none.
         """
+        with self.quickly(base.point, floor):
+            return self._look(base, floor, found, led, most=most, beyond=beyond, until=until)
+
+    def _look(self, base: Fit, floor: Floor, found: Sequence[Trial], led: Led | None, *, most: float, beyond: float, until: float) -> Look:
         asked = self.promising(base, floor, found, led, most=most, until=until)
         candidates, free, *_, starts, promise = asked
         hopeful = {c.key for c in candidates if promise.get(c.key, math.inf) < HOPELESS or not c.linear}
@@ -231,7 +235,9 @@ class Inference(Refining):
             return self.without_own(base.point, starts, found, ended)
 
         contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
-        left = sorted(self.mean_squares([fit.point for _, fit in contest.best.values()], floor), key=score)
+        ends = [fit.point for _, fit in contest.best.values() if fit.setting == self.own]
+        with self.under(self.own):
+            left = sorted(self.mean_squares(ends, floor), key=score)
         look = Look(base, asked, contest, left[:1])
         self.seen = self.seen if found else look
         return look
@@ -362,7 +368,8 @@ class Inference(Refining):
 
     def promised(self, at: Stand, beside: Trial) -> float:
         """The least share of the misfit there that an effect of few parameters would leave, predicted or by one simulation."""
-        return min(self.promising(at.fit, at.floor, [beside], most=MANY).promise.values(), default=1.0)
+        with self.quickly(at.fit.point, at.floor):
+            return min(self.promising(at.fit, at.floor, [beside], most=MANY).promise.values(), default=1.0)
 
     def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel) -> Round:
         """A round with the trials that fits make, and what is chosen of them."""
@@ -459,7 +466,8 @@ class Inference(Refining):
         best = dict(chosen) if chosen and self.deadline.over else {c.key: 0 for c in candidates} | chosen
         one = [replace(by_key[key], starts=(by_key[key].starts[i],)) for key, i in best.items()]
         new = [n for n in held if n not in self.fitted_recordings]
-        there = self.columns(point, one, new) if new else {}
+        with self.quickly(point, floor):
+            there = self.columns(point, one, new) if new else {}
         nuisances = floor.nuisances or {n: np.empty((len(self.problem.recordings[n].y), 0)) for n in self.scored_recordings}
         made = []
         for part, square in zip(self.parts, left, strict=True):

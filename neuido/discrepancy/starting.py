@@ -114,7 +114,7 @@ class Starting(Screening):
             own = [start for start in starts if start[0] is c]
             if len(c.size_parameters) > 1 or len(c.parameters) > SIZED or c.apart:
                 continue
-            places.append((own, own + self.tried(own[0], base, led_far=led_far) if c.linear else own))
+            places.append((own, own + (self.tried(own[0], base, led_far=led_far) if c.linear else self.each_as_declared(c, base.point))))
         out = [start for start in starts if all(start[0] is not own[0][0] for own, _ in places)]
         least: dict[str, float] = {}
         self.tell(f"{sum(len(made) for _, made in places)} starts of {len(places)} effects")
@@ -155,6 +155,10 @@ class Starting(Screening):
         others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
         made += [{**other, **value} for other in others for value in middle + far]
         return [(c, point, None) for point in made]
+
+    def each_as_declared(self, c: Candidate, point: Point) -> list[Start]:
+        """Every start of a candidate with the declared values: where one that does not act in proportion begins to act goes with these."""
+        return [(c, {**self.at_declared(point), **start}, None) for start in c.starts]
 
     def at_declared(self, point: Point) -> Point:
         """The point with the declared parameters, and the problem's own, as the model states them; the effects as they are."""

@@ -73,7 +73,7 @@ class Method:
     """A method of prediction as `first_rounds` asks it: nothing that it leaves is noise alone, and each of its rounds is `result`."""
 
     def __init__(self, result=None):
-        self.result, self.deadline = result, Deadline()
+        self.result, self.deadline, self.seen = result, Deadline(), None
 
     def is_noise(self, errors):
         return False
@@ -766,7 +766,7 @@ def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left
 def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
     real = attribution.first_rounds
 
-    def other_one(tried, starts):
+    def other_one(tried, starts, asked):
         chosen, firsts = real(tried, starts)
         assert [tried[i].setting for i in (chosen, *(i for i in firsts if i != chosen))] == [0, 1]
         return 1 - chosen, firsts
@@ -840,7 +840,7 @@ def test_what_there_was_no_time_to_be_sure_of_is_unknown_and_not_none(monkeypatc
     assert diagnose(Line(lambda t: 3.0 * t)).answer == "none"
     real = attribution.first_rounds
 
-    def unsure(tried, starts):
+    def unsure(tried, starts, asked):
         chosen, firsts = real(tried, starts)
         return chosen, {i: [replace(r, unsure=True) for r in own] for i, own in firsts.items()}
 
@@ -1158,12 +1158,25 @@ def test_fits_begin_at_the_size_that_leaves_least(together):
     clip, cube = by_key["clip"], by_key["cube"]
     starts = [(clip, {**base.fit.point, **start}, None) for start in clip.starts] + [(cube, {**base.fit.point, **cube.starts[0]}, None)]
     kept, least = inference.sized(starts, base.fit, slopes, base.floor)
-    assert [c.key for c, *_ in kept].count("clip") == 1
-    costs = dict(zip((c.key for c, *_ in kept), inference.costs([begin for _, begin, _ in kept], base.floor), strict=False))
-    tried = inference.costs([begin for c, begin, _ in starts if c is clip], base.floor)
-    assert costs["clip"] == min(tried)
+    places = [begin for c, begin, _ in starts if c is clip] + [{**inference.at_declared(base.fit.point), **start} for start in clip.starts]
+    tried = inference.costs(places, base.floor)
+    costs = inference.costs([begin for _, begin, _ in kept], base.floor)
+    assert [c.key for c, *_ in kept].count("clip") <= 2 and kept[0][0] is clip
+    assert costs[0] == min(tried)
     before = inference.costs([base.fit.point], base.floor)[0]
-    assert least["clip"] == pytest.approx(min(tried) / before) and least["cube"] <= costs["cube"] / before
+    assert least["clip"] == pytest.approx(min(tried) / before) and least["cube"] <= costs[-1] / before
+
+
+def test_what_does_not_act_in_proportion_is_tried_as_declared_too():
+    """The base fit may stand for it with values with which it does nothing, or too much."""
+    problem = Line(lambda t: np.minimum(1.1 * t, 0.8))
+    inference = Inference(problem)
+    base = inference.start()
+    clip = next(c for c in problem.candidates if c.key == "clip")
+    clip = replace(clip, starts=({"clip.inverse": 0.05}, {"clip.inverse": 1.3}))
+    astray = replace(base.fit, point={"a": -6.0})
+    kept, _ = inference.sized([(clip, {**astray.point, **clip.starts[0]}, None)], astray, {}, base.floor)
+    assert dict(kept[0][1]) == {"a": 1.0, "clip.inverse": 1.3}
 
 
 def test_what_got_no_fit_for_want_of_time_is_said_to(monkeypatch):
