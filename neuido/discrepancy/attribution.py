@@ -145,16 +145,17 @@ def diagnose(
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
         found.append(step)
-        settled = len(found) == most or inference.is_settled(step.errors)
+        # near the noise too: what leaves that alone in one simulation is told by it, however little it gains
+        settled = len(found) == most or inference.is_noise(step.errors)
         hurried = deadline.over
         if hurried and not settled:
             deadline.skips("a further effect")
         if hurried:  # what is left of the time is for the last fit
             deadline.conclude()
         at = inference.finished(step.stand)
-        if settled or hurried:
+        if settled or hurried or inference.is_noise(at.errors):
             break
-        if problem.settings > 1 and inference.over(at) < FURTHER:
+        if problem.settings > 1 and not inference.is_settled(at.errors) and inference.over(at) < FURTHER:
             break
         rounds.append(inference.round(at.fit, at.floor, found))
     if len(found) == 1 and not hurried:

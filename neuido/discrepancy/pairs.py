@@ -138,8 +138,8 @@ def second_beside(
 ) -> list[Round]:
     """The member beside which a second effect leaves least, and the round of that one.
 
-    Nothing is returned where none leaves clearly less than `errors`. A member is asked where the screening beside it promises much, or it
-    is `sure`. `at` is where the chosen one stands, if its fit was finished.
+    Nothing is returned where none leaves clearly less than `errors`, or nothing but noise in one simulation. A member is asked where the
+    screening beside it promises much, or it is `sure`. `at` is where the chosen one stands, if its fit was finished.
     """
     pairs: list[list[Round]] = []
     small = [t for t in members if len(t.candidate.parameters) <= MANY]
@@ -150,7 +150,10 @@ def second_beside(
         if t is not sure and inference.promised(here, t) > PROMISED:
             continue
         second = inference.round(here.fit, here.floor, [t], most=MANY)
-        if second.chosen is not None and inference.gain(errors, second.chosen.errors) > LEAST_GAIN:
+        told = second.chosen is not None and (
+            inference.gain(errors, second.chosen.errors) > LEAST_GAIN or inference.is_exact(second.chosen)
+        )
+        if told:
             pairs.append([replace(first, chosen=t), second])
             if inference.is_noise(second.chosen.errors):
                 break

@@ -126,3 +126,14 @@ def test_no_other_method_is_begun_where_one_simulation_leaves_the_noise(law, ask
     monkeypatch.setattr(attribution, "EARLY", 0.0)
     diagnose(Exact(law), keep=3)
     assert begun == ([0, 1] if asked else [0])
+
+
+@pytest.mark.parametrize("second", [0.45, 0.65, 0.0])
+def test_a_second_effect_near_the_noise_is_told_by_one_simulation(second):
+    """What the first one leaves is 1.4 or 1.9 times the noise, a fiftieth or less of what the settings differ by."""
+    problem = Exact(lambda t: 3.0 * t + 2.0 * t**2 + second * t**3, wiggle=1.0)
+    object.__setattr__(problem, "candidates", tuple(c for c in problem.candidates if len(c.parameters) == 1))
+    found = diagnose(problem, keep=3)
+    assert sorted(t.candidate.name for t in found.effects) == (["cube", "square"] if second else ["square"])
+    if second:
+        assert found.after["cube.c"] == pytest.approx(second, rel=0.3)
