@@ -78,6 +78,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         apart: str = "",
         far: float = 0.0,
         beside: Mapping[str, float] | None = None,
+        takes: Sequence[str] = (),
     ):
         made = tuple(
             Parameter(f"{name}.{key}", unit, 0.0 if not sizes or key in sizes.split() else starts[0][key], scale, low, high, log=log)
@@ -85,7 +86,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         )
         named = tuple({f"{name}.{k}": v for k, v in start.items()} for start in starts)
         own = tuple(f"{name}.{k}" for k in sizes.split())
-        out.append(Candidate(name, made, named, where, form, own, linear, apart and f"{name}.{apart}", far, beside or {}))
+        out.append(Candidate(name, made, named, where, form, own, linear, apart and f"{name}.{apart}", far, beside or {}, tuple(takes)))
 
     def vector(keys: Sequence[str], unit: str, scale: float, high: float) -> list[tuple]:
         return [(key, unit, scale, -high, high, False) for key in keys]
@@ -117,7 +118,8 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     add("viscosity_shear", "internal modes", [{"eta": 0.1 * eta}, {"eta": eta}], ("eta", "Pa s", eta, 0.0, 20 * eta, False))
     add("viscosity_bulk", "internal modes", [{"zeta": eta}, {"zeta": 5 * eta}], ("zeta", "Pa s", eta, 0.0, 60 * eta, False))
     add("maxwell", "internal modes", [{"ratio": 0.5, "time": s.wave * f} for f in (0.3, 1.5, 6.0)],
-        ("ratio", "1", 0.3, 0.0, 20.0, False), ("time", "s", 0.5, s.step, 20 * s.duration, True), sizes="ratio")  # fmt: skip
+        ("ratio", "1", 0.3, 0.0, 20.0, False), ("time", "s", 0.5, s.step, 20 * s.duration, True),
+        sizes="ratio", takes=("young",))  # fmt: skip
     add("hysteresis", "internal modes", [{"eta": 0.2}], ("eta", "1", 0.1, 0.0, 1.5, False))
     add(
         "stiffness_change",
@@ -125,18 +127,18 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         [{"rate": 0.5 / s.duration}],
         ("rate", "1/s", 0.3 / s.duration, -8 / s.duration, 8 / s.duration, False),
     )
-    add("tension_compression", "internal modes", [{"r": 0.3}], ("r", "1", 0.2, -0.8, 5.0, False))
+    add("tension_compression", "internal modes", [{"r": 0.3}], ("r", "1", 0.2, -0.8, 5.0, False), takes=("young",))
     add("stiffness_gradient", "internal modes", [dict.fromkeys("xyz", 0.6)], *vector("xyz", "1", 0.4, 5.0), form="gradient")
     add("stiffness_gradient", "internal modes", _places(experiment, s.length), ("log_ratio", "1", 0.5, -4.0, 4.0, False),
         *[(a, "m", 0.1 * s.length, -0.6 * s.length, 0.6 * s.length, False) for a in ("cx", "cy", "cz")],
         ("radius", "m", 0.15, 0.08 * s.length, 0.8 * s.length, True), form="inclusion", sizes="log_ratio",
         apart="log_ratio", far=math.log(8.0), beside={"young": -1 / 6})  # fmt: skip
     if plastic != "drucker_prager":
-        add("strain_stiffening", "internal modes", [{"k": 1.0}], ("k", "1", 1.0, -1.0, 60.0, False))
-        add("second_invariant", "internal modes", [{"c": 0.3}], ("c", "1", 0.3, -0.5, 5.0, False))
+        add("strain_stiffening", "internal modes", [{"k": 1.0}], ("k", "1", 1.0, -1.0, 60.0, False), takes=("young",))
+        add("second_invariant", "internal modes", [{"c": 0.3}], ("c", "1", 0.3, -0.5, 5.0, False), takes=("young",))
         add("fibre", "internal modes", [{"c": 0.3 * s.young, "azimuth": a, "elevation": e} for a, e in DIRECTIONS],
             ("c", "Pa", 0.3 * s.young, 0.0, 30 * s.young, False), ("azimuth", "rad", 0.2, -7.0, 7.0, False),
-            ("elevation", "rad", 0.2, -3.5, 3.5, False), sizes="c")  # fmt: skip
+            ("elevation", "rad", 0.2, -3.5, 3.5, False), sizes="c", takes=("young",))  # fmt: skip
         add("softening", "internal modes" if plastic == "identity" else "rest", [{"s": 1.0}], ("s", "1", 0.5, 0.0, 40.0, False))
     if planes:
         least = min(p.friction for p in planes)

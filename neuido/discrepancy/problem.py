@@ -75,6 +75,9 @@ class Candidate:
     beside: Mapping[str, float] = field(default_factory=dict)
     """By how much of `far` the logarithm of a declared parameter goes with it there: a stiff part in a soft rest, as stiff together."""
 
+    takes: tuple[str, ...] = ()
+    """Declared parameters that a fit without the effect makes too large for the lack of it: a modulus, of what stiffens."""
+
     @property
     def key(self) -> str:
         """Name and form."""

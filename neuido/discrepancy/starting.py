@@ -24,6 +24,8 @@ FAR = 6.0
 BESIDE = 2.0
 """Times the cost of a candidate's best start up to which one with the other declared values is kept beside it. By as much one as declared
 is taken to leave less, where the base fit made up for the effect: what does as well as that with the stated modulus does better between."""
+TAKEN = (0.75, 0.55)
+"""Times a declared parameter that a candidate takes from (`Candidate.takes`), at which larger sizes of it are tried too."""
 LED_FAR = 1.6
 """Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
 
@@ -141,7 +143,7 @@ class Starting(Screening):
         """Further starts of a candidate of one size: at larger sizes, and in the other shapes that it is screened in.
 
         How a large effect acts is not what the slope at none says. Where the base fit has gone far from the declared values (`led_far`)
-        from these too and from between, for it may have made up for the effect.
+        from these too and from between, for it may have made up for the effect; what stiffens a body is tried with less of a modulus too.
         """
         c, begun, _ = start
         (p,) = c.size_parameters
@@ -154,6 +156,9 @@ class Starting(Screening):
             made += [{**self.between(begin), **value} for value in far]
         others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
         made += [{**other, **value} for other in others for value in middle + far]
+        for less in TAKEN if c.takes else ():
+            taken = {name: less * begin[name] for name in c.takes if name in begin}
+            made += [{**place, **taken, **value} for place in [begin, *others] for value in [*([] if others else middle[:1]), far[0]]]
         return [(c, point, None) for point in made]
 
     def each_as_declared(self, c: Candidate, point: Point) -> list[Start]:

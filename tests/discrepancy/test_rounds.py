@@ -1167,6 +1167,19 @@ def test_fits_begin_at_the_size_that_leaves_least(together):
     assert least["clip"] == pytest.approx(min(tried) / before) and least["cube"] <= costs[-1] / before
 
 
+@pytest.mark.parametrize("takes", [("a",), ()])
+def test_what_stiffens_is_tried_with_less_of_what_stood_for_it(takes):
+    problem = Line(lambda t: 1.65 * t + 1.8 * t**3)
+    inference = Inference(problem)
+    base = inference.start()
+    cube = replace(next(c for c in problem.candidates if c.key == "cube"), takes=takes)
+    high = replace(base.fit, point={"a": 3.0})
+    slopes = inference.slopes(problem.declared, high.point, inference.scored_recordings)
+    kept, _ = inference.sized([(cube, {"a": 3.0, "cube.c": 0.3}, None)], high, slopes, base.floor)
+    best = dict(kept[0][1])
+    assert (best == pytest.approx({"a": 0.55 * 3.0, "cube.c": 6.0 * 0.3})) is bool(takes)
+
+
 def test_what_does_not_act_in_proportion_is_tried_as_declared_too():
     """The base fit may stand for it with values with which it does nothing, or too much."""
     problem = Line(lambda t: np.minimum(1.1 * t, 0.8))
