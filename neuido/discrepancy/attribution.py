@@ -121,12 +121,11 @@ def diagnose(
     deadline = Deadline(seconds, pace=lambda: memo.pace)
     tried: list[Inference] = []
     starts: list[Stand] = []
-    asked: dict[int, Round] = {}
     for n in problem.solvers:
         inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo, deadline=deadline)
         if starts and (tried[-1].is_settled(starts[-1].errors) or deadline.skips(problem.setting_name(n))):
             continue
-        if len(starts) == 1 and told_exactly(tried[0], starts[0], asked):
+        if len(starts) == 1 and told_exactly(tried[0], starts[0]):
             break
         # the problem's own parameters are about the other method
         near = {name: starts[0].fit.point[name] for name in inference.as_declared} if starts else None
@@ -134,7 +133,7 @@ def diagnose(
         if start is not None:
             tried.append(inference)
             starts.append(start)
-    chosen, firsts = first_rounds(tried, starts, asked)
+    chosen, firsts = first_rounds(tried, starts)
     inference, rounds = tried[chosen], firsts[chosen]
     start = rounds[0].plain or starts[chosen]
     if len(tried) > 1:
@@ -178,29 +177,26 @@ def diagnose(
     return conclude(inference, start, at, found, rounds)
 
 
-def told_exactly(inference: Inference, start: Stand, asked: dict[int, Round]) -> bool:
+def told_exactly(inference: Inference, start: Stand) -> bool:
     """Whether a method names an effect with which one simulation leaves nothing but noise: no other one is asked then.
 
-    Looked for where the residual is above the floor, and the first fits come down to noise; the round that it took goes into `asked`.
+    Looked for where the residual is above the floor, and the first fits come down to noise; `first_rounds` takes the round that it took.
     """
     if inference.problem.settings == 1 or inference.over(start) < EARLY:
         return False
     look = inference.look(start.fit, start.floor, until=LOOKS[0])
     if not look.least or not inference.is_noise(look.least[0]):
         return False
-    first = asked[0] = inference.round(start.fit, start.floor, [])
+    first = inference.round(start.fit, start.floor, [])
     if first.chosen is None or inference.deadline.over:
         return False
     return inference.is_exact(replace(first.chosen, stand=inference.finished(first.chosen.stand)))
 
 
-def first_rounds(
-    tried: Sequence[Inference], starts: Sequence[Stand], asked: Mapping[int, Round] | None = None
-) -> tuple[int, dict[int, list[Round]]]:
+def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[int, dict[int, list[Round]]]:
     """Which of the methods goes on, and the first round of each that was asked, or two where it takes two effects to gain enough.
 
-    The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for. `asked`: rounds of methods
-    that were asked before.
+    The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for.
     """
     settled = [i for i, start in enumerate(starts) if tried[i].is_noise(start.errors)]
     if settled:
@@ -225,8 +221,7 @@ def first_rounds(
         if firsts and tried[i].deadline.skips("effects by the other method"):
             unasked = True
             continue
-        begun = (asked or {}).get(i)
-        first = begun or tried[i].round(starts[i].fit, starts[i].floor, [], named[0] if named else None)
+        first = tried[i].asked or tried[i].round(starts[i].fit, starts[i].floor, [], named[0] if named else None)
         least = min((t.score for t in first.trials), default=math.inf)
         beaten = any(r.chosen and r.chosen.score <= least for r in named)
         firsts[i] = [first] if beaten else look_ahead(tried[i], first)
@@ -277,9 +272,7 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     others = [i for i in others if score(starts[i].errors) + handicap[i] <= limit]
     if not others:
         return {}
-    seen = tried[first].seen
-    begun = seen is not None and seen.base is starts[first].fit
-    look = seen if begun else tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0])
+    look = tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0])
     least = min([*look.least, starts[first].errors], key=score)
     if tried[first].gain(starts[first].errors, least) < LEAST_GAIN and tried[first].over(starts[first]) < 1.0:
         return {}

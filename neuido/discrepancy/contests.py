@@ -94,10 +94,10 @@ class Contests(Starting):
             best.update(better(fits, best))
 
         def left() -> np.ndarray:
-            c, fit = min(best.values(), key=lambda entry: entry[1].cost)
-            near, _ = self.closely(free, {c.key: (c, fit)}, None, floor, until)
+            leading = min(best.values(), key=lambda entry: entry[1].cost)
+            ((_, fit),) = self.wholly(free, [leading], floor, until)
             with self.under(self.own):
-                return self.mean_squares([near[c.key][1].point], floor)[0]
+                return self.mean_squares([fit.point], floor)[0]
 
         small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
         first = list(dict.fromkeys(small))[:LEADERS]
@@ -109,10 +109,11 @@ class Contests(Starting):
             if best and own and self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}", until):
                 unfitted |= {c.key: NO_TIME for wave in waves[i:] for c, *_ in wave}
                 break
-            if own and best and score(left()) > beyond:
+            remains = left() if own and best else None
+            if remains is not None and score(remains) > beyond:
                 unfitted = {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave}
                 return Contest(*self.closely(free, best, None, floor, until), unfitted)
-            if own and best and self.is_noise(left()):
+            if remains is not None and self.is_noise(remains):
                 if own is waves[2]:
                     unfitted |= {c.key: FEWER_DO for c, *_ in own}
                     break
@@ -138,16 +139,25 @@ class Contests(Starting):
     ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
         """Quick fits that came close once more under the own setting, from where they ended; the best first, and not all of many."""
         fits = sorted(best.values(), key=lambda entry: entry[1].cost)
-        if self.setting == self.own or not fits:
-            return dict(best), other
         near = [entry for entry in fits if entry[1].cost < IN_REACH * fits[0][1].cost][:CLOSELY]
-        entries = near if other is None else [*near, other]
+        ended = self.wholly(free, near if other is None else [*near, other], floor, until)
+        again = None if other is None else ended.pop()
+        return {**best, **{c.key: (c, fit) for c, fit in ended}}, again
+
+    def wholly(
+        self, free: Sequence[Parameter], fits: Sequence[tuple[Candidate, Fit]], floor: Floor, until: float
+    ) -> list[tuple[Candidate, Fit]]:
+        """Quick fits once more under the own setting, from where they ended; as they are where nothing runs there.
+
+        Without a race: who is in a class is said by where they end.
+        """
+        if self.setting == self.own:
+            return list(fits)
         with self.under(self.own):
-            options = {"until": until, "iterations": AT_MOST}  # without a race: who is in a class is said by where they end
-            requests = [self.request((*free, *c.parameters), fit.point, slopes=fit.slopes, **options) for c, fit in entries]
-            made = list(zip((c for c, _ in entries), self.fits(requests, floor), strict=True))
-        again = made.pop() if other is not None else None
-        return dict(best) | {c.key: (c, fit) for c, fit in made if np.isfinite(fit.cost)}, again
+            options = {"until": until, "iterations": AT_MOST}
+            requests = [self.request((*free, *c.parameters), fit.point, slopes=fit.slopes, **options) for c, fit in fits]
+            ends = self.fits(requests, floor)
+        return [(c, end if np.isfinite(end.cost) else fit) for (c, fit), end in zip(fits, ends, strict=True)]
 
     def other_sign(
         self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], ended: Sequence[tuple[Candidate, Fit]], floor: Floor

@@ -299,7 +299,7 @@ class Laboratory:
         begins = [{}, near] if near else self.starts({})
         with self.quickly():
             fit = self.base(begins, self.noise(), iterations=6, tolerance=ROUGH)
-        if not self.runs(fit.point):
+        if fit.setting != self.own and not self.runs(fit.point):
             fit = self.base(begins, self.noise(), iterations=6, tolerance=ROUGH)
         if near is not None and not self.runs(fit.point):
             return None
@@ -405,7 +405,7 @@ class Laboratory:
         return self.noise_squares + np.nanmean(left, axis=0) if left else self.noise_squares
 
     def nuisances(self, point: Point, recordings: Sequence[int]) -> dict[int, np.ndarray]:
-        """Directions of the nuisances of each recording, of one prior standard deviation."""
+        """Directions of the nuisances of each recording, of one prior standard deviation, as a quick motion has them."""
         asks = []
         for n in recordings:
             own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{self.problem.recordings[n].name}")]

@@ -228,8 +228,8 @@ class BodyRollouts(Problem):
         def fits(factor: float) -> bool:
             return all(substeps(r, r.scene.dt)[2] == substeps(r, r.scene.dt * factor)[2] for r in self.measured)
 
-        bears = math.exp(min(self.margin({}), 700.0)) / STEADY
-        return next((factor for factor in LONGER if factor <= bears and fits(factor)), 1.0)
+        margin = self.margin({})
+        return next((factor for factor in LONGER if math.log(factor * STEADY) <= margin and fits(factor)), 1.0)
 
     def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
         others, height, dx = self.others(setting), point.get(CONTACT_HEIGHT, 0.0), self.measured[0].scene.dx

@@ -127,6 +127,8 @@ class Inference(Refining):
         self.keep, self.draws, self.seed = keep, draws, seed
         self.seen: Look | None = None
         """The last look for a first effect."""
+        self.asked: Round | None = None
+        """The last round for a first effect."""
 
     @property
     def unexplained(self) -> float:
@@ -144,9 +146,8 @@ class Inference(Refining):
             most: Parameters that a candidate may have.
         """
         first = rival is None and not found
-        seen = self.seen is not None and self.seen.base is base and not found
         led, until = (None, 1.0) if rival is None else (rival.led, CONFIRMED)
-        look = self.seen if seen else self.look(base, floor, found, led, most=most, until=until)
+        look = self.look(base, floor, found, led, most=most, until=until)
         candidates, free, slopes, columns, chosen, *_ = look.asked
         best, other, errors = dict(look.contest.best), look.contest.other, self.mean_squares([base.point], floor)[0]
         if not self.deadline.skips("refining the best fits"):
@@ -169,6 +170,7 @@ class Inference(Refining):
         if plain is not None:
             result = self.judge(replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain), best, model)
             self.tell(self.verdict(result))
+        self.asked = self.asked if found else result
         return result
 
     def without_effect(self, result: Round, base: Fit, floor: Floor) -> Stand | None:
@@ -217,27 +219,25 @@ class Inference(Refining):
         beyond: float = math.inf,
         until: float = 1.0,
     ) -> Look:
-        """Screen the candidates, and fit the best; arguments as those of `round`.
+        """Screen the candidates, and fit the best; arguments as those of `round`. A base that was looked at last is not looked at again.
 
         `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
         which there are no others; `until`: share of the search's time past which there are none.
         """
+        if not found and self.seen is not None and self.seen.base is base:
+            return self.seen
         with self.quickly(base.point, floor):
-            return self._look(base, floor, found, led, most=most, beyond=beyond, until=until)
+            asked = self.promising(base, floor, found, led, most=most, until=until)
+            candidates, free, *_, starts, promise = asked
+            hopeful = {c.key for c in candidates if promise.get(c.key, math.inf) < HOPELESS or not c.linear}
+            self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
 
-    def _look(self, base: Fit, floor: Floor, found: Sequence[Trial], led: Led | None, *, most: float, beyond: float, until: float) -> Look:
-        asked = self.promising(base, floor, found, led, most=most, until=until)
-        candidates, free, *_, starts, promise = asked
-        hopeful = {c.key for c in candidates if promise.get(c.key, math.inf) < HOPELESS or not c.linear}
-        self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
+            def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
+                return self.without_own(base.point, starts, found, ended)
 
-        def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
-            return self.without_own(base.point, starts, found, ended)
-
-        contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
+            contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
         ends = [fit.point for _, fit in contest.best.values() if fit.setting == self.own]
-        with self.under(self.own):
-            left = sorted(self.mean_squares(ends, floor), key=score)
+        left = sorted(self.mean_squares(ends, floor), key=score)
         look = Look(base, asked, contest, left[:1])
         self.seen = self.seen if found else look
         return look

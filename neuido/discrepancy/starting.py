@@ -156,8 +156,9 @@ class Starting(Screening):
             made += [{**self.between(begin), **value} for value in far]
         others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
         made += [{**other, **value} for other in others for value in middle + far]
-        for less in TAKEN if c.takes else ():
-            taken = {name: less * begin[name] for name in c.takes if name in begin}
+        takes = [name for name in c.takes if name in self.as_declared]
+        for less in TAKEN if takes else ():
+            taken = {name: less * begin[name] for name in takes}
             made += [{**place, **taken, **value} for place in [begin, *others] for value in [*([] if others else middle[:1]), far[0]]]
         return [(c, point, None) for point in made]
 

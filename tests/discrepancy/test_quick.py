@@ -137,3 +137,15 @@ def test_a_second_effect_near_the_noise_is_told_by_one_simulation(second):
     assert sorted(t.candidate.name for t in found.effects) == (["cube", "square"] if second else ["square"])
     if second:
         assert found.after["cube.c"] == pytest.approx(second, rel=0.3)
+
+
+def test_a_base_is_looked_at_once():
+    inference = Inference(Hurried(lambda t: 3.0 * t + 0.8 * t**2), keep=3)
+    start = inference.start()
+    look = inference.look(start.fit, start.floor)
+    counts = dict(inference.problem.counts)
+    assert inference.look(start.fit, start.floor) is look and inference.problem.counts == counts
+    first = inference.round(start.fit, start.floor, [])
+    assert inference.asked is first and inference.seen is look
+    inference.round(first.chosen.fit, first.floor, [first.chosen])
+    assert inference.asked is first and inference.seen is look, "a second effect is looked for anew"
