@@ -46,7 +46,8 @@ def look_ahead(inference: Inference, first: Round) -> list[Round]:
     for t in (*bases, *blind):
         if inference.deadline.skips(f"a second effect beside {t.candidate.key}"):
             break
-        second = inference.round(t.fit, inference.stand(t.fit.point)[0], [t], most=MANY)
+        here = at_its_end(inference, t)
+        second = inference.round(here.fit, here.floor, [t], most=MANY)
         if second.chosen is None or inference.gain(first.errors, second.chosen.errors) < 2.0 * LEAST_GAIN:
             continue
         little = t in blind or t.gain <= by_chance  # what the two leave must be near the floor then
@@ -133,6 +134,12 @@ def from_there(inference: Inference, t: Trial, point: Point) -> Stand:
     return min(here, Stand(fit, *inference.stand(fit.point)), key=lambda stand: score(stand.errors)) if inference.runs(fit.point) else here
 
 
+def at_its_end(inference: Inference, t: Trial) -> Stand:
+    """Where an effect's fit comes to by itself: one that was given up in a race stands where nothing beside it looks like the truth."""
+    here = Stand(t.fit, *inference.stand(t.fit.point))
+    return here if t.fit.converged else inference.finished(here)
+
+
 def second_beside(
     inference: Inference, first: Round, members: Sequence[Trial], errors: np.ndarray, *, at: Stand | None = None, sure: Trial | None = None
 ) -> list[Round]:
@@ -144,9 +151,9 @@ def second_beside(
     pairs: list[list[Round]] = []
     small = [t for t in members if len(t.candidate.parameters) <= MANY]
     for t in sorted(small, key=lambda t: t.penalised)[:BESIDE]:
-        here = at if at is not None and t is first.chosen else Stand(t.fit, *inference.stand(t.fit.point))
         if inference.deadline.skips(f"a second effect beside {t.candidate.key}"):
             break
+        here = at if at is not None and t is first.chosen else at_its_end(inference, t)
         if t is not sure and inference.promised(here, t) > PROMISED:
             continue
         second = inference.round(here.fit, here.floor, [t], most=MANY)

@@ -780,6 +780,22 @@ def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
     assert found.setting == 1 and names(found) == ["low"]
 
 
+def test_beside_a_fit_that_was_given_up_a_second_effect_is_looked_for_where_it_ends():
+    shapes = {"low": np.sin(40 * T), "high": np.sin(62 * T)}
+    inference = Inference(problem := Mixed({name: (s, s) for name, s in shapes.items()}, {"low": 0.9, "high": 0.3}))
+    low = next(c for c in problem.candidates if c.name == "low")
+    parameters = (*problem.declared, *low.parameters)
+    (fit,) = inference.fits([inference.request(parameters, {"a": 2.0, "low.c": 0.1}, iterations=0)], inference.noise())
+    given_up = Trial(low, Stand(fit, *inference.stand(fit.point)), 1.0)
+    assert not fit.converged and fit.point["low.c"] == 0.1
+    there = pairs.at_its_end(inference, given_up)
+    (alone,) = inference.fits([inference.request(parameters, {"a": 2.0, "low.c": 0.1})], there.floor)
+    assert alone.point["low.c"] > 0.8 and there.fit.point == pytest.approx(alone.point, rel=0.01)
+    assert there.errors[0] < 0.2 * given_up.errors[0]
+    ended = Trial(low, replace(there, fit=replace(there.fit, converged=True)), 1.0)
+    assert pairs.at_its_end(inference, ended).fit is ended.fit
+
+
 def test_the_other_method_goes_on_from_where_the_chosen_one_has_come():
     """`low` acts as sin(40 t) for a near 3 alone: from anywhere below 2 no fit gets there."""
 
