@@ -143,13 +143,13 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     if planes:
         least = min(p.friction for p in planes)
         add("friction", "contact", [{"mu": 0.15}, {"mu": 0.5}], ("mu", "1", 0.1, -least, 3.0, False), linear=False)
-        # the rates are per substep of a node in contact: one that takes half of the speed in one substep is large
+        # per substep of a node in contact: one that takes half of the speed in one is large, above 10 nothing is left and no fit goes on
         rates = [0.02 / s.step, 0.2 / s.step]
         add(
             "stick",
             "contact",
             [{"rate": r} for r in rates],
-            ("rate", "1/s", 1.0, 1e-4 / s.step, 20 / s.step, True),
+            ("rate", "1/s", 1.0, 1e-4 / s.step, 200 / s.step, True),
             sizes="rate",
             linear=False,
         )
@@ -157,7 +157,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
             "restitution",
             "contact",
             [{"rate": r} for r in rates],
-            ("rate", "1/s", 1.0, 1e-4 / s.step, 20 / s.step, True),
+            ("rate", "1/s", 1.0, 1e-4 / s.step, 200 / s.step, True),
             sizes="rate",
             linear=False,
         )

@@ -780,6 +780,25 @@ def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
     assert found.setting == 1 and names(found) == ["low"]
 
 
+def test_what_leaves_as_much_as_grids_differ_by_is_not_named(monkeypatch):
+    """Without what grids may be it is named, however little it does to the held-out recording beside them."""
+    one = np.sin(40 * T)
+    problem = Mixed({"low": (one, one)}, {"low": 0.9}, rest=0.3 * np.sin(75 * T))
+    start = (inference := Inference(problem)).start()
+    first = inference.round(start.fit, start.floor, [])
+    assert first.chosen is not None and not inference.is_noise(first.chosen.errors)
+    wide = {n: np.full_like(v, 0.4) for n, v in first.chosen.stand.floor.spread.items()}
+    coarse = replace(first.chosen, stand=replace(first.chosen.stand, floor=replace(first.chosen.stand.floor, spread=wide)))
+    assert inference.is_like_a_grid(coarse, first.errors)
+    assert not inference.is_like_a_grid(coarse, 9.0 * first.errors)  # far more was to be explained
+    little = replace(coarse, stand=replace(coarse.stand, errors=0.3 * coarse.errors))
+    assert not inference.is_like_a_grid(little, first.errors)
+    monkeypatch.setattr(Inference, "is_like_a_grid", lambda self, t, before: t.candidate.name == "low")
+    again = inference.round(start.fit, start.floor, [])
+    (reason,) = (t.reason for t in again.trials if t.candidate.name == "low")
+    assert again.chosen is None and "another grid" in reason
+
+
 def test_beside_a_fit_that_was_given_up_a_second_effect_is_looked_for_where_it_ends():
     shapes = {"low": np.sin(40 * T), "high": np.sin(62 * T)}
     inference = Inference(problem := Mixed({name: (s, s) for name, s in shapes.items()}, {"low": 0.9, "high": 0.3}))
