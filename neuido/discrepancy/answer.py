@@ -16,9 +16,10 @@ from neuido.data.storage import write as write_text
 from neuido.discrepancy import ceiling, next_experiment, report, residual
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.believed import beside
+from neuido.discrepancy.judging import ALPHA
 from neuido.discrepancy.problem import Problem
 from neuido.discrepancy.rollouts import CONTACT_HEIGHT
-from neuido.discrepancy.rounds import ALPHA, Round, Trial
+from neuido.discrepancy.trials import Round, Trial
 
 FORMAT = "neuido-diagnosis/1"
 VERSION = neuido.__version__

@@ -10,12 +10,13 @@ from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
 from neuido.discrepancy.intervals import intervals
+from neuido.discrepancy.judging import ALPHA, WITHIN
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.pairs import WORSE, beside_members, by_another_method, look_ahead, neighbours, simpler
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.refining import BEYOND
-from neuido.discrepancy.rounds import ALPHA, UNEXPLAINED, WITHIN, Inference
+from neuido.discrepancy.rounds import UNEXPLAINED, Inference
 from neuido.discrepancy.trials import Round, Stand, Trial, score
 
 __all__ = [

@@ -12,8 +12,8 @@ from neuido.discrepancy import report_figures as draw
 from neuido.discrepancy import report_silhouettes as pictures
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.ceiling import Ceiling
+from neuido.discrepancy.judging import ALPHA
 from neuido.discrepancy.residual import Series
-from neuido.discrepancy.rounds import ALPHA
 from neuido.page import escaped, table
 from neuido.page import page as html_page
 

@@ -13,8 +13,10 @@ from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit, Race, levenberg_marquardt, run
 from neuido.discrepancy.intervals import intervals
+from neuido.discrepancy.judging import GAIN_IN_FLOOR, GAIN_TO_NOISE
+from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
-from neuido.discrepancy.rounds import GAIN_IN_FLOOR, GAIN_TO_NOISE, LEAST_GAIN, Inference, Look, Promising
+from neuido.discrepancy.rounds import Inference, Look, Promising
 from neuido.discrepancy.trials import Round, Stand, Trial
 
 T = np.linspace(0.0, 1.0, 120)
