@@ -307,7 +307,7 @@ def _round(d: Diagnosis, r: Round) -> dict[str, Any]:
         "base": dict(r.base),
         "mean_squares": list(r.errors),
         "noise": [r.floor.noise[p.recording] for p in d.parts],
-        "discretisation": [float(np.sqrt(np.mean(r.floor.spread[p.recording][p.rows] ** 2))) for p in d.parts],
+        "discretisation": np.sqrt(r.floor.spread_squares(d.parts)).tolist(),
         "floors": list(r.floors),
         "p_value": r.p_value,
         "chosen": r.chosen.candidate.key if r.chosen else None,

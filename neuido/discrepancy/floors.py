@@ -62,6 +62,10 @@ class Floor:
         """The floor with weights that leave so large a share of the discretisation error outside the directions of the differences."""
         return replace(self, weight={n: 1.0 / np.sqrt(self.noise[n] ** 2 + (share * self.spread[n]) ** 2) for n in self.weight})
 
+    def spread_squares(self, parts: Sequence[Part]) -> np.ndarray:
+        """Mean squares of what the settings differ by, without a refit, of each part, (len(parts),)."""
+        return np.array([np.mean(self.spread[p.recording][p.rows] ** 2) for p in parts])
+
     def without(self, setting: int) -> "Floor":
         """The floor without the difference of one of the other settings, by its place among them."""
         kept = {n: D * (np.arange(D.shape[1]) != setting) for n, D in self.differences.items()}

@@ -94,7 +94,7 @@ class Judging(Refining):
         out = ~np.array(self.fitted)
         if self.problem.settings == 1 or not out.any() or self.is_noise(t.errors):
             return False
-        spread = np.array([np.mean(t.stand.floor.spread[p.recording][p.rows] ** 2) for p in self.parts])[out]
+        spread = t.stand.floor.spread_squares(self.parts)[out]
         least, most = LIKE_A_GRID
         return times_over(t.errors[out], spread) > least and times_over(before[out], spread) < most
 

@@ -222,8 +222,7 @@ class Laboratory:
         """The floor for fits about where `errors`, mean squares of all parts, are left: no more than that is unseen."""
         if self.problem.settings == 1 or not np.isfinite(errors[self.fitted]).all():
             return floor
-        parts = [p for p in self.parts if p.fitted]
-        spread = np.mean([np.mean(floor.spread[p.recording][p.rows] ** 2) for p in parts])
+        spread = np.mean(floor.spread_squares([p for p in self.parts if p.fitted]))
         above = max(float(np.mean((errors - self.noise_squares)[self.fitted])), 0.0)
         return floor.weighed(min(UNSEEN, math.sqrt(above / max(float(spread), 1e-300))))
 
