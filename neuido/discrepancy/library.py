@@ -145,22 +145,9 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         add("friction", "contact", [{"mu": 0.15}, {"mu": 0.5}], ("mu", "1", 0.1, -least, 3.0, False), linear=False)
         # per substep of a node in contact: one that takes half of the speed in one is large, above 10 nothing is left and no fit goes on
         rates = [0.02 / s.step, 0.2 / s.step]
-        add(
-            "stick",
-            "contact",
-            [{"rate": r} for r in rates],
-            ("rate", "1/s", 1.0, 1e-4 / s.step, 200 / s.step, True),
-            sizes="rate",
-            linear=False,
-        )
-        add(
-            "restitution",
-            "contact",
-            [{"rate": r} for r in rates],
-            ("rate", "1/s", 1.0, 1e-4 / s.step, 200 / s.step, True),
-            sizes="rate",
-            linear=False,
-        )
+        rate = ("rate", "1/s", 1.0, 1e-4 / s.step, 200 / s.step, True)
+        for name in ("stick", "restitution"):
+            add(name, "contact", [{"rate": r} for r in rates], rate, sizes="rate", linear=False)
     if plastic == "identity":
         # at large yield stresses nothing flows and the slope is zero: the fit starts where something does
         starts = [{"inverse": 1.0 / (f * s.young)} for f in (0.2, 0.08, 0.03, 0.012)]

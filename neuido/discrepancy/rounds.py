@@ -153,7 +153,8 @@ class Inference(Judging):
         if plain is not None:
             result = self.judge(replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain), best, model)
             self.tell(self.verdict(result))
-        self.asked = self.asked if found else result
+        if not found:
+            self.asked = result
         return result
 
     def without_effect(self, result: Round, base: Fit, floor: Floor) -> Stand | None:
@@ -222,7 +223,8 @@ class Inference(Judging):
         ends = [fit.point for _, fit in contest.best.values() if fit.setting == self.own]
         left = sorted(self.mean_squares(ends, floor), key=score)
         look = Look(base, asked, contest, left[:1])
-        self.seen = self.seen if found else look
+        if not found:
+            self.seen = look
         return look
 
     def promising(

@@ -156,10 +156,10 @@ class Starting(Screening):
             made += [{**self.between(begin), **value} for value in far]
         others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
         made += [{**other, **value} for other in others for value in middle + far]
-        takes = [name for name in c.takes if name in self.as_declared]
-        for less in TAKEN if takes else ():
-            taken = {name: less * begin[name] for name in takes}
-            made += [{**place, **taken, **value} for place in [begin, *others] for value in [*([] if others else middle[:1]), far[0]]]
+        if takes := [name for name in c.takes if name in self.as_declared]:
+            sizes = far[:1] if others else middle[:1] + far[:1]
+            less = [{name: factor * begin[name] for name in takes} for factor in TAKEN]
+            made += [{**place, **taken, **value} for taken in less for place in [begin, *others] for value in sizes]
         return [(c, point, None) for point in made]
 
     def each_as_declared(self, c: Candidate, point: Point) -> list[Start]:
