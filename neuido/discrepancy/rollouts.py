@@ -151,10 +151,10 @@ class BodyRollouts(Problem):
         (frames,) = self._move([([point], recording)], setting)
         return frames
 
-    def _move(self, runs: Sequence[Motions], setting: int) -> list[ParticleState]:
-        """The frames of each recording under each of its points, (T, S, P, ...).
+    def _move(self, runs: Sequence[Motions], setting: int, finer: int = 0) -> list[ParticleState]:
+        """The frames of each recording under each of its points, (T, S, P, ...); of several motions those that fail are NaN.
 
-        All move in the same launches: their frames are the same substeps (`substeps`).
+        All move in the same launches: their frames are the same substeps (`substeps`). `finer`: which of `FINER`.
         """
         size = most = max(len(points) for points, _ in runs)
         if self.device != "cpu":
@@ -169,11 +169,13 @@ class BodyRollouts(Problem):
         every, steps, exact = substeps(self.measured[runs[0][1]], simulator.scenes[0].dt)
         given = {"state": self._start(simulator, full, [n for _, n in runs], lifts), "effects": effects}
         given |= {"every": every, "segment": segment_of(steps, every)}
+        elements = EVERY[setting].solver == "finite_elements"
         with torch.no_grad():
-            if EVERY[setting].solver == "finite_elements" and len(full) == 1:
+            if elements and len(full) == 1 and finer == 0:
                 out = _finite(simulator, full[0], steps, elasticity, plasticity, **given)
             else:
-                out = simulator.rollout(steps, elasticity, plasticity, **given)
+                more = {"finer": FINER[finer]} if elements else {}
+                out = simulator.rollout(steps, elasticity, plasticity, lenient=len(full) > 1 or finer > 0, **given, **more)
         if lifts.any():
             out = out._replace(x=out.x + _of_particles(lifts, simulator))
         moved, offsets = [], simulator.particles.offsets[::size]
@@ -181,7 +183,23 @@ class BodyRollouts(Problem):
             frames = ParticleState(*(t[:, a:b].unflatten(1, (size, -1))[:, : len(points)] for t in out))
             r = self.measured[n]
             moved.append(frames if exact else _at_times(frames, every * r.scene.dt * EVERY[setting].dt, r.t.to(out.x)))
+        if elements and (len(full) > 1 or finer > 0) and finer + 1 < len(FINER):
+            self._refine(runs, moved, setting, finer + 1)
         return moved
+
+    def _refine(self, runs: Sequence[Motions], moved: Sequence[ParticleState], setting: int, finer: int) -> None:
+        """Move what stiffened and failed again with finer inner steps, in place; what fails alone stays NaN."""
+        failed = []
+        for (points, _), frames in zip(runs, moved, strict=True):
+            broken = (~torch.isfinite(frames.x[-1]).flatten(1).all(dim=1)).tolist()
+            failed.append([i for i, point in enumerate(points) if broken[i] and _stiffens(self._full(point))])
+        live = [k for k, own in enumerate(failed) if own]
+        if not live:
+            return
+        again = [([runs[k][0][i] for i in failed[k]], runs[k][1]) for k in live]
+        for k, new in zip(live, self._move(again, setting, finer), strict=True):
+            for t, value in zip(moved[k], new, strict=True):
+                t[:, failed[k]] = value
 
     @functools.cached_property
     def _ups(self) -> list[np.ndarray]:
@@ -343,13 +361,17 @@ class BodyRollouts(Problem):
         return R if turned < 0.01 * size and turned < 0.5 * straight else eye
 
 
+def _stiffens(point: Point) -> bool:
+    return any(point.get(name, 0.0) > 0.0 for name in STIFFENING)
+
+
 def _finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -> ParticleState:
     """A rollout of one scene, with finer inner steps where an effect that stiffens leads to a motion that is not finite.
 
     Raises:
         UserError: As the rollout, with the finest of them.
     """
-    stiffens = any(point.get(name, 0.0) > 0.0 for name in STIFFENING)
+    stiffens = _stiffens(point)
     for finer in FINER[:-1] if stiffens else ():
         try:
             return simulator.rollout(*args, **given, finer=finer)

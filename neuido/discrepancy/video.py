@@ -152,6 +152,9 @@ class VideoProblem(BodyProblem):
         f = self.footage[run.recording]
         for s, group in enumerate(run.groups):
             motion = _alone(moved, s)
+            if not bool(torch.isfinite(motion.x[-1]).all()):
+                run.out[group] = np.nan
+                continue
             drawn: dict[tuple[float, float], Tensor] = {}
             for i in group:
                 clock = self._clock(run.points[i], run.recording)

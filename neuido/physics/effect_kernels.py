@@ -63,21 +63,26 @@ def build(real: type) -> SimpleNamespace:
 
     @func
     def extra_stress(F: mat33, material: wp.array2d(dtype=real), s: int, spectral: bool):
-        """What strain stiffening, the second invariant, fibres and the asymmetry add [Pa]."""
-        E = strain(F)
-        jm = volume_factor(F)
-        j = one + jm
-        tr = wp.trace(E)
+        """What strain stiffening, the second invariant, fibres and the asymmetry add [Pa].
+
+        One that is zero is not computed: an inverted body, which the base law may bear, has no logarithm of its stretches.
+        """
+        tau = mat33()
         k = material[s, 0]
         c = material[s, 1]
-        x = three * jm + j * tr
-        gain = x / wp.max(one - material[s, 8] * x, locked)
-        m = six * c / (six + four * tr + tr * tr - wp.ddot(E, E))
-        tau = deviator((k * gain * j + m * (one + tr)) * E - m * (E * E))
+        if k != zero or c != zero:
+            E = strain(F)
+            jm = volume_factor(F)
+            j = one + jm
+            tr = wp.trace(E)
+            x = three * jm + j * tr
+            gain = x / wp.max(one - material[s, 8] * x, locked)
+            m = six * c / (six + four * tr + tr * tr - wp.ddot(E, E))
+            tau = deviator((k * gain * j + m * (one + tr)) * E - m * (E * E))
         fibre = material[s, 3]
         n = F * vec3(material[s, 4], material[s, 5], material[s, 6])
         tau = tau + (fibre * (wp.dot(n, n) - one)) * wp.outer(n, n)
-        if spectral:
+        if spectral and material[s, 2] != zero:
             U, d, _V = frame(F)
             tau = tau + compose(U, material[s, 2] * negative(hencky(d)))
         return tau
@@ -114,7 +119,7 @@ def build(real: type) -> SimpleNamespace:
     ):
         """`scale_of` times the factor of damage."""
         out = scale_of(p, s, stiffness, growth)
-        if at_e_max >= 0:
+        if at_e_max >= 0 and material[s, 7] != zero:
             out = out * wp.exp(-material[s, 7] * history[p, at_e_max])
         return out
 

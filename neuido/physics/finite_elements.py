@@ -7,7 +7,7 @@ the smallest element and the fastest wave ask for.
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NoReturn
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from neuido.physics.assembly import Assembly, Inputs, Piece, piece_of
 from neuido.physics.device import real_of
 from neuido.physics.effects import Effects
 from neuido.physics.law import ElasticLaw, PlasticLaw
+from neuido.physics.lenient import spoil
 from neuido.physics.meshing import Mesh, mesh_body
 from neuido.physics.mpm import Simulator
 from neuido.physics.threads import one_thread_each, pool
@@ -117,6 +118,7 @@ class FiniteElements:
         viscosity: Tensor | None = None,
         mass: Tensor | None = None,
         stiffening: tuple[Tensor, Tensor] | None = None,
+        refused: list[int] | None = None,
     ) -> list[int]:
         """Inner steps a step that each scene needs, by 2/omega of the worst element (a bound: Belytschko et al., sec. 6.2).
 
@@ -125,6 +127,7 @@ class FiniteElements:
             viscosity: `Effects.viscosity` [Pa s], (S, 2), or None; it acts with the velocity of half a step before.
             mass: Particle masses [kg], (P,).
             stiffening: What effects add to each scene's modulus [Pa], and the largest factor on the sum, (S,) each.
+            refused: Gets the scenes that need more than `MOST_INNER`, in place of an error; they get no more than the others.
 
         Raises:
             UserError: A modulus that is negative, or more than `MOST_INNER`.
@@ -143,9 +146,13 @@ class FiniteElements:
                     damping = 4.0 * steep * (4.0 / 3.0 * eta + zeta) / density
                 # the root of (omega dt)^2 + 2 damping dt = 4
                 step = 4.0 / (damping + math.sqrt(damping**2 + 4.0 * omega**2)) if omega + damping > 0 else math.inf
-                need = max(need, math.ceil(self.scenes[s].dt / (SAFETY * step) - 1e-9))
-                if need > MOST_INNER:
-                    raise UserError(f"dt of scene {s} needs {need} inner steps of its smallest element; lower the stiffness, the viscosity "
+                own = math.ceil(self.scenes[s].dt / (SAFETY * step) - 1e-9)
+                if own <= MOST_INNER:
+                    need = max(need, own)
+                elif refused is not None:
+                    refused.append(s)
+                else:
+                    raise UserError(f"dt of scene {s} needs {own} inner steps of its smallest element; lower the stiffness, the viscosity "
                                     "or `elements`")  # fmt: skip
             out += [need] * (assembly.b - assembly.a)
         return out
@@ -166,6 +173,7 @@ class FiniteElements:
         check: bool = True,
         inner: int | None = None,
         finer: int = 1,
+        lenient: bool = False,
     ) -> ParticleState:
         """Run `steps` steps of the scenes; arguments and result are those of `mpm.Simulator.rollout`, without gradients.
 
@@ -184,6 +192,7 @@ class FiniteElements:
             check: Not read; the inner steps are always stable for the undeformed mesh.
             inner: Inner steps a step, in place of `inner_steps`.
             finer: Times that many: those of `inner_steps` are stable for the body at rest, and a law may stiffen with strain.
+            lenient: Frames of a scene that needs too many, or whose motion fails, are NaN, in place of an error.
 
         Returns:
             Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1: x and v interpolated in the element of
@@ -197,7 +206,7 @@ class FiniteElements:
             given = inputs.prepare(
                 self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
             )
-            return self._rollout(steps, elasticity, plasticity, given, every, inner, finer)
+            return self._rollout(steps, elasticity, plasticity, given, every, inner, finer, lenient)
 
     def _rollout(
         self,
@@ -208,10 +217,12 @@ class FiniteElements:
         every: int,
         inner: int | None,
         finer: int,
+        lenient: bool,
     ) -> ParticleState:
         state, effects, tables, viscosity, stiffness = given.state, given.effects, given.tables, given.viscosity, given.stiffness
+        refused: list[int] = []
         if inner is None:
-            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self))
+            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self), refused if lenient else None)
         else:
             inner_of = [inner] * self.scene_count
         inner_of = [n * finer for n in inner_of]
@@ -243,16 +254,19 @@ class FiniteElements:
         else:
             with one_thread_each():
                 list(self.pool.map(one, self.assemblies))
-        self._check(frames, steps, every, inner_of)
+        scene = self.particles.scene.long()
+        dt = self.dt / torch.tensor(inner_of).to(self.dt)
+        limit = (torch.tensor(self.sizes).to(self.dt) / dt)[scene]  # faster, and a point crosses an element in a step
+        fine = torch.isfinite(frames.x).all(dim=2) & (frames.v.norm(dim=2) <= limit)
+        if lenient:
+            refusing = torch.tensor([s in refused for s in range(self.scene_count)], device=self.device)
+            spoil(frames, refusing[scene] | ~fine.all(dim=0), scene)
+        elif not bool(fine.all()):
+            self._raise(fine, steps, every, inner_of)
         return frames
 
-    def _check(self, frames: ParticleState, steps: int, every: int, inner: list[int]) -> None:
-        """Raise where a motion is not finite, or so fast that a point crosses an element in a step."""
-        dt = self.dt / torch.tensor(inner).to(self.dt)
-        limit = (torch.tensor(self.sizes).to(self.dt) / dt)[self.particles.scene.long()]
-        fine = torch.isfinite(frames.x).all(dim=2) & (frames.v.norm(dim=2) <= limit)
-        if bool(fine.all()):
-            return
+    def _raise(self, fine: Tensor, steps: int, every: int, inner: list[int]) -> NoReturn:
+        """Say where a motion is not finite, or too fast; `fine` (K, P)."""
         frame, p = ((~fine).nonzero()[0]).tolist()
         s = int(self.particles.scene[p])
         raise UserError(f"the motion of scene {s} is not finite from step {max(frame - 1, 0) * every} of {steps} on; lower `dt` "

@@ -27,7 +27,7 @@ PAD = 2
 """Nodes added on each side of the domain."""
 
 LOST, FAST = 1, 2
-"""Codes in status[0]: a particle outside the padded grid; one that moves by more than a cell a substep, or is not finite."""
+"""Codes in the `status` of a scene: a particle outside the padded grid; one that moves by more than a cell a substep, or is not finite."""
 
 
 @functools.cache
@@ -354,7 +354,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         status: wp.array(dtype=wp.int32),
         span: wp.array(dtype=real),
     ):
-        """Gather; a particle that is lost, too fast or not finite leaves its code, index and step in `status`.
+        """Gather; the first particle of a scene that is lost, too fast or not finite leaves its code, index and step in `status`.
 
         Where `span` has room for two figures, it is widened to the x of all particles.
         """
@@ -391,9 +391,9 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         if not cell_of(y, origin[s], h, nodes):
             code = wp.max(code, wp.static(LOST))
         if code > 0:
-            if wp.atomic_cas(status, 0, 0, code) == 0:
-                status[1] = p
-                status[2] = step
+            if wp.atomic_cas(status, 3 * s, 0, code) == 0:
+                status[3 * s + 1] = p
+                status[3 * s + 2] = step
 
     @adjoint_kernel
     def grid_to_particles_adjoint(

@@ -21,6 +21,7 @@ from neuido.physics.device import real_of
 from neuido.physics.effects import Effects
 from neuido.physics.graphs import RolloutCache
 from neuido.physics.law import ElasticLaw, PlasticLaw
+from neuido.physics.lenient import spoil
 from neuido.physics.rollout import Plan
 from neuido.physics.threads import pool
 from neuido.types import Body, Particles, ParticleState, Scene
@@ -276,22 +277,31 @@ class Simulator:
             UserError: A negative modulus, dt c / dx above `COURANT_LIMIT`, too viscous for an explicit step, or a body faster than a cell
                 a step.
         """
-        for s, limit in enumerate(self.step_limits(elasticity, viscosity, mass, stiffer)):
+        for why in self._refusals(self.step_limits(elasticity, viscosity, mass, stiffer), viscosity):
+            if why:
+                raise UserError(why)
+
+    def _refusals(self, limits: Sequence[StepLimit], viscosity: Tensor | None) -> list[str]:
+        """Why the step of each scene is too long; nothing where it is not."""
+        out = []
+        for s, limit in enumerate(limits):
+            why = ""
             scene = self.scenes[s]
             own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
             if scene.dt > limit.of_waves:
                 wave = COURANT_LIMIT * scene.dx / limit.of_waves
-                raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_waves:.3g} s of a wave of {wave:.4g} m/s on "
-                                f"cells of {scene.dx:.4g} m; lower `dt`, `cells` or the stiffness")  # fmt: skip
-            if viscosity is not None and scene.dt > limit.of_viscosity:
+                why = (f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_waves:.3g} s of a wave of {wave:.4g} m/s on "
+                       f"cells of {scene.dx:.4g} m; lower `dt`, `cells` or the stiffness")  # fmt: skip
+            elif viscosity is not None and scene.dt > limit.of_viscosity:
                 bulk = float((viscosity[s, 1] - 2.0 / 3.0 * viscosity[s, 0]).detach())  # in the type in which it was added
                 eta = float(viscosity[s, 0].detach())
-                raise UserError(f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_viscosity:.3g} s of a shear viscosity of "
-                                f"{eta:.3g} and a bulk viscosity of {bulk:.3g} Pa s; lower `dt` or the viscosity")  # fmt: skip
-            speed = float(self.state.v[own].norm(dim=1).max())
-            if speed * scene.dt >= scene.dx:
-                raise UserError(f"the body of scene {s} starts with {speed:.4g} m/s and crosses a cell of {scene.dx:.4g} m in a step of "
-                                f"{scene.dt:g} s; lower `dt`")  # fmt: skip
+                why = (f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_viscosity:.3g} s of a shear viscosity of "
+                       f"{eta:.3g} and a bulk viscosity of {bulk:.3g} Pa s; lower `dt` or the viscosity")  # fmt: skip
+            elif (speed := float(self.state.v[own].norm(dim=1).max())) * scene.dt >= scene.dx:
+                why = (f"the body of scene {s} starts with {speed:.4g} m/s and crosses a cell of {scene.dx:.4g} m in a step of "
+                       f"{scene.dt:g} s; lower `dt`")  # fmt: skip
+            out.append(why)
+        return out
 
     def rollout(
         self,
@@ -307,6 +317,7 @@ class Simulator:
         every: int = 1,
         segment: int | None = None,
         check: bool = True,
+        lenient: bool = False,
     ) -> ParticleState:
         """Run `steps` substeps.
 
@@ -326,6 +337,7 @@ class Simulator:
                 backward pass, piece by piece (a third more time); on CUDA also without gradients: one captured piece serves all of them.
                 It must divide `steps` and be a multiple of `every`.
             check: Compare the step with the stability limit first.
+            lenient: Frames of a scene whose step is too long, or whose motion fails, are NaN, in place of an error.
 
         Returns:
             Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1; frame 0 is the start.
@@ -340,10 +352,14 @@ class Simulator:
             self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
         )
         pull = given.effects.accelerations(given.gravity, self.dt, steps).contiguous()
+        refused = []
         if check:
-            self.check_step(elasticity, given.viscosity, given.mass, given.stiffening(self))
+            limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
+            refused = self._refusals(limits, given.viscosity)
+            if not lenient and any(refused):
+                raise UserError(next(why for why in refused if why))
         tables, mass = given.tables, given.mass
-        plan = Plan(self, elasticity, plasticity, steps, every, tables)
+        plan = Plan(self, elasticity, plasticity, steps, every, tables, lenient)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
         history = mass.new_zeros(len(mass), plan.layout.width)
         start = [t[self.order] for t in (*given.state, history, mass)]
@@ -351,7 +367,12 @@ class Simulator:
         optional += [None] * 3 if tables is None else [tables.material, tables.branches, tables.flow]
         optional = [mass.new_empty(0) if t is None else t.contiguous() for t in optional]
         frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment)
-        return ParticleState(*(t[:, self.inverse] for t in frames[:4]))
+        out = ParticleState(*(t[:, self.inverse] for t in frames[:4]))
+        if lenient:
+            refusing = torch.tensor([bool(why) for why in refused or [False] * self.scene_count], device=self.device)
+            scene = self.particles.scene.long()
+            spoil(out, refusing[scene] | ~torch.isfinite(out.x[-1]).all(dim=1), scene)
+        return out
 
 
 def _short(t: Tensor) -> list[float]:

@@ -20,6 +20,7 @@ from neuido.physics import effect_kernels, kernels
 from neuido.physics.device import launch, real_of, torch_stream
 from neuido.physics.effect_tables import Layout, Tables
 from neuido.physics.law import ElasticLaw, Engine, PlasticLaw
+from neuido.physics.lenient import spoil
 from neuido.physics.recording import Stretches
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Tape(NamedTuple):
     F: Tensor
     history: Tensor
     status: Tensor
-    """Code, particle and substep of the first failure, (3,) int32."""
+    """Code, particle and substep of the first failure of each scene, (3 S,) int32."""
     tau: Tensor | None
     """Stress of each substep, (T, P, 3, 3), or None."""
     trial: Tensor | None
@@ -81,6 +82,7 @@ class Plan:
         steps: Substeps.
         every: Substeps between frames.
         tables: What the effects of the material need; of it the plan keeps what decides its launches.
+        lenient: Frames of a scene that fails are NaN, in place of an error.
     """
 
     def __init__(
@@ -91,8 +93,9 @@ class Plan:
         steps: int,
         every: int,
         tables: Tables | None = None,
+        lenient: bool = False,
     ) -> None:
-        self.simulator, self.elasticity, self.steps, self.every = simulator, elasticity, steps, every
+        self.simulator, self.elasticity, self.steps, self.every, self.lenient = simulator, elasticity, steps, every, lenient
         self.layout = Layout() if tables is None else tables.layout
         self.spectral = tables is not None and tables.spectral
         self.flow_kinds = () if tables is None else tables.kinds
@@ -132,7 +135,7 @@ class Plan:
         """The plan of one scene."""
         plastic = None if self.plasticity is None else self.plasticity.alone(s)
         tables = None if self.tables is None else self.tables._replace(kinds=self.flow_kinds[s : s + 1])
-        plan = Plan(self.simulator.alone(s), self.elasticity.alone(s), plastic, self.steps, self.every, tables)
+        plan = Plan(self.simulator.alone(s), self.elasticity.alone(s), plastic, self.steps, self.every, tables, self.lenient)
         plan.split = self.split
         return plan
 
@@ -159,7 +162,7 @@ class Plan:
         count = self.steps if keep_all else self.steps // self.every
         history = sim.mass.new_empty(len(sim.mass), self.layout.width)
         states = (t.new_empty(count + 1, *t.shape) for t in (*sim.state, history))
-        status = torch.zeros(3, dtype=torch.int32, device=sim.device)
+        status = torch.zeros(3 * sim.scene_count, dtype=torch.int32, device=sim.device)
         more = keep_all and sim.keep_grid
         tau = sim.state.F.new_empty(self.steps, *sim.state.F.shape) if more else None
         trial = torch.empty_like(tau) if tau is not None and self.corrects else None
@@ -335,17 +338,22 @@ class Plan:
         ]
 
     def check(self, tape: Tape) -> None:
-        """Raise what the kernels found, or a last frame that is not finite.
+        """Raise what the kernels found, or a last frame that is not finite; if `lenient`, make the frames of such scenes NaN.
 
         Raises:
             UserError: A particle lost, too fast, or not finite.
         """
-        code, p, step = tape.status.tolist()
-        if code == 0 and bool(torch.isfinite(tape.F[-1]).all()):
+        sim, found = self.simulator, tape.status.view(-1, 3)
+        finite = torch.isfinite(tape.F[-1]).all(dim=(1, 2))
+        if bool(finite.all()) and not bool(found.any()):
             return
+        if self.lenient:
+            spoil(tape.states[:4], ~finite | (found[:, 0] != 0)[sim.particles.scene.long()], sim.particles.scene)
+            return
+        # the first one in time
+        code, p, step = min((row for row in found.tolist() if row[0]), key=lambda row: row[2], default=(0, 0, 0))
         if code == 0:
-            p, step = int((~torch.isfinite(tape.F[-1]).all(dim=(1, 2))).nonzero()[0]), self.steps - 1
-        sim = self.simulator
+            p, step = int((~finite).nonzero()[0]), self.steps - 1
         s = int(sim.particles.scene[p])
         p = int(sim.order[p]) + sim.first_particle
         scene = sim.scenes[s]

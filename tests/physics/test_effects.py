@@ -294,6 +294,22 @@ def test_yield_leaves_a_dent():
     assert heights[1] < 0.97 * heights[0]
 
 
+def test_an_effect_of_size_zero_adds_nothing_to_a_body_turned_inside_out():
+    """Its stretches have no logarithm; the base law bears it, and so does the law with every effect at zero."""
+    body = block((0.3, 0.3, 0.3), (0.6, 0.6, 0.6), (3, 3, 3))
+    scene = Scene(cells=16, dt=1e-4, walls=None, gravity=(0.0, 0.0, 0.0))
+    sim = Simulator(scene, body, dtype=torch.float64, device=DEVICE)
+    F = torch.diag(torch.tensor([-0.4, 1.1, 0.9], dtype=torch.float64)).to(DEVICE)
+    state = sim.state._replace(F=F.expand_as(sim.state.F))
+    zero = Effects(strain_stiffening=0.0, second_invariant=0.0, tension_compression=0.0, fibre=0.0, fibre_direction=(1.0, 0.0, 0.0),
+                   softening=0.0, maxwell_ratio=0.0, maxwell_time=0.01)  # fmt: skip
+    plain = sim.rollout(5, FixedCorotated(1e4, 0.3), state=state)
+    with_zero = sim.rollout(5, FixedCorotated(1e4, 0.3), state=state, effects=zero)
+    assert float((plain.x[-1] - plain.x[0]).abs().max()) > 1e-6
+    assert torch.isfinite(with_zero.x).all()
+    torch.testing.assert_close(with_zero.x, plain.x, atol=1e-12, rtol=0.0)
+
+
 def test_parameter_sets_run_in_one_launch():
     scene, body = busy_scenes()[0][0], busy_scenes()[1][0]
     values = {"yield.inverse": [0.0, 1e-3, 0.0], "softening.s": [1.0, 0.0, 0.0], "maxwell.ratio": [0.0, 0.0, 0.5],

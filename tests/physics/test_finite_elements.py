@@ -379,3 +379,26 @@ def test_wrong_options_are_named():
         solver(FREE, body).rollout(4, FixedCorotated(1e4, 0.3), friction=torch.zeros(3, 3))
     given = FiniteElements([FREE] * 2, [body, Body(body.x, body.v, body.volume)], meshes=mesh)
     assert given.meshes[1] is mesh
+
+
+def test_scenes_that_fail_are_nan_and_the_others_as_alone():
+    """One needs too many inner steps, one leaves the finite: the others are what they are without them, in arrays of their own or not."""
+    scene = Scene(dt=1e-3, walls=None, gravity=(0.0, 0.0, 0.0))
+    body = block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (4, 4, 4), (0.5, 0.0, 0.0), (0.0, 0.0, 3.0))
+    young = torch.tensor([4e4, 1e13, 4e5, 8e4], dtype=torch.float64)
+    sim = solver([scene] * 4, [body] * 4)
+    start = ParticleState(*(t.clone() for t in sim.state))
+    start.v[sim.particles.offsets[2] : sim.particles.offsets[3]] *= 1e4
+    whole = [Assembly(sim, [a.pieces[0] for a in sim.assemblies], 0, 4)]
+    for assemblies in (sim.assemblies, whole):
+        sim.assemblies, sim.pool = assemblies, None
+        out = sim.rollout(20, FixedCorotated(young, 0.3), state=start, every=10, lenient=True)
+        for s in range(4):
+            own = slice(sim.particles.offsets[s], sim.particles.offsets[s + 1])
+            if s in (1, 2):
+                assert all(bool(torch.isnan(t[:, own]).all()) for t in out)
+                continue
+            alone = solver(scene, body).rollout(20, FixedCorotated(young[s : s + 1], 0.3), every=10)
+            assert float((out.x[:, own] - alone.x).abs().max()) < 1e-4, "more inner steps than alone"
+    with pytest.raises(UserError, match="dt of scene 1 needs"):
+        sim.rollout(20, FixedCorotated(young, 0.3), state=start, every=10)

@@ -356,3 +356,28 @@ def test_launches_do_not_hold_the_memory_of_their_tensors():
     from neuido.physics.device import _array
 
     assert _array(torch.zeros(7, 3), wp.vec3f)._ref is None
+
+
+@pytest.mark.parametrize("segment", [None, 20])
+@pytest.mark.parametrize("device", DEVICES)
+def test_scenes_that_fail_are_nan_and_the_others_as_alone(device, segment):
+    """One refuses its step, one loses particles, one blows up unchecked: the others are what they are without them."""
+    scene = Scene(cells=16, dt=1e-3, walls=None, gravity=(0.0, 0.0, 0.0))
+    still = block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (4, 4, 4), velocity=(0.1, 0.0, 0.0))
+    leaving = still._replace(v=still.v.new_tensor([-20.0, 0.0, 0.0]).expand_as(still.v))
+    stretching = still._replace(v=3.0 * (still.x - 0.5))
+    young = torch.tensor([5e4, 5e8, 5e4, 7e4])
+    sim = Simulator([scene] * 4, [still, stretching, leaving, still], device=device)
+    out = sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment, lenient=True)
+    broken = [bool(torch.isnan(t[:, a:b]).all()) for a, b in zip(sim.particles.offsets[:-1], sim.particles.offsets[1:]) for t in out[:1]]
+    assert broken == [False, True, True, False]
+    for s in (0, 3):
+        alone = Simulator(scene, still, device=device).rollout(60, FixedCorotated(young[s], 0.3), every=20)
+        for t, one in zip(out, alone, strict=True):
+            torch.testing.assert_close(t[:, sim.particles.offsets[s] : sim.particles.offsets[s + 1]], one, atol=1e-5, rtol=1e-5)
+    with pytest.raises(UserError, match="in scene 1, above the limit"):
+        sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment)
+    with pytest.raises(UserError, match=r"of scene [12] "):
+        sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment, check=False)
+    unchecked = sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment, check=False, lenient=True)
+    assert torch.equal(torch.isnan(unchecked.x), torch.isnan(out.x))
