@@ -42,8 +42,6 @@ def build(real: type) -> SimpleNamespace:
     @kernel
     def kinematics(
         elements: wp.array(dtype=wp.vec4i),
-        scene: wp.array(dtype=wp.int32),
-        dt: wp.array(dtype=real),
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         shape: wp.array(dtype=mat33),
@@ -51,23 +49,27 @@ def build(real: type) -> SimpleNamespace:
         gradients: wp.array(dtype=mat33),
         C: wp.array(dtype=mat33),
         F: wp.array(dtype=mat33),
-        F_next: wp.array(dtype=mat33),
     ):
-        """F = Ds `shape` where that is given (a body that only stretches), else (I + dt C) F; C and G where they are asked for.
+        """G, F = Ds `shape`, and C where it is asked for.
 
-        C is the gradient of the new velocity over the old places, and so both forms are the same motion.
+        C is the gradient of the new velocity over the old places, and so F is (I + dt C) of the last one; its error does not grow where
+        an element is turned inside out and G is large for a moment.
         """
         i = wp.tid()
         e = elements[i]
         D = edges(e, x)
         if rate:
-            c = edges(e, v) * gradients[i]
-            C[i] = c
-            if not shape:
-                F_next[i] = F[i] + dt[scene[i]] * (c * F[i])
-        if shape:
-            F_next[i] = D * shape[i]
+            C[i] = edges(e, v) * gradients[i]
+        F[i] = D * shape[i]
         gradients[i] = wp.inverse(D)
+
+    @kernel
+    def reshape(trial: wp.array(dtype=mat33), F: wp.array(dtype=mat33), gradients: wp.array(dtype=mat33), shape: wp.array(dtype=mat33)):
+        """The shape without stress, G F, of elements that flowed."""
+        i = wp.tid()
+        change = F[i] - trial[i]
+        if wp.ddot(change, change) != zero:
+            shape[i] = gradients[i] * F[i]
 
     @kernel
     def corner_forces(
@@ -206,6 +208,7 @@ def build(real: type) -> SimpleNamespace:
     return SimpleNamespace(
         reference=reference,
         kinematics=kinematics,
+        reshape=reshape,
         corner_forces=corner_forces,
         move=move,
         node_mean=node_mean,

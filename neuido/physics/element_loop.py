@@ -112,8 +112,7 @@ class Loop:
         assembly = self.assembly
         with torch_stream(assembly.solver.device):
             self._launch(assembly.solver.kernels.reference, len(self.F), assembly.elements, self.x, self.gradients)
-        if not self.changes:
-            torch.matmul(self.gradients, self.F, out=self.shape)
+        torch.matmul(self.gradients, self.F, out=self.shape)
 
     def advance(self, pull: Tensor | None = None, growth: Tensor | None = None) -> None:
         """Run an interval, with its rows of what changes over time."""
@@ -148,6 +147,8 @@ class Loop:
                 if self.layout.width > 0 or self.flows:
                     self._remember(growth)
                     self.history, self.history_next = self.history_next, self.history
+                if self.changes:
+                    self._launch(self.assembly.solver.kernels.reshape, len(self.F), self.trial, self.F, self.gradients, self.shape)
         self.history, self.history_next = begun
 
     def _engines(self) -> tuple[Engine, Engine | None]:
@@ -177,12 +178,12 @@ class Loop:
     def _move(self, pull: Tensor, *, last: bool) -> None:
         """Nodes by their forces, and the trial F of the elements (F itself where nothing corrects it)."""
         k, a, f = self.assembly.solver.kernels, self.assembly, self.fields
-        rates = last or self.changes or f.viscosity is not None or self.layout.width > 0
+        rates = last or f.viscosity is not None or self.layout.width > 0
         self._launch(k.corner_forces, len(self.F), a.volume, self.gradients, self.tau, self.force)
         self._launch(k.move, len(self.x), a.first, a.corner, a.node_scene, a.held, f.mass, f.dt, pull, f.force, self.plane, self.kind,
                      f.friction, self.force, self.x, self.v)  # fmt: skip
-        self._launch(k.kinematics, len(self.F), a.elements, a.particles.scene, f.dt, self.x, self.v, None if self.changes else self.shape,
-                     rates, self.gradients, self.C, self.F, self.trial if self.changes else self.F)  # fmt: skip
+        self._launch(k.kinematics, len(self.F), a.elements, self.x, self.v, self.shape, rates, self.gradients, self.C,
+                     self.trial if self.changes else self.F)  # fmt: skip
 
     def _remember(self, growth: Tensor | None) -> None:
         """The history after a step, and F where an effect makes it of the trial one."""
