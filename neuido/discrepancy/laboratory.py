@@ -92,6 +92,8 @@ class Laboratory:
 
     def about_alike(self, point: Point, floor: Floor, setting: int) -> bool:
         """Whether a setting differs from the own one by a small part of what is left, past what the differences of the settings take up."""
+        if self.problem.margin(point, setting) < 0.0:
+            return False
         with self.memo.during("discretisation"):
             rows = self.predicted([point], self.fitted_recordings, (self.own, setting))
         off = {n: rows[n, setting][0] - rows[n, self.own][0] for n in self.fitted_recordings}
