@@ -96,15 +96,17 @@ def build(real: type) -> SimpleNamespace:
         material: wp.array2d(dtype=real),
         branches: wp.array3d(dtype=real),
         spectral: bool,
+        idle: bool,
         history: wp.array2d(dtype=real),
     ):
-        """The stress before `worn_scale`: that of the base law, extra(F) and the branches [Pa]."""
+        """The stress before `worn_scale`: that of the base law, extra(F) and the branches [Pa]; `idle` as of `history_kernels.relax`."""
         out = base[p]
         if material:
             out = out + extra_stress(F[p], material, s, spectral)
         if branches:
             for b in range(branches.shape[1]):
-                out = out + branches[s, b, 0] * load(history, p, 6 * b)
+                if idle or branches[s, b, 0] != zero:
+                    out = out + branches[s, b, 0] * load(history, p, 6 * b)
         return out
 
     @func
@@ -132,6 +134,7 @@ def build(real: type) -> SimpleNamespace:
         branches: wp.array3d(dtype=real),
         spectral: bool,
         at_e_max: int,
+        idle: bool,
         F: wp.array(dtype=mat33),
         history: wp.array2d(dtype=real),
         tau: wp.array(dtype=mat33),
@@ -139,7 +142,7 @@ def build(real: type) -> SimpleNamespace:
         """tau = scale (tau + extra(F) + sum of the branches)."""
         p = wp.tid()
         s = scene[p]
-        t = undamaged(p, s, tau, F, material, branches, spectral, history)
+        t = undamaged(p, s, tau, F, material, branches, spectral, idle, history)
         tau[p] = worn_scale(p, s, stiffness, growth, material, history, at_e_max) * t
 
     @kernel
@@ -169,7 +172,7 @@ def build(real: type) -> SimpleNamespace:
         scale = worn_scale(p, s, stiffness, growth, material, history, at_e_max)
         G = (real(0.5) * scale) * (A + wp.transpose(A))
         if stiffness or growth or at_e_max >= 0:
-            t = undamaged(p, s, base, F, material, branches, spectral, history)
+            t = undamaged(p, s, base, F, material, branches, spectral, True, history)
             a_log = scale * wp.ddot(A, t)
             if stiffness:
                 a_stiffness[p] = a_stiffness[p] + a_log / stiffness[p]

@@ -167,7 +167,7 @@ class Loop:
         elastic.forward(self.smoothed, self.tau)
         if self.material is not None:
             self._launch(self.material.add_effect_stress, elements, scene, f.stiffness, growth, f.material, f.branches, self.spectral,
-                         self.layout.at_e_max, self.smoothed, self.history, self.tau)  # fmt: skip
+                         self.layout.at_e_max, False, self.smoothed, self.history, self.tau)  # fmt: skip
         if f.viscosity is not None:
             self._launch(k.add_viscous_stress, elements, scene, f.viscosity, self.C, self.smoothed, self.tau)
         if self.nodal:
@@ -189,7 +189,7 @@ class Loop:
         """The history after a step, and F where an effect makes it of the trial one."""
         f, scene, layout, k = self.fields, self.assembly.particles.scene, self.layout, self.material
         if f.branches is not None:
-            self._launch(k.relax, len(self.F), scene, f.dt, f.branches, self.C, self.history, self.history_next)
+            self._launch(k.relax, len(self.F), scene, f.dt, f.branches, False, self.C, self.history, self.history_next)
         if self.flows:
             self._launch(k.flow, len(self.F), scene, f.dt, self.kinds, f.flow, f.stiffness, growth, layout.at_alpha, layout.at_backstress,
                          self.trial, self.C, self.history, self.F, self.history_next)  # fmt: skip

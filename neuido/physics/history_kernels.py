@@ -36,20 +36,25 @@ def build(real: type) -> SimpleNamespace:
         scene: wp.array(dtype=wp.int32),
         dt: wp.array(dtype=real),
         branches: wp.array3d(dtype=real),
+        idle: bool,
         C: wp.array(dtype=mat33),
         history: wp.array2d(dtype=real),
         history_next: wp.array2d(dtype=real),
     ):
-        """e = exp(-dt/T) R e R^T + T (1 - exp(-dt/T)) dev D of each branch: exact for a steady D in the turning frame."""
+        """e = exp(-dt/T) R e R^T + T (1 - exp(-dt/T)) dev D of each branch: exact for a steady D in the turning frame.
+
+        `idle`: of those of weight zero too, whose slope with the weight a backward pass asks for. Else nobody reads them.
+        """
         p = wp.tid()
         s = scene[p]
         h = dt[s]
         R = rotation(half_turn(C[p], h))
         D = deviator(half * (C[p] + wp.transpose(C[p])))
         for b in range(branches.shape[1]):
-            x = h / branches[s, b, 1]
-            e = R * load(history, p, 6 * b) * wp.transpose(R)
-            store(history_next, p, 6 * b, wp.exp(-x) * e + (h * exp_slope(-x)) * D)
+            if idle or branches[s, b, 0] != zero:
+                x = h / branches[s, b, 1]
+                e = R * load(history, p, 6 * b) * wp.transpose(R)
+                store(history_next, p, 6 * b, wp.exp(-x) * e + (h * exp_slope(-x)) * D)
 
     @kernel
     def relax_adjoint(

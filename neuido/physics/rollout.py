@@ -56,6 +56,8 @@ class Tape(NamedTuple):
     """Nodal momentum and mass of each substep, (T, nodes, 4), or None."""
     velocity: Tensor | None
     """Nodal velocity of each substep, (T, nodes, 4), or None."""
+    whole: bool
+    """Whether a backward pass may follow."""
 
     @property
     def states(self) -> tuple[Tensor, ...]:
@@ -70,6 +72,8 @@ class Material(NamedTuple):
     material: Tensor | None
     branches: Tensor | None
     flow: Tensor | None
+    idle: bool = True
+    """Whether branches of weight zero are kept too, for a backward pass."""
 
 
 class Plan:
@@ -147,12 +151,12 @@ class Plan:
         """Whether the trial gradient is corrected, by a law or by an effect."""
         return self.plasticity is not None or bool(self.flow_kinds)
 
-    def material(self, inputs: Sequence[Tensor], n: int) -> Material | None:
+    def material(self, inputs: Sequence[Tensor], n: int, *, idle: bool = True) -> Material | None:
         """What the kernels of the effects read in substep n."""
         if self.tables is None:
             return None
         stiffness, growth, *tables = inputs[STATES + 5 : FIXED]
-        return Material(*(t if t.numel() else None for t in (stiffness, at_step(growth, n), *tables)))
+        return Material(*(t if t.numel() else None for t in (stiffness, at_step(growth, n), *tables)), idle)
 
     # Forward.
 
@@ -167,7 +171,7 @@ class Plan:
         tau = sim.state.F.new_empty(self.steps, *sim.state.F.shape) if more else None
         trial = torch.empty_like(tau) if tau is not None and self.corrects else None
         nodal = [sim.mass.new_empty(self.steps, sim.node_count, 4) if more else None for _ in range(2)]
-        return Tape(*states, status, tau, trial, *nodal)
+        return Tape(*states, status, tau, trial, *nodal, keep_all)
 
     def forward(self, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
         """Launch the substeps (all, or the first `steps`); checks nothing."""
@@ -199,7 +203,7 @@ class Plan:
                 grid = sim.scratch("grid") if tape.grid is None else tape.grid[n]
                 velocity = sim.scratch("velocity") if tape.velocity is None else tape.velocity[n]
                 if n == 0 or not steady:
-                    material, pull_now = self.material(inputs, n), at_step(pull, n)
+                    material, pull_now = self.material(inputs, n, idle=tape.whole), at_step(pull, n)
                 if not clears:
                     grid.zero_()
                 scatter = partial(self.scatter, inputs, now, material, elastic, tau, grid)
@@ -254,7 +258,7 @@ class Plan:
         sim = self.simulator
         elastic.forward(F, tau)
         if material is not None:
-            self.launch(self.effects.add_effect_stress, len(F), [*self.stress_inputs(material), F, history, tau])
+            self.launch(self.effects.add_effect_stress, len(F), [*self.stress_inputs(material), material.idle, F, history, tau])
         if viscosity.numel():
             self.launch(sim.kernels.add_viscous_stress, len(F), [sim.particles.scene, viscosity, C, F, tau])
 
@@ -270,7 +274,7 @@ class Plan:
         """The history of the next substep, and its F where an effect makes it of the trial one."""
         sim, k = self.simulator, self.effects
         if material.branches is not None:
-            self.launch(k.relax, len(F), [sim.particles.scene, sim.dt, material.branches, C, history, history_next])
+            self.launch(k.relax, len(F), [sim.particles.scene, sim.dt, material.branches, material.idle, C, history, history_next])
         if material.flow is not None:
             self.launch(k.flow, len(F), [*self.flow_inputs(material), trial, C, history, F, history_next])
         if self.layout.e_max:
