@@ -406,16 +406,18 @@ class Laboratory:
         return self.noise_squares + np.nanmean(left, axis=0) if left else self.noise_squares
 
     def nuisances(self, point: Point, recordings: Sequence[int]) -> dict[int, np.ndarray]:
-        """Directions of the nuisances of each recording, of one prior standard deviation, as a quick motion has them."""
-        asks = []
+        """Directions of the nuisances of each recording, of one prior standard deviation, as a quick motion has them where it runs."""
+        asks = {}
         for n in recordings:
             own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{self.problem.recordings[n].name}")]
-            moved = [dict(point) | {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + p.prior)} for p in own]
-            asks.append(([point, *moved], n, self.problem.quick(self.own)))
-        with self.memo.during("nuisances"):
-            predicted = self.memo.predict_several(asks)
+            asks[n] = [point, *(point | {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + p.prior)} for p in own)]
+        quick, predicted = self.problem.quick(self.own), {}
+        for setting in dict.fromkeys((quick, self.own) if self.problem.margin(point, quick) >= 0.0 else (self.own,)):
+            wanted = [n for n in recordings if n not in predicted or not np.isfinite(predicted[n][0]).all()]
+            with self.memo.during("nuisances"):
+                predicted |= dict(zip(wanted, self.memo.predict_several([(asks[n], n, setting) for n in wanted]), strict=True))
         out = {}
-        for n, (here, *rows) in zip(recordings, predicted, strict=True):
-            columns = [np.where(np.isfinite(row).all(), row - here, 0.0) for row in rows]
+        for n, (here, *rows) in predicted.items():
+            columns = [np.where(np.isfinite(row - here).all(), row - here, 0.0) for row in rows]
             out[n] = np.stack(columns, axis=1) if columns else np.empty((len(here), 0))
-        return out
+        return {n: out[n] for n in recordings}

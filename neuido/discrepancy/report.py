@@ -93,8 +93,8 @@ def _one(made: Details, d: Diagnosis) -> list[str]:
         ]
         out.append(f'<p class="note">{WEAK}</p>')
         for place, p in c["places"].items():
-            at = ", ".join(f"{v:.3g}" for v in p["from_centre"])
-            where = f"{place}: the missing force is largest at ({at}) m from the centre, {p['over_median']:.1f} times the median."
+            at = ", ".join(_said(v, 3) for v in p["from_centre"])
+            where = f"{place}: the missing force is largest at ({at}) m from the centre, {_said(p['over_median'], 2)} times the median."
             out.append(f"<p>{escaped(where)}</p>")
     elif made.silhouettes:
         out += pictures.section(made.silhouettes)
@@ -126,18 +126,17 @@ def _effects(c: dict[str, Any]) -> str:
                 rows.append((e["name"], key, value, p["unit"], "", f"{e['p_value']:.3g}", e["where"]))
             else:
                 low, high = p["interval90"]
-                rows.append((e["name"], key, p["value"], p["unit"], f"{low:.4g} to {high:.4g}", f"{e['p_value']:.3g}", e["where"]))
+                rows.append((e["name"], key, p["value"], p["unit"], f"{_said(low)} to {_said(high)}", f"{e['p_value']:.3g}", e["where"]))
     return table(("effect", "parameter", "value", "unit", "90 % interval", "p (family-wise)", "where"), rows) if rows else ""
 
 
 def _errors(c: dict[str, Any]) -> str:
     e = c["error"]
-    rows = [
-        (name, e["before"]["by_recording"][name], e["after"]["by_recording"][name], _ratio(e, name)) for name in e["before"]["by_recording"]
-    ]
+    rows = [(name, before, e["after"]["by_recording"][name]) for name, before in e["before"]["by_recording"].items()]
     for name, label in (("fit", "all that is fitted"), ("held_out", "all that is held out")):
         if e["before"][name] is not None:
-            rows.append((label, e["before"][name], e["after"][name], e["before"][name] / max(e["after"][name], 1e-300)))
+            rows.append((label, e["before"][name], e["after"][name]))
+    rows = [(label, before, after, None if None in (before, after) else before / max(after, 1e-300)) for label, before, after in rows]
     floors = f"Floors: noise {e['noise_floor']:.3g} {e['unit']}, discretisation {e['discretisation_floor']:.3g} {e['unit']}."
     out = f"<h2>Error [{escaped(e['unit'])}]</h2>" + table(("recording", "before", "after", "ratio"), rows) + f"<p>{escaped(floors)}</p>"
     return out + _settings(e)
@@ -151,15 +150,16 @@ def _settings(e: dict[str, Any]) -> str:
     rows = [(name, e["amounts"]["before"][name], amount) for name, amount in e["amounts"]["after"].items()]
     scored = "held_out" if e["one_setting"]["after"]["held_out"] is not None else "fit"
     before, after = (e["one_setting"][when][scored] for when in ("before", "after"))
-    alone = f"One simulation without them leaves {before:.3g} {e['unit']} before and {after:.3g} {e['unit']} after."
+    alone = f"One simulation without them leaves {_said(before, 3)} {e['unit']} before and {_said(after, 3)} {e['unit']} after."
     if height := e.get("contact_height"):
         places = " and ".join(f"{1e3 * height[when]:.3g} mm {when}" for when in ("before", "after"))
         alone += f" The colliders of that grid are higher than they are declared by {places}: a grid's floor is a layer of its nodes."
     return f"<p>{held}</p>" + table(("other setting", "amount before", "amount after"), rows) + f"<p>{escaped(alone)}</p>"
 
 
-def _ratio(e: dict[str, Any], name: str) -> float:
-    return e["before"]["by_recording"][name] / max(e["after"]["by_recording"][name], 1e-300)
+def _said(value: float | None, digits: int = 4) -> str:
+    """A figure; none is one that is not finite, where a recording cannot be predicted."""
+    return "infinite" if value is None else f"{value:.{digits}g}"
 
 
 def _stages(made: Details) -> str:
@@ -196,14 +196,6 @@ def _figures(c: dict[str, Any]) -> str:
     rows = []
     for name in c["declared"]:
         b, a = c["declared"][name], c["after"][name]
-        rows.append(
-            (
-                name,
-                b["unit"],
-                b["value"],
-                "{:.4g} to {:.4g}".format(*b["interval90"]),
-                a["value"],
-                "{:.4g} to {:.4g}".format(*a["interval90"]),
-            )
-        )
+        spans = (" to ".join(_said(v) for v in own["interval90"]) for own in (b, a))
+        rows.append((name, b["unit"], b["value"], next(spans), a["value"], next(spans)))
     return table(("figure", "unit", "before", "90 % interval", "after", "90 % interval"), rows) if rows else "<p>None was free.</p>"

@@ -7,7 +7,7 @@ import pytest
 
 from neuido.discrepancy import attribution
 from neuido.discrepancy.attribution import diagnose
-from neuido.discrepancy.body import body_problem
+from neuido.discrepancy.body import BodyProblem, body_problem
 from neuido.discrepancy.resume import CachedProblem
 from neuido.discrepancy.rollouts import EVERY, SETTINGS, SOLVERS
 from neuido.discrepancy.rounds import Inference
@@ -59,6 +59,33 @@ def test_a_longer_step_moves_as_the_suggested_one_but_for_what_half_of_it_does(e
     here, half, long = (problem.predict([{}], 0, s)[0] for s in (0, 1, quick))
     d, q = half - here, long - here
     assert 0.0 < np.linalg.norm(q) < 1.5 * EVERY[quick].dt * np.linalg.norm(d)
+
+
+@pytest.mark.parametrize("why", ["margin", "run"])
+def test_directions_of_nuisances_are_those_of_the_own_setting_where_a_longer_step_does_not_run(why, experiment, monkeypatch):
+    problem = with_step(experiment, 0.5)
+    quick, several = problem.quick(0), BodyProblem.predict_several
+    assert EVERY[quick].dt > 1.0
+    with monkeypatch.context() as patch:
+        patch.setattr(BodyProblem, "quick", lambda self, setting: setting)
+        own = Inference(problem).nuisances({}, [0, 1])
+    asked = []
+
+    def without(self, asks):
+        """The second recording fails with the longer step."""
+        for (_, n, setting), rows in zip(asks, several(self, asks), strict=True):
+            asked.append((n, setting))
+            yield np.full_like(rows, np.nan) if setting == quick and n == 1 else rows
+
+    monkeypatch.setattr(BodyProblem, "predict_several", without)
+    if why == "margin":
+        monkeypatch.setattr(BodyProblem, "margin", lambda self, point, setting=0: -0.1 if setting == quick else 1.0)
+    found = Inference(problem).nuisances({}, [0, 1])
+    assert asked == ([(0, quick), (1, quick), (1, 0)] if why == "run" else [(0, 0), (1, 0)])
+    assert list(found) == [0, 1]
+    assert np.abs(own[1]).max() > 1e-4
+    np.testing.assert_array_equal(found[1], own[1])
+    assert np.isfinite(found[0]).all()
 
 
 class Hurried(Line):

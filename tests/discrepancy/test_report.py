@@ -149,6 +149,23 @@ def test_figures_are_drawn():
     assert report_figures.ranking([], 0.0) == ""
 
 
+def test_a_recording_that_cannot_be_predicted_has_no_figure():
+    """Infinite errors are null in diagnosis.json; the report says so and is written all the same."""
+    errors = {"fit": 0.002, "held_out": None, "by_recording": {"first": 0.002, "second": None}}
+    alone = {"fit": 0.003, "held_out": None}
+    content = {
+        "error": {"unit": "m", "noise_floor": 1e-3, "discretisation_floor": 2e-3, "before": errors, "after": errors,
+                  "amounts": {"before": {}, "after": {}}, "one_setting": {"before": alone, "after": alone}},
+        "effects": [{"name": "yield", "p_value": 0.01, "where": "",
+                     "parameters": {"inverse": {"value": 1.0, "unit": "1/Pa", "interval90": [0.5, None]}}}],
+        "declared": {"young": {"value": 1e5, "unit": "Pa", "interval90": [None, None]}},
+        "after": {"young": {"value": 1e5, "unit": "Pa", "interval90": [9e4, 1.1e5]}},
+    }  # fmt: skip
+    text = report._errors(content) + report._effects(content) + report._figures(content)
+    assert "<td>second</td><td></td><td></td><td></td>" in text
+    assert "0.5 to infinite" in text and "infinite to infinite" in text and "9e+04 to 1.1e+05" in text
+
+
 def test_other_settings_are_named():
     e = {
         "unit": "m",
