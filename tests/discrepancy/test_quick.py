@@ -79,7 +79,7 @@ def test_directions_of_nuisances_are_those_of_the_own_setting_where_a_longer_ste
 
     monkeypatch.setattr(BodyProblem, "predict_several", without)
     if why == "margin":
-        monkeypatch.setattr(BodyProblem, "margin", lambda self, point, setting=0: -0.1 if setting == quick else 1.0)
+        monkeypatch.setattr(BodyProblem, "margin", lambda self, point, setting=0: 0.2 if setting == quick else 1.0)
     found = Inference(problem).nuisances({}, [0, 1])
     assert asked == ([(0, quick), (1, quick), (1, 0)] if why == "run" else [(0, 0), (1, 0)])
     assert list(found) == [0, 1]
