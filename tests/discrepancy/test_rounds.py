@@ -75,7 +75,7 @@ class Method:
     """A method of prediction as `first_rounds` asks it: nothing that it leaves is noise alone, and each of its rounds is `result`."""
 
     def __init__(self, result=None):
-        self.result, self.deadline, self.asked = result, Deadline(), None
+        self.result, self.deadline, self.asked, self.seen = result, Deadline(), None, None
 
     def is_noise(self, errors):
         return False
@@ -1097,6 +1097,34 @@ def test_the_suggested_method_is_looked_at_first_unless_it_is_far_worse(suggeste
     result = first_round(0.1, True)
     attribution.first_rounds([Method(result), Method(result)], [stood(suggested), stood(1.0)])
     assert orders == [[first, 1 - first]]
+
+
+@pytest.mark.parametrize(("left", "rounds_of"), [(0.1, [0, 1]), (2.0, [1, 0]), (3.9, [1])])
+def test_a_method_that_is_far_worse_without_effects_is_asked_where_with_one_it_is_not(left, rounds_of, monkeypatch):
+    """Its first fits were made before the other method was: what they leave counts, not what the declared model does there."""
+    asked, starts = [], [stood(4.0), stood(1.0)]
+
+    class Asked(Method):
+        def look(self, *_, **__):
+            return self.seen
+
+        def over(self, at):
+            return 1.5
+
+        def round(self, *_):
+            asked.append(self.result)
+            return first_round(0.8, False)
+
+    methods = [Asked(0), Asked(1)]
+    for method, start, least in zip(methods, starts, (left, 0.8), strict=True):
+        method.seen = SimpleNamespace(base=start.fit, least=[np.full(2, least**2)], led=None)
+    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
+    attribution.first_rounds(methods, starts)
+    assert asked == rounds_of
+    methods[0].seen.base = None  # of another stand of the declared model
+    asked.clear()
+    attribution.first_rounds(methods, starts)
+    assert asked == [1]
 
 
 @pytest.mark.parametrize(("there", "rounds_of"), [(0.5, [0, 1]), (0.9, [0])])
