@@ -209,7 +209,7 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     order = sorted(range(len(tried)), key=lambda i: base[i])
     # what is left of the declared model says little of the methods where an effect is missing: unless it is far worse, the suggested one
     suggested = base[0] - base[order[0]] < 2.0 * math.log(WORSE)
-    with_effects = [already_seen(*one) + h for one, h in zip(zip(tried, starts, strict=True), handicap, strict=True)]
+    with_effects = [already_seen(*own) + h for *own, h in zip(tried, starts, handicap, strict=True)]
     seen = by_first_fits(tried, starts, sorted(order, key=lambda i: i > 0) if suggested else order, handicap)
     order = sorted(order, key=lambda i: seen.get(i, math.inf) + 2.0 * math.log(CLEARLY) * (i > 0))
     firsts: dict[int, list[Round]] = {}

@@ -352,12 +352,12 @@ class Simulator:
             self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
         )
         pull = given.effects.accelerations(given.gravity, self.dt, steps).contiguous()
-        refused = []
+        refused = [""] * self.scene_count
         if check:
             limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
             refused = self._refusals(limits, given.viscosity)
-            if not lenient and any(refused):
-                raise UserError(next(why for why in refused if why))
+        if not lenient and any(refused):
+            raise UserError(next(why for why in refused if why))
         tables, mass = given.tables, given.mass
         plan = Plan(self, elasticity, plasticity, steps, every, tables, lenient)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
@@ -369,7 +369,7 @@ class Simulator:
         frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment)
         out = ParticleState(*(t[:, self.inverse] for t in frames[:4]))
         if lenient:
-            refusing = torch.tensor([bool(why) for why in refused or [False] * self.scene_count], device=self.device)
+            refusing = torch.tensor([bool(why) for why in refused], device=self.device)
             scene = self.particles.scene.long()
             spoil(out, refusing[scene] | ~torch.isfinite(out.x[-1]).all(dim=1), scene)
         return out
