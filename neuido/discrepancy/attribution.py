@@ -209,14 +209,13 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     order = sorted(range(len(tried)), key=lambda i: base[i])
     # what is left of the declared model says little of the methods where an effect is missing: unless it is far worse, the suggested one
     suggested = base[0] - base[order[0]] < 2.0 * math.log(WORSE)
-    with_effects = [already_seen(*own) + h for *own, h in zip(tried, starts, handicap, strict=True)]
     seen = by_first_fits(tried, starts, sorted(order, key=lambda i: i > 0) if suggested else order, handicap)
     order = sorted(order, key=lambda i: seen.get(i, math.inf) + 2.0 * math.log(CLEARLY) * (i > 0))
     firsts: dict[int, list[Round]] = {}
     unasked = False
     for i in order:
         named = [rounds[0] for rounds in firsts.values() if rounds[0].chosen]
-        if firsts and not named and min(base[i], with_effects[i]) - base[order[0]] > 2.0 * math.log(WORSE):
+        if firsts and not named and at_best(tried[i], starts[i]) + handicap[i] - base[order[0]] > 2.0 * math.log(WORSE):
             continue
         if any(r.chosen and seen.get(i, -math.inf) > r.chosen.score + handicap[i] + 2.0 * math.log(BEYOND) for r in named):
             continue
@@ -261,10 +260,11 @@ def unsearched(start: Stand, floors: np.ndarray) -> Round:
     return Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)
 
 
-def already_seen(inference: Inference, start: Stand) -> float:
-    """Score of what the first fits of effects leave, where they were made before another method was asked; infinite elsewhere."""
+def at_best(inference: Inference, start: Stand) -> float:
+    """Score of what the declared model leaves, or the first fits of effects beside it, where these were made already and leave less."""
     look = inference.seen
-    return score(look.least[0]) if look is not None and look.base is start.fit and look.least else math.inf
+    fits = look.least if look is not None and look.base is start.fit else []
+    return min(score(squares) for squares in [start.errors, *fits])
 
 
 def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Sequence[int], handicap: Sequence[float]) -> dict[int, float]:
@@ -277,7 +277,7 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     """
     first, *others = order
     limit = score(starts[first].errors) + handicap[first] + 2.0 * math.log(WORSE)
-    others = [i for i in others if min(score(starts[i].errors), already_seen(tried[i], starts[i])) + handicap[i] <= limit]
+    others = [i for i in others if at_best(tried[i], starts[i]) + handicap[i] <= limit]
     if not others:
         return {}
     look = tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0])

@@ -427,4 +427,4 @@ class Laboratory:
         for n, (here, *rows) in predicted.items():
             columns = [np.where(np.isfinite(row - here).all(), row - here, 0.0) for row in rows]
             out[n] = np.stack(columns, axis=1) if columns else np.empty((len(here), 0))
-        return {n: out[n] for n in recordings}
+        return out

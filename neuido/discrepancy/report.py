@@ -94,7 +94,7 @@ def _one(made: Details, d: Diagnosis) -> list[str]:
         out.append(f'<p class="note">{WEAK}</p>')
         for place, p in c["places"].items():
             at = ", ".join(_said(v, 3) for v in p["from_centre"])
-            where = f"{place}: the missing force is largest at ({at}) m from the centre, {_said(p['over_median'], 2)} times the median."
+            where = f"{place}: the missing force is largest at ({at}) m from the centre, {_said(p['over_median'], 3)} times the median."
             out.append(f"<p>{escaped(where)}</p>")
     elif made.silhouettes:
         out += pictures.section(made.silhouettes)

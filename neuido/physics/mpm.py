@@ -277,14 +277,16 @@ class Simulator:
             UserError: A negative modulus, dt c / dx above `COURANT_LIMIT`, too viscous for an explicit step, or a body faster than a cell
                 a step.
         """
-        for why in self._refusals(self.step_limits(elasticity, viscosity, mass, stiffer), viscosity):
+        for why in self._refusals(elasticity, viscosity, mass, stiffer):
             if why:
                 raise UserError(why)
 
-    def _refusals(self, limits: Sequence[StepLimit], viscosity: Tensor | None) -> list[str]:
-        """Why the step of each scene is too long; nothing where it is not."""
+    def _refusals(
+        self, elasticity: ElasticLaw, viscosity: Tensor | None, mass: Tensor | None, stiffer: tuple[Tensor, Tensor] | None
+    ) -> list[str]:
+        """Why the step of each scene is too long, in the words of `check_step`; nothing where it is not."""
         out = []
-        for s, limit in enumerate(limits):
+        for s, limit in enumerate(self.step_limits(elasticity, viscosity, mass, stiffer)):
             why = ""
             scene = self.scenes[s]
             own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
@@ -352,12 +354,12 @@ class Simulator:
             self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
         )
         pull = given.effects.accelerations(given.gravity, self.dt, steps).contiguous()
+        step = (elasticity, given.viscosity, given.mass, given.stiffening(self))
         refused = [""] * self.scene_count
-        if check:
-            limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
-            refused = self._refusals(limits, given.viscosity)
-        if not lenient and any(refused):
-            raise UserError(next(why for why in refused if why))
+        if check and lenient:
+            refused = self._refusals(*step)
+        elif check:
+            self.check_step(*step)
         tables, mass = given.tables, given.mass
         plan = Plan(self, elasticity, plasticity, steps, every, tables, lenient)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
