@@ -126,6 +126,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         "internal modes",
         [{"rate": 0.5 / s.duration}],
         ("rate", "1/s", 0.3 / s.duration, -8 / s.duration, 8 / s.duration, False),
+        beside={"young": -0.5 * s.duration},
     )
     add("tension_compression", "internal modes", [{"r": 0.3}], ("r", "1", 0.2, -0.8, 5.0, False), takes=("young",))
     add("stiffness_gradient", "internal modes", [dict.fromkeys("xyz", 0.6)], *vector("xyz", "1", 0.4, 5.0), form="gradient")

@@ -73,7 +73,7 @@ class Candidate:
     far: float = 0.0
     """What `apart` is, up and down, where every start is tried once at full strength; zero: nowhere."""
     beside: Mapping[str, float] = field(default_factory=dict)
-    """By how much of `far` the logarithm of a declared parameter goes with it there: a stiff part in a soft rest, as stiff together."""
+    """By how much of a size the logarithm of a declared parameter goes with it: a stiff part in a soft rest, as stiff together."""
     takes: tuple[str, ...] = ()
     """Declared parameters that a fit without the effect makes too large for the lack of it: a modulus, of what stiffens."""
 

@@ -75,17 +75,20 @@ class Starting(Screening):
         A part that is many times as stiff as the rest moves the body in another way than the direction of a little stiffness says, and a
         fit that begins at a little comes down into the nearest valley.
         """
-        beside = [p for p in self.problem.declared if p.log and p.name in c.beside]
-        begins: list[Point] = []
-        for size in (c.far, -c.far):
-            moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside[p.name] * size / p.scale) for p in beside}
-            begins += [{**point, **start, c.apart: size, **moved} for start in places]
+        begins = [{**point, **start, **self.along(c, point, {c.apart: size})} for size in (c.far, -c.far) for start in places]
         if not begins:
             return []
         self.tell(f"{len(begins)} places of {c.key} at full strength")
         costs = np.array(self.costs(begins, floor))
         best = (min((i for i, b in enumerate(begins) if b[c.apart] * sign > 0), key=lambda i: costs[i]) for sign in (1, -1))
         return [begins[i] for i in best if np.isfinite(costs[i])]
+
+    def along(self, c: Candidate, point: Point, size: Mapping[str, float]) -> dict[str, float]:
+        """A size of a candidate, with the declared parameters that go with it (`Candidate.beside`) from what they are at a point."""
+        (value,) = size.values()
+        beside = [p for p in self.problem.declared if p.log and p.name in c.beside]
+        moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside[p.name] * value / p.scale) for p in beside}
+        return {**moved, **size}
 
     def secant(self, c: Candidate, point: Point, base: Point, slopes: Mapping[int, np.ndarray], floor: Floor) -> np.ndarray | None:
         """About the slopes of a fit of a candidate of one size: those of the declared values at the base, and the secant from there.
@@ -143,7 +146,8 @@ class Starting(Screening):
         """Further starts of a candidate of one size: at larger sizes, and in the other shapes that it is screened in.
 
         How a large effect acts is not what the slope at none says. Where the base fit has gone far from the declared values (`led_far`)
-        from these too and from between, for it may have made up for the effect; what stiffens a body is tried with less of a modulus too.
+        from these too and from between, for it may have made up for the effect; what stiffens a body is tried with less of a modulus too,
+        and what goes with a declared value along a valley (`Candidate.beside`) with that.
         """
         c, begun, _ = start
         (p,) = c.size_parameters
@@ -156,6 +160,8 @@ class Starting(Screening):
             made += [{**self.between(begin), **value} for value in far]
         others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
         made += [{**other, **value} for other in others for value in middle + far]
+        if c.beside:
+            made += [{**begin, **self.along(c, begin, value)} for value in middle + far]
         if takes := [name for name in c.takes if name in self.as_declared]:
             sizes = far[:1] if others else middle[:1] + far[:1]
             less = [{name: factor * begin[name] for name in takes} for factor in TAKEN]

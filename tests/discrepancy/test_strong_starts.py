@@ -1,6 +1,7 @@
 """Where fits of an effect begin that is no direction: a part of a body many times as stiff as the rest."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -97,6 +98,21 @@ def test_large_sizes_and_the_declared_values_are_tried_where_the_base_fit_went_f
     near = Fit({"young": 1.0}, ("young",), 1.0, np.zeros(1), 1, True)  # where it did not go far these are the base's
     kept, _ = inference.sized([(slope, {"young": 1.0, "slope.k": 0.3}, None)], near, slopes, base.floor)
     assert [place for _, place, _ in kept] == [{"young": 1.0, "slope.k": pytest.approx(1.8)}]
+
+
+def test_a_size_is_tried_with_what_goes_with_it():
+    """A modulus that falls is at its mean where the declared model's fit takes one for the whole time."""
+    problem = Bar({"young": 1.0, "slope.k": 2.4})
+    inference = Inference(problem)
+    (slope,) = (replace(c, beside={"young": 0.5}) for c in problem.candidates if c.key == "slope")
+    base = Fit({"young": 3.0}, ("young",), 1.0, np.zeros(1), 1, True)
+    begin = (slope, {"young": 3.0, "slope.k": 0.3}, None)
+    without = [place for _, place, _ in inference.tried((problem.candidates[1], *begin[1:]), base, led_far=False)]
+    places = [place for _, place, _ in inference.tried(begin, base, led_far=False)]
+    assert places[: len(without)] == without
+    along = {place["slope.k"]: place["young"] for place in places[len(without) :]}
+    sizes = [sign * f * 0.3 for f in (math.sqrt(6), 6) for sign in (1, -1)]
+    assert along == pytest.approx({size: 3.0 * math.exp(0.5 * size) for size in sizes})
 
 
 def test_the_secant_to_a_size_is_its_slope():
