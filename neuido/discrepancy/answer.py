@@ -20,6 +20,7 @@ from neuido.discrepancy.judging import ALPHA
 from neuido.discrepancy.problem import Problem
 from neuido.discrepancy.rollouts import CONTACT_HEIGHT
 from neuido.discrepancy.trials import Round, Trial
+from neuido.errors import UserError
 
 FORMAT = "neuido-diagnosis/1"
 VERSION = neuido.__version__
@@ -55,6 +56,7 @@ def write(
         made.content["seconds"] = round(spent + time.monotonic() - begun, 1) if seconds is None else seconds
         details.append(made)
     tell("writing")
+    (out / "predicted").mkdir(parents=True, exist_ok=True)
     for made in details:
         for name, arrays in made.motion.items():
             _save(out / "predicted" / f"{name}.npz", arrays)
@@ -77,7 +79,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
     """The content of diagnosis.json and what the report shows beside it."""
     tell = tell or (lambda line: None)
     tell("motion before and after")
-    motion = motions(d)
+    motion, failed = motions(d)
     series = {name: _stages(d, name, arrays) for name, arrays in motion.items() if "positions" in arrays}
     tell("ceiling")
     ceilings = {when: ceiling.of(d, when, seed=seed) for when in ("before", "after")}
@@ -107,6 +109,8 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         "device": device,
         "version": VERSION,
     }
+    if failed:
+        content["not_predicted"] = failed
     if "body" in d.problem.labels:
         content["body"] = d.problem.labels["body"]
     drawn = d.problem.silhouettes(d) if hasattr(d.problem, "silhouettes") else {}
@@ -237,14 +241,17 @@ def _declared(d: Diagnosis, point: Mapping[str, float], intervals: Mapping[str, 
     return out
 
 
-def motions(d: Diagnosis) -> dict[str, dict[str, np.ndarray]]:
+def motions(d: Diagnosis) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, str]]:
     """What was measured and what is predicted before and after, for each recording, as the errors of the diagnosis count it.
+
+    And why, of each recording that is left out because it does not move there.
 
     Bodies: `positions` (1), `measured`, `before` and `after` (T, N, 3) [m], the clock, the ruler and the launch at their most probable
     values and the other settings in their amounts, `before_model` and `after_model` without all that, `t` (T,). Others: the data as
     vectors, with `times` and `groups` (which channel a row is of).
     """
-    out = {}
+    out: dict[str, dict[str, np.ndarray]] = {}
+    failed: dict[str, str] = {}
     problem: Problem = d.problem
     for n, recording in enumerate(problem.recordings):
         own = {when: ceiling.as_seen(d, when, n) for when in ("before", "after")}
@@ -254,13 +261,17 @@ def motions(d: Diagnosis) -> dict[str, dict[str, np.ndarray]]:
         r = problem.measured[n]
         arrays = {"positions": np.array(1), "t": r.t.numpy(), "measured": r.x.double().numpy()}
         seen = r.seen.numpy()
-        for when, point in (("before", d.before), ("after", d.after)):
-            model = problem.motion(point, n, d.setting)
+        try:
+            models = {when: problem.motion(point, n, d.setting) for when, point in (("before", d.before), ("after", d.after))}
+        except UserError as error:
+            failed[recording.name] = str(error)
+            continue
+        for when, model in models.items():
             shown = model.copy()
             shown[1:][seen[1:]] = own[when].reshape(-1, 3)
             arrays |= {when: shown, f"{when}_model": model}
         out[recording.name] = arrays
-    return out
+    return out, failed
 
 
 def _stages(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> list[residual.Series]:

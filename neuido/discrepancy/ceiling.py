@@ -36,12 +36,14 @@ class Ceiling:
 
 
 def of(d: Diagnosis, when: str, *, seed: int = 0) -> Ceiling:
-    """The ceiling of a problem's residual; `when`: before or after."""
+    """The ceiling of a problem's residual; `when`: before or after. NaN where a part is not predicted."""
     floor = d.final[when]
     rows = []
     for part in d.parts:
         n = part.recording
         seen = as_seen(d, when, n)
+        if not np.isfinite(seen[part.rows]).all():
+            return Ceiling(float("nan"), float("nan"), 0)
         features, target, weight = _samples(d, part, seen, d.problem.recordings[n].y - seen, floor.weight[n])
         rows.append((part.name, part.fitted, features, target, weight, floor.noise[n]))
     return train([row[1:5] for row in rows], noises=[row[5] for row in rows], names=[row[0] for row in rows], seed=seed)

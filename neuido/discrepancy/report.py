@@ -78,6 +78,8 @@ def _one(made: Details, d: Diagnosis) -> list[str]:
         out.append(
             f'<p class="note">{escaped("The time was up before: " + "; ".join(c["left_out"]) + ". More minutes go on from here.")}</p>'
         )
+    for place, reason in c.get("not_predicted", {}).items():
+        out.append(f'<p class="note">{escaped(f"{place} is not shown: {reason}.")}</p>')
     if bodies:
         out += [
             "<h2>Motion before and after</h2>",
@@ -98,7 +100,7 @@ def _one(made: Details, d: Diagnosis) -> list[str]:
             out.append(f"<p>{escaped(where)}</p>")
     elif made.silhouettes:
         out += pictures.section(made.silhouettes)
-    else:
+    elif made.motion:
         out += ["<h2>Data before and after</h2>", draw.data_curves(made.motion, d.problem.unit)]
     out += _ranking(d)
     out += ["<h2>Rejected</h2>", table(("effect", "reason"), [(r["name"], r["reason"]) for r in c["rejected"]])]
@@ -106,9 +108,9 @@ def _one(made: Details, d: Diagnosis) -> list[str]:
     share = made.ceilings["after"]
     fit, held = (100 * min(max(value, 0.0), 1.0) for value in (share.fit, share.held_out))
     there = "" if math.isnan(share.held_out) else f", and {held:.0f} % of it on what was held out"
-    out.append(
-        f"<p>A small network explains {fit:.0f} % of what remains beside noise where it was fitted{there}: the ceiling of any effect.</p>"
-    )
+    if not math.isnan(share.fit):
+        most = f"{fit:.0f} % of what remains beside noise where it was fitted{there}"
+        out.append(f"<p>A small network explains {most}: the ceiling of any effect.</p>")
     out += ["<h2>Next experiment</h2>", f"<p>{escaped(next_experiment.summary(c['next_experiment']))}</p>"]
     if c["next_experiment"]:
         out.append(

@@ -36,7 +36,7 @@ SIZES = (1, 4, 12, 32, 96)
 STIFFENING = ("strain_stiffening.k", "second_invariant.c", "tension_compression.r")
 """Effects that stiffen a body as it is strained, past what the inner steps of the finite elements are for."""
 FINER = (1, 2, 6)
-"""Times the inner steps that are tried for these, one after the other until the motion stays finite."""
+"""Times the inner steps that are tried, one after the other until the motion stays finite; the last only for what stiffens."""
 
 LEAST_LIFT, MOST_LIFT, GAP = 0.05, 0.8, 1.0
 """Suggested cells: what the contact height moves by, at the least; how far from where it is declared it may be; and how far from the
@@ -188,11 +188,11 @@ class BodyRollouts(Problem):
         return moved
 
     def _refine(self, runs: Sequence[Motions], moved: Sequence[ParticleState], setting: int, finer: int) -> None:
-        """Move what stiffened and failed again with finer inner steps, in place; what fails alone stays NaN."""
+        """Move what failed again with finer inner steps, in place; what fails with the finest that it gets stays NaN."""
         failed = []
         for (points, _), frames in zip(runs, moved, strict=True):
             broken = (~torch.isfinite(frames.x[-1]).flatten(1).all(dim=1)).tolist()
-            failed.append([i for i, point in enumerate(points) if broken[i] and _stiffens(self._full(point))])
+            failed.append([i for i, point in enumerate(points) if broken[i] and finer < len(_finer(self._full(point)))])
         live = [k for k, own in enumerate(failed) if own]
         if not live:
             return
@@ -361,23 +361,24 @@ class BodyRollouts(Problem):
         return R if turned < 0.01 * size and turned < 0.5 * straight else eye
 
 
-def _stiffens(point: Point) -> bool:
-    return any(point.get(name, 0.0) > 0.0 for name in STIFFENING)
+def _finer(point: Point) -> tuple[int, ...]:
+    """Those of `FINER` that a full point is tried with."""
+    return FINER if any(point.get(name, 0.0) > 0.0 for name in STIFFENING) else FINER[:2]
 
 
 def _finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -> ParticleState:
-    """A rollout of one scene, with finer inner steps where an effect that stiffens leads to a motion that is not finite.
+    """A rollout of one scene, with finer inner steps where the motion is not finite.
 
     Raises:
         UserError: As the rollout, with the finest of them.
     """
-    stiffens = _stiffens(point)
-    for finer in FINER[:-1] if stiffens else ():
+    *others, finest = _finer(point)
+    for finer in others:
         try:
             return simulator.rollout(*args, **given, finer=finer)
         except UserError:
             continue
-    return simulator.rollout(*args, **given, finer=FINER[-1] if stiffens else 1)
+    return simulator.rollout(*args, **given, finer=finest)
 
 
 def _up(r: Measured) -> np.ndarray:

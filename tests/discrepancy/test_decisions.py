@@ -4,6 +4,7 @@ Each case is diagnosed twice, the second time with the decision replaced: no tes
 least, and all of them kept. What is asserted of the first must not hold of the second.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,16 +19,17 @@ from neuido.data.material_tests import read_material_tests
 from neuido.data.tracks import read_tracks
 from neuido.data.undeclared.motion import Solver, move
 from neuido.demo_loop import ELASTIC, Launch, record
-from neuido.discrepancy import attribution, residual
+from neuido.discrepancy import answer, attribution, residual
 from neuido.discrepancy.answer import motions
 from neuido.discrepancy.attribution import Diagnosis
-from neuido.discrepancy.body import body_problem
+from neuido.discrepancy.body import BodyProblem, body_problem
 from neuido.discrepancy.command import restricted
 from neuido.discrepancy.material import MaterialProblem
 from neuido.discrepancy.problem import Problem
 from neuido.discrepancy.resume import CachedProblem
 from neuido.discrepancy.rounds import Inference, Round
 from neuido.discrepancy.track import track_problems
+from neuido.errors import UserError
 from neuido.types import Plane, Scene
 from tests.discrepancy import made
 
@@ -125,7 +127,7 @@ def test_each_stage_is_answered(stage, tmp_path, monkeypatch):
 
 def excess(d: Diagnosis, case: Case) -> tuple[float, float]:
     """Mean square of the residual over that of its noise in the case's stage of the fitted recording, before and after."""
-    m = motions(d)["a"]
+    m = motions(d)[0]["a"]
     options = {"mass": 27.0, "sigma": d.rounds[0].floor.noise[0], "planes": case.scene.colliders, "margin": 1.5 * case.scene.dx}
     found = residual.stages(m["measured"], m["t"], m["before"], m["after"], **options)
     (own,) = (s for s in found if s.name == case.stage)
@@ -138,6 +140,28 @@ def test_nothing_is_missing(tmp_path, monkeypatch):
     assert says(sound) == ("none",)
     assert sound.errors["after"]["b"] < 1.3 * sound.floors["noise"]
     assert says(smallest) != ("none",)
+
+
+@pytest.mark.parametrize("lost", [{1}, {0, 1}])
+def test_a_recording_that_does_not_move_is_left_out_of_the_report(lost, tmp_path, monkeypatch):
+    """A motion may fail alone that was finite beside others, with their inner steps."""
+    problem = body_problem(record(tmp_path / "block", {}, launches=FLIES, frames=13))
+    found = attribution.diagnose(restricted(problem, "drag_linear"), draws=39, most=1)
+    move = BodyProblem._move
+
+    def fails(self, runs, setting, finer=0):
+        if lost & {n for _, n in runs}:
+            raise UserError("the motion of scene 0 is not finite from step 420 of 840 on")
+        return move(self, runs, setting, finer)
+
+    monkeypatch.setattr(BodyProblem, "_move", fails)
+    answer.write(tmp_path / "out", [(found, 1.0)], kind="experiment", device="cpu")
+    content = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert content["answer"] == "none" and set(content["not_predicted"]) == {"ab"[n] for n in lost}
+    assert content["error"]["after"]["by_recording"] == pytest.approx(found.errors["after"])
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("is not finite from step 420") == len(lost) and "nan %" not in page
+    assert [p.stem for p in (tmp_path / "out" / "predicted").iterdir()] == (["a"] if lost == {1} else [])
 
 
 def test_what_no_effect_explains_is_unknown(tmp_path, monkeypatch):
