@@ -62,6 +62,7 @@ class Contests(Starting):
         then: Callable[[Sequence[tuple[Candidate, Fit]]], Sequence[Start]] = lambda led: (),
         beyond: float = math.inf,
         until: float = 1.0,
+        grown: Mapping[str, tuple[Candidate, Fit]] | None = None,
     ) -> Contest:
         """Fit the candidates side by side; fits that cannot catch up with the best one stop.
 
@@ -78,11 +79,12 @@ class Contests(Starting):
             then: Further starts, given the best fit of each candidate in the order of their costs.
             beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
             until: Share of the time for the search at which fits end where they are and no others begin: the rest is for other steps.
+            grown: Fits that were made before, by key, which set the pace.
         """
-        best: dict[str, tuple[Candidate, Fit]] = {}
+        best: dict[str, tuple[Candidate, Fit]] = dict(grown or {})
         ended: list[tuple[Candidate, Fit]] = []
         unfitted: dict[str, str] = {}
-        race = Race()
+        race = Race(min((fit.cost for _, fit in best.values()), default=math.inf))
 
         def fitted(own: Sequence[Start]) -> None:
             requests = []

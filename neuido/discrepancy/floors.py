@@ -62,6 +62,15 @@ class Floor:
         """The floor with weights that leave so large a share of the discretisation error outside the directions of the differences."""
         return replace(self, weight={n: 1.0 / np.sqrt(self.noise[n] ** 2 + (share * self.spread[n]) ** 2) for n in self.weight})
 
+    def early(self, problem: Problem, parts: Sequence[Part], share: float) -> "Floor":
+        """The floor that weighs nothing of the fitted recordings past this share of the time that is fitted of each."""
+        weight = dict(self.weight)
+        for p in parts:
+            if p.fitted and p.recording in weight:
+                t = problem.recordings[p.recording].times
+                weight[p.recording] = weight[p.recording] * (t <= t[p.rows].min() + share * np.ptp(t[p.rows]))
+        return replace(self, weight=weight)
+
     def spread_squares(self, parts: Sequence[Part]) -> np.ndarray:
         """Mean squares of what the settings differ by, without a refit, of each part, (len(parts),)."""
         return np.array([np.mean(self.spread[p.recording][p.rows] ** 2) for p in parts])

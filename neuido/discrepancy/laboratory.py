@@ -34,6 +34,10 @@ ALIKE = 0.3
 SURE = 1.3
 """Times a setting's step that must be stable for it to stand in for another one: a beam of a Poisson ratio of 0.494 failed at 1.15 in three
 recordings of five, and moved by itself in the others."""
+HORIZONS = (0.25, 0.4, 0.6, 0.8)
+"""Shares of the time of the fitted recordings that a growing fit reads, one after the other, before all of it."""
+STEPWISE = 6
+"""Iterations at each of these, at the most."""
 ASTRAY = 1.05
 """Times the error of the fitted parts from which on the end of a fit is not taken for a better one."""
 
@@ -69,6 +73,8 @@ class Laboratory:
         self.fitted_recordings = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
         self.as_declared = {p.name: p.value for p in problem.declared}
         """The declared parameters at the values that the model states."""
+        self.begun: Point | None = None
+        """Where the declared model fits the first part of the fitted recordings, if that was asked for."""
         self.still: Point | None = None
         """Where the declared model fits best without a parameter of the problem's own, if it was given one."""
         self.noise_squares = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
@@ -265,6 +271,22 @@ class Laboratory:
             starts = [min(short, key=lambda f: f.cost).point]
         return self.fits([self.request(free, starts[0], **options)], floor)[0]
 
+    def early(self, floor: Floor, share: float) -> Floor:
+        """`Floor.early` of this problem."""
+        return floor.early(self.problem, self.parts, share)
+
+    def grown(self, entries: Sequence[tuple[Sequence[Parameter], Point]], floor: Floor, *, after: int = 0) -> list[Fit]:
+        """Fits of parameters from points, side by side, to the first part of the recordings, then to more of them, and at last to all.
+
+        What a body does after it has bounced has many valleys, and what it does before has few: each horizon begins where the one before
+        it ended, near enough for the next bounce. `after`: horizons that are behind already.
+        """
+        fits: list[Fit] = []
+        for share in (*HORIZONS[after:], 1.0):
+            entries = [(free, fit.point) for (free, _), fit in zip(entries, fits, strict=True)] if fits else entries
+            fits = self.fits([self.request(free, point, **stepwise(share)) for free, point in entries], self.early(floor, share))
+        return fits
+
     def finished(self, named: Stand) -> Stand:
         """A fit once more from its end, with the floor there, until a standard deviation of the noise would show.
 
@@ -330,8 +352,29 @@ class Laboratory:
                 break
             floor, errors = self.stand(fit.point, like=floor, fitted=True)
             made.append(Stand(fit, floor, errors))
+        made += self.begun_anew(made)
         best = self.plainest(made)
         return Stand(best.fit, *self.stand(best.fit.point, like=best.floor))
+
+    def begun_anew(self, made: Sequence[Stand]) -> list[Stand]:
+        """The base fit by growing horizons from the declared values, where others leave more than noise: they may be in a side valley."""
+        best = min(made, key=lambda stand: score(stand.errors[self.fitted]))
+        free, floor = self.problem.declared, best.floor
+        if self.is_noise(best.errors[self.fitted], fitted=True) or not free or self.deadline.over:
+            return []
+        out: list[Stand] = []
+        with self.quickly():
+            begin = self.request(free, dict(self.as_declared), **stepwise(HORIZONS[0]))
+            (first,) = self.fits([begin], self.early(floor, HORIZONS[0]))
+            self.begun = first.point
+            (fit,) = self.grown([(free, first.point)], floor, after=1)
+        for _ in range(AGAIN):
+            if not self.runs(fit.point):
+                break
+            floor, errors = self.stand(fit.point, like=floor, fitted=True)
+            out.append(Stand(fit, floor, errors))
+            fit = self.base([fit.point], floor)
+        return out
 
     def plainest(self, made: Sequence[Stand]) -> Stand:
         """The stand that leaves least of the fitted parts: one whose point follows the amounts must leave clearly less than the others.
@@ -428,3 +471,8 @@ class Laboratory:
             columns = [np.where(np.isfinite(row - here).all(), row - here, 0.0) for row in rows]
             out[n] = np.stack(columns, axis=1) if columns else np.empty((len(here), 0))
         return out
+
+
+def stepwise(share: float) -> dict[str, int]:
+    """Options of a fit that reads a share of the time: where it ends is only where the next one begins."""
+    return {} if share == 1.0 else {"iterations": STEPWISE}

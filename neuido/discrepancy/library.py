@@ -120,7 +120,8 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     add("maxwell", "internal modes", [{"ratio": 0.5, "time": s.wave * f} for f in (0.3, 1.5, 6.0)],
         ("ratio", "1", 0.3, 0.0, 20.0, False), ("time", "s", 0.5, s.step, 20 * s.duration, True),
         sizes="ratio", takes=("young",))  # fmt: skip
-    add("hysteresis", "internal modes", [{"eta": 0.2}], ("eta", "1", 0.1, 0.0, 1.5, False))
+    # its branches stiffen the body by about twice the loss factor
+    add("hysteresis", "internal modes", [{"eta": 0.1}], ("eta", "1", 0.1, 0.0, 1.5, False), beside={"young": -2.0})
     add(
         "stiffness_change",
         "internal modes",
@@ -155,10 +156,11 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         add("yield", "rest", starts, ("inverse", "1/Pa", 0.3, 1e-9 / s.young, 1.0 / (0.001 * s.young), True), sizes="inverse", linear=False)
     if plastic == "von_mises":
         h = 0.1 * s.young
-        add("hardening", "rest", [{"h": h}, {"h": 5 * h}], ("h", "Pa", h, 0.0, 100 * h, False))
-        add("kinematic_hardening", "rest", [{"h": h}, {"h": 5 * h}], ("h", "Pa", h, 0.0, 100 * h, False))
+        for name in ("hardening", "kinematic_hardening"):
+            add(name, "rest", [{"h": h}, {"h": 5 * h}], ("h", "Pa", h, 0.0, 100 * h, False), takes=("yield_stress",))
         eta = float(experiment.model["plasticity"]["yield_stress"]) * s.duration
-        add("rate_yield", "rest", [{"eta": 0.02 * eta}, {"eta": 0.2 * eta}], ("eta", "Pa s", 0.1 * eta, 0.0, 20 * eta, False))
+        starts = [{"eta": 0.2 * eta}, {"eta": 0.02 * eta}]
+        add("rate_yield", "rest", starts, ("eta", "Pa s", 0.1 * eta, 0.0, 20 * eta, False), takes=("yield_stress",))
     if plastic == "drucker_prager":
         c = 0.3 * float(experiment.model["density"]) * g * s.length
         add("cohesion", "rest", [{"c": c}], ("c", "Pa", c, 0.0, 100 * c, False))

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from neuido.discrepancy.contests import IN_REACH, MANY, Contests, better
+from neuido.discrepancy.contests import IN_REACH, MANY, better
 from neuido.discrepancy.fit import Fit, Race
 from neuido.discrepancy.floors import Floor
+from neuido.discrepancy.growing import Growing
 from neuido.discrepancy.problem import Candidate, Parameter, Point
 from neuido.discrepancy.starting import FAR, SMALL
 from neuido.discrepancy.trials import Round, Stand, score
@@ -35,7 +36,7 @@ Onset = tuple[Sequence[Parameter], Fit, Sequence[Point]]
 """What is fitted, a fit of it, and where further ones begin."""
 
 
-class Refining(Contests):
+class Refining(Growing):
     """The further fits of a step of a diagnosis."""
 
     def polish(

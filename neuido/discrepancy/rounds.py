@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.discrepancy import evidence
-from neuido.discrepancy.contests import LEADERS, MANY, Contest
+from neuido.discrepancy.contests import LEADERS, MANY, Contest, better
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
@@ -162,7 +162,8 @@ class Inference(Judging):
 
         Where the settings' differences can do much, the fitted recordings say little of a modulus, and each fit with an effect ends at
         another one: what that alone does to the held-out recordings is no effect's. It must fit the fitted ones about as well. Where no
-        effect explains what is left, it is fitted from there: the base may stand in a side valley.
+        effect explains what is left, it is fitted from there: the base may stand in a side valley. Where a named one's fit ended it is
+        weighed with the floor there: the differences of the settings at the base may have led the base fit, and hide what is better.
         """
         if self.problem.settings == 1 or not result.trials:
             return None
@@ -173,14 +174,17 @@ class Inference(Judging):
         places = [t.candidate.without(t.fit.point) for t in result.trials if t.score < limit][:MEASURED]
         left = [score(squares) for squares in self.mean_squares(places, floor)]
         here, as_well = score(result.errors), score(result.errors[self.fitted]) + 2.0 * math.log(AS_WELL)
-        better = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < (math.inf if lost else here)]
-        if not better:
+        wanted = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < (math.inf if lost else here)]
+        if result.chosen is not None:  # by the floor of the base alone it may look worse there than it is
+            own = result.chosen.candidate.without(result.chosen.fit.point)
+            wanted = [own, *(place for place in wanted if place != own)][:PLAIN]
+        if not wanted:
             return None
-        self.foresee(better)
-        stands = [Stand(replace(base, point=place), *self.stand(place, like=floor)) for place in better]
+        self.foresee(wanted)
+        stands = [Stand(replace(base, point=place), *self.stand(place, like=floor)) for place in wanted]
         if lost and not self.deadline.skips("the declared model again from where effects were fitted"):
             free = [self.problem.parameter(name) for name in base.names]
-            able = [(s.fit.point, s.floor) for s, runs in zip(stands, self.which_run(better), strict=True) if runs]
+            able = [(s.fit.point, s.floor) for s, runs in zip(stands, self.which_run(wanted), strict=True) if runs]
             fits = self.fits([self.request(free, point) for point, _ in able], [own for _, own in able])
             ends = [fit.point for fit in fits]
             stands += [Stand(f, *self.stand(f.point, like=floor)) for f, ok in zip(fits, self.which_run(ends), strict=True) if ok]
@@ -219,13 +223,25 @@ class Inference(Judging):
             def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
                 return self.without_own(base.point, starts, found, ended)
 
-            contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until)
-        ends = [fit.point for _, fit in contest.best.values() if fit.setting == self.own]
-        left = sorted(self.mean_squares(ends, floor), key=score)
+            grows = not found and self.is_astray(base, floor) and not self.deadline.skips("fits by growing horizons", until)
+            grown = self.growing(base, floor, candidates, until=until) if grows else {}
+            contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until, grown=grown)
+            left = self.left_by(contest.best, floor)
+            if not found and not grows and self.leaves_much(left[:1]) and not self.deadline.skips("fits by growing horizons", until):
+                grown = self.growing(base, floor, candidates, until=until)
+                whole = self.wholly(free, list(grown.values()), floor, until)
+                contest = contest._replace(best={**contest.best, **better(whole, contest.best)})
+                left = self.left_by(contest.best, floor)
         look = Look(base, asked, contest, left[:1])
         if not found:
             self.seen = look
         return look
+
+    def left_by(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[np.ndarray]:
+        """What the fits under the own setting leave, mean squares of the parts, the least first."""
+        ends = [fit.point for _, fit in best.values() if fit.setting == self.own]
+        with self.under(self.own):
+            return sorted(self.mean_squares(ends, floor), key=score)
 
     def promising(
         self,

@@ -145,23 +145,24 @@ class Starting(Screening):
     def tried(self, start: Start, base: Fit, *, led_far: bool) -> list[Start]:
         """Further starts of a candidate of one size: at larger sizes, and in the other shapes that it is screened in.
 
-        How a large effect acts is not what the slope at none says. Where the base fit has gone far from the declared values (`led_far`)
-        from these too and from between, for it may have made up for the effect; what stiffens a body is tried with less of a modulus too,
-        and what goes with a declared value along a valley (`Candidate.beside`) with that.
+        How a large effect acts is not what the slope at none says, and one that has shapes may be very large. Where the base fit has gone
+        far from the declared values (`led_far`) from these too and from between, for it may have made up for the effect; what stiffens a
+        body is tried with less of a modulus too, and what goes with a declared value along a valley (`Candidate.beside`) with that.
         """
         c, begun, _ = start
         (p,) = c.size_parameters
         size, signs = abs(c.starts[0][p.name]), (1.0, -1.0) if p.lower < 0 else (1.0,)
         begin = {**begun, **{name: base.point.get(name, value) for name, value in self.as_declared.items()}}
-        near, middle, far = ([{p.name: p.within(sign * f * size)} for sign in signs] for f in (1.0, math.sqrt(FAR), FAR))
+        near, middle, far, beyond = ([{p.name: p.within(sign * f * size)} for sign in signs] for f in (1.0, math.sqrt(FAR), FAR, FAR**2))
         made = [{**begin, **value} for value in (far if begin == begun else near + far)]
         if led_far:
             made += [{**self.at_declared(begin), **value} for value in near + far]
             made += [{**self.between(begin), **value} for value in far]
         others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
         made += [{**other, **value} for other in others for value in middle + far]
+        made += [{**place, **value} for place in [begin, *others] for value in beyond] if others else []
         if c.beside:
-            made += [{**begin, **self.along(c, begin, value)} for value in middle + far]
+            made += [{**begin, **self.along(c, begin, value)} for value in near + middle + far]
         if takes := [name for name in c.takes if name in self.as_declared]:
             sizes = far[:1] if others else middle[:1] + far[:1]
             less = [{name: factor * begin[name] for name in takes} for factor in TAKEN]

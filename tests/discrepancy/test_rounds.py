@@ -975,11 +975,12 @@ def test_candidates_are_fitted_without_the_problems_own_parameters_too(found, mo
     ended = replace(moved.fit, point={**moved.fit.point, "a": 2.2, "square.c": 0.7})
     asked = []
 
-    def contest(self, free, starts, floor, hopeful, then, beyond, until):
+    def contest(self, free, starts, floor, hopeful, then, beyond, until, grown):
         asked.extend([*starts, *then([(square, ended)])])
         return contests.Contest({}, None, {})
 
     monkeypatch.setattr(rounds.Inference, "contest", contest)
+    monkeypatch.setattr(Inference, "leaves_much", lambda self, errors: False)
     inference.round(moved.fit, moved.floor, [Trial(cube, moved, 1.0)] if found else [])
     own = [{k: v for k, v in begin.items() if not k.startswith("square.")} for c, begin, _ in asked if c.name == "square"]
     still = beside if found else {"a": 2.5}
@@ -1191,6 +1192,7 @@ def test_by_another_method_those_are_fitted_that_led_by_the_first(monkeypatch):
     """The others are screened in the shape that they were fitted in, and the first of them alone are fitted."""
     monkeypatch.setattr(rounds, "OWN", 1)
     monkeypatch.setattr(rounds, "LED_BY", 1)
+    monkeypatch.setattr(Inference, "leaves_much", lambda self, errors: False)  # no fits that grow
     screen = Inference.screen
     screened = []
     monkeypatch.setattr(

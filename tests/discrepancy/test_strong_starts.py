@@ -111,7 +111,7 @@ def test_a_size_is_tried_with_what_goes_with_it():
     places = [place for _, place, _ in inference.tried(begin, base, led_far=False)]
     assert places[: len(without)] == without
     along = {place["slope.k"]: place["young"] for place in places[len(without) :]}
-    sizes = [sign * f * 0.3 for f in (math.sqrt(6), 6) for sign in (1, -1)]
+    sizes = [sign * f * 0.3 for f in (1, math.sqrt(6), 6) for sign in (1, -1)]
     assert along == pytest.approx({size: 3.0 * math.exp(0.5 * size) for size in sizes})
 
 

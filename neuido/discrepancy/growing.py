@@ -1,0 +1,74 @@
+"""First fits that read more and more of the recordings: where a bounce has led the fits of the whole astray."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from neuido.discrepancy.contests import IN_REACH, MANY, Contests
+from neuido.discrepancy.fit import Fit
+from neuido.discrepancy.floors import Floor
+from neuido.discrepancy.laboratory import HORIZONS, stepwise
+from neuido.discrepancy.problem import Candidate, Point
+from neuido.discrepancy.trials import score
+
+ABOVE = 2.5
+"""Times the noise of the fitted recordings that the best first fit leaves, from which on fits grow."""
+ELSEWHERE = 1.0
+"""Coordinates that the base fit stands apart from where the declared model fits the first part, to be taken for led astray."""
+SIDE_BY_SIDE, ONE_BY_ONE = 12, 4
+"""Candidates that grow, where a launch of several points costs as one and where every point costs; of more than `MANY` parameters one
+there."""
+
+
+class Growing(Contests):
+    """Fits of candidates by growing horizons."""
+
+    def leaves_much(self, errors: Sequence[np.ndarray]) -> bool:
+        """Whether the least of what fits leave of all parts, mean squares, is far above noise: they may have missed a valley."""
+        if self.problem.settings == 1 or not self.problem.declared:
+            return False
+        noise = score(self.noise_squares[self.fitted])
+        return all(score(squares[self.fitted]) - noise > 2.0 * math.log(ABOVE) for squares in errors)
+
+    def is_astray(self, base: Fit, floor: Floor) -> bool:
+        """Whether the base fit leaves much and stands elsewhere than the declared model fits the first part of the recordings."""
+        if self.begun is None or not self.leaves_much(self.mean_squares([base.point], floor)):
+            return False
+        moved = [p.coordinate(base.point[p.name]) - p.coordinate(self.begun[p.name]) for p in self.problem.declared]
+        return max(map(abs, moved)) > ELSEWHERE
+
+    def growing(self, base: Fit, floor: Floor, candidates: Sequence[Candidate], *, until: float = 1.0) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of the candidates that promise most in the first part of the fitted recordings, by growing horizons, by their keys.
+
+        They are screened where the declared model fits the first part of the recordings, by what they would take off a little more of
+        it, and the start of each that does best is the one that grows. What falls behind at a horizon is given up.
+        """
+        free = self.problem.declared
+        if self.begun is None:
+            request = self.request(free, self.at_declared(base.point), **stepwise(HORIZONS[0]))
+            self.begun = self.fits([request], self.early(floor, HORIZONS[0]))[0].point
+        at, wide = dict(self.begun), self.early(floor, HORIZONS[1])
+        ranked, _ = self.screen(at, candidates, wide, self.slopes(free, at, self.fitted_recordings))
+        starts: dict[str, tuple[Candidate, Point]] = {}
+        for _, c, _, begin in ranked:
+            starts.setdefault(c.key, (c, begin))
+        live = list(starts.values())
+        if self.problem.together:
+            live = live[:SIDE_BY_SIDE]
+        else:
+            large = [entry for entry in live if len(entry[0].parameters) > MANY][:1]
+            live = [entry for entry in live if entry in large or len(entry[0].parameters) <= MANY][:ONE_BY_ONE]
+        self.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
+        ended: list[tuple[Candidate, Fit]] = []
+        for share in (*HORIZONS[1:], 1.0):
+            if not live or (ended and self.deadline.past(until)):
+                break
+            requests = [self.request((*free, *c.parameters), point, until=until, **stepwise(share)) for c, point in live]
+            ended = list(zip((c for c, _ in live), self.fits(requests, self.early(floor, share)), strict=True))
+            least = min(fit.cost for _, fit in ended)
+            ended = [(c, fit) for c, fit in ended if fit.cost < IN_REACH * least]
+            live = [(c, fit.point) for c, fit in ended]
+        costs = self.costs([fit.point for _, fit in ended], floor) if ended else []  # the time may have ended them at an earlier horizon
+        return {c.key: (c, replace(fit, cost=cost)) for (c, fit), cost in zip(ended, costs, strict=True) if np.isfinite(cost)}

@@ -1,0 +1,137 @@
+"""Fits that read more and more of a recording: a motion whose phase a wrong law turns many times over has a valley for each turn."""
+
+import numpy as np
+import pytest
+
+from neuido.discrepancy import growing
+from neuido.discrepancy.attribution import diagnose
+from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
+from neuido.discrepancy.rounds import Inference
+
+T = np.linspace(0.01, 1.0, 300)
+NOISE = 0.02
+
+
+class Swing(Problem):
+    """sin(40 sqrt(a) t) with what candidates do to it: `chirp` turns the phase as t^2, `wind` shifts all, `tide` shifts it in time.
+
+    Setting 1 has a wiggle more.
+    """
+
+    def __init__(self, truth, *, together: bool = False, declared: float = 1.0) -> None:
+        chirp = Parameter("chirp.c", "1", 0.0, 0.3, -30.0, 30.0)
+        wind = Parameter("wind.c", "1", 0.0, 0.3, -5.0, 5.0)
+        tide = tuple(Parameter(f"tide.c{k}", "1", 0.0, 0.1, -5.0, 5.0) for k in range(6))
+        candidates = (
+            Candidate("chirp", (chirp,), ({chirp.name: 0.3},), "flight"),
+            Candidate("wind", (wind,), ({wind.name: 0.3},), "flight"),
+            Candidate("tide", tide, ({p.name: 0.1 for p in tide},), "flight"),
+        )
+        rng = np.random.default_rng(0)
+        recordings = tuple(
+            Recording(name, role, swing(truth, n) + NOISE * rng.normal(size=len(T)), NOISE, np.zeros(len(T), int), T)
+            for n, (name, role) in enumerate((("one", "fit"), ("two", "held_out")))
+        )
+        free = (Parameter("a", "1", declared, 0.15, 0.05, 20.0, log=True),)
+        super().__init__("swing", "rmse", "1", free, (), candidates, recordings, settings=2)
+        self.__dict__["_together"] = together
+
+    @property
+    def together(self):
+        return self._together
+
+    def predict(self, points, recording, setting=0):
+        return np.stack([swing(p, recording) + 0.02 * setting * np.sin(55 * T) for p in points])
+
+
+def swing(p, recording):
+    start = 0.4 * recording
+    phase = start + 40 * np.sqrt(p.get("a", 1.0)) * T + p.get("chirp.c", 0.0) * T**2
+    tide = sum(p.get(f"tide.c{k}", 0.0) * np.sin((k + 1) * 2.0 * T) for k in range(6))
+    return np.sin(phase) + p.get("wind.c", 0.0) * T + tide
+
+
+def without(monkeypatch):
+    """Fits of the whole alone."""
+    monkeypatch.setattr(Inference, "begun_anew", lambda self, made: [])
+    monkeypatch.setattr(Inference, "growing", lambda self, *_, **__: {})
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_the_declared_model_is_found_past_side_valleys(together, monkeypatch):
+    problem = Swing({"a": 1.3}, together=together)
+    found = Inference(problem).start()
+    assert found.fit.point["a"] == pytest.approx(1.3, rel=0.005)
+    assert Inference(problem).is_noise(found.errors)
+    without(monkeypatch)
+    astray = Inference(problem).start()
+    assert abs(astray.fit.point["a"] - 1.3) > 0.05 and not Inference(problem).is_noise(astray.errors)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_an_effect_is_found_past_side_valleys(together, monkeypatch):
+    problem = Swing({"a": 1.2, "chirp.c": 20.0}, together=together)
+    found = diagnose(problem, draws=39)
+    assert [t.candidate.name for t in found.effects] == ["chirp"]
+    assert found.after["chirp.c"] == pytest.approx(20.0, abs=0.1) and found.after["a"] == pytest.approx(1.2, rel=0.005)
+    without(monkeypatch)
+    assert not diagnose(problem, draws=39).effects
+
+
+def test_what_the_first_fits_bring_near_the_noise_does_not_grow(monkeypatch):
+    def fail(self, *_, **__):
+        raise AssertionError
+
+    monkeypatch.setattr(Inference, "growing", fail)
+    found = diagnose(Swing({"a": 1.0, "wind.c": 1.0}), draws=39)
+    assert [t.candidate.name for t in found.effects] == ["wind"]
+
+
+def test_where_the_base_fit_is_astray_fits_grow_first(monkeypatch):
+    """They set the pace of the others then: the race begins with the least of their costs."""
+    problem = Swing({"a": 1.2, "chirp.c": 20.0})
+    inference = Inference(problem)
+    base = inference.start()
+    assert inference.begun["a"] == pytest.approx(1.6, abs=0.2), "the phase of the first quarter, the chirp's too"
+    assert inference.is_astray(base.fit, base.floor)
+    contest, given = Inference.contest, []
+    monkeypatch.setattr(Inference, "contest", lambda self, *args, **o: given.append(o["grown"]) or contest(self, *args, **o))
+    look = inference.look(base.fit, base.floor)
+    assert "chirp" in given[0] and look.contest.best["chirp"][1].cost <= given[0]["chirp"][1].cost
+    inference.begun = {"a": base.fit.point["a"]}
+    assert not inference.is_astray(base.fit, base.floor)
+
+
+def test_an_early_floor_weighs_nothing_later():
+    problem = Swing({"a": 1.0})
+    inference = Inference(problem)
+    floor = inference.early(inference.noise(), 0.4)
+    here = floor.whitener(inference.parts)(np.ones(len(T)), 0)
+    assert here[T <= 0.01 + 0.4 * 0.99] == pytest.approx(1.0 / NOISE) and not here[T > 0.41].any()
+    assert floor.weight[1] is not None and (floor.weight[1] > 0).all(), "what is held out is scored whole"
+
+
+def test_few_candidates_grow_where_every_point_costs(monkeypatch):
+    monkeypatch.setattr(growing, "ONE_BY_ONE", 2)
+    told = []
+    problem = Swing({"a": 1.2, "chirp.c": 20.0})
+    inference = Inference(problem, tell=told.append)
+    base = inference.start()
+    grown = inference.growing(base.fit, base.floor, problem.candidates)
+    (line,) = (t for t in told if t.startswith("growing fits of"))
+    assert line.count(",") == 1 and "chirp" in grown
+    assert grown["chirp"][1].cost == pytest.approx(inference.costs([grown["chirp"][1].point], base.floor)[0])
+
+
+@pytest.mark.parametrize(("over", "horizons"), [(False, 4), (True, 1)])
+def test_growing_fits_end_with_the_time(over, horizons, monkeypatch):
+    problem = Swing({"a": 1.2, "chirp.c": 20.0})
+    inference = Inference(problem)
+    base = inference.start()
+    asked, fits = [], inference.fits
+    monkeypatch.setattr(type(inference.deadline), "past", lambda self, share: over)
+    monkeypatch.setattr(Inference, "fits", lambda self, *args, **options: asked.append(1) or fits(*args, **options))
+    grown = inference.growing(base.fit, base.floor, problem.candidates)
+    assert len(asked) == horizons
+    for c, fit in grown.values():
+        assert fit.cost == pytest.approx(inference.costs([fit.point], base.floor)[0]), c.key
