@@ -13,7 +13,7 @@ from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.judging import ALPHA, WITHIN
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
-from neuido.discrepancy.pairs import WORSE, beside_members, by_another_method, look_ahead, neighbours, simpler
+from neuido.discrepancy.pairs import WORSE, beside_members, by_another_method, in_its_place, look_ahead, neighbours, simpler
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.refining import BEYOND
 from neuido.discrepancy.rounds import UNEXPLAINED, Inference
@@ -160,6 +160,8 @@ def diagnose(
         rounds.append(inference.round(at.fit, at.floor, found))
     if len(found) == 1 and not hurried:
         pair = beside_members(inference, rounds, at)
+        if not pair and len(rounds) > 1:
+            pair = in_its_place(inference, rounds[0], rounds[1], at.errors)
         others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
         # beside what lies within its floor nothing was looked for
         if len(rounds) > 1 and (elsewhere := by_another_method(others, inference, pair[-1].chosen.stand if pair else at)):

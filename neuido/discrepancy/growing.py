@@ -9,17 +9,15 @@ import numpy as np
 from neuido.discrepancy.contests import IN_REACH, MANY, Contests
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.laboratory import HORIZONS, stepwise
+from neuido.discrepancy.laboratory import ELSEWHERE, HORIZONS, stepwise
 from neuido.discrepancy.problem import Candidate, Point
-from neuido.discrepancy.trials import score
+from neuido.discrepancy.trials import Trial, score
 
 ABOVE = 2.5
 """Times the noise of the fitted recordings that the best first fit leaves, from which on fits grow."""
-ELSEWHERE = 1.0
-"""Coordinates that the base fit stands apart from where the declared model fits the first part, to be taken for led astray."""
-SIDE_BY_SIDE, ONE_BY_ONE = 12, 4
-"""Candidates that grow, where a launch of several points costs as one and where every point costs; of more than `MANY` parameters one
-there."""
+SIDE_BY_SIDE, ONE_BY_ONE = 8, 4
+"""Candidates that grow, where a launch of several points costs as one and where every point costs; one of them of more than `MANY`
+parameters."""
 
 
 class Growing(Contests):
@@ -36,30 +34,32 @@ class Growing(Contests):
         """Whether the base fit leaves much and stands elsewhere than the declared model fits the first part of the recordings."""
         if self.begun is None or not self.leaves_much(self.mean_squares([base.point], floor)):
             return False
-        moved = [p.coordinate(base.point[p.name]) - p.coordinate(self.begun[p.name]) for p in self.problem.declared]
-        return max(map(abs, moved)) > ELSEWHERE
+        return self.apart(base.point, self.begun) > ELSEWHERE
 
-    def growing(self, base: Fit, floor: Floor, candidates: Sequence[Candidate], *, until: float = 1.0) -> dict[str, tuple[Candidate, Fit]]:
+    def growing(
+        self, base: Fit, floor: Floor, candidates: Sequence[Candidate], found: Sequence[Trial] = (), *, until: float = 1.0
+    ) -> dict[str, tuple[Candidate, Fit]]:
         """Fits of the candidates that promise most in the first part of the fitted recordings, by growing horizons, by their keys.
 
-        They are screened where the declared model fits the first part of the recordings, by what they would take off a little more of
-        it, and the start of each that does best is the one that grows. What falls behind at a horizon is given up.
+        They are screened where the declared model, with the effects that were found, fits the first part of the recordings, by what they
+        would take off a little more of it, and the start of each that does best is the one that grows. What falls behind at a horizon is
+        given up.
         """
-        free = self.problem.declared
-        if self.begun is None:
+        free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
+        if found or self.begun is None:
             request = self.request(free, self.at_declared(base.point), **stepwise(HORIZONS[0]))
-            self.begun = self.fits([request], self.early(floor, HORIZONS[0]))[0].point
-        at, wide = dict(self.begun), self.early(floor, HORIZONS[1])
+            begun = self.fits([request], self.early(floor, HORIZONS[0]))[0].point
+            self.begun = self.begun if found else begun
+        else:
+            begun = self.begun
+        at, wide = dict(begun), self.early(floor, HORIZONS[1])
         ranked, _ = self.screen(at, candidates, wide, self.slopes(free, at, self.fitted_recordings))
         starts: dict[str, tuple[Candidate, Point]] = {}
         for _, c, _, begin in ranked:
             starts.setdefault(c.key, (c, begin))
-        live = list(starts.values())
-        if self.problem.together:
-            live = live[:SIDE_BY_SIDE]
-        else:
-            large = [entry for entry in live if len(entry[0].parameters) > MANY][:1]
-            live = [entry for entry in live if entry in large or len(entry[0].parameters) <= MANY][:ONE_BY_ONE]
+        large = [entry for entry in starts.values() if len(entry[0].parameters) > MANY][:1]
+        live = [entry for entry in starts.values() if entry in large or len(entry[0].parameters) <= MANY]
+        live = live[: SIDE_BY_SIDE if self.problem.together else ONE_BY_ONE]
         self.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
         ended: list[tuple[Candidate, Fit]] = []
         for share in (*HORIZONS[1:], 1.0):

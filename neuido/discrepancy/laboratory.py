@@ -38,6 +38,8 @@ HORIZONS = (0.25, 0.4, 0.6, 0.8)
 """Shares of the time of the fitted recordings that a growing fit reads, one after the other, before all of it."""
 STEPWISE = 6
 """Iterations at each of these, at the most."""
+ELSEWHERE = 1.0
+"""Coordinates that the base fit stands apart from where the declared model fits the first horizon, to be taken for led astray."""
 ASTRAY = 1.05
 """Times the error of the fitted parts from which on the end of a fit is not taken for a better one."""
 
@@ -367,14 +369,22 @@ class Laboratory:
             begin = self.request(free, dict(self.as_declared), **stepwise(HORIZONS[0]))
             (first,) = self.fits([begin], self.early(floor, HORIZONS[0]))
             self.begun = first.point
+            if self.apart(best.fit.point, first.point) < ELSEWHERE:
+                return []
             (fit,) = self.grown([(free, first.point)], floor, after=1)
         for _ in range(AGAIN):
             if not self.runs(fit.point):
                 break
             floor, errors = self.stand(fit.point, like=floor, fitted=True)
             out.append(Stand(fit, floor, errors))
+            if score(errors[self.fitted]) - score(best.errors[self.fitted]) > 2.0 * math.log(FOLLOWED):
+                break
             fit = self.base([fit.point], floor)
         return out
+
+    def apart(self, point: Point, other: Point) -> float:
+        """The largest difference of two points in a coordinate of a declared parameter."""
+        return max(abs(p.coordinate(point[p.name]) - p.coordinate(other[p.name])) for p in self.problem.declared)
 
     def plainest(self, made: Sequence[Stand]) -> Stand:
         """The stand that leaves least of the fitted parts: one whose point follows the amounts must leave clearly less than the others.

@@ -25,6 +25,8 @@ PROMISED = 0.9
 """Share of the misfit that a second effect may leave beside a first one, predicted or by one simulation, to be fitted there."""
 BESIDE = 3
 """Members of a class beside which a second effect is looked for."""
+IN_PLACE = 5
+"""Effects that are fitted in the place of a first one beside the best that was tried beside it."""
 CLOSE = 2.5
 """Times the error of a chosen effect up to which one with fewer parameters is weighed again once others were found."""
 
@@ -165,6 +167,48 @@ def second_beside(
             if inference.is_noise(second.chosen.errors):
                 break
     return min(pairs, key=lambda pair: pair[1].chosen.score, default=[])
+
+
+def in_its_place(inference: Inference, first: Round, second: Round, errors: np.ndarray) -> list[Round]:
+    """Where nothing was named beside an effect, though one takes most off the fitted recordings: that one beside another first effect.
+
+    What leads alone, where there are two, need be neither of them, nor be in a class with one: a quadratic drag of a body that yields is a
+    linear one. The best of the others are fitted with the second one from where that ended, and beside what leaves least so one is looked
+    for as beside any. Nothing is returned where it is not named, or the two leave no less than `errors`.
+    """
+    fitted = inference.fitted
+    here = score(second.errors[fitted])
+    tried = [t for t in second.trials if len(t.candidate.parameters) <= MANY and not unphysical(t.candidate, t.fit.point)]
+    lead = min(tried, key=lambda t: score(t.errors[fitted]), default=None)
+    if lead is None or here - score(lead.errors[fitted]) < 2.0 * LEAST_GAIN:
+        return []
+    instead = [t for t in others(first) if len(t.candidate.parameters) <= MANY and t.candidate.name != lead.candidate.name]
+    instead = sorted((t for t in instead if np.isfinite(t.score)), key=lambda t: t.penalised)[:IN_PLACE]
+    if not instead or inference.deadline.skips(f"effects in the place of {first.chosen.candidate.key}"):
+        return []
+    inference.tell(
+        f"beside {lead.candidate.key}, in the place of {first.chosen.candidate.key}: {', '.join(t.candidate.key for t in instead)}"
+    )
+    floor, free = inference.stand(lead.fit.point)[0], inference.problem.declared
+    without = first.chosen.candidate.without(lead.fit.point)
+    requests = [
+        inference.request((*free, *t.candidate.parameters, *lead.candidate.parameters), {**without, **t.candidate.own(t.fit.point)})
+        for t in instead
+    ]
+    made = [(t, fit) for t, fit in zip(instead, inference.fits(requests, floor), strict=True) if inference.runs(fit.point)]
+    stands = [(t, Stand(fit, *inference.stand(fit.point))) for t, fit in made]
+    if not stands:
+        return []
+    best, there = min(stands, key=lambda entry: score(entry[1].errors))
+    if inference.gain(errors, there.errors) < LEAST_GAIN:
+        return []
+    alone = at_its_end(inference, best)
+    led = replace(second, chosen=None, members=[], trials=[replace(lead, stand=there)])
+    again = inference.round(alone.fit, alone.floor, [best], led, most=MANY)
+    if again.chosen is None or inference.gain(errors, again.chosen.errors) < LEAST_GAIN:
+        return []
+    best.reason = ""
+    return [replace(first, chosen=best, members=[best]), again]
 
 
 def simpler(r: Round, chosen: Trial) -> list[Trial]:

@@ -223,19 +223,26 @@ class Inference(Judging):
             def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
                 return self.without_own(base.point, starts, found, ended)
 
-            grows = not found and self.is_astray(base, floor) and not self.deadline.skips("fits by growing horizons", until)
-            grown = self.growing(base, floor, candidates, until=until) if grows else {}
+            # where a launch of several points costs as one, the others are as quick
+            first = not found and not self.problem.together and self.is_astray(base, floor)
+            grown = self.grow(base, floor, candidates, found, until) if first else {}
             contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until, grown=grown)
             left = self.left_by(contest.best, floor)
-            if not found and not grows and self.leaves_much(left[:1]) and not self.deadline.skips("fits by growing horizons", until):
-                grown = self.growing(base, floor, candidates, until=until)
-                whole = self.wholly(free, list(grown.values()), floor, until)
+            if not first and len(found) < 2 and self.leaves_much(left[:1]):
+                whole = self.wholly(free, list(self.grow(base, floor, candidates, found, until).values()), floor, until)
                 contest = contest._replace(best={**contest.best, **better(whole, contest.best)})
                 left = self.left_by(contest.best, floor)
         look = Look(base, asked, contest, left[:1])
         if not found:
             self.seen = look
         return look
+
+    def grow(
+        self, base: Fit, floor: Floor, candidates: Sequence[Candidate], found: Sequence[Trial], until: float
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """What `growing` makes of the candidates, unless there is no time for it."""
+        late = self.deadline.skips("fits by growing horizons", until)
+        return {} if late else self.growing(base, floor, candidates, found, until=until)
 
     def left_by(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[np.ndarray]:
         """What the fits under the own setting leave, mean squares of the parts, the least first."""

@@ -712,6 +712,27 @@ def test_a_neighbour_takes_the_place_of_an_effect_once_the_other_one_was_found(m
     assert names(diagnose(problem, most=2)) == ["high", "mix"]
 
 
+def test_what_fits_beside_the_wrong_effect_is_tried_beside_the_others(monkeypatch):
+    """`mix` leads alone, and `high` fits beside it but foretells nothing: it belongs beside `low`."""
+    one, two, three = (np.sin(w * T) for w in (40, 62, 87))
+    shapes = {"low": (one, one), "high": (two, two), "mix": (one + 0.3 * two, 0.8 * one + 0.45 * two - 0.25 * three)}
+    problem = Mixed(shapes, {"low": 0.9, "high": 0.4})
+    start = (inference := Inference(problem)).start()
+    first = inference.round(start.fit, start.floor, [])
+    assert first.chosen.candidate.name == "mix"
+    second = inference.round(first.chosen.fit, first.chosen.stand.floor, [first.chosen])
+    assert second.chosen is None
+    low, high = pairs.in_its_place(inference, first, second, first.chosen.errors)
+    assert (low.chosen.candidate.name, high.chosen.candidate.name) == ("low", "high") and low.members == [low.chosen]
+    assert inference.is_noise(high.chosen.errors)
+    assert not pairs.in_its_place(inference, first, second, high.chosen.errors), "no less than that"
+    found = diagnose(problem)
+    assert names(found) == ["high", "low"]
+    assert found.after["low.c"] == pytest.approx(0.9, abs=0.01) and found.after["high.c"] == pytest.approx(0.4, abs=0.01)
+    monkeypatch.setattr(attribution, "in_its_place", lambda *_: [])
+    assert names(diagnose(problem)) != ["high", "low"]
+
+
 class Late(Tones):
     """What the candidate `late` does begins at a size of one."""
 
