@@ -62,7 +62,7 @@ class Contests(Starting):
         then: Callable[[Sequence[tuple[Candidate, Fit]]], Sequence[Start]] = lambda led: (),
         beyond: float = math.inf,
         until: float = 1.0,
-        grown: Mapping[str, tuple[Candidate, Fit]] | None = None,
+        between: Callable[[np.ndarray], Iterable[tuple[Candidate, Fit]]] = lambda remains: (),
     ) -> Contest:
         """Fit the candidates side by side; fits that cannot catch up with the best one stop.
 
@@ -79,12 +79,12 @@ class Contests(Starting):
             then: Further starts, given the best fit of each candidate in the order of their costs.
             beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
             until: Share of the time for the search at which fits end where they are and no others begin: the rest is for other steps.
-            grown: Fits that were made before, by key, which set the pace.
+            between: Further fits after the first ones, given what the leading one of these leaves, where there are others to come.
         """
-        best: dict[str, tuple[Candidate, Fit]] = dict(grown or {})
+        best: dict[str, tuple[Candidate, Fit]] = {}
         ended: list[tuple[Candidate, Fit]] = []
         unfitted: dict[str, str] = {}
-        race = Race(min((fit.cost for _, fit in best.values()), default=math.inf))
+        race = Race()
 
         def fitted(own: Sequence[Start]) -> None:
             requests = []
@@ -112,6 +112,10 @@ class Contests(Starting):
                 unfitted |= {c.key: NO_TIME for wave in waves[i:] for c, *_ in wave}
                 break
             remains = left() if own and best else None
+            if remains is not None and i == 1 and (further := better(between(remains), best)):
+                best |= further
+                race.best = min(race.best, *(fit.cost for _, fit in further.values()))
+                remains = left()
             if remains is not None and score(remains) > beyond:
                 unfitted = {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave}
                 return Contest(*self.closely(free, best, None, floor, until), unfitted)

@@ -223,26 +223,27 @@ class Inference(Judging):
             def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
                 return self.without_own(base.point, starts, found, ended)
 
-            # where a launch of several points costs as one, the others are as quick
-            first = not found and not self.problem.together and self.is_astray(base, floor)
-            grown = self.grow(base, floor, candidates, found, until) if first else {}
-            contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until, grown=grown)
+            grown: list[tuple[Candidate, Fit]] = []
+
+            def grow(remains: Sequence[np.ndarray]) -> Sequence[tuple[Candidate, Fit]]:
+                if len(found) < 2 and not grown and self.leaves_much(remains) and not self.deadline.skips("growing fits", until):
+                    grown.extend(self.growing(base, floor, candidates, found, until=until).values())
+                    return grown
+                return ()
+
+            def between(remains: np.ndarray) -> Sequence[tuple[Candidate, Fit]]:
+                return grow([remains]) if not found and self.is_astray(base, floor) else ()
+
+            contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until, between=between)
             left = self.left_by(contest.best, floor)
-            if not first and len(found) < 2 and self.leaves_much(left[:1]):
-                whole = self.wholly(free, list(self.grow(base, floor, candidates, found, until).values()), floor, until)
+            if further := grow(left[:1]):
+                whole = self.wholly(free, further, floor, until)
                 contest = contest._replace(best={**contest.best, **better(whole, contest.best)})
                 left = self.left_by(contest.best, floor)
         look = Look(base, asked, contest, left[:1])
         if not found:
             self.seen = look
         return look
-
-    def grow(
-        self, base: Fit, floor: Floor, candidates: Sequence[Candidate], found: Sequence[Trial], until: float
-    ) -> dict[str, tuple[Candidate, Fit]]:
-        """What `growing` makes of the candidates, unless there is no time for it."""
-        late = self.deadline.skips("fits by growing horizons", until)
-        return {} if late else self.growing(base, floor, candidates, found, until=until)
 
     def left_by(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[np.ndarray]:
         """What the fits under the own setting leave, mean squares of the parts, the least first."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neuido.discrepancy import growing
+from neuido.discrepancy import contests, growing
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import Inference
@@ -87,18 +87,24 @@ def test_what_the_first_fits_bring_near_the_noise_does_not_grow(monkeypatch):
     assert [t.candidate.name for t in found.effects] == ["wind"]
 
 
-def test_where_the_base_fit_is_astray_fits_grow_first(monkeypatch):
-    """They set the pace of the others then: the race begins with the least of their costs."""
-    problem = Swing({"a": 1.2, "chirp.c": 20.0})
+@pytest.mark.parametrize("together", [True, False])
+def test_where_the_base_fit_is_astray_fits_grow_after_the_first(together, monkeypatch):
+    """They set the pace of the others then; where these cost nothing, they come after all of them."""
+    monkeypatch.setattr(contests, "LEADERS", 1)
+    problem = Swing({"a": 1.2, "chirp.c": 20.0}, together=together)
     inference = Inference(problem)
     base = inference.start()
     assert inference.begun["a"] == pytest.approx(1.6, abs=0.2), "the phase of the first quarter, the chirp's too"
     assert inference.is_astray(base.fit, base.floor)
-    contest, given = Inference.contest, []
-    monkeypatch.setattr(Inference, "contest", lambda self, *args, **o: given.append(o["grown"]) or contest(self, *args, **o))
+    events, grow, fits = [], Inference.growing, Inference.fits
+    monkeypatch.setattr(Inference, "growing", lambda self, *args, **o: events.append("growing") or grow(self, *args, **o))
+    monkeypatch.setattr(Inference, "fits", lambda self, *args, **o: events.append("fits") or fits(self, *args, **o))
     look = inference.look(base.fit, base.floor)
-    assert "chirp" in given[0] and look.contest.best["chirp"][1].cost <= given[0]["chirp"][1].cost
-    inference.begun = {"a": base.fit.point["a"]}
+    assert look.contest.best["chirp"][1].point["chirp.c"] == pytest.approx(20.0, abs=0.2)
+    assert events.count("growing") == 1
+    after = len(events) - 1 - events.index("growing")
+    assert after == 4 if together else after > 4
+    inference.begun, inference.seen = {"a": base.fit.point["a"]}, None
     assert not inference.is_astray(base.fit, base.floor)
 
 

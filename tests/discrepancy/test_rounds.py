@@ -996,7 +996,7 @@ def test_candidates_are_fitted_without_the_problems_own_parameters_too(found, mo
     ended = replace(moved.fit, point={**moved.fit.point, "a": 2.2, "square.c": 0.7})
     asked = []
 
-    def contest(self, free, starts, floor, hopeful, then, beyond, until, grown):
+    def contest(self, free, starts, floor, hopeful, then, beyond, until, between):
         asked.extend([*starts, *then([(square, ended)])])
         return contests.Contest({}, None, {})
 
