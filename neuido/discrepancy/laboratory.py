@@ -359,19 +359,24 @@ class Laboratory:
         return Stand(best.fit, *self.stand(best.fit.point, like=best.floor))
 
     def begun_anew(self, made: Sequence[Stand]) -> list[Stand]:
-        """The base fit by growing horizons from the declared values, where others leave more than noise: they may be in a side valley."""
+        """The base fit by growing horizons from the declared values, where others leave more than noise: they may be in a side valley.
+
+        It is weighed by the floor where the first horizon ends, for what the settings differ by elsewhere may have led the others.
+        """
         best = min(made, key=lambda stand: score(stand.errors[self.fitted]))
-        free, floor = self.problem.declared, best.floor
+        free = self.problem.declared
         if self.is_noise(best.errors[self.fitted], fitted=True) or not free or self.deadline.over:
             return []
-        out: list[Stand] = []
         with self.quickly():
             begin = self.request(free, dict(self.as_declared), **stepwise(HORIZONS[0]))
-            (first,) = self.fits([begin], self.early(floor, HORIZONS[0]))
-            self.begun = first.point
-            if self.apart(best.fit.point, first.point) < ELSEWHERE:
-                return []
+            (first,) = self.fits([begin], self.early(best.floor, HORIZONS[0]))
+        self.begun = first.point
+        if self.apart(best.fit.point, first.point) < ELSEWHERE or not self.runs(first.point):
+            return []
+        floor = self.floor(first.point, like=best.floor, fitted=True)
+        with self.quickly():
             (fit,) = self.grown([(free, first.point)], floor, after=1)
+        out: list[Stand] = []
         for _ in range(AGAIN):
             if not self.runs(fit.point):
                 break

@@ -44,6 +44,8 @@ for a second one."""
 PLAIN, AS_WELL = 2, 1.2
 """Places where fits with an effect ended at which the model is weighed without it, and times the error of the base fit in the fitted
 recordings up to which it stands there instead."""
+MEMBERS = 3
+"""Members of a class where whose fits ended the model is weighed without them."""
 UNEXPLAINED = 2.0
 """Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
 UNEXPLAINED_EXACT = 3.0
@@ -162,7 +164,7 @@ class Inference(Judging):
 
         Where the settings' differences can do much, the fitted recordings say little of a modulus, and each fit with an effect ends at
         another one: what that alone does to the held-out recordings is no effect's. It must fit the fitted ones about as well. Where no
-        effect explains what is left, it is fitted from there: the base may stand in a side valley. Where a named one's fit ended it is
+        effect explains what is left, it is fitted from there: the base may stand in a side valley. Where those that are named ended it is
         weighed with the floor there: the differences of the settings at the base may have led the base fit, and hide what is better.
         """
         if self.problem.settings == 1 or not result.trials:
@@ -176,8 +178,8 @@ class Inference(Judging):
         here, as_well = score(result.errors), score(result.errors[self.fitted]) + 2.0 * math.log(AS_WELL)
         wanted = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < (math.inf if lost else here)]
         if result.chosen is not None:  # by the floor of the base alone it may look worse there than it is
-            own = result.chosen.candidate.without(result.chosen.fit.point)
-            wanted = [own, *(place for place in wanted if place != own)][:PLAIN]
+            own = [t.candidate.without(t.fit.point) for t in result.members[:MEMBERS]]
+            wanted = own + [place for place in wanted if place not in own][: PLAIN - len(own)]
         if not wanted:
             return None
         self.foresee(wanted)
