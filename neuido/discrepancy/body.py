@@ -179,19 +179,35 @@ class BodyProblem(BodyRollouts):
 
     # Forward runs.
 
-    def _predict(self, runs: Sequence[Run]) -> None:
-        """Fill the rows of groups of points that move alike, all of one setting and in one launch; NaN where a simulation is impossible."""
+    def _predict(self, runs: Sequence[Run], *, freed: bool = False) -> None:
+        """Fill the rows of groups of points that move alike, all of one setting and in one launch; NaN where a simulation is impossible.
+
+        A launch for which a GPU has no memory is divided, once what is kept for others is given up (`freed`).
+
+        Raises:
+            UserError: There is no memory for a single motion.
+        """
+        moved, full = None, False
         try:
             moved = self._simulate([(run.firsts, run.recording) for run in runs], runs[0].setting)
         except UserError:
-            halves = _halves(runs)
-            for half in halves:
-                self._predict(half)
-            if not halves:
-                runs[0].out[runs[0].groups[0]] = np.nan
+            pass
+        except torch.OutOfMemoryError:
+            full = True
+        if moved is not None:
+            for run, own in zip(runs, moved, strict=True):
+                self._fill(run, own)
             return
-        for run, own in zip(runs, moved, strict=True):
-            self._fill(run, own)
+        halves = _halves(runs)
+        if full:
+            self.free()
+            if not halves and freed:
+                raise UserError(f"{self.device} has no memory left for one motion; end what else runs there, or use --device cpu")
+            halves = halves or [list(runs)]
+        for half in halves:
+            self._predict(half, freed=full)
+        if not halves:
+            runs[0].out[runs[0].groups[0]] = np.nan
 
     def _simulate(self, runs: Sequence[Motions], setting: int) -> Sequence[Any]:
         """The motions of each recording, as `_fill` takes them."""

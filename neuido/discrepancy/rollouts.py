@@ -4,6 +4,7 @@ A launch moves one or several recordings under one or several points each. What 
 """
 
 import functools
+import gc
 import math
 import threading
 from collections.abc import Mapping, Sequence
@@ -295,6 +296,13 @@ class BodyRollouts(Problem):
                     self._simulators.pop(next(iter(self._simulators)))
             self._simulators[key] = found  # the last one used is the last one to go
         return found
+
+    def free(self) -> None:
+        """Give up the simulators that are kept, with their buffers and captured launches."""
+        with self._lock:
+            self._simulators.clear()
+        gc.collect()
+        torch.cuda.empty_cache()
 
     def _made(self, recordings: Sequence[int], setting: int, count: int, device: str) -> Simulator | FiniteElements:
         s = EVERY[setting]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuido.discrepancy import rollouts
-from neuido.discrepancy.body import body_problem
+from neuido.discrepancy.body import BodyProblem, body_problem
 from neuido.discrepancy.rollouts import SETTINGS
 from neuido.errors import UserError
 from neuido.physics.finite_elements import FiniteElements
@@ -164,6 +164,31 @@ def test_what_fails_in_a_launch_of_finite_elements_fails_alone(experiment, monke
         torch.testing.assert_close(frames.x[:, s], alone.x[:, 0], atol=2e-5 if s in (0, 3) else 2e-3, rtol=0.0)
     with pytest.raises(UserError, match="inner steps of its smallest element"):
         problem._moved(points[2], 0, setting)
+
+
+@pytest.mark.parametrize("most", [2, 1, 0])
+def test_a_launch_without_memory_is_divided(experiment, monkeypatch, most):
+    """Until it fits; for one motion that does not, what is kept is given up once, and then it is the user's."""
+    problem = body_problem(experiment)
+    expected = problem.predict(POINTS[:3], 0)
+    simulate, launches = BodyProblem._simulate, []
+
+    def small(self, runs, setting):
+        launches.append(sum(len(points) for points, _ in runs))
+        if launches[-1] > most:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return simulate(self, runs, setting)
+
+    monkeypatch.setattr(BodyProblem, "_simulate", small)
+    (run,) = problem._runs([(POINTS[:3], 0, 0)])
+    if most == 0:
+        with pytest.raises(UserError, match="no memory left for one motion"):
+            problem._predict([run])
+        assert launches == [3, 2, 1]
+        return
+    problem._predict([run])
+    assert launches == ([3, 2, 1] if most == 2 else [3, 2, 1, 1, 1])
+    np.testing.assert_array_equal(run.out, expected)
 
 
 @pytest.mark.parametrize(("point", "tried"), [({"young": 1e5}, [1, 2]), ({"young": 1e5, "strain_stiffening.k": 4.0}, [1, 2, 6])])
