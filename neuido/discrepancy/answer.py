@@ -374,7 +374,6 @@ def _body(d: Diagnosis) -> str:
 
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     hidden = path.with_name(f".{path.name}.tmp")
     with hidden.open("wb") as stream:
         np.savez_compressed(stream, **arrays)

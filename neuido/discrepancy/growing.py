@@ -9,7 +9,7 @@ import numpy as np
 from neuido.discrepancy.contests import IN_REACH, MANY, Contests
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.laboratory import ELSEWHERE, HORIZONS, stepwise
+from neuido.discrepancy.laboratory import ELSEWHERE, HORIZONS
 from neuido.discrepancy.problem import Candidate, Point
 from neuido.discrepancy.trials import Trial, score
 
@@ -46,13 +46,11 @@ class Growing(Contests):
         given up.
         """
         free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
-        if found or self.begun is None:
-            request = self.request(free, self.at_declared(base.point), **stepwise(HORIZONS[0]))
-            begun = self.fits([request], self.early(floor, HORIZONS[0]))[0].point
-            self.begun = self.begun if found else begun
-        else:
-            begun = self.begun
-        at, wide = dict(begun), self.early(floor, HORIZONS[1])
+        at = None if found else self.begun
+        if at is None:
+            at = self.first_part(free, self.at_declared(base.point), floor)
+            self.begun = self.begun if found else at
+        wide = self.early(floor, HORIZONS[1])
         ranked, _ = self.screen(at, candidates, wide, self.slopes(free, at, self.fitted_recordings))
         starts: dict[str, tuple[Candidate, Point]] = {}
         for _, c, _, begin in ranked:
@@ -61,14 +59,7 @@ class Growing(Contests):
         live = [entry for entry in starts.values() if entry in large or len(entry[0].parameters) <= MANY]
         live = live[: SIDE_BY_SIDE if self.problem.together else ONE_BY_ONE]
         self.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
-        ended: list[tuple[Candidate, Fit]] = []
-        for share in (*HORIZONS[1:], 1.0):
-            if not live or (ended and self.deadline.past(until)):
-                break
-            requests = [self.request((*free, *c.parameters), point, until=until, **stepwise(share)) for c, point in live]
-            ended = list(zip((c for c, _ in live), self.fits(requests, self.early(floor, share)), strict=True))
-            least = min(fit.cost for _, fit in ended)
-            ended = [(c, fit) for c, fit in ended if fit.cost < IN_REACH * least]
-            live = [(c, fit.point) for c, fit in ended]
+        entries = [((*free, *c.parameters), point) for c, point in live]
+        ended = [(live[i][0], fit) for i, fit in self.grown(entries, floor, until=until, reach=IN_REACH)]
         costs = self.costs([fit.point for _, fit in ended], floor) if ended else []  # the time may have ended them at an earlier horizon
         return {c.key: (c, replace(fit, cost=cost)) for (c, fit), cost in zip(ended, costs, strict=True) if np.isfinite(cost)}

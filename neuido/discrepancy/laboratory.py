@@ -277,17 +277,32 @@ class Laboratory:
         """`Floor.early` of this problem."""
         return floor.early(self.problem, self.parts, share)
 
-    def grown(self, entries: Sequence[tuple[Sequence[Parameter], Point]], floor: Floor, *, after: int = 0) -> list[Fit]:
-        """Fits of parameters from points, side by side, to the first part of the recordings, then to more of them, and at last to all.
+    def first_part(self, free: Sequence[Parameter], point: Point, floor: Floor) -> Point:
+        """Where a fit of parameters from a point to the first horizon ends."""
+        (fit,) = self.fits([self.request(free, point, iterations=STEPWISE)], self.early(floor, HORIZONS[0]))
+        return fit.point
+
+    def grown(
+        self, entries: Sequence[tuple[Sequence[Parameter], Point]], floor: Floor, *, until: float = 1.0, reach: float = math.inf
+    ) -> list[tuple[int, Fit]]:
+        """Fits of parameters from points of the first horizon, side by side, to more of the recordings and at last to all of them.
 
         What a body does after it has bounced has many valleys, and what it does before has few: each horizon begins where the one before
-        it ended, near enough for the next bounce. `after`: horizons that are behind already.
+        it ended, near enough for the next bounce. What costs more than `reach` times the least at a horizon is given up; past the share
+        `until` of the time they are where they are. Each with its place among the entries.
         """
-        fits: list[Fit] = []
-        for share in (*HORIZONS[after:], 1.0):
-            entries = [(free, fit.point) for (free, _), fit in zip(entries, fits, strict=True)] if fits else entries
-            fits = self.fits([self.request(free, point, **stepwise(share)) for free, point in entries], self.early(floor, share))
-        return fits
+        ended: list[tuple[int, Fit]] = []
+        live = [(i, point) for i, (_, point) in enumerate(entries)]
+        for share in (*HORIZONS[1:], 1.0):
+            if not live or (ended and self.deadline.past(until)):
+                break
+            options = {} if share == 1.0 else {"iterations": STEPWISE}
+            requests = [self.request(entries[i][0], point, until=until, **options) for i, point in live]
+            fits = self.fits(requests, self.early(floor, share))
+            least = min(fit.cost for fit in fits)
+            ended = [(i, fit) for (i, _), fit in zip(live, fits, strict=True) if fit.cost <= reach * least]
+            live = [(i, fit.point) for i, fit in ended]
+        return ended
 
     def finished(self, named: Stand) -> Stand:
         """A fit once more from its end, with the floor there, until a standard deviation of the noise would show.
@@ -368,14 +383,12 @@ class Laboratory:
         if self.is_noise(best.errors[self.fitted], fitted=True) or not free or self.deadline.over:
             return []
         with self.quickly():
-            begin = self.request(free, dict(self.as_declared), **stepwise(HORIZONS[0]))
-            (first,) = self.fits([begin], self.early(best.floor, HORIZONS[0]))
-        self.begun = first.point
-        if self.apart(best.fit.point, first.point) < ELSEWHERE or not self.runs(first.point):
+            first = self.begun = self.first_part(free, dict(self.as_declared), best.floor)
+        if self.apart(best.fit.point, first) < ELSEWHERE or not self.runs(first):
             return []
-        floor = self.floor(first.point, like=best.floor, fitted=True)
+        floor = self.floor(first, like=best.floor, fitted=True)
         with self.quickly():
-            (fit,) = self.grown([(free, first.point)], floor, after=1)
+            ((_, fit),) = self.grown([(free, first)], floor)
         out: list[Stand] = []
         for _ in range(AGAIN):
             if not self.runs(fit.point):
@@ -486,8 +499,3 @@ class Laboratory:
             columns = [np.where(np.isfinite(row - here).all(), row - here, 0.0) for row in rows]
             out[n] = np.stack(columns, axis=1) if columns else np.empty((len(here), 0))
         return out
-
-
-def stepwise(share: float) -> dict[str, int]:
-    """Options of a fit that reads a share of the time: where it ends is only where the next one begins."""
-    return {} if share == 1.0 else {"iterations": STEPWISE}
