@@ -179,7 +179,7 @@ class Inference(Judging):
         wanted = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < (math.inf if lost else here)]
         if result.chosen is not None:  # by the floor of the base alone it may look worse there than it is
             own = [t.candidate.without(t.fit.point) for t in result.members[:MEMBERS]]
-            wanted = own + [place for place in wanted if place not in own][: PLAIN - len(own)]
+            wanted = own + [place for place in wanted if place not in own][: max(PLAIN - len(own), 0)]
         if not wanted:
             return None
         self.foresee(wanted)

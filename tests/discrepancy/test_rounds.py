@@ -921,6 +921,24 @@ def test_a_model_is_weighed_without_an_effect_where_the_fit_with_it_ended(bend, 
         assert np.all(plain.errors < 4 * NOISE**2)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_so_many_places_without_an_effect_are_weighed(count, monkeypatch):
+    """Those of the members, three at the most, and of others up to two in all."""
+    inference = Inference(Line(lambda t: 3.0 * t))
+    start = inference.start()
+    square = inference.problem.candidates[0]
+    ends = [{"a": 3.01 - 0.002 * i, "square.c": 0.0} for i in range(6)]
+    trials = [Trial(square, replace(stood(NOISE, end), floor=start.floor), 1.0) for end in ends]
+    members = trials[-count:]
+    errors, floors = np.array([1.0, 400.0]) * NOISE**2, np.full(2, NOISE**2)
+    r = Round(start.fit.point, errors, trials, members[0], members, 0.01, start.floor, floors)
+    asked = []
+    monkeypatch.setattr(Inference, "foresee", lambda self, points, **_: asked.extend(points))
+    inference.without_effect(r, start.fit, start.floor)
+    own = [{"a": t.fit.point["a"]} for t in members[:3]]
+    assert asked[: len(own)] == own and len(asked) == max(len(own), 2)
+
+
 @pytest.mark.parametrize(("bend", "found"), [(0.0, True), (1.0, False)])
 def test_a_residual_that_no_effect_explains_has_the_model_fitted_from_where_those_ended(bend, found, monkeypatch):
     inference = Inference(Line(lambda t: 3.0 * t + bend * t**2))
