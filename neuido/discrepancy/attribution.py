@@ -163,8 +163,8 @@ def diagnose(
         if not pair and len(rounds) > 1:
             pair = in_its_place(inference, rounds[0], rounds[1], at.errors)
         others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
-        # beside what lies within its floor nothing was looked for
-        if len(rounds) > 1 and (elsewhere := by_another_method(others, inference, pair[-1].chosen.stand if pair else at)):
+        there = pair[-1].chosen.stand if pair else at
+        if elsewhere := by_another_method(others, inference, there, within=len(rounds) == 1):
             inference, pair = elsewhere
             start = pair[0].plain or starts[tried.index(inference)]
         if pair:

@@ -99,7 +99,9 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
     return pair
 
 
-def by_another_method(others: Mapping[Inference, Round], inference: Inference, at: Stand) -> tuple[Inference, list[Round]] | None:
+def by_another_method(
+    others: Mapping[Inference, Round], inference: Inference, at: Stand, *, within: bool = False
+) -> tuple[Inference, list[Round]] | None:
     """Where more than noise is left: another method by which two effects leave less than that, and the two rounds.
 
     The method goes by what one effect leaves. Where there are two, that is no measure: by the wrong method one effect may stand for both
@@ -110,6 +112,7 @@ def by_another_method(others: Mapping[Inference, Round], inference: Inference, a
         others: The other methods, with their first rounds.
         inference: The one that named an effect.
         at: Where that stands.
+        within: It lies within its floor, where no second one was looked for: two effects must show a promise, and leave noise alone.
     """
     if inference.is_settled(at.errors):
         return None
@@ -120,7 +123,8 @@ def by_another_method(others: Mapping[Inference, Round], inference: Inference, a
         if first.chosen is None or first.chosen.score > score(at.errors) + 2.0 * math.log(WORSE):
             continue
         here = from_there(other, first.chosen, at.fit.point)
-        if pair := second_beside(other, first, first.members, at.errors, at=here, sure=first.chosen):
+        pair = second_beside(other, first, first.members, at.errors, at=here, sure=None if within else first.chosen)
+        if pair and (not within or other.is_noise(pair[-1].chosen.errors)):
             first.chosen.stand, first.chosen.gain = here, other.gain(first.errors, here.errors)
             made.append((other, pair))
     return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)

@@ -135,8 +135,29 @@ def test_the_floor_is_what_a_refit_leaves():
     floors = inference.floors(start.fit.point, inference.problem.declared, start.floor)
     assert floors == pytest.approx(NOISE**2 + 0.02**2 / 2, rel=0.2)
     # and the gain that it takes goes by that
-    small, large = (inference.least_gain(k * floors, floors, floors) for k in (0.2, 4.0))
+    trial = SimpleNamespace(errors=floors, fit=start.fit)
+    small, large = (inference.least_gain(residual(start, k * floors, floors), trial) for k in (0.2, 4.0))
     assert (small, large) == (GAIN_IN_FLOOR, LEAST_GAIN)
+
+
+def residual(start, errors, floors):
+    """A round of a declared model that leaves `errors`."""
+    return Round(start.fit.point, errors, [], None, [], 1.0, start.floor, floors)
+
+
+def test_what_brings_the_declared_values_back_need_not_pass_the_floor():
+    inference = Inference(Line(lambda t: 3.0 * t))
+    start = inference.start()
+    young = Parameter("young", "Pa", 1e5, 1.0, 1e3, 1e7, log=True)
+    inference.problem.__dict__["declared"] = (young,)
+    r = residual(start, np.full(2, 100.0) * NOISE**2, np.full(2, 400.0) * NOISE**2)
+
+    def takes(base, there):
+        trial = SimpleNamespace(errors=np.full(2, 9.0) * NOISE**2, fit=SimpleNamespace(point={"young": there}))
+        return inference.least_gain(replace(r, base={"young": base}), trial)
+
+    assert takes(5e5, 8e4) == takes(2e4, 1.3e5) == LEAST_GAIN
+    assert takes(5e5, 2e5) == takes(2e5, 1e5) == pytest.approx(GAIN_IN_FLOOR)
 
 
 def test_a_fit_that_runs_nowhere_ends_without_a_residual():
@@ -451,9 +472,11 @@ def test_a_member_of_a_class_is_fitted_from_its_leader():
 
 def test_what_leaves_noise_alone_need_not_pass_the_floor():
     inference = Inference(Line(lambda t: 3.0 * t))
-    errors, floors, noise = np.full(2, 9.0) * NOISE**2, np.full(2, 36.0) * NOISE**2, np.full(2, NOISE**2)
-    assert inference.least_gain(errors, floors, 1.2 * noise) == GAIN_TO_NOISE
-    assert inference.least_gain(errors, floors, 3.0 * noise) == GAIN_IN_FLOOR
+    start = inference.start()
+    r = residual(start, np.full(2, 9.0) * NOISE**2, np.full(2, 36.0) * NOISE**2)
+    noise = np.full(2, NOISE**2)
+    assert inference.least_gain(r, SimpleNamespace(errors=1.2 * noise, fit=start.fit)) == GAIN_TO_NOISE
+    assert inference.least_gain(r, SimpleNamespace(errors=3.0 * noise, fit=start.fit)) == GAIN_IN_FLOOR
 
 
 def test_a_method_that_fails_at_one_point_is_tried_all_the_same():
@@ -770,20 +793,32 @@ class Apart(Mixed):
         return rows
 
 
+@pytest.mark.parametrize("within", [False, True])
 @pytest.mark.parametrize(("left", "found"), [(1.0, True), (0.4, True), (0.2, False), (0.05, False)])
-def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left, found):
+def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left, found, within):
     """`left`: what the chosen method leaves of what one effect leaves by this one; 0.05 is noise, 0.2 too far away."""
     problem = Apart()
     inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
     start = other.start()
     first = other.round(start.fit, start.floor, [])
     assert first.chosen.candidate.name == "low"
-    both = pairs.by_another_method({other: first}, inference, replace(first.chosen.stand, errors=left**2 * first.chosen.errors))
+    at = replace(first.chosen.stand, errors=left**2 * first.chosen.errors)
+    both = pairs.by_another_method({other: first}, inference, at, within=within)
     assert bool(both) is found
     if found:
         assert both[0] is other
         assert [r.chosen.candidate.name for r in both[1]] == ["low", "high"]
         assert other.is_noise(both[1][-1].chosen.errors)
+
+
+def test_beside_what_lies_within_its_floor_two_effects_by_another_method_leave_noise_alone(monkeypatch):
+    problem = Apart()
+    inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
+    start = other.start()
+    first = other.round(start.fit, start.floor, [])
+    monkeypatch.setattr(other, "is_noise", lambda *_, **__: False)
+    assert pairs.by_another_method({other: first}, inference, first.chosen.stand)
+    assert not pairs.by_another_method({other: first}, inference, first.chosen.stand, within=True)
 
 
 def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
