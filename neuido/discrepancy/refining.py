@@ -32,6 +32,11 @@ SOME_GAIN = math.log(1.2)
 ALIKE = 0.3
 """Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
 
+HALF = 0.5
+"""Share of the base fit's cost below which the leading effect says where the declared values are."""
+INSTEAD, PROMISING = 4, 0.75
+"""Candidates that are fitted from there in its place, and the share of the misfit that they may leave there, as their directions say."""
+
 Onset = tuple[Sequence[Parameter], Fit, Sequence[Point]]
 """What is fitted, a fit of it, and where further ones begin."""
 
@@ -271,3 +276,37 @@ class Refining(Growing):
             if mine < its:
                 out[c.key] = (c, replace(further, cost=self.costs([further.point], floor)[0]))
         return out
+
+    def instead(
+        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], candidates: Sequence[Candidate], base: Fit, floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of other candidates from where the leading one ended, without it, in the order of what their directions promise there.
+
+        The base fit makes up for what it lacks by a modulus far from the true one, and the fits that begin there may all miss their valleys
+        but for one effect that stands in for the true one: with it the declared values come near theirs.
+        """
+        small = [entry for entry in best.values() if len(entry[0].parameters) <= MANY]
+        if not small or self.problem.settings == 1:
+            return {}
+        lead, fit = min(small, key=lambda entry: entry[1].cost)
+        before, squares = self.mean_squares([base.point, fit.point], floor)
+        if fit.cost > HALF * self.costs([base.point], floor)[0] or self.is_noise(squares) or self.gain(before, squares) < SOME_GAIN:
+            return {}
+        begin = lead.without(fit.point)
+        if not self.runs(begin):
+            return {}
+        behind = [
+            c for c in candidates if c.name != lead.name and not (c.key in best and best[c.key][1].cost < 1.5 * fit.cost)
+            and len(c.parameters) <= (MANY if self.problem.together else SMALL)
+        ]  # fmt: skip
+        ranked, _ = self.screen(begin, behind, floor, self.slopes(free, begin, self.fitted_recordings))
+        starts: dict[str, tuple[Candidate, Point]] = {}
+        for stays, c, _, start in ranked:
+            if stays < PROMISING and len(starts) < INSTEAD:
+                starts.setdefault(c.key, (c, start))
+        if not starts:
+            return {}
+        self.tell(f"in the place of {lead.key}: {', '.join(starts)}")
+        race = Race(fit.cost)
+        fits = self.fits([self.request((*free, *c.parameters), start, race=race) for c, start in starts.values()], floor)
+        return better(zip((c for c, _ in starts.values()), fits, strict=True), best)

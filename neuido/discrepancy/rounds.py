@@ -139,6 +139,8 @@ class Inference(Judging):
             best |= self.limits(free, best, candidates, floor)
             best |= self.polish(free, best, base, floor, rival, other)
             best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
+            if not found:
+                best |= self.instead(free, best, candidates, base, floor)
         floors = self.floors(base.point, free, floor)
         model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)
         null, unfitted = model.null(errors, self.draws), look.contest.unfitted

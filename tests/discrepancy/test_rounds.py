@@ -111,7 +111,11 @@ def test_a_small_candidate_that_the_screening_passes_over_is_fitted(together, mo
     assert [t.candidate.name for t in found.effects] == ["clip"]
     assert 1.0 / found.after["clip.inverse"] == pytest.approx(1.6, abs=0.02)
     monkeypatch.setattr(rounds, "SMALL", 0)
-    assert "clip" not in [t.candidate.name for t in diagnose(Line(clipped, together=together), keep=1).rounds[0].trials]
+    with monkeypatch.context() as without:
+        without.setattr(Inference, "instead", lambda *_: {})
+        assert "clip" not in [t.candidate.name for t in diagnose(Line(clipped, together=together), keep=1).rounds[0].trials]
+    # where another one ends it is found all the same
+    assert [t.candidate.name for t in diagnose(Line(clipped, together=together), keep=1).effects] == ["clip"]
 
 
 def test_many_parameters_are_not_fitted_where_one_leaves_noise_alone():
@@ -468,6 +472,38 @@ def test_a_member_of_a_class_is_fitted_from_its_leader():
     assert list(more) == ["high"]
     assert more["high"][1].point["high.c"] == pytest.approx(2 * fit.point["low.c"], rel=0.01)
     assert inference.alike(problem.declared, best | more, candidates, {"low": 0, "high": 0}, columns, slopes, start.floor) == {}
+
+
+class Tuned(Line):
+    """A tone whose pitch goes with `a`, and one that stays and stands in for it where `a` is 3."""
+
+    def __init__(self):
+        super().__init__(lambda t: 3.0 * t + 0.5 * np.sin(60 * t))
+        own = [Candidate(n, (Parameter(f"{n}.c", "1", 0.0, 0.1, -5.0, 5.0),), ({f"{n}.c": 0.1},), "flight") for n in ("tuned", "fixed")]
+        self.__dict__["candidates"] = (*self.candidates, *own)
+
+    def predict(self, points, recording, setting=0):
+        fixed = np.sin(60 * T) + 0.2 * np.sin(25 * T)
+        own = [p.get("tuned.c", 0.0) * np.sin(20 * p.get("a", 1.0) * T) + p.get("fixed.c", 0.0) * fixed for p in points]
+        return super().predict(points, recording) + 0.02 * setting * np.sin(40 * T) + np.stack(own)
+
+
+def test_what_stands_in_for_an_effect_says_where_that_one_begins():
+    inference = Inference(problem := Tuned())
+    start, free = inference.start(), problem.declared
+    by_key = {c.key: c for c in problem.candidates}
+    base = Fit({"a": 2.0}, ("a",), inference.costs([{"a": 2.0}], start.floor)[0], np.zeros(1), 1, True)
+    (fixed,) = inference.fits([inference.request((*free, *by_key["fixed"].parameters), {"a": 3.0, "fixed.c": 0.4})], start.floor)
+    astray = Fit({"a": 2.0, "tuned.c": 0.0}, ("a", "tuned.c"), base.cost, np.zeros(1), 1, True)
+    best = {"fixed": (by_key["fixed"], fixed), "tuned": (by_key["tuned"], astray)}
+    more = inference.instead(free, best, problem.candidates, base, start.floor)
+    assert more["tuned"][1].point["tuned.c"] == pytest.approx(0.5, abs=0.02) and "fixed.c" not in more["tuned"][1].point
+    assert inference.is_noise(inference.mean_squares([more["tuned"][1].point], start.floor)[0])
+    # not where the leading one leaves noise alone, nor where it says little of the declared values
+    assert not inference.instead(free, best | more, problem.candidates, base, start.floor)
+    near = replace(base, point={"a": fixed.point["a"]})
+    little = {"fixed": (by_key["fixed"], replace(fixed, cost=0.6 * inference.costs([near.point], start.floor)[0]))}
+    assert not inference.instead(free, little, problem.candidates, near, start.floor)
 
 
 def test_what_leaves_noise_alone_need_not_pass_the_floor():
