@@ -175,7 +175,7 @@ def test_render_table_is_the_measured_one():
 
 def test_blind_table_is_the_measured_one():
     measured = []
-    for seed in (13, 19):
+    for seed in (13, 20):
         with (ROOT / "benchmarks" / "results" / f"blind-seed-{seed}.csv").open() as file:
             own = [row for row in csv.DictReader(file) if row["measured"] == "body"]
         measured += [row for row in own if (row["ablation"] == "no-discretisation") == (seed == 13)]
