@@ -10,6 +10,7 @@ from neuido.discrepancy.contests import IN_REACH, MANY, better
 from neuido.discrepancy.fit import Fit, Race
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.growing import Growing
+from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Candidate, Parameter, Point
 from neuido.discrepancy.starting import FAR, SMALL
 from neuido.discrepancy.trials import Round, Stand, score
@@ -34,8 +35,14 @@ ALIKE = 0.3
 
 HALF = 0.5
 """Share of the base fit's cost below which the leading effect says where the declared values are."""
-INSTEAD, PROMISING = 4, 0.75
-"""Candidates that are fitted from there in its place, and the share of the misfit that they may leave there, as their directions say."""
+PROMISING = 0.75
+"""Share of the misfit that a candidate may leave there, as its directions say, to be tried in its place."""
+INSTEAD, INSTEAD_ONE_BY_ONE = 4, 2
+"""Candidates that are fitted there, and the same where every point costs."""
+SCANNED = 8
+"""Candidates whose sizes are tried there where every point costs; otherwise all that promise."""
+STEP, STEPS = 1.5, 9
+"""Ratio of these sizes, and how many: up to 26 times the one that the candidate is screened at."""
 
 Onset = tuple[Sequence[Parameter], Fit, Sequence[Point]]
 """What is fitted, a fit of it, and where further ones begin."""
@@ -280,33 +287,53 @@ class Refining(Growing):
     def instead(
         self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], candidates: Sequence[Candidate], base: Fit, floor: Floor
     ) -> dict[str, tuple[Candidate, Fit]]:
-        """Fits of other candidates from where the leading one ended, without it, in the order of what their directions promise there.
+        """Fits of other candidates from where the leading one ended, without it.
 
         The base fit makes up for what it lacks by a modulus far from the true one, and the fits that begin there may all miss their valleys
-        but for one effect that stands in for the true one: with it the declared values come near theirs.
+        but for one effect that stands in for the true one: with it the declared values come near theirs. They are held while sizes of what
+        promises something there are tried and fitted, for the valleys of a size and a modulus together are narrow.
         """
         small = [entry for entry in best.values() if len(entry[0].parameters) <= MANY]
         if not small or self.problem.settings == 1:
             return {}
         lead, fit = min(small, key=lambda entry: entry[1].cost)
         before, squares = self.mean_squares([base.point, fit.point], floor)
-        if fit.cost > HALF * self.costs([base.point], floor)[0] or self.is_noise(squares) or self.gain(before, squares) < SOME_GAIN:
+        if fit.cost > HALF * self.costs([base.point], floor)[0] or self.is_noise(squares) or self.gain(before, squares) < LEAST_GAIN:
             return {}
         begin = lead.without(fit.point)
-        if not self.runs(begin):
+        if not self.runs(begin) or self.deadline.skips(f"effects in the place of {lead.key}"):
             return {}
         behind = [
             c for c in candidates if c.name != lead.name and not (c.key in best and best[c.key][1].cost < 1.5 * fit.cost)
             and len(c.parameters) <= (MANY if self.problem.together else SMALL)
         ]  # fmt: skip
-        ranked, _ = self.screen(begin, behind, floor, self.slopes(free, begin, self.fitted_recordings))
+        there, _ = self.stand(fit.point, like=floor, fitted=True)
+        ranked, _ = self.screen(begin, behind, there, self.slopes(free, begin, self.fitted_recordings))
         starts: dict[str, tuple[Candidate, Point]] = {}
         for stays, c, _, start in ranked:
-            if stays < PROMISING and len(starts) < INSTEAD:
+            if stays < PROMISING and (self.problem.together or len(starts) < SCANNED):
                 starts.setdefault(c.key, (c, start))
         if not starts:
             return {}
-        self.tell(f"in the place of {lead.key}: {', '.join(starts)}")
-        race = Race(fit.cost)
-        fits = self.fits([self.request((*free, *c.parameters), start, race=race) for c, start in starts.values()], floor)
-        return better(zip((c for c, _ in starts.values()), fits, strict=True), best)
+        tried = [(c, point) for c, start in starts.values() for point in (start, *self.scanned(c, start))]
+        found: dict[str, tuple[float, Candidate, Point]] = {}
+        for (c, point), cost in zip(tried, self.costs([point for _, point in tried], there), strict=True):
+            if np.isfinite(cost) and cost < found.get(c.key, (math.inf,))[0]:
+                found[c.key] = (cost, c, point)
+        leading = sorted(found.values(), key=lambda entry: entry[0])[: INSTEAD if self.problem.together else INSTEAD_ONE_BY_ONE]
+        self.tell(f"in the place of {lead.key}: {', '.join(c.key for _, c, _ in leading)}")
+        alone = self.fits([self.request(c.parameters, point) for _, c, point in leading], there)
+        placed = [(c, end) for (_, c, _), end in zip(leading, alone, strict=True)]
+        race = Race(self.costs([fit.point], there)[0])
+        fits = self.fits([self.request((*free, *c.parameters), end.point, race=race) for c, end in placed], there)
+        costs = self.costs([end.point for end in fits], floor)
+        return better(((c, replace(end, cost=cost)) for (c, _), end, cost in zip(placed, fits, costs, strict=True)), best)
+
+    def scanned(self, c: Candidate, start: Point) -> list[Point]:
+        """A start of a candidate of one size with sizes of either sign from the one that it is screened at up."""
+        if len(c.size_parameters) > 1 or not c.linear:
+            return []
+        (p,) = c.size_parameters
+        unit, signs = abs(c.starts[0][p.name]), (1.0, -1.0) if p.lower < 0 else (1.0,)
+        sizes = [sign * unit * STEP**k for sign in signs for k in range(STEPS)]
+        return [{**start, p.name: size} for size in sizes if p.lower < size < p.upper]

@@ -496,6 +496,9 @@ def test_what_stands_in_for_an_effect_says_where_that_one_begins():
     (fixed,) = inference.fits([inference.request((*free, *by_key["fixed"].parameters), {"a": 3.0, "fixed.c": 0.4})], start.floor)
     astray = Fit({"a": 2.0, "tuned.c": 0.0}, ("a", "tuned.c"), base.cost, np.zeros(1), 1, True)
     best = {"fixed": (by_key["fixed"], fixed), "tuned": (by_key["tuned"], astray)}
+    assert [p["tuned.c"] for p in inference.scanned(by_key["tuned"], astray.point)][:3] == pytest.approx([0.1, 0.15, 0.225])
+    assert {p["tuned.c"] < 0 for p in inference.scanned(by_key["tuned"], astray.point)} == {True, False}
+    assert not inference.scanned(by_key["clip"], astray.point)
     more = inference.instead(free, best, problem.candidates, base, start.floor)
     assert more["tuned"][1].point["tuned.c"] == pytest.approx(0.5, abs=0.02) and "fixed.c" not in more["tuned"][1].point
     assert inference.is_noise(inference.mean_squares([more["tuned"][1].point], start.floor)[0])
