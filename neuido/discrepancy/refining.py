@@ -41,6 +41,8 @@ INSTEAD, INSTEAD_ONE_BY_ONE = 4, 2
 """Candidates that are fitted there, and the same where every point costs."""
 SCANNED = 8
 """Candidates whose sizes are tried there where every point costs; otherwise all that promise."""
+FROM_THERE = 10.0
+"""Times the cost of the leading fit up to which one of these sizes is fitted: the two that this has found began at 0.4 and 6 times."""
 STEP, STEPS = 1.5, 9
 """Ratio of these sizes, and how many: up to 26 times the one that the candidate is screened at."""
 
@@ -320,11 +322,15 @@ class Refining(Growing):
         for (c, point), cost in zip(tried, self.costs([point for _, point in tried], there), strict=True):
             if np.isfinite(cost) and cost < found.get(c.key, (math.inf,))[0]:
                 found[c.key] = (cost, c, point)
-        leading = sorted(found.values(), key=lambda entry: entry[0])[: INSTEAD if self.problem.together else INSTEAD_ONE_BY_ONE]
+        limit = self.costs([fit.point], there)[0]
+        leading = sorted((entry for entry in found.values() if entry[0] < FROM_THERE * limit), key=lambda entry: entry[0])
+        leading = leading[: INSTEAD if self.problem.together else INSTEAD_ONE_BY_ONE]
+        if not leading:
+            return {}
         self.tell(f"in the place of {lead.key}: {', '.join(c.key for _, c, _ in leading)}")
         alone = self.fits([self.request(c.parameters, point) for _, c, point in leading], there)
         placed = [(c, end) for (_, c, _), end in zip(leading, alone, strict=True)]
-        race = Race(self.costs([fit.point], there)[0])
+        race = Race(limit)
         fits = self.fits([self.request((*free, *c.parameters), end.point, race=race) for c, end in placed], there)
         costs = self.costs([end.point for end in fits], floor)
         return better(((c, replace(end, cost=cost)) for (c, _), end, cost in zip(placed, fits, costs, strict=True)), best)
