@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from neuido.discrepancy.base_fits import ELSEWHERE, HORIZONS
 from neuido.discrepancy.contests import IN_REACH, MANY, Contests
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.laboratory import ELSEWHERE, HORIZONS
 from neuido.discrepancy.problem import Candidate, Point
 from neuido.discrepancy.trials import Trial, score
 

@@ -8,9 +8,10 @@ import numpy as np
 
 from neuido.discrepancy import evidence
 from neuido.discrepancy.fit import Fit
+from neuido.discrepancy.instead import Instead
 from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Candidate
-from neuido.discrepancy.refining import SOME_GAIN, Refining
+from neuido.discrepancy.refining import SOME_GAIN
 from neuido.discrepancy.trials import Round, Trial, times_over, unphysical
 
 ALPHA = 0.05
@@ -40,7 +41,7 @@ LIKE_A_GRID = 0.5, 2.5
 second was to be explained is not named. Of 223 named in eight blind seeds one was like that, a wrong one."""
 
 
-class Judging(Refining):
+class Judging(Instead):
     """The decisions of a step."""
 
     draws: int

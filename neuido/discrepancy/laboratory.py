@@ -1,4 +1,4 @@
-"""What a diagnosis measures on one problem under one setting: fits of the declared model, floors, and what is left."""
+"""What a diagnosis measures on one problem under one setting: fits, floors, and what is left."""
 
 import functools
 import math
@@ -16,32 +16,19 @@ from neuido.discrepancy.fit import Fit, Request, levenberg_marquardt, residuals,
 from neuido.discrepancy.floors import Floor, over_time, split
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Parameter, Point, Problem
-from neuido.discrepancy.trials import Stand, score
+from neuido.discrepancy.trials import score
 
 LEAST_GAIN = math.log(1.7)
 """Smaller gains are no reason to name anything: other solvers differ by as much in ways that no setting of one solver shows."""
 ROUGH = 0.02
-"""Relative gain that ends the fit before the floors are known."""
-FOLLOWED = 1.5
-"""What the errors of the declared model must fall by for a parameter of the problem's own to leave its place."""
+"""Relative gain that ends a fit which only says where floors are to be found, or what they are."""
 UNSEEN = 0.1
 """Largest share of the differences of the settings that lies outside their directions: what a fit weighs the data by, beside the noise."""
-AGAIN, MOST_AGAIN = 2, 4
-"""Fits of the declared model with the differences of the settings, each with those of where the last one ended: the least, and the most
-while a parameter of the problem's own follows the amounts."""
 ALIKE = 0.3
 """Share of what is left that a quick setting may differ by, so that a search there is for what is left."""
 SURE = 1.3
 """Times a setting's step that must be stable for it to stand in for another one: a beam of a Poisson ratio of 0.494 failed at 1.15 in three
 recordings of five, and moved by itself in the others."""
-HORIZONS = (0.25, 0.4, 0.6, 0.8)
-"""Shares of the time of the fitted recordings that a growing fit reads, one after the other, before all of it."""
-STEPWISE = 6
-"""Iterations at each of these, at the most."""
-ELSEWHERE = 1.0
-"""Coordinates that the base fit stands apart from where the declared model fits the first horizon, to be taken for led astray."""
-ASTRAY = 1.05
-"""Times the error of the fitted parts from which on the end of a fit is not taken for a better one."""
 
 Tell = Callable[[str], None]
 
@@ -264,162 +251,6 @@ class Laboratory:
         margin = functools.partial(self.problem.margin, setting=self.setting)
         together = self.problem.together
         return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.deadline.past(until), **options)
-
-    def base(self, starts: Sequence[Point], floor: Floor, **options: Any) -> Fit:
-        """The declared parameters fitted from several starts; the best one after a few iterations goes on, with options of the fit."""
-        free = self.problem.declared
-        if len(starts) > 1:
-            short = self.fits([self.request(free, s, iterations=3) for s in starts], floor)
-            starts = [min(short, key=lambda f: f.cost).point]
-        return self.fits([self.request(free, starts[0], **options)], floor)[0]
-
-    def early(self, floor: Floor, share: float) -> Floor:
-        """`Floor.early` of this problem."""
-        return floor.early(self.problem, self.parts, share)
-
-    def first_part(self, free: Sequence[Parameter], point: Point, floor: Floor) -> Point:
-        """Where a fit of parameters from a point to the first horizon ends."""
-        (fit,) = self.fits([self.request(free, point, iterations=STEPWISE)], self.early(floor, HORIZONS[0]))
-        return fit.point
-
-    def grown(
-        self, entries: Sequence[tuple[Sequence[Parameter], Point]], floor: Floor, *, until: float = 1.0, reach: float = math.inf
-    ) -> list[tuple[int, Fit]]:
-        """Fits of parameters from points of the first horizon, side by side, to more of the recordings and at last to all of them.
-
-        What a body does after it has bounced has many valleys, and what it does before has few: each horizon begins where the one before
-        it ended, near enough for the next bounce. What costs more than `reach` times the least at a horizon is given up; past the share
-        `until` of the time they are where they are. Each with its place among the entries.
-        """
-        ended: list[tuple[int, Fit]] = []
-        live = [(i, point) for i, (_, point) in enumerate(entries)]
-        for share in (*HORIZONS[1:], 1.0):
-            if not live or (ended and self.deadline.past(until)):
-                break
-            options = {} if share == 1.0 else {"iterations": STEPWISE}
-            requests = [self.request(entries[i][0], point, until=until, **options) for i, point in live]
-            fits = self.fits(requests, self.early(floor, share))
-            least = min(fit.cost for fit in fits)
-            ended = [(i, fit) for (i, _), fit in zip(live, fits, strict=True) if fit.cost <= reach * least]
-            live = [(i, fit.point) for i, fit in ended]
-        return ended
-
-    def finished(self, named: Stand) -> Stand:
-        """A fit once more from its end, with the floor there, until a standard deviation of the noise would show.
-
-        Unless that leaves more of the fitted parts than `named` does, with the floor where it stands or the one that it was named with:
-        weights are about what another grid does, and a step along that can go further from the data.
-        """
-
-        def left(stand: Stand) -> float:
-            return score(stand.errors[self.fitted])
-
-        fit = named.fit
-        here = Stand(fit, *self.stand(fit.point))
-        unit = 1.0 / sum(int(p.rows.sum()) for p in self.parts if p.fitted)
-        parameters = [self.problem.parameter(name) for name in fit.names]
-        begin = self.recentred(fit.point, here.floor)
-        (further,) = self.fits([self.request(parameters, begin, iterations=6, tolerance=0.3 * unit, nothing=0.1 * unit)], here.floor)
-        least = min(named, here, key=left)
-        if not parameters or not self.runs(further.point):
-            return least
-        _, after = self.stand(further.point, like=here.floor)
-        if score(after[self.fitted]) - left(least) > 2.0 * math.log(ASTRAY):
-            return least
-        return Stand(further, *self.stand(further.point))
-
-    def starts(self, point: Point) -> list[Point]:
-        """A point, and half and twice each parameter whose logarithm is fitted."""
-        out = [dict(point)]
-        for p in self.problem.declared:
-            if p.log:
-                value = point.get(p.name, p.value)
-                out += [dict(point) | {p.name: p.within(value * f)} for f in (0.5, 2.0)]
-        return out
-
-    def start(self, near: Point | None = None) -> Stand | None:
-        """The base fit, with what noise and discretisation do to it; from about the declared values, or from them and from `near`.
-
-        None: given `near`, the fit ends where not every recording can be predicted.
-        """
-        # the first fit only says where the floor is to be found
-        begins = [{}, near] if near else self.starts({})
-        with self.quickly():
-            fit = self.base(begins, self.noise(), iterations=6, tolerance=ROUGH)
-        if fit.setting != self.own and not self.runs(fit.point):
-            fit = self.base(begins, self.noise(), iterations=6, tolerance=ROUGH)
-        if near is not None and not self.runs(fit.point):
-            return None
-        if self.problem.settings == 1:
-            floor = self.floor(fit.point)
-            fit = self.base([fit.point], floor)
-            return Stand(fit, floor, self.mean_squares([fit.point], floor)[0])
-        floor, errors = self.stand(fit.point, fitted=True)
-        made, asked = [Stand(fit, floor, errors)], False
-        for turn in range(MOST_AGAIN):
-            begin = self.recentred(fit.point, floor) if turn else fit.point
-            if turn >= AGAIN and begin == fit.point:
-                break
-            begins = [begin]
-            if begin != fit.point and not asked:  # a modulus may have made up for where the floor is
-                begins.append({**begin, **self.as_declared})
-                asked = True
-            fit = self.base(begins, floor)
-            if not self.runs(fit.point):
-                break
-            floor, errors = self.stand(fit.point, like=floor, fitted=True)
-            made.append(Stand(fit, floor, errors))
-        made += self.begun_anew(made)
-        best = self.plainest(made)
-        return Stand(best.fit, *self.stand(best.fit.point, like=best.floor))
-
-    def begun_anew(self, made: Sequence[Stand]) -> list[Stand]:
-        """The base fit by growing horizons from the declared values, where others leave more than noise: they may be in a side valley.
-
-        It is weighed by the floor where the first horizon ends, for what the settings differ by elsewhere may have led the others.
-        """
-        best = min(made, key=lambda stand: score(stand.errors[self.fitted]))
-        free = self.problem.declared
-        if self.is_noise(best.errors[self.fitted], fitted=True) or not free or self.deadline.over:
-            return []
-        with self.quickly():
-            first = self.begun = self.first_part(free, dict(self.as_declared), best.floor)
-        if self.apart(best.fit.point, first) < ELSEWHERE or not self.runs(first):
-            return []
-        floor = self.floor(first, like=best.floor, fitted=True)
-        with self.quickly():
-            ((_, fit),) = self.grown([(free, first)], floor)
-        out: list[Stand] = []
-        for _ in range(AGAIN):
-            if not self.runs(fit.point):
-                break
-            floor, errors = self.stand(fit.point, like=floor, fitted=True)
-            out.append(Stand(fit, floor, errors))
-            if score(errors[self.fitted]) - score(best.errors[self.fitted]) > 2.0 * math.log(FOLLOWED):
-                break
-            fit = self.base([fit.point], floor)
-        return out
-
-    def apart(self, point: Point, other: Point) -> float:
-        """The largest difference of two points in a coordinate of a declared parameter."""
-        return max(abs(p.coordinate(point[p.name]) - p.coordinate(other[p.name])) for p in self.problem.declared)
-
-    def plainest(self, made: Sequence[Stand]) -> Stand:
-        """The stand that leaves least of the fitted parts: one whose point follows the amounts must leave clearly less than the others.
-
-        A parameter of the problem's own that makes up for an effect in part stands in the way of all that begins there.
-        """
-
-        def left(stand: Stand) -> float:
-            return score(stand.errors[self.fitted])
-
-        own = [{k: v for k, v in stand.fit.point.items() if k not in self.as_declared} for stand in made]
-        still = min((stand for stand, place in zip(made, own, strict=True) if place == own[0]), key=left)
-        best = min(made, key=left)
-        if left(still) - left(best) <= 2.0 * math.log(FOLLOWED):
-            return still
-        self.still = still.fit.point
-        return best
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""

@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from neuido.discrepancy.base_fits import BaseFits
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.laboratory import Laboratory
 from neuido.discrepancy.problem import Candidate, Parameter, Point
 
 
-class Screening(Laboratory):
+class Screening(BaseFits):
     """The linear look at every candidate that comes before full fits of a few."""
 
     def columns(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from neuido.discrepancy import attribution, contests, pairs, refining, rounds, starting
+from neuido.discrepancy import attribution, contests, instead, pairs, refining, rounds, starting
 from neuido.discrepancy.answer import rejected, trace
 from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
 from neuido.discrepancy.deadline import Deadline
@@ -391,7 +391,7 @@ def test_a_limit_of_the_leading_candidate_is_fitted_from_its_declared_values(mon
     (chord,) = inference.fits([inference.request((*free, *by_key["chord"].parameters), start.fit.point)], start.floor)
     best = {"chord": (by_key["chord"], chord), "low": (by_key["low"], far)}
     assert not inference.limits(free, best, inference.problem.candidates, start.floor)
-    monkeypatch.setitem(refining.LIMITS, "chord", ("low",))
+    monkeypatch.setitem(instead.LIMITS, "chord", ("low",))
     ((key, (_, fit)),) = inference.limits(free, best, inference.problem.candidates, start.floor).items()
     assert key == "low" and fit.point["low.c"] == pytest.approx(0.5, abs=0.02) and "chord.c" not in fit.point
     near = replace(far, cost=1.2 * chord.cost)  # it is as good already

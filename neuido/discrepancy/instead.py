@@ -1,0 +1,159 @@
+"""Other candidates from where the leading effect's fit ended: what it is in a limit, what acts alike, and what it may stand in for."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from neuido.discrepancy.contests import MANY, better
+from neuido.discrepancy.fit import Fit, Race
+from neuido.discrepancy.floors import Floor
+from neuido.discrepancy.laboratory import LEAST_GAIN
+from neuido.discrepancy.problem import Candidate, Parameter, Point
+from neuido.discrepancy.refining import Refining
+from neuido.discrepancy.starting import SMALL
+from neuido.physics.effect_library import LIMITS
+
+ALIKE = 0.3
+"""Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
+HALF = 0.5
+"""Share of the base fit's cost below which the leading effect says where the declared values are."""
+PROMISING = 0.75
+"""Share of the misfit that a candidate may leave there, as its directions say, to be tried in its place."""
+INSTEAD, INSTEAD_ONE_BY_ONE = 4, 2
+"""Candidates that are fitted there, and the same where every point costs."""
+SCANNED = 8
+"""Candidates whose sizes are tried there where every point costs; otherwise all that promise."""
+FROM_THERE = 10.0
+"""Times the cost of the leading fit up to which one of these sizes is fitted: the two that this has found began at 0.4 and 6 times."""
+STEP, STEPS = 1.5, 9
+"""Ratio of these sizes, and how many: up to 26 times the one that the candidate is screened at."""
+
+
+class Instead(Refining):
+    """What is fitted from the end of the leading fit."""
+
+    def limits(
+        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], candidates: Sequence[Candidate], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of what the leading candidate is in a limit, from its declared values and with sizes that do about as much.
+
+        The base fit may have led theirs astray.
+        """
+        if not best:
+            return {}
+        lead, fit = min(best.values(), key=lambda entry: entry[1].cost)
+        own = [
+            c for c in candidates if c.name in LIMITS.get(lead.name, ()) and not (c.key in best and best[c.key][1].cost < 1.5 * fit.cost)
+        ]
+        if not own:
+            return {}
+        begin, wanted = lead.without(fit.point), self.fitted_recordings
+        does = np.concatenate([there - here for here, there in self.predicted([begin, fit.point], wanted).values()])
+        columns = self.columns(begin, own, wanted)
+        requests = []
+        for c in own:
+            A = np.concatenate([columns[c.key, 0][n] for n in wanted])
+            amount = np.linalg.lstsq(A, does, rcond=1e-6)[0] if np.isfinite(A).all() and np.isfinite(does).all() else np.ones(A.shape[1])
+            requests.append(self.request((*free, *c.parameters), begin | c.times(c.starts[0], amount)))
+        return better(zip(own, self.fits(requests, floor), strict=True), best)
+
+    def alike(
+        self,
+        free: Sequence[Parameter],
+        best: Mapping[str, tuple[Candidate, Fit]],
+        candidates: Sequence[Candidate],
+        chosen: Mapping[str, int],
+        columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
+        slopes: Mapping[int, np.ndarray],
+        floor: Floor,
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of the candidates that act on the data as the leading one does, from its fit, with the sizes that do as much.
+
+        A fit that started far from there may have been given up, and a class would lack one of its members.
+        """
+        small = [entry for entry in best.values() if len(entry[0].parameters) <= MANY]
+        if not small:
+            return {}
+        lead, fit = min(small, key=lambda entry: entry[1].cost)
+        if not lead.linear or lead.size_parameters != lead.parameters:
+            return {}
+        at = chosen.get(lead.key, 0)  # what is a limit of another one may lead without a place in the screening
+        past, start = self.past(slopes, floor), lead.starts[at]
+        does = past(columns[lead.key, at]) @ np.array([fit.point[p.name] / start[p.name] for p in lead.parameters])
+        if not np.isfinite(does).all():
+            return {}
+        requests, of = [], []
+        without = {k: v for k, v in fit.point.items() if k not in start}
+        for c in candidates:
+            if c is lead or not c.linear or len(c.parameters) > MANY or (c.key in best and best[c.key][1].cost < 1.5 * fit.cost):
+                continue
+            for i, shape in enumerate(c.starts):
+                A = past(columns[c.key, i])
+                if not np.isfinite(A).all():
+                    continue
+                amount = np.linalg.lstsq(A, does, rcond=1e-6)[0]
+                if np.sum((does - A @ amount) ** 2) < ALIKE * np.sum(does**2):
+                    requests.append(self.request((*free, *c.parameters), without | c.times(shape, amount), race=Race(fit.cost)))
+                    of.append(c)
+                    break
+        return better(zip(of, self.fits(requests, floor), strict=True), best)
+
+    def instead(
+        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], candidates: Sequence[Candidate], base: Fit, floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of other candidates from where the leading one ended, without it.
+
+        The base fit makes up for what it lacks by a modulus far from the true one, and the fits that begin there may all miss their valleys
+        but for one effect that stands in for the true one: with it the declared values come near theirs. They are held while sizes of what
+        promises something there are tried and fitted, for the valleys of a size and a modulus together are narrow.
+        """
+        small = [entry for entry in best.values() if len(entry[0].parameters) <= MANY]
+        if not small or self.problem.settings == 1:
+            return {}
+        lead, fit = min(small, key=lambda entry: entry[1].cost)
+        before, squares = self.mean_squares([base.point, fit.point], floor)
+        if fit.cost > HALF * self.costs([base.point], floor)[0] or self.is_noise(squares) or self.gain(before, squares) < LEAST_GAIN:
+            return {}
+        begin = lead.without(fit.point)
+        if not self.runs(begin) or self.deadline.skips(f"effects in the place of {lead.key}"):
+            return {}
+        behind = [
+            c for c in candidates if c.name != lead.name and not (c.key in best and best[c.key][1].cost < 1.5 * fit.cost)
+            and len(c.parameters) <= (MANY if self.problem.together else SMALL)
+        ]  # fmt: skip
+        there, _ = self.stand(fit.point, like=floor, fitted=True)
+        ranked, _ = self.screen(begin, behind, there, self.slopes(free, begin, self.fitted_recordings))
+        starts: dict[str, tuple[Candidate, Point]] = {}
+        for stays, c, _, start in ranked:
+            if stays < PROMISING and (self.problem.together or len(starts) < SCANNED):
+                starts.setdefault(c.key, (c, start))
+        if not starts:
+            return {}
+        tried = [(c, point) for c, start in starts.values() for point in (start, *self.scanned(c, start))]
+        found: dict[str, tuple[float, Candidate, Point]] = {}
+        for (c, point), cost in zip(tried, self.costs([point for _, point in tried], there), strict=True):
+            if np.isfinite(cost) and cost < found.get(c.key, (math.inf,))[0]:
+                found[c.key] = (cost, c, point)
+        limit = self.costs([fit.point], there)[0]
+        leading = sorted((entry for entry in found.values() if entry[0] < FROM_THERE * limit), key=lambda entry: entry[0])
+        leading = leading[: INSTEAD if self.problem.together else INSTEAD_ONE_BY_ONE]
+        if not leading:
+            return {}
+        self.tell(f"in the place of {lead.key}: {', '.join(c.key for _, c, _ in leading)}")
+        alone = self.fits([self.request(c.parameters, point) for _, c, point in leading], there)
+        placed = [(c, end) for (_, c, _), end in zip(leading, alone, strict=True)]
+        race = Race(limit)
+        fits = self.fits([self.request((*free, *c.parameters), end.point, race=race) for c, end in placed], there)
+        costs = self.costs([end.point for end in fits], floor)
+        return better(((c, replace(end, cost=cost)) for (c, _), end, cost in zip(placed, fits, costs, strict=True)), best)
+
+    def scanned(self, c: Candidate, start: Point) -> list[Point]:
+        """A start of a candidate of one size with sizes of either sign from the one that it is screened at up."""
+        if len(c.size_parameters) > 1 or not c.linear:
+            return []
+        (p,) = c.size_parameters
+        unit, signs = abs(c.starts[0][p.name]), (1.0, -1.0) if p.lower < 0 else (1.0,)
+        sizes = [sign * unit * STEP**k for sign in signs for k in range(STEPS)]
+        return [{**start, p.name: size} for size in sizes if p.lower < size < p.upper]
