@@ -335,17 +335,23 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
 
 
 def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:
-    """Leave out effects that the others make needless, from where all of them together brought the fit."""
-    for trial in list(found):
-        rest = [t for t in found if t is not trial]
-        if not rest:
+    """Leave out effects that the others make needless, from where all of them together brought the fit, the most needless one first.
+
+    What is held out says so: what fits the fitted recordings alone as well may foretell nothing.
+    """
+    while len(found) > 1:
+        declared, requests = inference.problem.declared, []
+        rests = [[t for t in found if t is not trial] for trial in found]
+        for trial, rest in zip(found, rests, strict=True):
+            free = (*declared, *(p for t in rest for p in t.candidate.parameters))
+            requests.append(inference.request(free, trial.candidate.without(base.point)))
+        fits = inference.fits(requests, floor)
+        with_all, *squares = inference.mean_squares([base.point, *(fit.point for fit in fits)], floor)
+        lost = [inference.foretold(without, with_all) for without in squares]
+        least = min(range(len(found)), key=lambda i: lost[i])
+        if lost[least] > LEAST_GAIN / 2:
             break
-        extra = tuple(p for t in rest for p in t.candidate.parameters)
-        start = trial.candidate.without(base.point)
-        (fit,) = inference.fits([inference.request((*inference.problem.declared, *extra), start)], floor)
-        without, with_it = inference.mean_squares([fit.point, base.point], floor)
-        if inference.gain(without, with_it) < LEAST_GAIN / 2:
-            base, found = fit, rest
+        base, found = fits[least], rests[least]
     return base, found
 
 

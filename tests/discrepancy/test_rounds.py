@@ -431,6 +431,22 @@ def test_an_effect_that_was_found_last_is_dropped_too():
     assert fit.point["low.c"] == pytest.approx(0.5, abs=0.01)
 
 
+@pytest.mark.parametrize("order", [("low", "high", "broad"), ("broad", "low", "high")])
+def test_what_fits_alone_and_foretells_nothing_is_what_is_dropped(order):
+    """In the fitted recording `broad` stands for both of the others; in the other one it does not."""
+    one, two, three = (np.sin(w * T) for w in (40, 62, 87))
+    shapes = {"low": (one, one), "high": (two, two), "broad": (one + two, three)}
+    problem = Mixed(shapes, {"low": 0.5, "high": 0.4}, rest=0.05 * np.sin(111 * T))
+    inference = Inference(problem)
+    start = inference.start()
+    named = [next(c for c in problem.candidates if c.name == name) for name in order]
+    free = (*problem.declared, *(p for c in named for p in c.parameters))
+    (all_three,) = inference.fits([inference.request(free, {"low.c": 0.5, "high.c": 0.4, "broad.c": 0.01})], start.floor)
+    found = [Trial(c, Stand(all_three, start.floor, start.errors), 1.0) for c in named]
+    _, left = drop(inference, all_three, start.floor, found)
+    assert [t.candidate.name for t in left] == ["low", "high"]
+
+
 def test_what_cannot_run_where_the_base_fit_went_is_fitted_from_the_declared_values():
     def low(p):
         return p.get("low.c", 0.0) * (T + 0.2 * np.sin(40 * T))
