@@ -8,7 +8,7 @@ from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.laboratory import ROUGH, Laboratory
 from neuido.discrepancy.problem import Parameter, Point
-from neuido.discrepancy.trials import Stand, score
+from neuido.discrepancy.trials import Stand
 
 FOLLOWED = 1.5
 """What the errors of the declared model must fall by for a parameter of the problem's own to leave its place."""
@@ -117,7 +117,7 @@ class BaseFits(Laboratory):
 
         It is weighed by the floor where the first horizon ends, for what the settings differ by elsewhere may have led the others.
         """
-        best = min(made, key=lambda stand: score(stand.errors[self.fitted]))
+        best = min(made, key=lambda stand: self.fitted_score(stand.errors))
         free = self.problem.declared
         if self.is_noise(best.errors[self.fitted], fitted=True) or not free or self.deadline.over:
             return []
@@ -134,7 +134,7 @@ class BaseFits(Laboratory):
                 break
             floor, errors = self.stand(fit.point, like=floor, fitted=True)
             out.append(Stand(fit, floor, errors))
-            if score(errors[self.fitted]) - score(best.errors[self.fitted]) > 2.0 * math.log(FOLLOWED):
+            if self.fitted_score(errors) - self.fitted_score(best.errors) > 2.0 * math.log(FOLLOWED):
                 break
             fit = self.base([fit.point], floor)
         return out
@@ -150,7 +150,7 @@ class BaseFits(Laboratory):
         """
 
         def left(stand: Stand) -> float:
-            return score(stand.errors[self.fitted])
+            return self.fitted_score(stand.errors)
 
         own = [{k: v for k, v in stand.fit.point.items() if k not in self.as_declared} for stand in made]
         still = min((stand for stand, place in zip(made, own, strict=True) if place == own[0]), key=left)
@@ -168,7 +168,7 @@ class BaseFits(Laboratory):
         """
 
         def left(stand: Stand) -> float:
-            return score(stand.errors[self.fitted])
+            return self.fitted_score(stand.errors)
 
         fit = named.fit
         here = Stand(fit, *self.stand(fit.point))
@@ -180,6 +180,6 @@ class BaseFits(Laboratory):
         if not parameters or not self.runs(further.point):
             return least
         _, after = self.stand(further.point, like=here.floor)
-        if score(after[self.fitted]) - left(least) > 2.0 * math.log(ASTRAY):
+        if self.fitted_score(after) - left(least) > 2.0 * math.log(ASTRAY):
             return least
         return Stand(further, *self.stand(further.point))

@@ -98,16 +98,17 @@ def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: n
         data: Of the base with the data themselves, where `before` is of a draw, which is at the noise whatever the data are.
     """
     fitted = np.array(fitted)
-
-    def ratio(group: np.ndarray) -> float:
-        return 0.5 * (score(np.minimum(before[group], 1e300)) - score(np.minimum(after[group], 1e300)))
-
     if not (~fitted).any():
-        return ratio(fitted)
+        return ratio(before, after, fitted)
     seen = [before, after] if data is None else [before, after, data]
     if fitted.any() and not max(squares[fitted].mean() for squares in seen) < NOISE_ALONE * noise[fitted].mean():
-        return min(ratio(fitted), ratio(~fitted))
-    return ratio(~fitted)
+        return min(ratio(before, after, fitted), ratio(before, after, ~fitted))
+    return ratio(before, after, ~fitted)
+
+
+def ratio(before: np.ndarray, after: np.ndarray, group: np.ndarray) -> float:
+    """Logarithm of the ratio of errors, before over after, of a group of the parts; of their mean squares."""
+    return 0.5 * (score(np.minimum(before[group], 1e300)) - score(np.minimum(after[group], 1e300)))
 
 
 class _Part:

@@ -49,7 +49,8 @@ class Growing(Contests):
         at = None if found else self.begun
         if at is None:
             at = self.first_part(free, self.at_declared(base.point), floor)
-            self.begun = self.begun if found else at
+            if not found:
+                self.begun = at
         wide = self.early(floor, HORIZONS[1])
         ranked, _ = self.screen(at, candidates, wide, self.slopes(free, at, self.fitted_recordings))
         starts: dict[str, tuple[Candidate, Point]] = {}

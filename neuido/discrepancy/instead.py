@@ -15,6 +15,8 @@ from neuido.discrepancy.refining import Refining
 from neuido.discrepancy.starting import SMALL
 from neuido.physics.effect_library import LIMITS
 
+NEAR_IT = 1.5
+"""Times the cost of the leading fit from which on a candidate is behind it."""
 ALIKE = 0.3
 """Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
 HALF = 0.5
@@ -31,6 +33,16 @@ STEP, STEPS = 1.5, 9
 """Ratio of these sizes, and how many: up to 26 times the one that the candidate is screened at."""
 
 
+def leader(best: Mapping[str, tuple[Candidate, Fit]]) -> tuple[Candidate, Fit] | None:
+    """The candidate of few parameters with the fit of least cost, if there is one."""
+    return min((entry for entry in best.values() if len(entry[0].parameters) <= MANY), key=lambda entry: entry[1].cost, default=None)
+
+
+def is_behind(c: Candidate, best: Mapping[str, tuple[Candidate, Fit]], fit: Fit) -> bool:
+    """Whether a candidate has no fit that comes near a leading one."""
+    return c.key not in best or best[c.key][1].cost >= NEAR_IT * fit.cost
+
+
 class Instead(Refining):
     """What is fitted from the end of the leading fit."""
 
@@ -44,9 +56,7 @@ class Instead(Refining):
         if not best:
             return {}
         lead, fit = min(best.values(), key=lambda entry: entry[1].cost)
-        own = [
-            c for c in candidates if c.name in LIMITS.get(lead.name, ()) and not (c.key in best and best[c.key][1].cost < 1.5 * fit.cost)
-        ]
+        own = [c for c in candidates if c.name in LIMITS.get(lead.name, ()) and is_behind(c, best, fit)]
         if not own:
             return {}
         begin, wanted = lead.without(fit.point), self.fitted_recordings
@@ -73,10 +83,10 @@ class Instead(Refining):
 
         A fit that started far from there may have been given up, and a class would lack one of its members.
         """
-        small = [entry for entry in best.values() if len(entry[0].parameters) <= MANY]
-        if not small:
+        top = leader(best)
+        if top is None:
             return {}
-        lead, fit = min(small, key=lambda entry: entry[1].cost)
+        lead, fit = top
         if not lead.linear or lead.size_parameters != lead.parameters:
             return {}
         at = chosen.get(lead.key, 0)  # what is a limit of another one may lead without a place in the screening
@@ -87,7 +97,7 @@ class Instead(Refining):
         requests, of = [], []
         without = {k: v for k, v in fit.point.items() if k not in start}
         for c in candidates:
-            if c is lead or not c.linear or len(c.parameters) > MANY or (c.key in best and best[c.key][1].cost < 1.5 * fit.cost):
+            if c is lead or not c.linear or len(c.parameters) > MANY or not is_behind(c, best, fit):
                 continue
             for i, shape in enumerate(c.starts):
                 A = past(columns[c.key, i])
@@ -109,20 +119,18 @@ class Instead(Refining):
         but for one effect that stands in for the true one: with it the declared values come near theirs. They are held while sizes of what
         promises something there are tried and fitted, for the valleys of a size and a modulus together are narrow.
         """
-        small = [entry for entry in best.values() if len(entry[0].parameters) <= MANY]
-        if not small or self.problem.settings == 1:
+        top = leader(best)
+        if top is None or self.problem.settings == 1:
             return {}
-        lead, fit = min(small, key=lambda entry: entry[1].cost)
+        lead, fit = top
         before, squares = self.mean_squares([base.point, fit.point], floor)
         if fit.cost > HALF * self.costs([base.point], floor)[0] or self.is_noise(squares) or self.gain(before, squares) < LEAST_GAIN:
             return {}
         begin = lead.without(fit.point)
         if not self.runs(begin) or self.deadline.skips(f"effects in the place of {lead.key}"):
             return {}
-        behind = [
-            c for c in candidates if c.name != lead.name and not (c.key in best and best[c.key][1].cost < 1.5 * fit.cost)
-            and len(c.parameters) <= (MANY if self.problem.together else SMALL)
-        ]  # fmt: skip
+        most = MANY if self.problem.together else SMALL
+        behind = [c for c in candidates if c.name != lead.name and len(c.parameters) <= most and is_behind(c, best, fit)]
         there, _ = self.stand(fit.point, like=floor, fitted=True)
         ranked, _ = self.screen(begin, behind, there, self.slopes(free, begin, self.fitted_recordings))
         starts: dict[str, tuple[Candidate, Point]] = {}
@@ -154,6 +162,6 @@ class Instead(Refining):
         if len(c.size_parameters) > 1 or not c.linear:
             return []
         (p,) = c.size_parameters
-        unit, signs = abs(c.starts[0][p.name]), (1.0, -1.0) if p.lower < 0 else (1.0,)
-        sizes = [sign * unit * STEP**k for sign in signs for k in range(STEPS)]
+        unit = abs(c.starts[0][p.name])
+        sizes = [sign * unit * STEP**k for sign in p.signs for k in range(STEPS)]
         return [{**start, p.name: size} for size in sizes if p.lower < size < p.upper]

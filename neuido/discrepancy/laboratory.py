@@ -285,8 +285,12 @@ class Laboratory:
 
     def foretold(self, before: np.ndarray, after: np.ndarray) -> float:
         """Logarithm of the ratio of errors of what is held out, or of all parts where nothing is; of mean squares of the parts."""
-        of = ~np.array(self.fitted) if not all(self.fitted) else np.array(self.fitted)
-        return 0.5 * (score(np.minimum(before[of], 1e300)) - score(np.minimum(after[of], 1e300)))
+        fitted = np.array(self.fitted)
+        return evidence.ratio(before, after, fitted if fitted.all() else ~fitted)
+
+    def fitted_score(self, errors: np.ndarray) -> float:
+        """Score of what is left of the fitted parts, of mean squares of all."""
+        return score(errors[self.fitted])
 
     def residual(self, point: Point, n: int) -> np.ndarray:
         return self.memo.predict([point], n, self.setting)[0] - self.problem.recordings[n].y

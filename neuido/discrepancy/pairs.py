@@ -74,7 +74,7 @@ def fits_alone(inference: Inference, first: Round, others: Sequence[Trial]) -> l
     if not trials:
         return []
     fitted = inference.fitted
-    best = min(trials, key=lambda t: score(t.errors[fitted]))
+    best = min(trials, key=lambda t: inference.fitted_score(t.errors))
     far = math.log(times_over(first.errors[fitted], best.errors[fitted])) > BLIND_GAIN
     return [best] if far and best not in others else []
 
@@ -180,11 +180,10 @@ def in_its_place(inference: Inference, first: Round, second: Round, errors: np.n
     linear one. The best of the others are fitted with the second one from where that ended, and beside what leaves least so one is looked
     for as beside any. Nothing is returned where it is not named, or the two leave no less than `errors`.
     """
-    fitted = inference.fitted
-    here = score(second.errors[fitted])
+    here = inference.fitted_score(second.errors)
     tried = [t for t in second.trials if len(t.candidate.parameters) <= MANY and not unphysical(t.candidate, t.fit.point)]
-    lead = min(tried, key=lambda t: score(t.errors[fitted]), default=None)
-    if lead is None or here - score(lead.errors[fitted]) < 2.0 * LEAST_GAIN:
+    lead = min(tried, key=lambda t: inference.fitted_score(t.errors), default=None)
+    if lead is None or here - inference.fitted_score(lead.errors) < 2.0 * LEAST_GAIN:
         return []
     instead = [t for t in others(first) if len(t.candidate.parameters) <= MANY and t.candidate.name != lead.candidate.name]
     instead = sorted((t for t in instead if np.isfinite(t.score)), key=lambda t: t.penalised)[:IN_PLACE]

@@ -50,6 +50,11 @@ class Parameter:
         """The value, clipped to the range."""
         return min(max(value, self.lower), self.upper)
 
+    @property
+    def signs(self) -> tuple[float, ...]:
+        """Those that its range has."""
+        return (1.0, -1.0) if self.lower < 0 else (1.0,)
+
 
 @dataclass(frozen=True)
 class Candidate:

@@ -29,7 +29,6 @@ not come to its end."""
 SOME_GAIN = math.log(1.2)
 """Smaller gains are no reason to look further."""
 
-
 Onset = tuple[Sequence[Parameter], Fit, Sequence[Point]]
 """What is fitted, a fit of it, and where further ones begin."""
 
@@ -169,7 +168,7 @@ class Refining(Growing):
             if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
                 continue
             (p,) = c.size_parameters
-            for sign in (1.0, -1.0) if p.lower < 0 else (1.0,):
+            for sign in p.signs:
                 size = p.within(sign * FAR * abs(starts[key][p.name]))
                 begins.append((c, dict(fit.point) | self.as_declared | {p.name: size}))
         self.tell(f"again from elsewhere: {', '.join(dict.fromkeys(c.key for c, _ in begins))}")

@@ -177,7 +177,7 @@ class Inference(Judging):
         limit = (result.chosen or result.trials[0]).score + 2.0 * math.log(NEAR)
         places = [t.candidate.without(t.fit.point) for t in result.trials if t.score < limit][:MEASURED]
         left = [score(squares) for squares in self.mean_squares(places, floor)]
-        here, as_well = score(result.errors), score(result.errors[self.fitted]) + 2.0 * math.log(AS_WELL)
+        here, as_well = score(result.errors), self.fitted_score(result.errors) + 2.0 * math.log(AS_WELL)
         wanted = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < (math.inf if lost else here)]
         if result.chosen is not None:  # by the floor of the base alone it may look worse there than it is
             own = [t.candidate.without(t.fit.point) for t in result.members[:MEMBERS]]
@@ -192,7 +192,7 @@ class Inference(Judging):
             fits = self.fits([self.request(free, point) for point, _ in able], [own for _, own in able])
             ends = [fit.point for fit in fits]
             stands += [Stand(f, *self.stand(f.point, like=floor)) for f, ok in zip(fits, self.which_run(ends), strict=True) if ok]
-        found = [s for s in stands if score(s.errors) < here and score(s.errors[self.fitted]) < as_well]
+        found = [s for s in stands if score(s.errors) < here and self.fitted_score(s.errors) < as_well]
         return min(found, key=lambda s: score(s.errors), default=None)
 
     def is_unexplained(self, r: Round) -> bool:

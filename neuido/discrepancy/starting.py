@@ -151,9 +151,9 @@ class Starting(Screening):
         """
         c, begun, _ = start
         (p,) = c.size_parameters
-        size, signs = abs(c.starts[0][p.name]), (1.0, -1.0) if p.lower < 0 else (1.0,)
+        size = abs(c.starts[0][p.name])
         begin = {**begun, **{name: base.point.get(name, value) for name, value in self.as_declared.items()}}
-        near, middle, far, beyond = ([{p.name: p.within(sign * f * size)} for sign in signs] for f in (1.0, math.sqrt(FAR), FAR, FAR**2))
+        near, middle, far, beyond = ([{p.name: p.within(sign * f * size)} for sign in p.signs] for f in (1.0, math.sqrt(FAR), FAR, FAR**2))
         made = [{**begin, **value} for value in (far if begin == begun else near + far)]
         if led_far:
             made += [{**self.at_declared(begin), **value} for value in near + far]

@@ -140,13 +140,8 @@ def test_the_floor_is_what_a_refit_leaves():
     assert floors == pytest.approx(NOISE**2 + 0.02**2 / 2, rel=0.2)
     # and the gain that it takes goes by that
     trial = SimpleNamespace(errors=floors, fit=start.fit)
-    small, large = (inference.least_gain(residual(start, k * floors, floors), trial) for k in (0.2, 4.0))
+    small, large = (inference.least_gain(attribution.unsearched(replace(start, errors=k * floors), floors), trial) for k in (0.2, 4.0))
     assert (small, large) == (GAIN_IN_FLOOR, LEAST_GAIN)
-
-
-def residual(start, errors, floors):
-    """A round of a declared model that leaves `errors`."""
-    return Round(start.fit.point, errors, [], None, [], 1.0, start.floor, floors)
 
 
 def test_what_brings_the_declared_values_back_need_not_pass_the_floor():
@@ -154,7 +149,7 @@ def test_what_brings_the_declared_values_back_need_not_pass_the_floor():
     start = inference.start()
     young = Parameter("young", "Pa", 1e5, 1.0, 1e3, 1e7, log=True)
     inference.problem.__dict__["declared"] = (young,)
-    r = residual(start, np.full(2, 100.0) * NOISE**2, np.full(2, 400.0) * NOISE**2)
+    r = attribution.unsearched(replace(start, errors=np.full(2, 100.0) * NOISE**2), np.full(2, 400.0) * NOISE**2)
 
     def takes(base, there):
         trial = SimpleNamespace(errors=np.full(2, 9.0) * NOISE**2, fit=SimpleNamespace(point={"young": there}))
@@ -528,7 +523,7 @@ def test_what_stands_in_for_an_effect_says_where_that_one_begins():
 def test_what_leaves_noise_alone_need_not_pass_the_floor():
     inference = Inference(Line(lambda t: 3.0 * t))
     start = inference.start()
-    r = residual(start, np.full(2, 9.0) * NOISE**2, np.full(2, 36.0) * NOISE**2)
+    r = attribution.unsearched(replace(start, errors=np.full(2, 9.0) * NOISE**2), np.full(2, 36.0) * NOISE**2)
     noise = np.full(2, NOISE**2)
     assert inference.least_gain(r, SimpleNamespace(errors=1.2 * noise, fit=start.fit)) == GAIN_TO_NOISE
     assert inference.least_gain(r, SimpleNamespace(errors=3.0 * noise, fit=start.fit)) == GAIN_IN_FLOOR
