@@ -9,6 +9,13 @@ class UserError(ValueError):
     """Bad input. The command line prints the message as one line and exits with status 2."""
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether a device had no memory: torch says so in three types of error, of which a failed capture of a CUDA graph is one, and Warp in
+    another.
+    """
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in ("out of memory", "Failed to allocate"))
+
+
 def one_line(error: BaseException) -> str | None:
     """What a command prints of an error: one line, or None for an error that only a programmer can mend."""
     cause: BaseException | None = error
@@ -20,6 +27,8 @@ def one_line(error: BaseException) -> str | None:
         return _condense(str(error))
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.strerror}: '{error.filename}'"
+    if is_out_of_memory(error):
+        return f"the device has no memory left ({str(error).splitlines()[0]}): end what else runs there, ask for less, or use the CPU"
     if isinstance(error, pickle.UnpicklingError):
         return "the checkpoint cannot be read weights-only: it is damaged, or holds objects that reading would execute"
     if isinstance(error, FileNotFoundError) or type(error).__name__ == "MisconfigurationException":

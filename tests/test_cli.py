@@ -1,5 +1,6 @@
 """The command line: help without torch, and one line with status 2 for whatever the user can mend."""
 
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import torch
 import neuido
 from neuido import cli
 from neuido.cli import main
+from neuido.simulate import simulate
 from tests.command import run
 
 ROOT = Path(neuido.__file__).parents[1]
@@ -33,6 +35,7 @@ def test_help_loads_no_torch(name):
 import atexit, sys
 atexit.register(lambda: print("LOADED", sorted({{"torch", "lightning", "warp"}} & set(sys.modules))))
 from neuido.cli import main
+from neuido.simulate import simulate
 main({name.split()!r})
 """
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
@@ -63,6 +66,15 @@ def test_module_and_script_are_one_command():
     answer = subprocess.run([sys.executable, "-m", "neuido", "simlate"], capture_output=True, text=True, cwd=ROOT)
     assert answer.returncode == 2
     assert answer.stderr == f"neuido: unknown command 'simlate': use one of {', '.join([*cli.HEAVY, *cli.LIGHT])}\n"
+
+
+def test_a_device_without_memory_is_one_line(capsys, monkeypatch):
+    @functools.wraps(simulate)
+    def full(**options):
+        raise RuntimeError("CUDA error: out of memory\nFor debugging consider passing CUDA_LAUNCH_BLOCKING=1")
+
+    monkeypatch.setattr("neuido.simulate.simulate", full)
+    assert_one_line(capsys, ["simulate", "--out", "x"], "no memory left", "CUDA error: out of memory)", "CPU")
 
 
 def test_light_wrong_key_on_the_command_line(capsys):

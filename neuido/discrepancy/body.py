@@ -22,7 +22,7 @@ from neuido.discrepancy.declared import declared
 from neuido.discrepancy.library import body_candidates, present
 from neuido.discrepancy.problem import Ask, Parameter, Point, Recording, Rows
 from neuido.discrepancy.rollouts import EVERY, SETTINGS, SOLVERS, BodyRollouts, Motions, substeps
-from neuido.errors import UserError
+from neuido.errors import UserError, is_out_of_memory
 from neuido.physics import effect_kernels, law_kernels
 from neuido.physics.device import real_of
 from neuido.physics.effect_library import KNOTS
@@ -192,7 +192,9 @@ class BodyProblem(BodyRollouts):
             moved = self._simulate([(run.firsts, run.recording) for run in runs], runs[0].setting)
         except UserError:
             pass
-        except torch.OutOfMemoryError:
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
             full = True
         if moved is not None:
             for run, own in zip(runs, moved, strict=True):

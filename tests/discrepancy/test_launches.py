@@ -166,8 +166,16 @@ def test_what_fails_in_a_launch_of_finite_elements_fails_alone(experiment, monke
         problem._moved(points[2], 0, setting)
 
 
+NO_MEMORY = (
+    torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 MiB."),
+    getattr(torch, "AcceleratorError", RuntimeError)("CUDA error: out of memory\nSearch for `cudaErrorMemoryAllocation'"),
+    RuntimeError("Failed to allocate 96 bytes on device 'cuda:0'"),
+)
+
+
+@pytest.mark.parametrize("error", NO_MEMORY, ids=["torch", "capture", "warp"])
 @pytest.mark.parametrize("most", [2, 1, 0])
-def test_a_launch_without_memory_is_divided(experiment, monkeypatch, most):
+def test_a_launch_without_memory_is_divided(experiment, monkeypatch, most, error):
     """Until it fits; for one motion that does not, what is kept is given up once, and then it is the user's."""
     problem = body_problem(experiment)
     expected = problem.predict(POINTS[:3], 0)
@@ -176,7 +184,7 @@ def test_a_launch_without_memory_is_divided(experiment, monkeypatch, most):
     def small(self, runs, setting):
         launches.append(sum(len(points) for points, _ in runs))
         if launches[-1] > most:
-            raise torch.OutOfMemoryError("CUDA out of memory")
+            raise error
         return simulate(self, runs, setting)
 
     monkeypatch.setattr(BodyProblem, "_simulate", small)
