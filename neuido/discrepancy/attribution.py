@@ -13,7 +13,7 @@ from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.judging import ALPHA, WITHIN
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
-from neuido.discrepancy.pairs import WORSE, beside_members, by_another_method, in_its_place, look_ahead, neighbours, simpler
+from neuido.discrepancy.pairs import WORSE, look_ahead, neighbours, simpler, two_effects
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.refining import BEYOND
 from neuido.discrepancy.rounds import UNEXPLAINED, Inference
@@ -159,14 +159,10 @@ def diagnose(
             break
         rounds.append(inference.round(at.fit, at.floor, found))
     if len(found) == 1 and not hurried:
-        pair = beside_members(inference, rounds, at)
-        if not pair and len(rounds) > 1:
-            pair = in_its_place(inference, rounds[0], rounds[1], at.errors)
         others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
-        there = pair[-1].chosen.stand if pair else at
-        if elsewhere := by_another_method(others, inference, there, within=len(rounds) == 1):
-            inference, pair = elsewhere
-            start = pair[0].plain or starts[tried.index(inference)]
+        by, pair = two_effects(inference, rounds, at, others)
+        if by is not inference:
+            inference, start = by, pair[0].plain or starts[tried.index(by)]
         if pair:
             rounds = pair
             found = [r.chosen for r in pair]

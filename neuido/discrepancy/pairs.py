@@ -79,6 +79,31 @@ def fits_alone(inference: Inference, first: Round, others: Sequence[Trial]) -> l
     return [best] if far and best not in others else []
 
 
+def two_effects(
+    inference: Inference, rounds: Sequence[Round], at: Stand, others: Mapping[Inference, Round]
+) -> tuple[Inference, list[Round]]:
+    """Where one effect was found and leaves more than noise: two of them, if any, as their rounds, and the method that they are found by.
+
+    The other method comes before what else its own has, for it need not be the right one: of nine pairs that five blind seeds missed, seven
+    were looked for by the wrong one. What it finds is taken where that leaves nothing but noise, or clearly less than its own.
+
+    Args:
+        inference: The one that named an effect.
+        rounds: Its rounds: the first, and one beside that effect where one was made.
+        at: Where the effect stands.
+        others: The other methods, with their first rounds.
+    """
+    elsewhere = by_another_method(others, inference, at, within=len(rounds) == 1)
+    if elsewhere is not None and elsewhere[0].is_noise(elsewhere[1][-1].chosen.errors):
+        return elsewhere
+    own = beside_members(inference, rounds, at)
+    if not own and len(rounds) > 1:
+        own = in_its_place(inference, rounds[0], rounds[1], at.errors)
+    if elsewhere is not None and (not own or inference.gain(own[-1].chosen.errors, elsewhere[1][-1].chosen.errors) > LEAST_GAIN):
+        return elsewhere
+    return inference, own
+
+
 def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> list[Round]:
     """Where one effect was found and leaves more than noise: a member of its class beside which a second one is named, and that round.
 

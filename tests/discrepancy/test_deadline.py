@@ -108,7 +108,7 @@ def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
 
     monkeypatch.setattr(attribution.Inference, "round", late)
     monkeypatch.setattr(attribution.Inference, "finished", seen)
-    monkeypatch.setattr(attribution, "beside_members", lambda *args: asked.append(args) or [])
+    monkeypatch.setattr(attribution, "two_effects", lambda inference, *rest: asked.append(rest) or (inference, []))
     problem = restricted(body_problem(block), "drag_linear,viscosity_shear")
     noise = 1.0 if settled else 0.25  # stated too small, it is never reached
     recordings = tuple(replace(r, noise=noise * r.noise) for r in problem.recordings)

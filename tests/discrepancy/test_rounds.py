@@ -802,7 +802,7 @@ def test_what_fits_beside_the_wrong_effect_is_tried_beside_the_others(monkeypatc
     found = diagnose(problem)
     assert names(found) == ["high", "low"]
     assert found.after["low.c"] == pytest.approx(0.9, abs=0.01) and found.after["high.c"] == pytest.approx(0.4, abs=0.01)
-    monkeypatch.setattr(attribution, "in_its_place", lambda *_: [])
+    monkeypatch.setattr(pairs, "in_its_place", lambda *_: [])
     assert names(diagnose(problem)) != ["high", "low"]
 
 
@@ -879,13 +879,16 @@ def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
         assert [tried[i].setting for i in (chosen, *(i for i in firsts if i != chosen))] == [0, 1]
         return 1 - chosen, firsts
 
+    asked, beside = [], pairs.beside_members
     monkeypatch.setattr(attribution, "first_rounds", other_one)
+    monkeypatch.setattr(pairs, "beside_members", lambda *args: asked.append(args) or beside(*args))
     found = diagnose(Apart())
     assert found.setting == 0 and names(found) == ["high", "low"]
+    assert not asked, "the other method leaves noise"
     assert all(e == pytest.approx(NOISE, rel=0.2) for e in found.errors["after"].values())
     monkeypatch.setattr(pairs, "WORSE", 0.1)
     found = diagnose(Apart())
-    assert found.setting == 1 and names(found) == ["low"]
+    assert found.setting == 1 and names(found) == ["low"] and len(asked) == 1
 
 
 def test_what_leaves_as_much_as_grids_differ_by_is_not_named(monkeypatch):
