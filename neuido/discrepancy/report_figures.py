@@ -2,6 +2,7 @@
 
 import base64
 import json
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -11,6 +12,7 @@ from neuido.page import figure, small, svg
 
 INK, BEFORE, AFTER = "#333333", "#c0392b", "#1f77b4"
 MOST_POINTS, MOST_FRAMES = 400, 60
+MOST_TICKS = 9
 
 
 def stage_curves(stages: Mapping[str, Sequence[Series]]) -> str:
@@ -80,6 +82,8 @@ def residual_maps(motion: Mapping[str, Mapping[str, np.ndarray]]) -> str:
             shown = ax.scatter(place[:, a], place[:, b], c=sizes[when], s=6, cmap="viridis", vmin=0.0, vmax=top, linewidths=0)
             ax.set_aspect("equal")
             ax.set_title(f"{name}, {when}, along {'zx'[i % 2]}", fontsize=8)
+            ax.set_xlabel(f"{'xz'[i % 2]} [m]", fontsize=7)
+            ax.set_ylabel("y [m]" if i == 0 else "", fontsize=7)
             small(ax)
         bar = made.colorbar(shown, ax=list(row), shrink=0.8)
         bar.set_label("mm", fontsize=7)
@@ -111,7 +115,7 @@ def data_curves(motion: Mapping[str, Mapping[str, np.ndarray]], unit: str) -> st
 
 
 def ranking(trials: Sequence[tuple[str, float, bool]], floor: float) -> str:
-    """Gains of the candidates as bars, those of the class in the colour of `after`, and what chance takes."""
+    """Gains of the candidates as bars from one, those of the class in the colour of `after`, and what chance takes."""
     if not trials:
         return ""
     drawn = figure(1, 1, (6.0, 0.26 * len(trials) + 0.9))
@@ -120,15 +124,28 @@ def ranking(trials: Sequence[tuple[str, float, bool]], floor: float) -> str:
     made, axes = drawn
     ax = axes[0, 0]
     names, gains, kept = zip(*reversed(trials), strict=True)
-    ax.barh(range(len(names)), np.exp(gains), color=[AFTER if k else "#bbbbbb" for k in kept], height=0.7)
+    ax.barh(range(len(names)), np.exp(gains) - 1.0, left=1.0, color=[AFTER if k else "#bbbbbb" for k in kept], height=0.7)
+    ax.axvline(1.0, color=INK, lw=0.6)
     ax.set_yticks(range(len(names)), names)
     ax.axvline(np.exp(floor), color=BEFORE, lw=1, ls="--")
     ax.set_xscale("log")
-    for which in (ax.xaxis.set_major_formatter, ax.xaxis.set_minor_formatter):
-        which("{x:g}")
+    ax.minorticks_off()
+    ax.set_xticks(log_ticks(*ax.get_xlim()))
+    ax.xaxis.set_major_formatter("{x:g}")
     ax.set_xlabel("error before over error after (fitted or held out, the smaller); dashed: 95 % of what chance brings", fontsize=7)
     small(ax)
     return svg(made)
+
+
+def log_ticks(low: float, high: float) -> np.ndarray:
+    """At most `MOST_TICKS` round numbers within a range that is drawn by logarithms: 1, 2, 5 and their tens, or equal steps."""
+    ticks = np.outer(10.0 ** np.arange(-6, 7), (1.0, 2.0, 5.0)).ravel()
+    ticks = ticks[(low <= ticks) & (ticks <= high)]
+    if len(ticks) < 3:
+        step = 10.0 ** math.floor(math.log10(high - low))
+        step *= next(f for f in (0.2, 0.5, 1.0, 2.0) if (high - low) / (f * step) < MOST_TICKS)
+        ticks = step * np.arange(math.ceil(low / step), math.floor(high / step) + 1)
+    return ticks[:: math.ceil(len(ticks) / MOST_TICKS)]
 
 
 def player(motion: Mapping[str, Mapping[str, np.ndarray]]) -> str:

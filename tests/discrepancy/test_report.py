@@ -149,6 +149,22 @@ def test_figures_are_drawn():
     assert report_figures.ranking([], 0.0) == ""
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [
+        (0.4, 4.5, [0.5, 1, 2]),
+        (0.9, 1.24, [0.9, 0.95, 1, 1.05, 1.1, 1.15, 1.2]),
+        (0.09, 210, [0.1, 0.5, 2, 10, 50, 200]),
+        (1.1, 2.45, [1.2, 1.4, 1.6, 1.8, 2.0, 2.2, 2.4]),
+    ],
+)
+def test_ticks_are_round_and_few(low, high, ticks):
+    np.testing.assert_allclose(report_figures.log_ticks(low, high), ticks)
+    for width in np.geomspace(1.01, 1e9, 200):
+        own = report_figures.log_ticks(1e-3, 1e-3 * width)
+        assert 2 <= len(own) <= report_figures.MOST_TICKS and np.all(np.diff(own) > 0)
+
+
 def test_a_recording_that_cannot_be_predicted_has_no_figure():
     """Infinite errors are null in diagnosis.json; the report says so and is written all the same."""
     errors = {"fit": 0.002, "held_out": None, "by_recording": {"first": 0.002, "second": None}}
