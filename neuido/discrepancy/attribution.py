@@ -1,7 +1,7 @@
 """From a residual to a name: grow the model by one effect at a time, drop what became needless, and say how sure the answer is."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor, Part, split
 from neuido.discrepancy.intervals import intervals
-from neuido.discrepancy.judging import ALPHA, WITHIN
+from neuido.discrepancy.judging import ALPHA, CLASS_RATIO, WITHIN
 from neuido.discrepancy.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.pairs import WORSE, look_ahead, neighbours, simpler, two_effects
@@ -158,15 +158,17 @@ def diagnose(
         if problem.settings > 1 and not inference.is_settled(at.errors) and inference.over(at) < FURTHER:
             break
         rounds.append(inference.round(at.fit, at.floor, found))
-    if len(found) == 1 and not hurried:
-        others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
-        by, pair = two_effects(inference, rounds, at, others)
+    others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
+    if 0 < len(found) < 3 and not hurried:
+        by, pair = two_effects(inference, rounds, found, at, others)
         if by is not inference:
             inference, start = by, pair[0].plain or starts[tried.index(by)]
         if pair:
             rounds = pair
             found = [r.chosen for r in pair]
             at = inference.finished(found[-1].stand)
+    if len(found) == 1:
+        widen(inference, rounds[0], at, others.values())
     deadline.conclude()
     if len(found) > 1:
         floor = inference.floor(at.fit.point)
@@ -292,6 +294,22 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
         there = tried[i].look(starts[i].fit, starts[i].floor, led=look.led, beyond=beyond, until=LOOKS[1])
         left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
     return left
+
+
+def widen(inference: Inference, r: Round, at: Stand, others: Iterable[Round]) -> None:
+    """Put into the class of a round what another method named that leaves about as much, where that is more than noise.
+
+    The methods differ there by as much as the effects do, so that the data tell neither apart.
+    """
+    if inference.is_settled(at.errors):
+        return
+    for other in others:
+        if other.chosen is None or other.chosen.score > score(at.errors) + 2.0 * math.log(CLASS_RATIO):
+            continue
+        for t in other.members:
+            if t.candidate.name not in {m.candidate.name for m in r.members}:
+                r.trials = sorted([*(o for o in r.trials if o.candidate.key != t.candidate.key), t], key=lambda t: t.score)
+                r.members = [*r.members, t]
 
 
 def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:

@@ -29,6 +29,10 @@ SCANNED = 8
 """Candidates whose sizes are tried there where every point costs; otherwise all that promise."""
 FROM_THERE = 10.0
 """Times the cost of the leading fit up to which one of these sizes is fitted: the two that this has found began at 0.4 and 6 times."""
+LED_AWAY = 2.5
+"""Ratio of a declared parameter to what the model states at which a base fit is led away by what it lacks."""
+NO_MORE = 1.1
+"""Mean squares up to so many times those of the noise that are no reason to look further where a base fit is led away."""
 STEP, STEPS = 1.5, 9
 """Ratio of these sizes, and how many: up to 26 times the one that the candidate is screened at."""
 
@@ -124,7 +128,11 @@ class Instead(Refining):
             return {}
         lead, fit = top
         before, squares = self.mean_squares([base.point, fit.point], floor)
-        if fit.cost > HALF * self.costs([base.point], floor)[0] or self.is_noise(squares) or self.gain(before, squares) < LEAST_GAIN:
+        if (
+            fit.cost > HALF * self.costs([base.point], floor)[0]
+            or self.leaves_no_more(base, squares)
+            or self.gain(before, squares) < LEAST_GAIN
+        ):
             return {}
         begin = lead.without(fit.point)
         if not self.runs(begin) or self.deadline.skips(f"effects in the place of {lead.key}"):
@@ -156,6 +164,10 @@ class Instead(Refining):
         fits = self.fits([self.request((*free, *c.parameters), end.point, race=race) for c, end in placed], there)
         costs = self.costs([end.point for end in fits], floor)
         return better(((c, replace(end, cost=cost)) for (c, _), end, cost in zip(placed, fits, costs, strict=True)), best)
+
+    def leaves_no_more(self, base: Fit, squares: np.ndarray) -> bool:
+        """Whether noise alone is left; a little more than that may be what a stand-in leaves, where the base fit is led away."""
+        return self.is_noise(squares) and (self.moved(base.point) < LED_AWAY or bool(np.all(squares < NO_MORE * self.noise_squares)))
 
     def scanned(self, c: Candidate, start: Point) -> list[Point]:
         """A start of a candidate of one size with sizes of either sign from the one that it is screened at up."""

@@ -80,24 +80,26 @@ def fits_alone(inference: Inference, first: Round, others: Sequence[Trial]) -> l
 
 
 def two_effects(
-    inference: Inference, rounds: Sequence[Round], at: Stand, others: Mapping[Inference, Round]
+    inference: Inference, rounds: Sequence[Round], found: Sequence[Trial], at: Stand, others: Mapping[Inference, Round]
 ) -> tuple[Inference, list[Round]]:
-    """Where one effect was found and leaves more than noise: two of them, if any, as their rounds, and the method that they are found by.
+    """Where more than noise is left: two effects, if any, as their rounds, and the method that they are found by.
 
     The other method comes before what else its own has, for it need not be the right one: of nine pairs that five blind seeds missed, seven
-    were looked for by the wrong one. What it finds is taken where that leaves nothing but noise, or clearly less than its own.
+    were looked for by the wrong one. What it finds is taken where that leaves nothing but noise, or clearly less than its own. Where two
+    were found already it alone is asked.
 
     Args:
         inference: The one that named an effect.
         rounds: Its rounds: the first, and one beside that effect where one was made.
-        at: Where the effect stands.
+        found: The effects that they named.
+        at: Where these stand.
         others: The other methods, with their first rounds.
     """
-    elsewhere = by_another_method(others, inference, at, within=len(rounds) == 1)
+    elsewhere = by_another_method(others, inference, at, found, within=len(rounds) == 1)
     if elsewhere is not None and elsewhere[0].is_noise(elsewhere[1][-1].chosen.errors):
         return elsewhere
-    own = beside_members(inference, rounds, at)
-    if not own and len(rounds) > 1:
+    own = beside_members(inference, rounds, at) if len(found) == 1 else []
+    if not own and len(found) == 1 and len(rounds) > 1:
         own = in_its_place(inference, rounds[0], rounds[1], at.errors)
     if elsewhere is not None and (not own or inference.gain(own[-1].chosen.errors, elsewhere[1][-1].chosen.errors) > LEAST_GAIN):
         return elsewhere
@@ -125,43 +127,53 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
 
 
 def by_another_method(
-    others: Mapping[Inference, Round], inference: Inference, at: Stand, *, within: bool = False
+    others: Mapping[Inference, Round], inference: Inference, at: Stand, found: Sequence[Trial], *, within: bool = False
 ) -> tuple[Inference, list[Round]] | None:
     """Where more than noise is left: another method by which two effects leave less than that, and the two rounds.
 
     The method goes by what one effect leaves. Where there are two, that is no measure: by the wrong method one effect may stand for both
     and for what the method gets wrong, and beside it there is no other. The first one of the other method gets what that of the chosen
-    method had: a search beside it, whatever the screening promises.
+    method had: a search beside it, whatever the screening promises. Where that named none, and what is left is above its floor, so does
+    the first one that the chosen method named.
 
     Args:
         others: The other methods, with their first rounds.
         inference: The one that named an effect.
-        at: Where that stands.
+        at: Where what it named stands.
+        found: The effects that it named.
         within: It lies within its floor, where no second one was looked for: two effects must show a promise, and leave noise alone.
     """
     if inference.is_settled(at.errors):
         return None
     made = []
+    alone = score(at.errors) if len(found) == 1 else found[0].score
     for other, first in others.items():
+        lead = first.chosen
+        if lead is None and not within and inference.over(at) > 1.0:
+            lead = next((t for t in first.trials if t.candidate.key == found[0].candidate.key and np.isfinite(t.score)), None)
+        if lead is None or lead.score > alone + 2.0 * math.log(WORSE):
+            continue
         if inference.deadline.skips("two effects by the other method"):
             break
-        if first.chosen is None or first.chosen.score > score(at.errors) + 2.0 * math.log(WORSE):
-            continue
-        here = from_there(other, first.chosen, at.fit.point)
-        pair = second_beside(other, first, first.members, at.errors, at=here, sure=None if within else first.chosen)
+        here = from_there(other, lead, at.fit.point)
+        members = first.members if lead is first.chosen else [lead]
+        pair = second_beside(other, replace(first, chosen=lead), members, at.errors, at=here, sure=None if within else lead)
         if pair and (not within or other.is_noise(pair[-1].chosen.errors)):
-            first.chosen.stand, first.chosen.gain = here, other.gain(first.errors, here.errors)
-            made.append((other, pair))
+            lead.stand, lead.gain, lead.reason = here, other.gain(first.errors, here.errors), ""
+            made.append((other, [replace(pair[0], members=members), *pair[1:]]))
     return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)
 
 
 def from_there(inference: Inference, t: Trial, point: Point) -> Stand:
-    """An effect's fit, or the one from the declared values of a point, where another method has come further: what leaves less."""
-    declared = inference.problem.declared
-    here, begin = Stand(t.fit, *inference.stand(t.fit.point)), dict(t.fit.point) | {p.name: point[p.name] for p in declared}
+    """An effect's fit, or the one from the declared values of a point, where another method has come further: what leaves less.
+
+    And from the sizes that the effect has there, if it has any.
+    """
+    free = (*inference.problem.declared, *t.candidate.parameters)
+    here, begin = Stand(t.fit, *inference.stand(t.fit.point)), dict(t.fit.point) | {p.name: point[p.name] for p in free if p.name in point}
     if not inference.runs(begin):
         return here
-    (fit,) = inference.fits([inference.request((*declared, *t.candidate.parameters), begin)], inference.stand(begin)[0])
+    (fit,) = inference.fits([inference.request(free, begin)], inference.stand(begin)[0])
     return min(here, Stand(fit, *inference.stand(fit.point)), key=lambda stand: score(stand.errors)) if inference.runs(fit.point) else here
 
 

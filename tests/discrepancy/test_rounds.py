@@ -515,6 +515,9 @@ def test_what_stands_in_for_an_effect_says_where_that_one_begins():
     assert inference.is_noise(inference.mean_squares([more["tuned"][1].point], start.floor)[0])
     # not where the leading one leaves noise alone, nor where it says little of the declared values
     assert not inference.instead(free, best | more, problem.candidates, base, start.floor)
+    inference.moved = lambda point: point["a"]
+    for led, more, wanted in ((2.4, 1.5, True), (3.0, 1.05, True), (3.0, 1.5, False), (2.4, 2.0, False)):
+        assert inference.leaves_no_more(replace(base, point={"a": led}), more * inference.noise_squares) is wanted
     near = replace(base, point={"a": fixed.point["a"]})
     little = {"fixed": (by_key["fixed"], replace(fixed, cost=0.6 * inference.costs([near.point], start.floor)[0]))}
     assert not inference.instead(free, little, problem.candidates, near, start.floor)
@@ -853,7 +856,7 @@ def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left
     first = other.round(start.fit, start.floor, [])
     assert first.chosen.candidate.name == "low"
     at = replace(first.chosen.stand, errors=left**2 * first.chosen.errors)
-    both = pairs.by_another_method({other: first}, inference, at, within=within)
+    both = pairs.by_another_method({other: first}, inference, at, [first.chosen], within=within)
     assert bool(both) is found
     if found:
         assert both[0] is other
@@ -867,8 +870,62 @@ def test_beside_what_lies_within_its_floor_two_effects_by_another_method_leave_n
     start = other.start()
     first = other.round(start.fit, start.floor, [])
     monkeypatch.setattr(other, "is_noise", lambda *_, **__: False)
-    assert pairs.by_another_method({other: first}, inference, first.chosen.stand)
-    assert not pairs.by_another_method({other: first}, inference, first.chosen.stand, within=True)
+    assert pairs.by_another_method({other: first}, inference, first.chosen.stand, [first.chosen])
+    assert not pairs.by_another_method({other: first}, inference, first.chosen.stand, [first.chosen], within=True)
+
+
+@pytest.fixture
+def unnamed():
+    """The chosen method, another one with its first round which named nothing, and the trial there of what the chosen one named."""
+    problem = Apart()
+    inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
+    start = other.start()
+    first = other.round(start.fit, start.floor, [])
+    low = first.chosen
+    low.reason = "too little"
+    return inference, other, replace(first, chosen=None, members=[]), low
+
+
+@pytest.mark.parametrize(("over", "found"), [(1.1, True), (0.9, False)])
+def test_another_method_that_named_nothing_is_asked_beside_what_was_named(over, found, unnamed, monkeypatch):
+    inference, other, first, low = unnamed
+    monkeypatch.setattr(inference, "over", lambda at: over)
+    assert not pairs.by_another_method({other: first}, inference, low.stand, [low], within=True)
+    high = next(t for t in first.trials if t.candidate.name == "high")
+    assert not pairs.by_another_method({other: replace(first, trials=[high])}, inference, low.stand, [low])
+    both = pairs.by_another_method({other: first}, inference, low.stand, [low])
+    assert bool(both) is found and bool(low.reason) is not found
+    if found:
+        assert [r.chosen.candidate.name for r in both[1]] == ["low", "high"] and both[1][0].members == [low]
+        assert first.chosen is None
+
+
+def test_where_two_were_found_the_other_method_alone_is_asked(unnamed, monkeypatch):
+    def fail(*_):
+        raise AssertionError
+
+    inference, other, first, low = unnamed
+    for name in ("beside_members", "in_its_place"):
+        monkeypatch.setattr(pairs, name, fail)
+    by, pair = pairs.two_effects(inference, [first, first], [low, low], low.stand, {other: first})
+    assert by is other and [r.chosen.candidate.name for r in pair] == ["low", "high"]
+    assert pairs.two_effects(inference, [first, first], [low, low], low.stand, {}) == (inference, [])
+
+
+def test_what_another_method_names_with_as_much_left_is_in_the_class(unnamed):
+    inference, other, first, low = unnamed
+    high = next(t for t in first.trials if t.candidate.name == "high")
+
+    def widened(left, of=low.errors):
+        named = replace(first, trials=[low, high], chosen=low, members=[low])
+        joins = replace(high, stand=replace(high.stand, errors=left**2 * of))
+        attribution.widen(inference, named, replace(low.stand, errors=of), [first, replace(first, chosen=joins, members=[joins, low])])
+        assert len(named.trials) == 2 and (joins in named.trials) is (joins in named.members)
+        return [t.candidate.name for t in named.members]
+
+    assert widened(1.3) == ["low", "high"] and widened(0.7) == ["low", "high"]
+    assert widened(1.5) == ["low"]
+    assert widened(1.0, inference.noise_squares) == ["low"], "nothing is left to be told"
 
 
 def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
@@ -904,6 +961,8 @@ def test_what_leaves_as_much_as_grids_differ_by_is_not_named(monkeypatch):
     assert not inference.is_like_a_grid(coarse, 9.0 * first.errors)  # far more was to be explained
     little = replace(coarse, stand=replace(coarse.stand, errors=0.3 * coarse.errors))
     assert not inference.is_like_a_grid(little, first.errors)
+    told = replace(coarse, stand=replace(coarse.stand, errors=np.where(inference.fitted, inference.noise_squares, coarse.errors)))
+    assert not inference.is_like_a_grid(told, first.errors), "what is fitted comes to the noise"
     monkeypatch.setattr(Inference, "is_like_a_grid", lambda self, t, before: t.candidate.name == "low")
     again = inference.round(start.fit, start.floor, [])
     (reason,) = (t.reason for t in again.trials if t.candidate.name == "low")
