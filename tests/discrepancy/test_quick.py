@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuido.discrepancy import attribution
+from neuido.discrepancy import attribution, choosing
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.body import BodyProblem, body_problem
 from neuido.discrepancy.resume import CachedProblem
@@ -150,7 +150,7 @@ class Exact(Hurried):
 def test_no_other_method_is_begun_where_one_simulation_leaves_the_noise(law, asked, monkeypatch):
     begun, real = [], attribution.Inference.start
     monkeypatch.setattr(attribution.Inference, "start", lambda self, near=None: begun.append(self.setting) or real(self, near))
-    monkeypatch.setattr(attribution, "EARLY", 0.0)
+    monkeypatch.setattr(choosing, "EARLY", 0.0)
     diagnose(Exact(law), keep=3)
     assert begun == ([0, 1] if asked else [0])
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from neuido.discrepancy import attribution, contests, instead, pairs, refining, rounds, starting
+from neuido.discrepancy import attribution, choosing, classes, contests, instead, pairs, refining, rounds, starting
 from neuido.discrepancy.answer import rejected, trace
 from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
 from neuido.discrepancy.deadline import Deadline
@@ -140,7 +140,7 @@ def test_the_floor_is_what_a_refit_leaves():
     assert floors == pytest.approx(NOISE**2 + 0.02**2 / 2, rel=0.2)
     # and the gain that it takes goes by that
     trial = SimpleNamespace(errors=floors, fit=start.fit)
-    small, large = (inference.least_gain(attribution.unsearched(replace(start, errors=k * floors), floors), trial) for k in (0.2, 4.0))
+    small, large = (inference.least_gain(choosing.unsearched(replace(start, errors=k * floors), floors), trial) for k in (0.2, 4.0))
     assert (small, large) == (GAIN_IN_FLOOR, LEAST_GAIN)
 
 
@@ -149,7 +149,7 @@ def test_what_brings_the_declared_values_back_need_not_pass_the_floor():
     start = inference.start()
     young = Parameter("young", "Pa", 1e5, 1.0, 1e3, 1e7, log=True)
     inference.problem.__dict__["declared"] = (young,)
-    r = attribution.unsearched(replace(start, errors=np.full(2, 100.0) * NOISE**2), np.full(2, 400.0) * NOISE**2)
+    r = choosing.unsearched(replace(start, errors=np.full(2, 100.0) * NOISE**2), np.full(2, 400.0) * NOISE**2)
 
     def takes(base, there):
         trial = SimpleNamespace(errors=np.full(2, 9.0) * NOISE**2, fit=SimpleNamespace(point={"young": there}))
@@ -207,8 +207,8 @@ def test_a_held_out_recording_far_above_its_floor_is_unknown():
 def test_a_method_that_leaves_more_than_what_another_named_is_not_looked_further_with(left, looks, monkeypatch):
     methods = [Method(first_round(0.1, True)), Method(first_round(left, False))]
     asked = []
-    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: asked.append(methods.index(inference)) or [first])
-    attribution.first_rounds(methods, [stood(1.0)] * 2)
+    monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: asked.append(methods.index(inference)) or [first])
+    choosing.first_rounds(methods, [stood(1.0)] * 2)
     assert asked == looks
 
 
@@ -526,7 +526,7 @@ def test_what_stands_in_for_an_effect_says_where_that_one_begins():
 def test_what_leaves_noise_alone_need_not_pass_the_floor():
     inference = Inference(Line(lambda t: 3.0 * t))
     start = inference.start()
-    r = attribution.unsearched(replace(start, errors=np.full(2, 9.0) * NOISE**2), np.full(2, 36.0) * NOISE**2)
+    r = choosing.unsearched(replace(start, errors=np.full(2, 9.0) * NOISE**2), np.full(2, 36.0) * NOISE**2)
     noise = np.full(2, NOISE**2)
     assert inference.least_gain(r, SimpleNamespace(errors=1.2 * noise, fit=start.fit)) == GAIN_TO_NOISE
     assert inference.least_gain(r, SimpleNamespace(errors=3.0 * noise, fit=start.fit)) == GAIN_IN_FLOOR
@@ -784,7 +784,7 @@ def test_a_neighbour_takes_the_place_of_an_effect_once_the_other_one_was_found(m
     alone = inference.round(start.fit, start.floor, [])
     assert [t.candidate.name for t in alone.members] == ["mix"]
     assert names(diagnose(problem, most=2)) == ["high", "low"]
-    monkeypatch.setattr(attribution, "neighbours", lambda r, chosen: [])
+    monkeypatch.setattr(classes, "neighbours", lambda r, chosen: [])
     assert names(diagnose(problem, most=2)) == ["high", "mix"]
 
 
@@ -919,7 +919,7 @@ def test_what_another_method_names_with_as_much_left_is_in_the_class(unnamed):
     def widened(left, of=low.errors):
         named = replace(first, trials=[low, high], chosen=low, members=[low])
         joins = replace(high, stand=replace(high.stand, errors=left**2 * of))
-        attribution.widen(inference, named, replace(low.stand, errors=of), [first, replace(first, chosen=joins, members=[joins, low])])
+        classes.widen(inference, named, replace(low.stand, errors=of), [first, replace(first, chosen=joins, members=[joins, low])])
         assert len(named.trials) == 2 and (joins in named.trials) is (joins in named.members)
         return [t.candidate.name for t in named.members]
 
@@ -929,7 +929,7 @@ def test_what_another_method_names_with_as_much_left_is_in_the_class(unnamed):
 
 
 def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
-    real = attribution.first_rounds
+    real = choosing.first_rounds
 
     def other_one(tried, starts):
         chosen, firsts = real(tried, starts)
@@ -1009,33 +1009,33 @@ def test_the_other_method_goes_on_from_where_the_chosen_one_has_come():
 @pytest.mark.parametrize(("left", "chosen"), [(0.8, 0), (0.5, 1)])
 def test_an_effect_by_the_worse_method_leaves_clearly_less_than_the_better_one_without_any(left, chosen, monkeypatch):
     """Else an effect stands for what another method gets wrong."""
-    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
+    monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: [first])
     methods = [Method(first_round(0.95, False, base=1.0)), Method(first_round(left, True, base=1.5))]
-    assert attribution.first_rounds(methods, [stood(1.0), stood(1.5)])[0] == chosen
+    assert choosing.first_rounds(methods, [stood(1.0), stood(1.5)])[0] == chosen
 
 
 @pytest.mark.parametrize(("left", "answered"), [(0.5, False), (0.1, True)])
 def test_an_effect_leaves_less_than_a_method_that_was_not_asked_does_without_any(left, answered, monkeypatch):
-    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
-    monkeypatch.setattr(attribution, "by_first_fits", lambda *_: {0: 0.0})
+    monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: [first])
+    monkeypatch.setattr(choosing, "by_first_fits", lambda *_: {0: 0.0})
     asked, late = Method(first_round(left, named=True)), Method()
     asked.result.chosen.gain = np.log(10.0)
     late.deadline, late.problem = Deadline(0.0), SimpleNamespace(declared=())
     late.floors = lambda point, free, floor: np.full(2, 1e-4)
-    chosen, firsts = attribution.first_rounds([asked, late], [stood(1.0), stood(0.4)])
+    chosen, firsts = choosing.first_rounds([asked, late], [stood(1.0), stood(0.4)])
     assert (firsts[chosen][0].chosen is not None) is answered
     assert firsts[chosen][0].errors[0] == pytest.approx(1.0 if answered else 0.16)
 
 
 @pytest.mark.parametrize(("gain", "late", "named"), [(2.6, True, False), (3.5, True, True), (2.6, False, True)])
 def test_an_effect_gains_much_where_there_was_no_time_for_another_method(gain, late, named, monkeypatch):
-    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
-    monkeypatch.setattr(attribution, "by_first_fits", lambda *_: {0: 0.0})
+    monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: [first])
+    monkeypatch.setattr(choosing, "by_first_fits", lambda *_: {0: 0.0})
     first = first_round(0.2, named=True)
     first.chosen.gain = np.log(gain)
     other = Method(first_round(1.0, named=False))
     other.deadline = Deadline(0.0 if late else np.inf)
-    chosen, firsts = attribution.first_rounds([Method(first), other], [stood(1.0), stood(1.1)])
+    chosen, firsts = choosing.first_rounds([Method(first), other], [stood(1.0), stood(1.1)])
     assert chosen == 0 and (firsts[0][0].chosen is not None) is named and firsts[0][0].unsure is not named
     assert bool(first.trials[0].reason) is not named
     assert named or "no time for the other method" in first.trials[0].reason
@@ -1043,7 +1043,7 @@ def test_an_effect_gains_much_where_there_was_no_time_for_another_method(gain, l
 
 def test_what_there_was_no_time_to_be_sure_of_is_unknown_and_not_none(monkeypatch):
     assert diagnose(Line(lambda t: 3.0 * t)).answer == "none"
-    real = attribution.first_rounds
+    real = choosing.first_rounds
 
     def unsure(tried, starts):
         chosen, firsts = real(tried, starts)
@@ -1236,7 +1236,7 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, over, th
             return SimpleNamespace(least=[np.full(2, self.result**2)], led=self.result)
 
     methods, starts = [Looking(left), Looking(there)], [stood(1.0)] * 2
-    seen = attribution.by_first_fits(methods, starts, [0, 1], [0.0, 0.1])
+    seen = choosing.by_first_fits(methods, starts, [0, 1], [0.0, 0.1])
     assert sorted((0, 1), key=lambda i: seen.get(i, np.inf)) == order
     both = left > 0.03 and not (left == 0.9 and over < 1.0)
     assert asked == ([None, left] if both else [None])
@@ -1244,7 +1244,7 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, over, th
     assert seen == (first | {1: pytest.approx(2 * np.log(there) + 0.1)} if both else {} if left == 0.9 else first)
     asked.clear()
     far = 2.0 * np.log(pairs.WORSE) + 0.1
-    assert attribution.by_first_fits(methods, starts, [0, 1], [0.0, far]) == {} and not asked
+    assert choosing.by_first_fits(methods, starts, [0, 1], [0.0, far]) == {} and not asked
 
 
 @pytest.mark.parametrize("together", [True, False])
@@ -1279,10 +1279,10 @@ def test_what_leaves_far_more_than_the_best_is_not_refined(monkeypatch):
 @pytest.mark.parametrize(("suggested", "first"), [(2.5, 0), (3.5, 1)])
 def test_the_suggested_method_is_looked_at_first_unless_it_is_far_worse(suggested, first, monkeypatch):
     orders = []
-    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
-    monkeypatch.setattr(attribution, "by_first_fits", lambda tried, starts, order, _: orders.append(order) or {})
+    monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: [first])
+    monkeypatch.setattr(choosing, "by_first_fits", lambda tried, starts, order, _: orders.append(order) or {})
     result = first_round(0.1, True)
-    attribution.first_rounds([Method(result), Method(result)], [stood(suggested), stood(1.0)])
+    choosing.first_rounds([Method(result), Method(result)], [stood(suggested), stood(1.0)])
     assert orders == [[first, 1 - first]]
 
 
@@ -1305,12 +1305,12 @@ def test_a_method_that_is_far_worse_without_effects_is_asked_where_with_one_it_i
     methods = [Asked(0), Asked(1)]
     for method, start, least in zip(methods, starts, (left, 0.8), strict=True):
         method.seen = SimpleNamespace(base=start.fit, least=[np.full(2, least**2)], led=None)
-    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
-    attribution.first_rounds(methods, starts)
+    monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: [first])
+    choosing.first_rounds(methods, starts)
     assert asked == rounds_of
     methods[0].seen.base = None  # of another stand of the declared model
     asked.clear()
-    attribution.first_rounds(methods, starts)
+    choosing.first_rounds(methods, starts)
     assert asked == [1]
 
 
@@ -1323,9 +1323,9 @@ def test_a_method_whose_first_fits_are_far_from_what_was_named_is_not_asked_furt
             asked.append(self.result)
             return first_round(0.1, True)
 
-    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
-    monkeypatch.setattr(attribution, "by_first_fits", lambda *_: {0: 2 * np.log(0.1), 1: 2 * np.log(there) + np.log(1.2)})
-    attribution.first_rounds([Asked(0), Asked(1)], [stood(1.0)] * 2)
+    monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: [first])
+    monkeypatch.setattr(choosing, "by_first_fits", lambda *_: {0: 2 * np.log(0.1), 1: 2 * np.log(there) + np.log(1.2)})
+    choosing.first_rounds([Asked(0), Asked(1)], [stood(1.0)] * 2)
     assert asked == rounds_of
 
 
@@ -1341,8 +1341,8 @@ def test_no_other_method_is_asked_where_a_named_effect_leaves_little_more_than_n
         def is_noise(self, errors):
             return bool(np.all(errors < noise**2))
 
-    monkeypatch.setattr(attribution, "look_ahead", lambda inference, first: [first])
-    attribution.first_rounds([Asked(0), Asked(1)], [stood(1.0)] * 2)
+    monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: [first])
+    choosing.first_rounds([Asked(0), Asked(1)], [stood(1.0)] * 2)
     assert asked == rounds_of
 
 
