@@ -10,14 +10,14 @@ from neuido.discrepancy.base_fits import ELSEWHERE, HORIZONS
 from neuido.discrepancy.contests import IN_REACH, MANY, Contests
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.problem import Candidate, Parameter, Point
+from neuido.discrepancy.problem import Candidate, Point
 from neuido.discrepancy.trials import Trial, score
 
 ABOVE = 2.5
 """Times the noise of the fitted recordings that the best first fit leaves, from which on fits grow."""
 SIDE_BY_SIDE, ONE_BY_ONE = 8, 4
-"""Candidates that grow, where a launch of several points costs as one and where every point costs; one of them of more than `MANY`
-parameters."""
+"""Candidates that grow, where a launch of several points costs as one, one of them of more than `MANY` parameters, and where every point
+costs, none of those."""
 
 
 class Growing(Contests):
@@ -43,7 +43,7 @@ class Growing(Contests):
 
         They are screened where the declared model, with the effects that were found, fits the first part of the recordings, by what they
         would take off a little more of it, and the start of each that does best is the one that grows. What falls behind at a horizon is
-        given up. Where every point costs, one of many parameters grows after the others, if these leave much.
+        given up. One of many parameters grows where a launch of several points costs as one.
         """
         free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
         at = None if found else self.begun
@@ -57,22 +57,10 @@ class Growing(Contests):
         for _, c, _, begin in ranked:
             starts.setdefault(c.key, (c, begin))
         large = [entry for entry in starts.values() if len(entry[0].parameters) > MANY][:1]
-        live = [entry for entry in starts.values() if entry in large or len(entry[0].parameters) <= MANY]
-        if self.problem.together:
-            return self.grown_of(live[:SIDE_BY_SIDE], free, floor, until)
-        live = live[:ONE_BY_ONE]
-        found = self.grown_of([entry for entry in live if entry not in large], free, floor, until)
-        # one of many parameters costs as much as the others together
-        if self.leaves_much(self.mean_squares([fit.point for _, fit in found.values()], floor)) and not self.deadline.past(until):
-            found |= self.grown_of([entry for entry in live if entry in large], free, floor, until)
-        return found
-
-    def grown_of(
-        self, live: Sequence[tuple[Candidate, Point]], free: Sequence[Parameter], floor: Floor, until: float
-    ) -> dict[str, tuple[Candidate, Fit]]:
-        """Fits of candidates that grow from their points of the first horizon, side by side, by their keys."""
-        if not live:
-            return {}
+        small = [entry for entry in starts.values() if len(entry[0].parameters) <= MANY]
+        live = [entry for entry in starts.values() if entry in small or entry in large][:SIDE_BY_SIDE]
+        if not self.problem.together:  # there one of many parameters takes five times as long as the others together
+            live = small[:ONE_BY_ONE]
         self.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
         entries = [((*free, *c.parameters), point) for c, point in live]
         ended = [(live[i][0], fit) for i, fit in self.grown(entries, floor, until=until, reach=IN_REACH)]
