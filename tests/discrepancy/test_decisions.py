@@ -61,6 +61,7 @@ def both(problem: Problem, effects: str, folder: Path, monkeypatch, most: int) -
     sound = attribution.diagnose(cached, draws=39, most=most)
     monkeypatch.setattr(attribution, "Inference", SmallestError)
     monkeypatch.setattr(attribution, "FURTHER", 0.0)
+    monkeypatch.setattr(attribution, "two_effects", lambda inference, *rest: (inference, []))
     monkeypatch.setattr(attribution, "drop", lambda inference, at, floor, found: (at, found))
     monkeypatch.setattr(attribution, "narrow", lambda inference, at, floor, found, rounds: (at, found))
     return sound, attribution.diagnose(cached, draws=39, most=most)
