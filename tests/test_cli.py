@@ -35,7 +35,6 @@ def test_help_loads_no_torch(name):
 import atexit, sys
 atexit.register(lambda: print("LOADED", sorted({{"torch", "lightning", "warp"}} & set(sys.modules))))
 from neuido.cli import main
-from neuido.simulate import simulate
 main({name.split()!r})
 """
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
