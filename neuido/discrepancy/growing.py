@@ -56,11 +56,10 @@ class Growing(Contests):
         starts: dict[str, tuple[Candidate, Point]] = {}
         for _, c, _, begin in ranked:
             starts.setdefault(c.key, (c, begin))
-        large = [entry for entry in starts.values() if len(entry[0].parameters) > MANY][:1]
-        small = [entry for entry in starts.values() if len(entry[0].parameters) <= MANY]
-        live = [entry for entry in starts.values() if entry in small or entry in large][:SIDE_BY_SIDE]
-        if not self.problem.together:  # there one of many parameters takes five times as long as the others together
-            live = small[:ONE_BY_ONE]
+        # where every point costs one of many parameters takes five times as long as the others together
+        large = [entry for entry in starts.values() if len(entry[0].parameters) > MANY][: 1 if self.problem.together else 0]
+        live = [entry for entry in starts.values() if entry in large or len(entry[0].parameters) <= MANY]
+        live = live[: SIDE_BY_SIDE if self.problem.together else ONE_BY_ONE]
         self.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
         entries = [((*free, *c.parameters), point) for c, point in live]
         ended = [(live[i][0], fit) for i, fit in self.grown(entries, floor, until=until, reach=IN_REACH)]

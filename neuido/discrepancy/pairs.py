@@ -156,11 +156,11 @@ def by_another_method(
         if inference.deadline.skips("two effects by the other method"):
             break
         here = from_there(other, lead, at.fit.point)
-        members = first.members if lead is first.chosen else [lead]
-        pair = second_beside(other, replace(first, chosen=lead), members, at.errors, at=here, sure=None if within else lead)
+        own = first if lead is first.chosen else replace(first, chosen=lead, members=[lead])
+        pair = second_beside(other, own, own.members, at.errors, at=here, sure=None if within else lead)
         if pair and (not within or other.is_noise(pair[-1].chosen.errors)):
             lead.stand, lead.gain, lead.reason = here, other.gain(first.errors, here.errors), ""
-            made.append((other, [replace(pair[0], members=members), *pair[1:]]))
+            made.append((other, pair))
     return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)
 
 
