@@ -192,3 +192,33 @@ def test_blind_table_is_the_measured_one():
         assert quoted[f"single effects {label}"][0] == f"{single.count('True')} of {len(single)}"
     covered, intervals = (sum(int(row[name]) for row in answered) for name in ("covered", "intervals"))
     assert quoted["90 % intervals that cover (goal 80 to 97 %)"][0] == f"{covered} of {intervals}"
+
+
+def test_table_of_the_ablations_is_the_measured_one():
+    with (ROOT / "benchmarks" / "results" / "blind-seed-22.csv").open() as file:
+        measured = list(csv.DictReader(file))
+    quoted = {label: cells for label, *cells in rows("Closed loop: a blind seed with its ablations")}
+
+    def share(test, among):
+        return f"{sum(map(test, among))} of {len(among)}"
+
+    for column, ablation in enumerate(("none", "no-discretisation", "single-recording")):
+        of = [row for row in measured if row["ablation"] == ablation]
+        nulls, single, pairs, outside = (
+            [r for r in of if r["group"] in groups] for groups in (("null", "nuisance"), ("one",), ("two",), ("outside",))
+        )
+        expected = {
+            "false alarms on nulls": share(lambda r: r["answer"] in ("effect", "class"), nulls),
+            "nulls answered none": share(lambda r: r["answer"] == "none", nulls),
+            "effects in class": share(lambda r: r["in_class"] == "True", single + pairs),
+            "two effects, both in class": share(lambda r: r["in_class"] == "True", pairs),
+            "outside the library: unknown": share(lambda r: r["answer"] == "unknown", outside),
+            "outside the library: a near effect": share(lambda r: r["answer"] in ("effect", "class") and r["near"] == "True", outside),
+        }
+        for solver, label in (("same", "by the suggested solver"), ("finer", "on a finer grid"), ("elements", "by finite elements")):
+            expected[f"single effects {label}"] = share(lambda r: r["in_class"] == "True", [r for r in single if r["solver"] == solver])
+        if ablation != "none":
+            covered, intervals = (sum(int(row[name]) for row in single + pairs) for name in ("covered", "intervals"))
+            expected["90 % intervals that cover"] = f"{covered} of {intervals}"
+        for label, figure in expected.items():
+            assert quoted[label][column] == figure, (ablation, label)

@@ -110,7 +110,8 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
     """Where one effect was found and leaves more than noise: a member of its class beside which a second one is named, and that round.
 
     Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two. Nor was a
-    second one looked for beside what lies within its floor. One of many parameters may stand for both: what is simpler is tried instead.
+    second one looked for beside what lies within its floor. One of many parameters may stand for both: what is simpler is tried instead,
+    and it itself last, for what is simpler may leave too much alone to say what is beside it; `narrow` then takes it for what it is.
     """
     if inference.is_settled(at.errors):
         return []
@@ -123,6 +124,8 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
             t.reason = f"leaves {math.exp(0.5 * (score(at.errors) - pair[1].chosen.score)):.1f} times the error of two effects"
         pair[0].chosen.reason = ""
         pair[0] = replace(pair[0], members=[pair[0].chosen])
+    if not pair and grown is None and len(first.chosen.candidate.parameters) > MANY:
+        pair = second_beside(inference, first, [first.chosen], at.errors, at=at, many=True)
     return pair
 
 
@@ -184,16 +187,23 @@ def at_its_end(inference: Inference, t: Trial) -> Stand:
 
 
 def second_beside(
-    inference: Inference, first: Round, members: Sequence[Trial], errors: np.ndarray, *, at: Stand | None = None, sure: Trial | None = None
+    inference: Inference,
+    first: Round,
+    members: Sequence[Trial],
+    errors: np.ndarray,
+    *,
+    at: Stand | None = None,
+    sure: Trial | None = None,
+    many: bool = False,
 ) -> list[Round]:
-    """The member beside which a second effect leaves least, and the round of that one.
+    """The member, of few parameters unless `many`, beside which a second effect leaves least, and the round of that one.
 
     Nothing is returned where none leaves clearly less than `errors`, or nothing but noise in one simulation. A member is asked where the
     screening beside it promises much, or it is `sure`. `at` is where the chosen one stands, if its fit was finished.
     """
     pairs: list[list[Round]] = []
-    small = [t for t in members if len(t.candidate.parameters) <= MANY]
-    for t in sorted(small, key=lambda t: t.penalised)[:BESIDE]:
+    able = [t for t in members if many or len(t.candidate.parameters) <= MANY]
+    for t in sorted(able, key=lambda t: t.penalised)[:BESIDE]:
         if inference.deadline.skips(f"a second effect beside {t.candidate.key}"):
             break
         here = at if at is not None and t is first.chosen else at_its_end(inference, t)

@@ -386,6 +386,25 @@ def test_beside_what_is_simpler_than_an_effect_of_many_parameters_a_second_one_i
     (reason,) = (t.reason for t in low.trials if t.candidate.name == "chord")
     assert reason.endswith("times the error of two effects")
     monkeypatch.setattr(pairs, "simpler", lambda r, chosen: [])
+    beside, *_ = pairs.beside_members(inference, [first], at)
+    assert beside.chosen is first.chosen  # for want of anything simpler
+
+
+def test_beside_an_effect_of_many_parameters_a_second_one_is_looked_for_last(monkeypatch):
+    start = (
+        inference := Inference(Tones(lambda t: 3.0 * t + 2.0 * np.sin(3.0 * t) + np.sin(7.0 * t) + 0.1 * np.sin(40 * t), "low"))
+    ).start()
+    first = inference.round(start.fit, start.floor, [])
+    at = first.chosen.stand
+    assert (
+        first.chosen.candidate.key.startswith("wave")
+        and len(first.chosen.candidate.parameters) > pairs.MANY
+        and not inference.is_settled(at.errors)
+    )
+    wave, low = pairs.beside_members(inference, [first], at)
+    assert wave.chosen is first.chosen and low.chosen.candidate.name == "low" and inference.is_noise(low.chosen.errors)
+    assert not pairs.beside_members(inference, [first, replace(low, chosen=None)], at), "a round beside it was made"
+    monkeypatch.setattr(Inference, "promised", lambda self, at, beside: 1.0)
     assert not pairs.beside_members(inference, [first], at)
 
 
