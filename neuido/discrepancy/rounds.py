@@ -282,6 +282,8 @@ class Inference(Judging):
             if found:
                 near = _near(promise[c.key] for c, *_ in starts if len(c.parameters) <= MANY)
                 out = {key for key in keys[self.keep :] if promise.get(key, math.inf) >= near}
+            elif self.tries_all(led):
+                out = set([key for key in keys if key not in led.keys][OWN:])
             elif not self.problem.together:
                 runs = {c.key for _, c, *_ in ranked}
                 able = {c.key for c, *_ in starts if c.linear and c.key in runs and c.key in least}
@@ -289,6 +291,13 @@ class Inference(Judging):
             starts = [start for start in starts if start[0].key not in out]
             chosen = {key: i for key, i in chosen.items() if key not in out}
         return Promising(candidates, free, slopes, columns, chosen, starts, promise)
+
+    def tries_all(self, led: Led | None) -> bool:
+        """Whether the first look by another method tries every small candidate at several sizes, before it keeps a few: in one launch.
+
+        A viscosity of volume promised nothing by its direction where the declared model was fitted, and left noise alone at a larger size.
+        """
+        return led is not None and led.chosen is not None and self.problem.together
 
     def begin(
         self,
@@ -314,7 +323,8 @@ class Inference(Judging):
         near = _near(stays for stays, c, *_ in ranked if len(c.parameters) <= MANY)
         keep, leaders = (self.keep, ()) if led is None else (min(self.keep, OWN), led.keys)
         first = led is None and not found
-        every = bool(found) and not hurried  # beside an effect they are tried at larger sizes before any is chosen
+        # beside an effect they are tried at larger sizes before any is chosen, and by another method where that costs one launch
+        every = bool(found or self.tries_all(led)) and not hurried
         for stays, c, i, begin in ranked:
             leads = c.key in leaders
             small = len(c.parameters) <= SMALL and (every or (first and (stays < VAIN or not c.linear)))

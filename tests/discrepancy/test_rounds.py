@@ -1437,6 +1437,21 @@ def test_by_another_method_those_are_fitted_that_led_by_the_first(monkeypatch):
     assert len(whole.contest.best) == 2 and "cube" in whole.contest.best
 
 
+@pytest.mark.parametrize(("together", "fitted"), [(True, ["late", "low", "square"]), (False, ["cube", "low", "square"])])
+def test_by_another_method_what_promises_nothing_at_first_is_tried_at_larger_sizes(together, fitted, monkeypatch):
+    """In one launch; the best of them by that is kept."""
+    monkeypatch.setattr(rounds, "OWN", 2)
+    problem = Late(lambda t: 3.0 * t + 0.5 * np.sin(62 * t) + 0.1 * np.sin(40 * t))
+    problem.__dict__["_together"] = together
+    inference = Inference(problem)
+    base = inference.start()
+    best = {c.key: (c, replace(base.fit, point=base.fit.point | c.starts[0])) for c in problem.candidates if c.key == "square"}
+    asked = inference.promising(base.fit, base.floor, led=looked(best).led)
+    own = [c.key for c, *_ in asked.starts if len(c.parameters) == 1]
+    assert sorted(dict.fromkeys(own)) == fitted and set(asked.chosen) == set(own) | {c.key for c, *_ in asked.starts}
+    assert not together or len(asked.chosen) == 3
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_fits_begin_at_the_size_that_leaves_least(together):
     """A slope at nothing says little of what a large effect does, and what the base fit made up for is no place to begin at."""
