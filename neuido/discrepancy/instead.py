@@ -22,13 +22,14 @@ ALIKE = 0.3
 HALF = 0.5
 """Share of the base fit's cost below which the leading effect says where the declared values are."""
 PROMISING = 0.75
-"""Share of the misfit that a candidate may leave there, as its directions say, to be tried in its place."""
-INSTEAD, INSTEAD_ONE_BY_ONE = 4, 2
+"""Share of the misfit that a candidate may leave there, as its directions say, to be tried in its place where every point costs: another
+stiffness in compression left more than 0.82 by them, and was the true effect."""
+INSTEAD, INSTEAD_ONE_BY_ONE = 8, 2
 """Candidates that are fitted there, and the same where every point costs."""
 SCANNED = 8
 """Candidates whose sizes are tried there where every point costs; otherwise all that promise."""
-FROM_THERE = 10.0
-"""Times the cost of the leading fit up to which one of these sizes is fitted: the two that this has found began at 0.4 and 6 times."""
+FROM_THERE = 20.0
+"""Times the cost of the leading fit up to which one of these sizes is fitted: three that this has found began at 0.4, 6 and 15 times."""
 LED_AWAY = 2.5
 """Ratio of a declared parameter to what the model states at which a base fit is led away by what it lacks."""
 NO_MORE = 1.1
@@ -121,7 +122,8 @@ class Instead(Refining):
 
         The base fit makes up for what it lacks by a modulus far from the true one, and the fits that begin there may all miss their valleys
         but for one effect that stands in for the true one: with it the declared values come near theirs. They are held while sizes of what
-        promises something there are tried and fitted, for the valleys of a size and a modulus together are narrow.
+        promises something there, or of all where that is one launch, are tried and fitted: the valleys of a size and a modulus together are
+        narrow.
         """
         top = leader(best)
         if top is None or self.problem.settings == 1:
@@ -143,7 +145,7 @@ class Instead(Refining):
         ranked, _ = self.screen(begin, behind, there, self.slopes(free, begin, self.fitted_recordings))
         starts: dict[str, tuple[Candidate, Point]] = {}
         for stays, c, _, start in ranked:
-            if stays < PROMISING and (self.problem.together or len(starts) < SCANNED):
+            if self.problem.together or (stays < PROMISING and len(starts) < SCANNED):
                 starts.setdefault(c.key, (c, start))
         if not starts:
             return {}

@@ -560,6 +560,19 @@ def test_what_stands_in_for_an_effect_says_where_that_one_begins():
     assert not inference.instead(free, little, problem.candidates, near, start.floor)
 
 
+@pytest.mark.parametrize("together", [True, False])
+def test_what_promises_nothing_in_the_place_of_another_is_tried_where_that_is_one_launch(together, monkeypatch):
+    monkeypatch.setattr(instead, "PROMISING", 0.0)
+    problem = Tuned()
+    problem.__dict__["_together"] = together
+    start, by_key = (inference := Inference(problem)).start(), {c.key: c for c in problem.candidates}
+    base = Fit({"a": 2.0}, ("a",), inference.costs([{"a": 2.0}], start.floor)[0], np.zeros(1), 1, True)
+    free = (*problem.declared, *by_key["fixed"].parameters)
+    (fixed,) = inference.fits([inference.request(free, {"a": 3.0, "fixed.c": 0.4})], start.floor)
+    more = inference.instead(problem.declared, {"fixed": (by_key["fixed"], fixed)}, problem.candidates, base, start.floor)
+    assert ("tuned" in more) is together
+
+
 def test_what_leaves_noise_alone_need_not_pass_the_floor():
     inference = Inference(Line(lambda t: 3.0 * t))
     start = inference.start()
