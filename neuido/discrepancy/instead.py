@@ -27,7 +27,7 @@ stiffness in compression left more than 0.82 by them, and was the true effect.""
 INSTEAD, INSTEAD_ONE_BY_ONE = 8, 2
 """Candidates that are fitted there, and the same where every point costs."""
 SCANNED = 8
-"""Candidates whose sizes are tried there where every point costs; otherwise all that promise."""
+"""Candidates whose sizes are tried there where every point costs; otherwise all."""
 FROM_THERE = 20.0
 """Times the cost of the leading fit up to which one of these sizes is fitted: three that this has found began at 0.4, 6 and 15 times."""
 LED_AWAY = 2.5

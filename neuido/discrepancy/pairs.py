@@ -1,7 +1,7 @@
 """Two effects at once: what is tried with a second one where none is enough alone, and where one leaves more than noise."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -118,14 +118,15 @@ def beside_members(inference: Inference, rounds: Sequence[Round], at: Stand) -> 
     first = rounds[0]
     grown = first.chosen if len(rounds) > 1 else None
     instead = simpler(first, first.chosen) if len(first.chosen.candidate.parameters) > MANY else []
-    pair = second_beside(inference, first, [t for t in (*first.members, *instead) if t is not grown], at.errors, at=at)
+    members = few(t for t in (*first.members, *instead) if t is not grown)
+    pair = second_beside(inference, first, members, at.errors, at=at)
     if pair and pair[0].chosen in instead:
         for t in first.members:
             t.reason = f"leaves {math.exp(0.5 * (score(at.errors) - pair[1].chosen.score)):.1f} times the error of two effects"
         pair[0].chosen.reason = ""
         pair[0] = replace(pair[0], members=[pair[0].chosen])
     if not pair and grown is None and len(first.chosen.candidate.parameters) > MANY:
-        pair = second_beside(inference, first, [first.chosen], at.errors, at=at, many=True)
+        pair = second_beside(inference, first, [first.chosen], at.errors, at=at)
     return pair
 
 
@@ -160,7 +161,7 @@ def by_another_method(
             break
         here = from_there(other, lead, at.fit.point)
         own = first if lead is first.chosen else replace(first, chosen=lead, members=[lead])
-        pair = second_beside(other, own, own.members, at.errors, at=here, sure=None if within else lead)
+        pair = second_beside(other, own, few(own.members), at.errors, at=here, sure=None if within else lead)
         if pair and (not within or other.is_noise(pair[-1].chosen.errors)):
             lead.stand, lead.gain, lead.reason = here, other.gain(first.errors, here.errors), ""
             made.append((other, pair))
@@ -187,23 +188,15 @@ def at_its_end(inference: Inference, t: Trial) -> Stand:
 
 
 def second_beside(
-    inference: Inference,
-    first: Round,
-    members: Sequence[Trial],
-    errors: np.ndarray,
-    *,
-    at: Stand | None = None,
-    sure: Trial | None = None,
-    many: bool = False,
+    inference: Inference, first: Round, members: Sequence[Trial], errors: np.ndarray, *, at: Stand | None = None, sure: Trial | None = None
 ) -> list[Round]:
-    """The member, of few parameters unless `many`, beside which a second effect leaves least, and the round of that one.
+    """The member beside which a second effect leaves least, and the round of that one.
 
     Nothing is returned where none leaves clearly less than `errors`, or nothing but noise in one simulation. A member is asked where the
     screening beside it promises much, or it is `sure`. `at` is where the chosen one stands, if its fit was finished.
     """
     pairs: list[list[Round]] = []
-    able = [t for t in members if many or len(t.candidate.parameters) <= MANY]
-    for t in sorted(able, key=lambda t: t.penalised)[:BESIDE]:
+    for t in sorted(members, key=lambda t: t.penalised)[:BESIDE]:
         if inference.deadline.skips(f"a second effect beside {t.candidate.key}"):
             break
         here = at if at is not None and t is first.chosen else at_its_end(inference, t)
@@ -228,11 +221,11 @@ def in_its_place(inference: Inference, first: Round, second: Round, errors: np.n
     for as beside any. Nothing is returned where it is not named, or the two leave no less than `errors`.
     """
     here = inference.fitted_score(second.errors)
-    tried = [t for t in second.trials if len(t.candidate.parameters) <= MANY and not unphysical(t.candidate, t.fit.point)]
+    tried = [t for t in few(second.trials) if not unphysical(t.candidate, t.fit.point)]
     lead = min(tried, key=lambda t: inference.fitted_score(t.errors), default=None)
     if lead is None or here - inference.fitted_score(lead.errors) < 2.0 * LEAST_GAIN:
         return []
-    instead = [t for t in others(first) if len(t.candidate.parameters) <= MANY and t.candidate.name != lead.candidate.name]
+    instead = [t for t in few(others(first)) if t.candidate.name != lead.candidate.name]
     instead = sorted((t for t in instead if np.isfinite(t.score)), key=lambda t: t.penalised)[:IN_PLACE]
     if not instead or inference.deadline.skips(f"effects in the place of {first.chosen.candidate.key}"):
         return []
@@ -276,6 +269,11 @@ def neighbours(r: Round, chosen: Trial) -> list[Trial]:
     """The best trials of no more parameters than the chosen one that came close to it."""
     most = len(chosen.candidate.parameters)
     return [t for t in close_to(r, chosen) if len(t.candidate.parameters) <= most][:LOOKED_AHEAD]
+
+
+def few(trials: Iterable[Trial]) -> list[Trial]:
+    """Those whose candidates have few parameters."""
+    return [t for t in trials if len(t.candidate.parameters) <= MANY]
 
 
 def others(r: Round) -> list[Trial]:
