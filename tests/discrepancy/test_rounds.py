@@ -159,6 +159,24 @@ def test_what_brings_the_declared_values_back_need_not_pass_the_floor():
     assert takes(5e5, 2e5) == takes(2e5, 1e5) == pytest.approx(GAIN_IN_FLOOR)
 
 
+def test_what_leads_all_others_by_far_need_not_pass_the_floor():
+    inference = Inference(Line(lambda t: 3.0 * t))
+    start = inference.start()
+    within = choosing.unsearched(replace(start, errors=np.full(2, 9.0) * NOISE**2), np.full(2, 36.0) * NOISE**2)
+
+    def takes(gain, others, parameters=1, name="other"):
+        def trial(g, name, count):
+            candidate = SimpleNamespace(name=name, size_parameters=[None] * count)
+            return SimpleNamespace(gain=g, candidate=candidate, errors=np.full(2, 4.0) * NOISE**2, fit=start.fit)
+
+        top = trial(gain, "top", parameters)
+        return inference.least_gain(replace(within, trials=[top, *(trial(g, name, 1) for g in others)]), top)
+
+    assert takes(0.9, [0.2, -0.5]) == GAIN_TO_NOISE
+    assert takes(0.9, [0.5]) == takes(0.9, [0.2], parameters=5) == takes(0.9, []) == GAIN_IN_FLOOR
+    assert takes(0.9, [0.2], name="top") == GAIN_IN_FLOOR, "another form of the same effect is no other one"
+
+
 def test_near_the_noise_a_gain_is_that_of_what_is_above_it(monkeypatch):
     inference = Inference(Line(lambda t: 3.0 * t + 2.0 * t**3))
 
@@ -1013,6 +1031,7 @@ def test_what_leaves_as_much_as_grids_differ_by_is_not_named(monkeypatch):
     assert not inference.is_like_a_grid(little, first.errors)
     told = replace(coarse, stand=replace(coarse.stand, errors=np.where(inference.fitted, inference.noise_squares, coarse.errors)))
     assert not inference.is_like_a_grid(told, first.errors), "what is fitted comes to the noise"
+    assert not inference.is_like_a_grid(replace(coarse, gain=1.01 * GAIN_IN_FLOOR), first.errors), "it gains what it takes within the floor"
     monkeypatch.setattr(Inference, "is_like_a_grid", lambda self, t, before: t.candidate.name == "low")
     again = inference.round(start.fit, start.floor, [])
     (reason,) = (t.reason for t in again.trials if t.candidate.name == "low")
