@@ -13,6 +13,8 @@ import pytest
 
 import neuido
 from neuido import cli
+from neuido.discrepancy import judging
+from neuido.discrepancy.laboratory import LEAST_GAIN
 
 ROOT = Path(neuido.__file__).parents[1]
 README = ROOT / "README.md"
@@ -227,3 +229,17 @@ def test_blind_tables_are_the_measured_ones():
     for label, cells in together.items():
         counts = [list(map(int, cell.split(" of "))) for cell in cells]
         assert counts[-1] == [sum(count) for count in zip(*counts[:-1], strict=True)], label
+
+
+def test_what_naming_takes_is_what_the_code_asks():
+    section = TEXT.split("**When an effect is named.**")[1].split("**Beside one effect")[0]
+    quoted = [float(line.strip("| ").split("|")[-1]) for line in section.splitlines() if line.startswith("| where")]
+    asked = [
+        LEAST_GAIN,
+        judging.GAIN_AT_FLOOR,
+        judging.GAIN_IN_FLOOR,
+        judging.GAIN_TO_NOISE,
+        LEAST_GAIN,
+        judging.LEAST_GAIN_EXACT,
+    ]
+    assert quoted == pytest.approx([math.exp(gain) for gain in asked])
