@@ -101,6 +101,8 @@ class ChamferDistance(Metric):
 
     full_state_update = False
     higher_is_better = False
+    total: Tensor
+    frames: Tensor
 
     def __init__(self, scale: float = 1e4, **kwargs: Any):
         super().__init__(**kwargs)

@@ -152,7 +152,7 @@ def diagnose(
             inference, start = by, pair[0].plain or starts[tried.index(by)]
         if pair:
             rounds = pair
-            found = [r.chosen for r in pair]
+            found = [r.chosen for r in pair if r.chosen is not None]
             at = inference.finished(found[-1].stand)
     if len(found) == 1:
         widen(inference, rounds[0], at, others.values())

@@ -69,7 +69,7 @@ class BaseFits(Laboratory):
 
     def starts(self, point: Point) -> list[Point]:
         """A point, and half and twice each parameter whose logarithm is fitted."""
-        out = [dict(point)]
+        out: list[Point] = [dict(point)]
         for p in self.problem.declared:
             if p.log:
                 value = point.get(p.name, p.value)

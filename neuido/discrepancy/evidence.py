@@ -97,13 +97,13 @@ def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: n
         noise: Of the noise.
         data: Of the base with the data themselves, where `before` is of a draw, which is at the noise whatever the data are.
     """
-    fitted = np.array(fitted)
-    if not (~fitted).any():
-        return ratio(before, after, fitted)
+    own = np.array(fitted)
+    if own.all():
+        return ratio(before, after, own)
     seen = [before, after] if data is None else [before, after, data]
-    if fitted.any() and not max(squares[fitted].mean() for squares in seen) < NOISE_ALONE * noise[fitted].mean():
-        return min(ratio(before, after, fitted), ratio(before, after, ~fitted))
-    return ratio(before, after, ~fitted)
+    if own.any() and not max(squares[own].mean() for squares in seen) < NOISE_ALONE * noise[own].mean():
+        return min(ratio(before, after, own), ratio(before, after, ~own))
+    return ratio(before, after, ~own)
 
 
 def ratio(before: np.ndarray, after: np.ndarray, group: np.ndarray) -> float:

@@ -135,7 +135,7 @@ def levenberg_marquardt(
     high = np.array([_bound(p, p.upper) for p in parameters])
     count = 0
 
-    def point_at(at: np.ndarray) -> dict[str, float]:
+    def point_at(at: np.ndarray) -> Point:
         return fixed | {p.name: p.physical(v) for p, v in zip(parameters, at, strict=True)}
 
     def ask(asked: Sequence[np.ndarray]):

@@ -175,7 +175,7 @@ class Instead(Refining):
         """A start of a candidate of one size with sizes of either sign from the one that it is screened at up."""
         if len(c.size_parameters) > 1 or not c.linear:
             return []
-        (p,) = c.size_parameters
+        p = c.size_parameters[0]
         unit = abs(c.starts[0][p.name])
         sizes = [sign * unit * STEP**k for sign in p.signs for k in range(STEPS)]
         return [{**start, p.name: size} for size in sizes if p.lower < size < p.upper]

@@ -167,7 +167,7 @@ class Refining(Growing):
         for key, (c, fit) in best.items():
             if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
                 continue
-            (p,) = c.size_parameters
+            p = c.size_parameters[0]
             for sign in p.signs:
                 size = p.within(sign * FAR * abs(starts[key][p.name]))
                 begins.append((c, dict(fit.point) | self.as_declared | {p.name: size}))

@@ -367,7 +367,7 @@ class Inference(Judging):
         if not found and self.still is not None:
             plain = dict(self.still)
         keys = {*list(dict.fromkeys(c.key for c, *_ in starts))[:LEADERS], *(c.key for c, _ in ended[:ALSO_WITHOUT])}
-        begun = [(c, plain | c.own(b), None) for c, b, _ in starts if c.key in keys]
+        begun: list[Start] = [(c, plain | c.own(b), None) for c, b, _ in starts if c.key in keys]
         return begun + [(c, self.with_effect(plain, c, fit.point), None) for c, fit in ended[:ALSO_WITHOUT]]
 
     def screened(self, point: Point, floor: Floor, found: Sequence[Trial], most: float, led: Led | None = None):

@@ -4,7 +4,7 @@ import gc
 import sys
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 import warp as wp
@@ -151,7 +151,7 @@ class AdaptModule(FilmedModule):
 
     def fit_of(self, name: str) -> SceneFit:
         """The fit of a scene of this run."""
-        return self.fits[self._names.index(name)]
+        return cast(SceneFit, self.fits[self._names.index(name)])
 
     def _training_views(self, prepared: Prepared) -> list[int]:
         """The views that are trained on."""

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning.pytorch import LightningModule
@@ -102,7 +102,7 @@ class FilmedModule(LightningModule):
         if not hasattr(self, "_lpips_module"):
             opened = open_lpips(self.hparams.lpips_backbone, self.hparams.lpips_net, self.device)
             object.__setattr__(self, "_lpips_module", opened)  # no part of the checkpoint
-        return self._lpips_module
+        return cast(LPIPS | Absent, self._lpips_module)
 
     def _log(self, values: dict[str, Tensor | float]) -> None:
         if self._trainer is not None:

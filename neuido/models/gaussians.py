@@ -1,5 +1,6 @@
 """Gaussians as a body wears them: harmonics, 3DGS PLY files, and motion with the particles that carry them."""
 
+import functools
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -102,11 +103,9 @@ class Binding(NamedTuple):
 
     def average(self, values: Tensor) -> Tensor:
         """Weighted mean over the particles of each Gaussian: (..., P, m) -> (..., N, m)."""
-        index, total = self.index.to(values.device), None
-        for j, w in enumerate(self.weight.to(values).unbind(1)):
-            part = values.index_select(-2, index[:, j]) * w[:, None]
-            total = part if total is None else total + part
-        return total
+        index = self.index.to(values.device)
+        parts = (values.index_select(-2, index[:, j]) * w[:, None] for j, w in enumerate(self.weight.to(values).unbind(1)))
+        return functools.reduce(torch.add, parts)
 
 
 def bind(gaussians: Gaussians, x: Tensor, *, nearest: int = 10, reach: float = REACH) -> Binding:

@@ -260,11 +260,10 @@ class Assembly:
         count: int,
     ) -> Loop:
         """A loop for these launches; those that are captured are kept, the least recently used dropped first."""
-        if self._alone:
-            elasticity = elasticity.alone(self.a)
-            plasticity = None if plasticity is None else plasticity.alone(self.a)
-        own = element_loop.key(elasticity, plasticity, tables, fields, laws, count) if self.solver.graphs else None
-        loop = self.loops.pop(own, None) or Loop(self, elasticity, plasticity, tables, fields, laws, count, own is not None)
+        elastic: Law = elasticity.alone(self.a) if self._alone else elasticity
+        plastic: Law | None = plasticity.alone(self.a) if self._alone and plasticity is not None else plasticity
+        own = element_loop.key(elastic, plastic, tables, fields, laws, count) if self.solver.graphs else None
+        loop = self.loops.pop(own, None) or Loop(self, elastic, plastic, tables, fields, laws, count, own is not None)
         if own is not None:
             while len(self.loops) >= CAPACITY:
                 self.loops.pop(next(iter(self.loops)))

@@ -100,7 +100,7 @@ def shear_modulus(law: ElasticLaw) -> Tensor:
     scene = torch.arange(rows, dtype=torch.int32, device=like.device).repeat_interleave(6)
     tau = law(F.reshape(-1, 3, 3), Particles(scene, tuple(range(0, 6 * rows + 1, 6)))).reshape(rows, 3, 2, 3, 3)
     jump = tau[:, :, 0] - tau[:, :, 1]
-    return sum(jump[:, n, i, j] + jump[:, n, j, i] for n, (i, j) in enumerate(planes)) / (24 * h)
+    return torch.stack([jump[:, n, i, j] + jump[:, n, j, i] for n, (i, j) in enumerate(planes)]).sum(dim=0) / (24 * h)
 
 
 def hysteresis_spectrum(loss: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ deformation gradient of a trial one. Each has an engine form (`tensors`, `forwar
 """
 
 from collections.abc import Callable, Hashable, Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -147,7 +148,7 @@ class AutogradLaw(Law):
         """(row of the tensors, first particle, end)."""
         if self._scenes == 1:
             return [(0, 0, particles.offsets[-1])]
-        return [(s, *particles.offsets[s : s + 2]) for s in range(len(particles.offsets) - 1)]
+        return [(s, first, end) for s, (first, end) in enumerate(pairwise(particles.offsets))]
 
     def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
         with torch.no_grad():
