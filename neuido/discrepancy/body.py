@@ -21,8 +21,10 @@ from neuido.discrepancy.believed import CLASSICAL, classical
 from neuido.discrepancy.declared import declared
 from neuido.discrepancy.library import body_candidates, present
 from neuido.discrepancy.problem import Ask, Parameter, Point, Recording, Rows
-from neuido.discrepancy.rollouts import EVERY, SETTINGS, SOLVERS, BodyRollouts, Motions, load_kernels, substeps
+from neuido.discrepancy.rollouts import EVERY, SETTINGS, SOLVERS, BodyRollouts, Motions, substeps
 from neuido.errors import UserError, is_out_of_memory
+from neuido.physics import effect_kernels, law_kernels
+from neuido.physics.device import real_of
 from neuido.physics.effect_library import KNOTS
 from neuido.physics.meshing import follow
 from neuido.physics.threads import one_thread_each, pool
@@ -83,7 +85,6 @@ class BodyProblem(BodyRollouts):
         return rows
 
     def predict_several(self, asks: Sequence[Ask]) -> Rows:
-        load_kernels(self.device)
         with one_thread_each():  # what the host prepares for a launch is small too
             yield from (self._side_by_side if self.device == "cpu" else self._in_one_launch)(self._runs(asks))
 
@@ -308,7 +309,9 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
 
 @functools.cache
 def _workers() -> ThreadPoolExecutor:
-    """Threads for single scenes."""
+    """Threads for single scenes; what they launch is built before, for two threads must not build the same kernels."""
+    for build in (effect_kernels.build, law_kernels.kernels):
+        build(real_of(torch.float32))
     return pool()
 
 

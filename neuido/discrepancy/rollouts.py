@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
 from neuido.data.experiments import Experiment
@@ -22,8 +21,6 @@ from neuido.discrepancy.believed import laws_of
 from neuido.discrepancy.library import effects_of
 from neuido.discrepancy.problem import Point, Problem
 from neuido.errors import UserError
-from neuido.physics import effect_kernels, element_kernels, kernels, law_kernels
-from neuido.physics.device import load_together, real_of
 from neuido.physics.effects import Effects
 from neuido.physics.finite_elements import FiniteElements
 from neuido.physics.meshing import Mesh, mesh_body
@@ -417,16 +414,6 @@ def _against(point: dict[str, float], lift: np.ndarray) -> dict[str, float]:
     """A full point for a body that starts below a lift (3,) [m]: what has a place in space is below it too."""
     own = {f"position_force.{a}": d for a, d in zip("xyz", lift, strict=True)}
     return {name: value - own.get(name, 0.0) for name, value in point.items()} if lift.any() else point
-
-
-@functools.cache
-def load_kernels(device: str) -> None:
-    """Have what a diagnosis launches compiled and loaded, before threads that would each do so: all of it side by side."""
-    real = real_of(torch.float32)
-    built = [build(real) for build in (kernels.build, effect_kernels.build, element_kernels.build)]
-    laws = law_kernels.kernels(real)
-    own = [kernel for namespace in built for kernel in vars(namespace).values() if isinstance(kernel, wp.Kernel)]
-    load_together([*own, laws.stress, laws.correct], torch.device(device))
 
 
 def substeps(r: Measured, dt: float) -> tuple[int, int, bool]:

@@ -5,7 +5,7 @@ import ctypes
 import functools
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import warp as wp
@@ -107,19 +107,6 @@ def _contract(kernel: wp.Kernel) -> None:
         flags = wp.config.cpu_compiler_flags
         flags = "-march=native" if flags is None else flags
         wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast".strip()}, module=module)
-
-
-def load_together(kernels: Iterable[wp.Kernel], device: torch.device) -> None:
-    """Compile the modules of kernels for a device side by side, and load them there, before their first launches.
-
-    One after the other, as they are first launched, a GPU's take half a minute. What lies in the cache is only loaded.
-    """
-    modules = {}
-    for kernel in kernels:
-        _contract(kernel)
-        modules[kernel.module] = None
-    with _making:
-        wp.force_load(wp.device_from_torch(device), list(modules), max_workers=len(modules))
 
 
 def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:

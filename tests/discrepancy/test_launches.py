@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from neuido import physics
 from neuido.discrepancy import rollouts
 from neuido.discrepancy.body import BodyProblem, body_problem
 from neuido.discrepancy.rollouts import SETTINGS
@@ -56,18 +55,6 @@ def test_recordings_in_one_launch_move_as_alone(setting, device, experiment):
             alone = problem._moved(point, n, setting)
             torch.testing.assert_close(frames.x[:, s], alone.x[:, 0], atol=2e-5, rtol=0.0)
     assert float((problem._moved(POINTS[2], 0).x - problem._moved({"young": 6e4}, 0).x).abs().max()) > 1e-3
-
-
-def test_what_is_launched_was_loaded_before(experiment, monkeypatch):
-    loaded = set()
-    monkeypatch.setattr(rollouts, "load_together", lambda kernels, device: loaded.update(kernel.module for kernel in kernels))
-    rollouts.load_kernels.__wrapped__("cpu")
-    physics.device._commands.clear()
-    problem = body_problem(experiment)
-    for setting in (problem.solvers[0], problem.solvers[1]):
-        problem.predict(POINTS, 0, setting)
-    launched = {kernel.module for kernel, *_ in physics.device._commands}
-    assert launched and launched <= loaded
 
 
 def test_fibres_and_gradients_turn_with_the_body(experiment):

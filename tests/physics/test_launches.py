@@ -28,27 +28,6 @@ def add(factor: float, shift: int, twice: bool, box: wp.vec3i, x: wp.array(dtype
     out[i] = y
 
 
-@wp.kernel(module="neuido.tests.launches.first", enable_backward=False)
-def first(x: wp.array(dtype=float)):
-    x[wp.tid()] = 1.0
-
-
-@wp.kernel(module="neuido.tests.launches.second", enable_backward=False)
-def second(x: wp.array(dtype=float)):
-    x[wp.tid()] = 2.0
-
-
-def test_modules_are_loaded_side_by_side_as_a_launch_loads_them():
-    device.load_together([first, second, first], CPU)
-    loaded = [dict(kernel.module.execs) for kernel in (first, second)]
-    assert all(loaded)
-    x = torch.zeros(3)
-    for kernel, value in ((first, 1.0), (second, 2.0)):
-        device.launch(kernel, 3, [x], CPU)
-        assert torch.equal(x, torch.full((3,), value))
-    assert [dict(kernel.module.execs) for kernel in (first, second)] == loaded, "nothing was compiled again"
-
-
 def test_scalars_change_and_vectors_are_told_apart():
     x, out = torch.arange(5.0), torch.empty(5)
     for factor, shift, twice, first in [(1.0, 0, False, 0), (2.5, 3, True, 0), (1.0, 0, False, 7), (0.5, -2, True, 7)]:
