@@ -1038,6 +1038,26 @@ def test_what_leaves_as_much_as_grids_differ_by_is_not_named(monkeypatch):
     assert again.chosen is None and "another grid" in reason
 
 
+def test_what_is_behind_by_less_than_grids_differ_by_is_in_the_class():
+    """Only what fits the fitted recordings as well, with no more parameters, and where what is named leaves more than noise there."""
+    one = np.sin(40 * T)
+    inference = Inference(Mixed({"low": (one, one), "high": (np.sin(62 * T), one)}, {"low": 0.9}, rest=0.3 * np.sin(75 * T)))
+    start = inference.start()
+    first = inference.round(start.fit, start.floor, [])
+    other, fitted = next(t for t in first.trials if t.candidate.name == "high"), np.array(inference.fitted)
+    wide = {n: np.full_like(v, 0.4) for n, v in first.chosen.stand.floor.spread.items()}
+    top = replace(first.chosen, stand=replace(first.chosen.stand, floor=replace(first.chosen.stand.floor, spread=wide)))
+
+    def rival(share, left, of=top, candidate=other.candidate):
+        errors = np.where(fitted, share * of.errors, left**2)
+        return inference.is_rival(replace(other, candidate=candidate, gain=0.0, stand=replace(other.stand, errors=errors)), of)
+
+    assert rival(0.9, 0.35) and not rival(0.9, 0.45) and not rival(1.1, 0.35)
+    assert not rival(0.9, 0.35, candidate=replace(other.candidate, parameters=(other.candidate.parameters[0],) * 2))
+    noise = replace(top, stand=replace(top.stand, errors=np.where(fitted, inference.noise_squares, top.errors)))
+    assert not rival(0.9, 0.35, of=noise)
+
+
 def test_beside_a_fit_that_was_given_up_a_second_effect_is_looked_for_where_it_ends():
     shapes = {"low": np.sin(40 * T), "high": np.sin(62 * T)}
     inference = Inference(problem := Mixed({name: (s, s) for name, s in shapes.items()}, {"low": 0.9, "high": 0.3}))
