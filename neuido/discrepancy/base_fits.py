@@ -99,6 +99,8 @@ class BaseFits(Laboratory):
             begin = self.recentred(fit.point, floor) if turn else fit.point
             if turn >= AGAIN and begin == fit.point:
                 break
+            if turn and self.deadline.skips("the declared model again"):
+                break
             begins = [begin]
             if begin != fit.point and not asked:  # a modulus may have made up for where the floor is
                 begins.append({**begin, **self.as_declared})
