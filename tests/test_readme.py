@@ -213,14 +213,16 @@ def covering(of):
 
 def test_blind_tables_are_the_measured_ones():
     measured = blind(23)
-    quoted = {label.split(" (goal")[0]: cells for label, *cells in rows("Closed loop: blind cases")[:17]}
+    lines = rows("Closed loop: blind cases")
+    second = next(i for i, cells in enumerate(lines) if "seed 19" in cells)
+    quoted = {label.split(" (goal")[0]: cells for label, *cells in lines[:second]}
     for column, ablation in enumerate(("none", "no-discretisation", "single-recording", "plain-bic", "no-unknown", "take-smallest-error")):
         figures, of = measured[ablation]
         for label, figure in figures.items():
             assert quoted[label][column] == figure, (ablation, label)
         if column < 3:  # the others have no intervals
             assert quoted["90 % intervals that cover"][column] == covering([row for row in of if row["group"] in ("one", "two")])
-    together = {label: cells for label, *cells in rows("Closed loop: blind cases")[19:]}
+    together = {label: cells for label, *cells in lines[second + 2 :]}
     for column, seed in enumerate((19, 20, 21, 22, 23)):
         figures, of = blind(seed)["none"]
         figures["90 % intervals that cover"] = covering([row for row in of if row["group"] in ("one", "two")])

@@ -33,7 +33,7 @@ BROUGHT_BACK = 1.5
 """Ratio of a declared parameter to what the model states up to which it is as stated: what brings a base fit back there that is led away
 (`LED_AWAY`) need gain no more than `LEAST_GAIN`. Of 344 blind cases, 119 nulls among them, it changes one answer, to a right one."""
 GAIN_TO_NOISE = math.log(2.0)
-"""What it takes where noise alone is left: a candidate can take the place of what the grid does."""
+"""What it takes where noise alone is left, for a candidate can take the place of what the grid does; and of one that `stands_alone`."""
 SEEN = 0.1
 """Share of the noise, mean squares, that counts as above it where less is left."""
 WITHIN = 0.5
@@ -111,13 +111,17 @@ class Judging(Instead):
 
         Not where the effect brings what is fitted to the noise, or gains what one within the floor needs: there it does what no grid does.
         """
-        fitted = np.array(self.fitted)
-        out = ~fitted
-        if self.problem.settings == 1 or not out.any() or t.gain > GAIN_IN_FLOOR or self.is_noise(t.errors[fitted], fitted=True):
+        if t.gain > GAIN_IN_FLOOR or self.is_noise(t.errors[self.fitted], fitted=True):
             return False
-        spread = t.stand.floor.spread_squares(self.parts)[out]
         least, most = LIKE_A_GRID
-        return times_over(t.errors[out], spread) > least and times_over(before[out], spread) < most
+        return self.over_grids(t.errors, t) > least and self.over_grids(before, t) < most
+
+    def over_grids(self, errors: np.ndarray, at: Trial) -> float:
+        """Errors of what is held out over what grids differ by where a trial stands; NaN where nothing is held out, or there is no grid."""
+        out = ~np.array(self.fitted)
+        if self.problem.settings == 1 or not out.any():
+            return math.nan
+        return times_over(errors[out], at.stand.floor.spread_squares(self.parts)[out])
 
     def verdict(self, r: Round) -> str:
         """A line about what a round found."""
@@ -129,7 +133,7 @@ class Judging(Instead):
         return f"named: {left}" if r.chosen else f"nothing named: {left}"
 
     def least_gain(self, r: Round, t: Trial) -> float:
-        """The gain that an effect must bring: from the residual over the floor, what it leaves, and where it has the declared values."""
+        """The gain that an effect must bring, by the residual over the floor, what it and others leave, and where declared values go."""
         if self.problem.settings == 1:  # nothing is discretised: only chance is to be beaten
             return LEAST_GAIN_EXACT
         if self.is_noise(t.errors):  # whatever the floor, no error of the discretisation is in there
@@ -173,13 +177,10 @@ class Judging(Instead):
         With no more parameters it leaves no more of what is fitted, and the best one leaves more than noise there. Of 304 named steps of
         ten blind seeds that puts a further effect into two classes, in one of them the true one.
         """
-        fitted = np.array(self.fitted)
-        out = ~fitted
-        if self.problem.settings == 1 or not out.any() or self.is_noise(top.errors[fitted], fitted=True):
+        if self.is_noise(top.errors[self.fitted], fitted=True):
             return False
-        within = times_over(t.errors[out], top.stand.floor.spread_squares(self.parts)[out]) < 1.0
         few = len(t.candidate.size_parameters) <= len(top.candidate.size_parameters)
-        return within and few and self.fitted_score(t.errors) <= self.fitted_score(top.errors)
+        return few and self.fitted_score(t.errors) <= self.fitted_score(top.errors) and self.over_grids(t.errors, top) < 1.0
 
     def _why(self, t: Trial, top: Trial, result: Round) -> str:
         if result.chosen is None:

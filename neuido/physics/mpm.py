@@ -174,8 +174,11 @@ class Simulator:
             hold = torch.zeros(len(bx), dtype=torch.bool, device=self.device)
             for box in scene.clamps:
                 hold |= inside_box(bx, box, name="clamp")
-            for values, own in zip((x, v, mass, volume, held), (bx, bv, m, V, hold), strict=True):
-                values.append(own)
+            x.append(bx)
+            v.append(bv)
+            mass.append(m)
+            volume.append(V)
+            held.append(hold)
             C.append(affine_velocity(bx, bv))
             eye = torch.eye(3, dtype=torch.float64, device=self.device).expand(len(bx), 3, 3)
             F.append(eye if body.F is None else torch.as_tensor(body.F).to(self.device, torch.float64))

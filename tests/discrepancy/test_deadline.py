@@ -85,7 +85,7 @@ def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypa
         assert found.left_out == () and [t.candidate.name for t in found.effects] == ["drag_linear"]
         assert found.after["drag_linear.k"] == pytest.approx(3.0, rel=0.05)
     else:
-        assert "refining the best fits" in found.left_out
+        assert {"the declared model again", "refining the best fits"} <= set(found.left_out)
         assert len(found.effects) <= 1
         assert all(np.isfinite(found.intervals[name]).all() for name in found.intervals)
 
