@@ -92,10 +92,6 @@ def diagnose(
     if not any(work.iterdir()):  # a run that goes on keeps its log
         (target / "log.csv").unlink(missing_ok=True)
     log = Log(target / "log.csv", shown=progress, begun=begun)
-    if kind == "experiment":
-        from neuido.physics.loading import load_for_bodies
-
-        load_for_bodies(chosen)
     found: list[tuple[Diagnosis, float]] = []
     for i, problem in enumerate(problems):
         started = time.monotonic()
