@@ -17,6 +17,7 @@ from neuido.discrepancy.contests import LEADERS, MANY, Contest, better
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
+from neuido.discrepancy.instead import LED_AWAY
 from neuido.discrepancy.judging import WITHIN, Judging
 from neuido.discrepancy.laboratory import Tell
 from neuido.discrepancy.memo import Memo
@@ -74,6 +75,8 @@ class Look(NamedTuple):
     contest: Contest
     least: list[np.ndarray]
     """What the best of them leaves, mean squares of the parts; empty where nothing runs."""
+    grown: bool = False
+    """Whether some grew with the recordings."""
 
     @property
     def led(self) -> Led:
@@ -153,6 +156,13 @@ class Inference(Judging):
             best |= self.elsewhere(base, best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
             result = self.judge(empty, best, model)
             self.tell(self.verdict(result))
+        missed = again and result.chosen is None and not look.grown and self.is_led_away(base, result)
+        if missed and not self.deadline.skips("growing fits"):
+            with self.quickly(base.point, floor):
+                grown = list(self.growing(base, floor, candidates).values())
+            best |= self.ahead(grown, best, floor)
+            result = self.judge(empty, best, model)
+            self.tell(self.verdict(result))
         plain = self.without_effect(result, base, floor)
         if plain is not None:
             result = self.judge(replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain), best, model)
@@ -194,6 +204,10 @@ class Inference(Judging):
             stands += [Stand(f, *self.stand(f.point, like=floor)) for f, ok in zip(fits, self.which_run(ends), strict=True) if ok]
         found = [s for s in stands if score(s.errors) < here and self.fitted_score(s.errors) < as_well]
         return min(found, key=lambda s: score(s.errors), default=None)
+
+    def is_led_away(self, base: Fit, r: Round) -> bool:
+        """Whether the base fit leaves more than noise of what is fitted, at declared values far from those stated."""
+        return self.moved(base.point) > LED_AWAY and not self.is_noise(r.errors[self.fitted], fitted=True)
 
     def is_unexplained(self, r: Round) -> bool:
         """Whether the residual of a round's base is above what noise and discretisation would leave, by so much that it is not none."""
@@ -244,7 +258,7 @@ class Inference(Judging):
                 whole = self.wholly(free, further, floor, until)
                 contest = contest._replace(best={**contest.best, **better(whole, contest.best)})
                 left = self.left_by(contest.best, floor)
-        look = Look(base, asked, contest, left[:1])
+        look = Look(base, asked, contest, left[:1], bool(grown))
         if not found:
             self.seen = look
         return look

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neuido.discrepancy import contests, growing
+from neuido.discrepancy import contests, growing, rounds
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import Inference
@@ -85,6 +85,18 @@ def test_what_the_first_fits_bring_near_the_noise_does_not_grow(monkeypatch):
     monkeypatch.setattr(Inference, "growing", fail)
     found = diagnose(Swing({"a": 1.0, "wind.c": 1.0}), draws=39)
     assert [t.candidate.name for t in found.effects] == ["wind"]
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_where_nothing_is_named_from_a_base_that_is_led_away_fits_grow_at_last(together, monkeypatch):
+    monkeypatch.setattr(Inference, "leaves_much", lambda self, errors: False)  # as after first fits that came nearer
+    problem = Swing({"a": 1.2, "chirp.c": 20.0}, together=together)
+    monkeypatch.setattr(rounds, "LED_AWAY", 2.0)
+    assert not diagnose(problem, draws=39).effects
+    monkeypatch.setattr(rounds, "LED_AWAY", 1.1)
+    found = diagnose(problem, draws=39)
+    assert [t.candidate.name for t in found.effects] == ["chirp"]
+    assert found.after["chirp.c"] == pytest.approx(20.0, abs=0.1)
 
 
 @pytest.mark.parametrize("together", [True, False])

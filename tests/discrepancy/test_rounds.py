@@ -13,7 +13,7 @@ from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit, Race, levenberg_marquardt, run
 from neuido.discrepancy.intervals import intervals
-from neuido.discrepancy.judging import GAIN_IN_FLOOR, GAIN_TO_NOISE
+from neuido.discrepancy.judging import FORETELLS, GAIN_IN_FLOOR, GAIN_TO_NOISE
 from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import Inference, Look, Promising
@@ -175,6 +175,25 @@ def test_what_leads_all_others_by_far_need_not_pass_the_floor():
     assert takes(0.9, [0.2, -0.5]) == GAIN_TO_NOISE
     assert takes(0.9, [0.5]) == takes(0.9, [0.2], parameters=5) == takes(0.9, []) == GAIN_IN_FLOOR
     assert takes(0.9, [0.2], name="top") == GAIN_IN_FLOOR, "another form of the same effect is no other one"
+
+
+def test_what_alone_brings_the_fitted_recordings_to_the_noise_need_not_pass_the_floor():
+    inference = Inference(Line(lambda t: 3.0 * t))
+    start = inference.start()
+    within = choosing.unsearched(replace(start, errors=np.array([100.0, 36.0]) * NOISE**2), np.full(2, 400.0) * NOISE**2)
+
+    def takes(fitted, others, parameters=3, before=within):
+        def trial(squares, name):
+            candidate = SimpleNamespace(name=name, parameters=[None] * parameters, size_parameters=[None] * 3)
+            return SimpleNamespace(gain=0.0, candidate=candidate, errors=np.array([squares, 16.0]) * NOISE**2, fit=start.fit)
+
+        top = trial(fitted, "top")
+        return inference.least_gain(replace(before, trials=[top, *(trial(squares, "other") for squares in others)]), top)
+
+    assert takes(1.2, [20.0, 5.0]) == takes(1.2, []) == FORETELLS
+    assert takes(2.0, [20.0]) == takes(1.2, [20.0, 4.0]) == takes(1.2, [20.0], parameters=4) == GAIN_IN_FLOOR
+    less = replace(within, errors=np.array([15.0, 36.0]) * NOISE**2)
+    assert takes(1.2, [20.0], before=less) == GAIN_IN_FLOOR, "little was to be explained"
 
 
 def test_near_the_noise_a_gain_is_that_of_what_is_above_it(monkeypatch):
