@@ -76,6 +76,18 @@ def test_nothing_to_tell_apart(body):
     assert "Nothing" in next_experiment.summary(None)
 
 
+def test_rivals_that_a_longer_step_does_not_bear_are_told_apart_with_the_suggested_one(body):
+    quick = body.quick(0)
+    assert quick != 0
+    viscous = {"viscosity_shear.eta": 100.0}
+    while body.margin(viscous, quick) >= 0.0:
+        viscous = {name: 1.2 * eta for name, eta in viscous.items()}
+    assert body.margin(viscous) > 0.0
+    d = diagnosis(body, {"viscosity_shear": viscous, "drag_linear": {"drag_linear.k": 1.5}})
+    assert not np.isfinite(body.predict([viscous], 0, quick)).all()
+    assert next_experiment.propose(d)["tells_apart"] == ["viscosity_shear", "drag_linear"]
+
+
 def test_changes_do_what_they_say(body):
     r = body.measured[0]
     found = dict(next_experiment.changes(r, 1000.0))

@@ -196,6 +196,18 @@ def test_what_alone_brings_the_fitted_recordings_to_the_noise_need_not_pass_the_
     assert takes(1.2, [20.0], before=less) == GAIN_IN_FLOOR, "little was to be explained"
 
 
+@pytest.mark.parametrize(("together", "count"), [(True, 3), (False, 1)])
+def test_all_fits_are_measured_where_they_end_where_that_is_one_launch(together, count, monkeypatch):
+    monkeypatch.setattr(refining, "MEASURED", 1)
+    problem = Line(lambda t: 3.0 * t + 0.5 * np.sin(40.0 * t), together=together)
+    inference, seen = Inference(problem), []
+    start = inference.start()
+    monkeypatch.setattr(Inference, "foresee", lambda self, points, **_: seen.append(len(points)))
+    best = {c.key: (c, replace(start.fit, point={**start.fit.point, **c.starts[0]})) for c in problem.candidates[:3]}
+    inference.measured(best, start.floor)
+    assert seen == [count]
+
+
 def test_near_the_noise_a_gain_is_that_of_what_is_above_it(monkeypatch):
     inference = Inference(Line(lambda t: 3.0 * t + 2.0 * t**3))
 
