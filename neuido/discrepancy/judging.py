@@ -66,11 +66,11 @@ class Judging(Instead):
     draws: int
     """Of the bootstrap."""
 
-    def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel) -> Round:
-        """A round with the trials that fits make, and what is chosen of them."""
+    def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel, *, every: bool = False) -> Round:
+        """A round with the trials that fits make, and what is chosen of them; `every` as for `measured`."""
         errors = empty.errors
         trials = []
-        for (c, fit), stand in zip(best.values(), self.measured(best, empty.floor), strict=True):
+        for (c, fit), stand in zip(best.values(), self.measured(best, empty.floor, every=every), strict=True):
             trial = Trial(c, stand, self.gain(errors, stand.errors))
             trial.reason = unphysical(c, fit.point) if np.isfinite(stand.errors).all() else "not every recording runs where its fit ends"
             trials.append(trial)

@@ -21,8 +21,8 @@ NEARBY = 2.5
 BEYOND = 8.0
 """Times the error of what another solver named beyond which fits are not refined: that has gained up to 7-fold."""
 MEASURED, NEAR = 6, 4.0
-"""Fits whose errors are measured with the differences of the settings where they end: so many of the best, all where that is one launch,
-within this factor of their errors."""
+"""Fits whose errors are measured with the differences of the settings where they end: so many of the best, or all, within this factor of
+their errors."""
 ONWARD = 3
 """Further fits of a candidate, each with the differences of the settings where the last one ended: while each gains `SOME_GAIN` or has
 not come to its end."""
@@ -135,11 +135,11 @@ class Refining(Growing):
             out.append((ends[int(np.argmin(left))], owns[k]))
         return out
 
-    def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[Stand]:
+    def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor, *, every: bool = False) -> list[Stand]:
         """Each fit, in their order, with what it leaves by `floor`, or for the leading ones by that where they end, if it leaves less.
 
         What another grid does moves with the law: the differences at the base say little of it where a fit has gone far. By these the
-        truth of a blind case, a yield stress that grows with the rate, was behind twenty others and left 29 mm where it leaves 4.
+        truth of a blind case, a yield stress that grows with the rate, was behind twenty others. `every`: not the leading ones alone.
         """
         fits, points = [fit for _, fit in best.values()], [fit.point for _, fit in best.values()]
         squares: dict[int, np.ndarray] = {}
@@ -151,7 +151,7 @@ class Refining(Growing):
         if self.problem.settings == 1 or not points:
             return found
         order = sorted(range(len(points)), key=lambda i: score(found[i].errors))
-        order = order if self.problem.together else order[:MEASURED]
+        order = order if every else order[:MEASURED]
         limit = score(found[order[0]].errors) + 2.0 * math.log(NEAR)
         leading = [i for i in order if score(found[i].errors) < limit and not self.is_noise(found[i].errors)]
         self.foresee([points[i] for i in leading])

@@ -148,24 +148,30 @@ class Inference(Judging):
         model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)
         null, unfitted = model.null(errors, self.draws), look.contest.unfitted
         empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=null, unfitted=unfitted)
-        result = self.judge(empty, best, model)
+        every = self.problem.together
+        result = self.judge(empty, best, model, every=every)
         self.tell(self.verdict(result))
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
         again = first and result.chosen is None and (promising or result.over > 1.0)
         if again and not self.deadline.skips("fits from elsewhere"):
             best |= self.elsewhere(base, best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
-            result = self.judge(empty, best, model)
+            result = self.judge(empty, best, model, every=every)
+            self.tell(self.verdict(result))
+        if again and result.chosen is None and not every and not self.deadline.skips("measuring every fit where it ends"):
+            every = True
+            result = self.judge(empty, best, model, every=every)
             self.tell(self.verdict(result))
         missed = again and result.chosen is None and not look.grown and self.is_led_away(base, result)
         if missed and not self.deadline.skips("growing fits"):
             with self.quickly(base.point, floor):
                 grown = list(self.growing(base, floor, candidates).values())
             best |= self.ahead(grown, best, floor)
-            result = self.judge(empty, best, model)
+            result = self.judge(empty, best, model, every=every)
             self.tell(self.verdict(result))
         plain = self.without_effect(result, base, floor)
         if plain is not None:
-            result = self.judge(replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain), best, model)
+            weighed = replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain)
+            result = self.judge(weighed, best, model, every=every)
             self.tell(self.verdict(result))
         if not found:
             self.asked = result

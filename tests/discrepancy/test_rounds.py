@@ -196,16 +196,28 @@ def test_what_alone_brings_the_fitted_recordings_to_the_noise_need_not_pass_the_
     assert takes(1.2, [20.0], before=less) == GAIN_IN_FLOOR, "little was to be explained"
 
 
-@pytest.mark.parametrize(("together", "count"), [(True, 3), (False, 1)])
-def test_all_fits_are_measured_where_they_end_where_that_is_one_launch(together, count, monkeypatch):
+@pytest.mark.parametrize("every", [True, False])
+def test_all_fits_or_the_leading_ones_are_measured_where_they_end(every, monkeypatch):
     monkeypatch.setattr(refining, "MEASURED", 1)
-    problem = Line(lambda t: 3.0 * t + 0.5 * np.sin(40.0 * t), together=together)
+    problem = Line(lambda t: 3.0 * t + 0.5 * np.sin(40.0 * t))
     inference, seen = Inference(problem), []
     start = inference.start()
     monkeypatch.setattr(Inference, "foresee", lambda self, points, **_: seen.append(len(points)))
     best = {c.key: (c, replace(start.fit, point={**start.fit.point, **c.starts[0]})) for c in problem.candidates[:3]}
-    inference.measured(best, start.floor)
-    assert seen == [count]
+    inference.measured(best, start.floor, every=every)
+    assert seen == [3 if every else 1]
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_every_fit_is_measured_where_it_ends_before_nothing_is_named(together, monkeypatch):
+    """Side by side at once; where every point costs, once nothing was named among the leading ones."""
+    asked, judge = [], Inference.judge
+    monkeypatch.setattr(Inference, "judge", lambda self, *given, every=False: asked.append(every) or judge(self, *given, every=every))
+    problem = Line(lambda t: 3.0 * t + np.sin(40.0 * t), together=together)
+    inference = Inference(problem)
+    start = inference.start()
+    assert inference.round(start.fit, start.floor, []).chosen is None
+    assert asked[-1] and asked[0] is together
 
 
 def test_near_the_noise_a_gain_is_that_of_what_is_above_it(monkeypatch):
