@@ -29,18 +29,16 @@ GAIN_IN_FLOOR = math.log(4.0)
 EXACT = 1.05
 """Mean squares up to so many times those of the noise, and three deviations of their own, that one simulation alone leaves where no other
 grid has a part in the data."""
-FEW = 3
-"""Parameters of an effect, at the most, that is told by the fitted recordings alone (`FITS_ALONE`)."""
 BROUGHT_BACK = 1.5
 """Ratio of a declared parameter to what the model states up to which it is as stated: what brings a base fit back there that is led away
 (`LED_AWAY`) need gain no more than `LEAST_GAIN`. Of 344 blind cases, 119 nulls among them, it changes one answer, to a right one."""
 GAIN_TO_NOISE = math.log(2.0)
 """What it takes where noise alone is left, for a candidate can take the place of what the grid does; and of one that `stands_alone`."""
-FITS_ALONE, LEADS_BY = math.log(4.0), math.log(2.0)
-"""Gains in the fitted recordings, of the declared model and of every other effect, with which one of few parameters that leaves noise alone
-there is told by these: in a blind seed ten of eleven like that were named, all rightly, and nothing like it came up on its twenty nulls."""
+FIT_GAIN, FIT_LEAD, FEW = math.log(4.0), math.log(2.0), 3
+"""An effect is told by the fitted recordings where it leaves noise alone there, gains the first, leads every other by the second and has
+no more parameters than the third. In a blind seed ten of eleven like that were named, all rightly, and none came up on its twenty nulls."""
 FORETELLS = math.log(1.3)
-"""What it takes of the held-out recordings then."""
+"""What such a one must gain in what is held out."""
 SEEN = 0.1
 """Share of the noise, mean squares, that counts as above it where less is left."""
 WITHIN = 0.5
@@ -145,7 +143,7 @@ class Judging(Instead):
             return LEAST_GAIN_EXACT
         if self.is_noise(t.errors):  # whatever the floor, no error of the discretisation is in there
             return GAIN_TO_NOISE
-        if self.fits_alone(r, t):
+        if self.is_told_by_fit(r, t):
             return FORETELLS
         if self.moved(r.base) > LED_AWAY and self.moved(t.fit.point) < BROUGHT_BACK:
             return LEAST_GAIN
@@ -153,7 +151,7 @@ class Judging(Instead):
         at_least = float(np.interp(math.log(r.over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
         return min(at_least, GAIN_TO_NOISE) if stands_alone(r, t) else at_least
 
-    def fits_alone(self, r: Round, t: Trial) -> bool:
+    def is_told_by_fit(self, r: Round, t: Trial) -> bool:
         """Whether an effect of few parameters, and no other one by far, brings the fitted recordings from far above the noise down to it.
 
         What is held out may lie within what grids differ by all the same, for there their amounts are those of the fitted ones.
@@ -162,8 +160,8 @@ class Judging(Instead):
             return False
         here = self.fitted_score(t.errors)
         others = [self.fitted_score(o.errors) for o in r.trials if o.candidate.name != t.candidate.name]
-        by_far = not others or min(others) - here > 2.0 * LEADS_BY
-        return by_far and self.fitted_score(r.errors) - here > 2.0 * FITS_ALONE
+        by_far = not others or min(others) - here > 2.0 * FIT_LEAD
+        return by_far and self.fitted_score(r.errors) - here > 2.0 * FIT_GAIN
 
     def above_noise(self, before: np.ndarray, t: Trial) -> float:
         """The gain, that of the fitted recordings by what is above the noise: near it nothing lowers the whole of an error by much.
