@@ -75,15 +75,29 @@ def plan(cases: int, curves: int, seed: int, *, particles: int = 0, seconds: flo
 
 
 def make_one(name: str, seed: int, case: Case, folder: str, device: str) -> str:
-    """One case; a seed that gives none is followed by others."""
-    for attempt in range(ATTEMPTS):
-        out = Path(folder) / name
-        try:
-            make_undeclared(seed + 100_000 * attempt, str(out), case=case, device=device, progress=False)
-            return ""
-        except UserError as error:
-            reason = str(error)
+    """One case, or what failed; a seed that gives none is followed by others."""
+    reason = ""
+    try:
+        for attempt in range(ATTEMPTS):
+            try:
+                make_undeclared(seed + 100_000 * attempt, str(Path(folder) / name), case=case, device=device, progress=False)
+                return ""
+            except UserError as error:
+                reason = str(error)
+    except Exception as error:  # a GPU without memory, say: the other cases are made, and the same command makes this one
+        reason = f"{type(error).__name__}: {error}"
+    finally:
+        give_memory_back(device)
     return reason
+
+
+def give_memory_back(device: str) -> None:
+    """What a worker's last case left on a GPU: it would grow from case to case, and twenty workers fill a GPU."""
+    if device != "cpu":
+        import torch
+
+        gc.collect()
+        torch.cuda.empty_cache()
 
 
 def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: float = 0.0) -> str:
@@ -112,11 +126,7 @@ def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: flo
         (target / "failed.txt").write_text(f"{type(error).__name__}: {error}\n")
         return f"{type(error).__name__}: {error}"
     finally:
-        if device != "cpu":  # else a worker's memory grows from case to case, and twenty of them fill a GPU
-            import torch
-
-            gc.collect()
-            torch.cuda.empty_cache()
+        give_memory_back(device)
     (target / "failed.txt").unlink(missing_ok=True)
     return ""
 

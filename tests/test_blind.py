@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from neuido.data.undeclared import Case
+from neuido.errors import UserError
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 if not (FOLDER / "blind.py").is_file():
@@ -155,6 +156,18 @@ def test_plan_is_even():
 def case(tmp_path):
     assert blind.make_one("case-000", 1, Case(measured="track", kind="none"), str(tmp_path / "cases"), "cpu") == ""
     return tmp_path / "cases" / "case-000", tmp_path
+
+
+def test_a_case_whose_making_fails_leaves_the_others(tmp_path, monkeypatch):
+    seeds = []
+
+    def full(seed, *_, **__):
+        seeds.append(seed)
+        raise UserError("too little moves") if len(seeds) == 1 else RuntimeError("out of memory")
+
+    monkeypatch.setattr(blind, "make_undeclared", full)
+    assert blind.make_one("case-000", 7, Case(), str(tmp_path), "cpu") == "RuntimeError: out of memory"
+    assert seeds == [7, 100_007], "what is too little is drawn again, what fails is not"
 
 
 def test_from_a_case_to_its_score(case):
