@@ -212,8 +212,9 @@ class Inference(Judging):
         return min(found, key=lambda s: score(s.errors), default=None)
 
     def is_led_away(self, base: Fit, r: Round) -> bool:
-        """Whether the base fit leaves more than noise of what is fitted, at declared values far from those stated."""
-        return self.moved(base.point) > LED_AWAY and not self.is_noise(r.errors[self.fitted], fitted=True)
+        """Whether the base fit of a motion leaves more than noise of what is fitted, at declared values far from those stated."""
+        far = self.problem.settings > 1 and self.moved(base.point) > LED_AWAY
+        return far and not self.is_noise(r.errors[self.fitted], fitted=True)
 
     def is_unexplained(self, r: Round) -> bool:
         """Whether the residual of a round's base is above what noise and discretisation would leave, by so much that it is not none."""
