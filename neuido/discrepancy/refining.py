@@ -186,21 +186,25 @@ class Refining(Growing):
     ) -> dict[str, tuple[Candidate, Fit]]:
         """Ends of fits once more with the floor where they stand, those that leave least: candidates that then leave less than their best.
 
-        What another grid does there may be another thing than at the base, and by the weights of that the truth stays behind.
+        Any will do for one that has none. What another grid does there may be another thing than at the base, and by the weights of that
+        the truth stays behind.
         """
         ended = [entry for entry in ended if np.isfinite(entry[1].cost)]
         if self.problem.settings == 1 or not ended or self.deadline.over:
             return {}
+
+        def left_there(fit: Fit, there: Floor) -> float:
+            return score(self.mean_squares([fit.point], there, fitted=True)[0])
+
         with self.under(ended[0][1].setting):
             left = [score(squares) for squares in self.mean_squares([fit.point for _, fit in ended], floor)]
         out: dict[str, tuple[Candidate, Fit]] = {}
         ends = self.able([ended[i] for i in np.argsort(left)[:POLISHED]])
         made = self.from_here([((*self.problem.declared, *c.parameters), fit, [fit.point]) for c, fit in ends], floor)
         for (c, _), (further, own) in zip(ends, made, strict=True):
-            rival = (out.get(c.key) or best[c.key])[1]
-            there = self.stand(rival.point, like=floor, fitted=True)[0]
-            pairs = ((further, own), (rival, there))
-            mine, its = (score(self.mean_squares([end.point], f, fitted=True)[0]) for end, f in pairs)
-            if mine < its:
+            rival, its = out.get(c.key) or best.get(c.key), math.inf
+            if rival is not None:
+                its = left_there(rival[1], self.stand(rival[1].point, like=floor, fitted=True)[0])
+            if left_there(further, own) < its:
                 out[c.key] = (c, replace(further, cost=self.costs([further.point], floor)[0]))
         return out

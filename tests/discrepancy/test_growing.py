@@ -99,6 +99,21 @@ def test_where_nothing_is_named_from_a_base_that_is_led_away_fits_grow_at_last(t
     assert found.after["chirp.c"] == pytest.approx(20.0, abs=0.1)
 
 
+def test_what_had_no_first_fit_may_grow_at_last(monkeypatch):
+    """There may have been no time for it, or no hope by the directions at the base."""
+    contest = Inference.contest
+
+    def without_chirp(self, *given, **options):
+        fits = contest(self, *given, **options)
+        return fits._replace(best={key: fit for key, fit in fits.best.items() if key != "chirp"})
+
+    monkeypatch.setattr(Inference, "leaves_much", lambda self, errors: False)
+    monkeypatch.setattr(Inference, "contest", without_chirp)
+    monkeypatch.setattr(rounds, "LED_AWAY", 1.1)
+    found = diagnose(Swing({"a": 1.2, "chirp.c": 20.0}), draws=39)
+    assert [t.candidate.name for t in found.effects] == ["chirp"]
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_where_the_base_fit_is_astray_fits_grow_after_the_first(together, monkeypatch):
     """They set the pace of the others then; where these cost nothing, they come after all of them."""
