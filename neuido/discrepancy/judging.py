@@ -158,10 +158,9 @@ class Judging(Instead):
         """
         if all(self.fitted) or not self.is_noise(t.errors[self.fitted], fitted=True) or len(t.candidate.parameters) > FEW:
             return False
-        here = self.fitted_score(t.errors)
-        others = [self.fitted_score(o.errors) for o in r.trials if o.candidate.name != t.candidate.name]
-        by_far = not others or min(others) - here > 2.0 * FIT_LEAD
-        return by_far and self.fitted_score(r.errors) - here > 2.0 * FIT_GAIN
+        fitted = np.array(self.fitted)
+        leads = [evidence.ratio(o.errors, t.errors, fitted) for o in r.trials if o.candidate.name != t.candidate.name]
+        return min(leads, default=math.inf) > FIT_LEAD and evidence.ratio(r.errors, t.errors, fitted) > FIT_GAIN
 
     def above_noise(self, before: np.ndarray, t: Trial) -> float:
         """The gain, that of the fitted recordings by what is above the noise: near it nothing lowers the whole of an error by much.
