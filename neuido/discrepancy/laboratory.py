@@ -26,9 +26,6 @@ UNSEEN = 0.1
 """Largest share of the differences of the settings that lies outside their directions: what a fit weighs the data by, beside the noise."""
 ALIKE = 0.3
 """Share of what is left that a quick setting may differ by, so that a search there is for what is left."""
-SURE = 1.3
-"""Times a setting's step that must be stable for it to stand in for another one: a beam of a Poisson ratio of 0.494 failed at 1.15 in three
-recordings of five, and moved by itself in the others."""
 
 Tell = Callable[[str], None]
 
@@ -103,8 +100,8 @@ class Laboratory:
         return score(squares) < score(here) + 2.0 * math.log(ALIKE)
 
     def bears(self, point: Point, setting: int) -> bool:
-        """Whether a setting in place of the own one is `SURE` to run at a point."""
-        return setting == self.own or self.problem.margin(point, setting) >= math.log(SURE)
+        """Whether a setting is the own one, or sure to run at a point in its place."""
+        return setting == self.own or self.problem.bears(point, setting)
 
     def fits(
         self,

@@ -16,7 +16,6 @@ import torch
 
 from neuido.data.experiments import Recording as Measured
 from neuido.discrepancy.attribution import Diagnosis
-from neuido.discrepancy.laboratory import SURE
 from neuido.discrepancy.problem import Point, Problem
 from neuido.errors import UserError
 from neuido.types import AttachedMass, Body, Box
@@ -46,7 +45,8 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
     rivals = rivals_of(d)
     if len(rivals) < 2:
         return None
-    inner, setting = getattr(d.problem, "problem", d.problem), _setting(d, rivals)
+    inner, quick = getattr(d.problem, "problem", d.problem), d.problem.quick(d.setting)
+    setting = quick if all(d.problem.bears(r.point, quick) for r in rivals) else d.setting
     if hasattr(inner, "motion"):
         catalogue = _bodies(inner if inner.tracked else inner.as_tracked(), rivals[0].point, setting)
     elif hasattr(inner, "tests"):
@@ -78,12 +78,6 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
         "expected_log_odds": round(odds, 2),
         "others": [{"change": name, "expected_log_odds": round(odds, 2)} for odds, _, name in final[1:]],
     }
-
-
-def _setting(d: Diagnosis, rivals: Sequence[Rival]) -> int:
-    """What moves about as the setting of a diagnosis does, for less, where every rival is sure to run with it; else that one."""
-    quick = d.problem.quick(d.setting)
-    return quick if all(d.problem.margin(rival.point, quick) >= math.log(SURE) for rival in rivals) else d.setting
 
 
 def rivals_of(d: Diagnosis) -> list[Rival]:
