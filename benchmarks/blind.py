@@ -76,18 +76,16 @@ def plan(cases: int, curves: int, seed: int, *, particles: int = 0, seconds: flo
 
 def make_one(name: str, seed: int, case: Case, folder: str, device: str) -> str:
     """One case, or what failed; a seed that gives none is followed by others."""
-    reason = ""
-    try:
-        for attempt in range(ATTEMPTS):
-            try:
-                make_undeclared(seed + 100_000 * attempt, str(Path(folder) / name), case=case, device=device, progress=False)
-                return ""
-            except UserError as error:
-                reason = str(error)
-    except Exception as error:  # a GPU without memory, say: the other cases are made, and the same command makes this one
-        reason = f"{type(error).__name__}: {error}"
-    finally:
-        give_memory_back(device)
+    for attempt in range(ATTEMPTS):
+        try:
+            make_undeclared(seed + 100_000 * attempt, str(Path(folder) / name), case=case, device=device, progress=False)
+            return ""
+        except UserError as error:
+            reason = str(error)
+        except Exception as error:  # a GPU without memory, say: the other cases are made, and the same command makes this one
+            return f"{type(error).__name__}: {error}"
+        finally:
+            give_memory_back(device)
     return reason
 
 
