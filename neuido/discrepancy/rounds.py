@@ -149,30 +149,30 @@ class Inference(Judging):
         null, unfitted = model.null(errors, self.draws), look.contest.unfitted
         empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=null, unfitted=unfitted)
         every = self.problem.together
-        result = self.judge(empty, best, model, every=every)
-        self.tell(self.verdict(result))
+
+        def judged(step: Round) -> Round:
+            result = self.judge(step, best, model, every=every)
+            self.tell(self.verdict(result))
+            return result
+
+        result = judged(empty)
         promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
         again = first and result.chosen is None and (promising or result.over > 1.0)
         if again and not self.deadline.skips("fits from elsewhere"):
             best |= self.elsewhere(base, best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
-            result = self.judge(empty, best, model, every=every)
-            self.tell(self.verdict(result))
+            result = judged(empty)
         if again and result.chosen is None and not every and not self.deadline.skips("measuring every fit where it ends"):
             every = True
-            result = self.judge(empty, best, model, every=every)
-            self.tell(self.verdict(result))
+            result = judged(empty)
         missed = again and result.chosen is None and not look.grown and self.is_led_away(base, result)
         if missed and not self.deadline.skips("growing fits"):
             with self.quickly(base.point, floor):
                 grown = list(self.growing(base, floor, candidates).values())
             best |= self.ahead(grown, best, floor)
-            result = self.judge(empty, best, model, every=every)
-            self.tell(self.verdict(result))
+            result = judged(empty)
         plain = self.without_effect(result, base, floor)
         if plain is not None:
-            weighed = replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain)
-            result = self.judge(weighed, best, model, every=every)
-            self.tell(self.verdict(result))
+            result = judged(replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain))
         if not found:
             self.asked = result
         return result
