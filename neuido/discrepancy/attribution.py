@@ -146,7 +146,7 @@ def diagnose(
             break
         rounds.append(inference.round(at.fit, at.floor, found))
     others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
-    if 0 < len(found) < 3 and not hurried:
+    if len(found) < 3 and not hurried:
         by, pair = two_effects(inference, rounds, found, at, others)
         if by is not inference:
             inference, start = by, pair[0].plain or starts[tried.index(by)]

@@ -46,13 +46,21 @@ class BaseFits(Laboratory):
         return fit.point
 
     def grown(
-        self, entries: Sequence[tuple[Sequence[Parameter], Point]], floor: Floor, *, until: float = 1.0, reach: float = math.inf
+        self,
+        entries: Sequence[tuple[Sequence[Parameter], Point]],
+        floor: Floor,
+        *,
+        until: float = 1.0,
+        reach: float = math.inf,
+        most: int | None = None,
+        sizes: Sequence[Sequence[str]] = (),
     ) -> list[tuple[int, Fit]]:
         """Fits of parameters from points of the first horizon, side by side, to more of the recordings and at last to all of them.
 
         What a body does after it has bounced has many valleys, and what it does before has few: each horizon begins where the one before
-        it ended, near enough for the next bounce. What costs more than `reach` times the least at a horizon is given up; past the share
-        `until` of the time they are where they are. Each with its place among the entries.
+        it ended, near enough for the next bounce. What costs more than `reach` times the least at a horizon is given up, and all but the
+        `most` that cost least; past the share `until` of the time they are where they are. Each with its place among the entries.
+        `sizes`: of each entry, what begins smaller where its point does not run.
         """
         ended: list[tuple[int, Fit]] = []
         live = [(i, point) for i, (_, point) in enumerate(entries)]
@@ -60,10 +68,11 @@ class BaseFits(Laboratory):
             if not live or (ended and self.deadline.past(until)):
                 break
             options = {} if share == 1.0 else {"iterations": STEPWISE}
-            requests = [self.request(entries[i][0], point, until=until, **options) for i, point in live]
+            requests = [self.request(entries[i][0], point, until=until, sizes=sizes[i] if sizes else (), **options) for i, point in live]
             fits = self.fits(requests, self.early(floor, share))
             least = min(fit.cost for fit in fits)
             ended = [(i, fit) for (i, _), fit in zip(live, fits, strict=True) if fit.cost <= reach * least]
+            ended = sorted(ended, key=lambda entry: entry[1].cost)[:most]
             live = [(i, fit.point) for i, fit in ended]
         return ended
 

@@ -3,14 +3,15 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from neuido.discrepancy.base_fits import ELSEWHERE, HORIZONS
+from neuido.discrepancy.base_fits import ELSEWHERE, HORIZONS, STEPWISE
 from neuido.discrepancy.contests import IN_REACH, MANY, Contests
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
-from neuido.discrepancy.problem import Candidate, Point
+from neuido.discrepancy.problem import Candidate, Parameter, Point
 from neuido.discrepancy.trials import Trial, score
 
 ABOVE = 2.5
@@ -18,6 +19,17 @@ ABOVE = 2.5
 SIDE_BY_SIDE, ONE_BY_ONE = 8, 4
 """Candidates that grow, where a launch of several points costs as one, one of them of more than `MANY` parameters, and where every point
 costs, none of those."""
+FIRSTS, SECONDS, PAIRS = 10, 4, 12
+"""Candidates beside which a second one grows, how many beside each, and how many pairs go on past the second horizon."""
+FEW_FIRSTS, FEW_SECONDS, FEW_PAIRS, FEW = 5, 3, 4, 4
+"""The same where every point costs, and the most parameters of a candidate there."""
+
+
+class Pair(NamedTuple):
+    """Two effects that were fitted together."""
+
+    candidates: tuple[Candidate, Candidate]
+    fit: Fit
 
 
 class Growing(Contests):
@@ -46,22 +58,59 @@ class Growing(Contests):
         given up. One of many parameters grows where a launch of several points costs as one.
         """
         free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
-        at = None if found else self.begun
-        if at is None:
-            at = self.first_part(free, self.at_declared(base.point), floor)
-            if not found:
-                self.begun = at
-        wide = self.early(floor, HORIZONS[1])
-        ranked, _ = self.screen(at, candidates, wide, self.slopes(free, at, self.fitted_recordings))
-        starts: dict[str, tuple[Candidate, Point]] = {}
-        for _, c, _, begin in ranked:
-            starts.setdefault(c.key, (c, begin))
+        at = self.at_first(free, self.at_declared(base.point), floor, found)
+        starts = self.leading(at, candidates, self.early(floor, HORIZONS[1]), free)
         # where every point costs one of many parameters takes five times as long as the others together
-        large = [entry for entry in starts.values() if len(entry[0].parameters) > MANY][: 1 if self.problem.together else 0]
-        live = [entry for entry in starts.values() if entry in large or len(entry[0].parameters) <= MANY]
+        large = [entry for entry in starts if len(entry[0].parameters) > MANY][: 1 if self.problem.together else 0]
+        live = [entry for entry in starts if entry in large or len(entry[0].parameters) <= MANY]
         live = live[: SIDE_BY_SIDE if self.problem.together else ONE_BY_ONE]
         self.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
         entries = [((*free, *c.parameters), point) for c, point in live]
         ended = [(live[i][0], fit) for i, fit in self.grown(entries, floor, until=until, reach=IN_REACH)]
         costs = self.costs([fit.point for _, fit in ended], floor) if ended else []  # the time may have ended them at an earlier horizon
         return {c.key: (c, replace(fit, cost=cost)) for (c, fit), cost in zip(ended, costs, strict=True) if np.isfinite(cost)}
+
+    def growing_pairs(self, base: Point, floor: Floor) -> list[Pair]:
+        """Fits of two effects at once by growing horizons, the least cost first.
+
+        In the first part of the recordings many a single effect does about as well as the right ones, whichever they are; a little later
+        the second one shows beside it. What one effect alone leaves of the whole says little of that.
+        """
+        free = self.problem.declared
+        firsts_kept, seconds_kept, pairs_kept, most = FIRSTS, SECONDS, PAIRS, MANY
+        if not self.problem.together:
+            firsts_kept, seconds_kept, pairs_kept, most = FEW_FIRSTS, FEW_SECONDS, FEW_PAIRS, FEW
+        small = [c for c in self.problem.candidates if len(c.parameters) <= most]
+        wide = self.early(floor, HORIZONS[1])
+        firsts = self.leading(self.at_first(free, self.at_declared(base), floor), small, wide, free)[:firsts_kept]
+        self.tell(f"growing pairs beside {', '.join(c.key for c, _ in firsts)}")
+        requests = [self.request((*free, *c.parameters), point, iterations=STEPWISE) for c, point in firsts]
+        fits = self.fits(requests, self.early(floor, HORIZONS[0]))
+        begun: dict[frozenset[str], tuple[tuple[Candidate, Candidate], Point]] = {}
+        for (c, _), fit in zip(firsts, fits, strict=True):
+            if np.isfinite(fit.cost):
+                beside = [other for other in small if other.name != c.name]
+                for other, point in self.leading(fit.point, beside, wide, (*free, *c.parameters))[:seconds_kept]:
+                    begun.setdefault(frozenset((c.key, other.key)), ((c, other), point))
+        live = list(begun.values())
+        entries = [((*free, *c.parameters, *other.parameters), point) for (c, other), point in live]
+        sizes = [[p.name for p in other.size_parameters] if other.linear else [] for (_, other), _ in live]
+        ended = self.grown(entries, floor, reach=IN_REACH, most=pairs_kept, sizes=sizes)
+        made = [Pair(live[i][0], fit) for i, fit in ended if np.isfinite(fit.cost)]
+        return sorted(made, key=lambda pair: pair.fit.cost)
+
+    def at_first(self, free: Sequence[Parameter], point: Point, floor: Floor, found: Sequence[Trial] = ()) -> Point:
+        """`first_part`, which is kept where no effect was found yet."""
+        if found:
+            return self.first_part(free, point, floor)
+        if self.begun is None:
+            self.begun = self.first_part(free, point, floor)
+        return self.begun
+
+    def leading(self, at: Point, candidates: Sequence[Candidate], floor: Floor, free: Sequence[Parameter]) -> list[tuple[Candidate, Point]]:
+        """Candidates, those first that would take most off there past the free parameters, each with the start that does best."""
+        ranked, _ = self.screen(at, candidates, floor, self.slopes(free, at, self.fitted_recordings))
+        starts: dict[str, tuple[Candidate, Point]] = {}
+        for _, c, _, begin in ranked:
+            starts.setdefault(c.key, (c, begin))
+        return list(starts.values())

@@ -292,7 +292,8 @@ class Inference(Judging):
         candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most, led)
         hurried = self.deadline.past(until)
         chosen, begun = self.begin(base, floor, found, led, candidates, free, slopes, ranked, columns, hurried=hurried)
-        starts = [(c, self.with_effect(base.point, c, ends[c.key]), None) for c in candidates if c.key in chosen and c.key in ends] + begun
+        led_here = [c for c in candidates if c.key in chosen and c.key in ends]
+        starts = [(c, self.with_effect(base.point, c, ends[c.key], found), None) for c in led_here] + begun
         promise = {c.key: stays for stays, c, *_ in reversed(ranked)}
         if (first or found) and not hurried:
             starts, least = self.sized(starts, base, slopes, floor, until=until)
@@ -371,9 +372,10 @@ class Inference(Judging):
             starts += [(c, begin, None) for begin in self.strong(c, places, base.point, floor)]
         return chosen, starts
 
-    def with_effect(self, point: Point, c: Candidate, end: Point) -> Point:
-        """A point with a candidate's parameters, and the declared ones, of the end of another fit of it."""
-        return {**point, **{name: value for name, value in end.items() if name in self.as_declared}, **c.own(end)}
+    def with_effect(self, point: Point, c: Candidate, end: Point, found: Sequence[Trial] = ()) -> Point:
+        """A point with a candidate's parameters, the declared ones and those of what was found, of the end of another fit of it."""
+        names = {*self.as_declared, *(p.name for t in found for p in t.candidate.parameters)}
+        return {**point, **{name: value for name, value in end.items() if name in names}, **c.own(end)}
 
     def without_own(
         self, point: Point, starts: Sequence[Start], found: Sequence[Trial], ended: Sequence[tuple[Candidate, Fit]]

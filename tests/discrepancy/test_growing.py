@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neuido.discrepancy import contests, growing, rounds
+from neuido.discrepancy import contests, growing, pairs, rounds
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import Inference
@@ -15,16 +15,18 @@ NOISE = 0.02
 class Swing(Problem):
     """sin(40 sqrt(a) t) with what candidates do to it: `chirp` turns the phase as t^2, `wind` shifts all, `tide` shifts it in time.
 
-    Setting 1 has a wiggle more.
+    With `jerk` that turns the phase as t^3 too. Setting 1 has a wiggle more.
     """
 
-    def __init__(self, truth, *, together: bool = False, declared: float = 1.0) -> None:
+    def __init__(self, truth, *, together: bool = False, declared: float = 1.0, jerk: bool = False) -> None:
         chirp = Parameter("chirp.c", "1", 0.0, 0.3, -30.0, 30.0)
         wind = Parameter("wind.c", "1", 0.0, 0.3, -5.0, 5.0)
+        turn = Parameter("jerk.c", "1", 0.0, 0.3, -30.0, 30.0)
         tide = tuple(Parameter(f"tide.c{k}", "1", 0.0, 0.1, -5.0, 5.0) for k in range(6))
         candidates = (
             Candidate("chirp", (chirp,), ({chirp.name: 0.3},), "flight"),
             Candidate("wind", (wind,), ({wind.name: 0.3},), "flight"),
+            *((Candidate("jerk", (turn,), ({turn.name: 0.3},), "flight"),) if jerk else ()),
             Candidate("tide", tide, ({p.name: 0.1 for p in tide},), "flight"),
         )
         rng = np.random.default_rng(0)
@@ -46,7 +48,7 @@ class Swing(Problem):
 
 def swing(p, recording):
     start = 0.4 * recording
-    phase = start + 40 * np.sqrt(p.get("a", 1.0)) * T + p.get("chirp.c", 0.0) * T**2
+    phase = start + 40 * np.sqrt(p.get("a", 1.0)) * T + p.get("chirp.c", 0.0) * T**2 + p.get("jerk.c", 0.0) * T**3
     tide = sum(p.get(f"tide.c{k}", 0.0) * np.sin((k + 1) * 2.0 * T) for k in range(6))
     return np.sin(phase) + p.get("wind.c", 0.0) * T + tide
 
@@ -179,3 +181,41 @@ def test_growing_fits_end_with_the_time(over, horizons, monkeypatch):
     assert len(asked) == horizons
     for c, fit in grown.values():
         assert fit.cost == pytest.approx(inference.costs([fit.point], base.floor)[0]), c.key
+
+
+PAIR = {"a": 0.83, "chirp.c": -18.6, "jerk.c": -17.2}
+"""Two effects of which neither, alone, comes near to what they do together."""
+
+
+def test_two_effects_grow_together_where_neither_is_named_alone(monkeypatch):
+    problem = Swing(PAIR, together=True, jerk=True)
+    found = diagnose(problem, draws=39)
+    assert {t.candidate.name for t in found.effects} == {"chirp", "jerk"}
+    assert dict(found.after) == pytest.approx(PAIR, rel=0.02)
+    assert Inference(problem).is_noise(np.square(list(found.errors["after"].values())))
+    monkeypatch.setattr(pairs, "by_growing", lambda *_: None)
+    alone = diagnose(problem, draws=39)
+    assert alone.answer == "unknown" and not alone.effects
+
+
+def test_pairs_do_not_grow_where_every_point_costs_or_little_is_left(monkeypatch):
+    def fail(self, *_):
+        raise AssertionError
+
+    monkeypatch.setattr(Inference, "growing_pairs", fail)
+    assert diagnose(Swing(PAIR, jerk=True), draws=39).answer == "unknown"
+    found = diagnose(Swing({"a": 1.2, "chirp.c": 20.0}, together=True, jerk=True), draws=39)
+    assert [t.candidate.name for t in found.effects] == ["chirp"]
+
+
+def test_pairs_that_cost_least_go_on(monkeypatch):
+    monkeypatch.setattr(growing, "PAIRS", 2)
+    problem = Swing(PAIR, together=True, jerk=True)
+    inference = Inference(problem)
+    base = inference.start()
+    asked, fits = [], inference.fits
+    monkeypatch.setattr(inference, "fits", lambda requests, *args, **o: asked.append(len(requests)) or fits(requests, *args, **o))
+    made = inference.growing_pairs(base.fit.point, base.floor)
+    firsts, together, *later = asked
+    assert firsts == 3 and together == 3 and max(later) <= 2, "three small candidates and as many pairs, each once"
+    assert {c.name for c in made[0].candidates} == {"chirp", "jerk"} and made[0].fit.cost == min(pair.fit.cost for pair in made)
