@@ -15,7 +15,7 @@ from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.judging import ALPHA, WITHIN
 from neuido.discrepancy.laboratory import Tell
 from neuido.discrepancy.memo import Memo, Work
-from neuido.discrepancy.pairs import two_effects
+from neuido.discrepancy.pairs import by_growing, two_effects
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import UNEXPLAINED, Inference
 from neuido.discrepancy.trials import Round, Stand, Trial
@@ -128,7 +128,8 @@ def diagnose(
         inference.tell(f"solver: {problem.setting_name(inference.setting)}")
     at = start
     found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
-    hurried = False
+    others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
+    hurried, grown = False, None
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
         found.append(step)
@@ -142,12 +143,13 @@ def diagnose(
         at = inference.finished(step.stand)
         if settled or hurried or inference.is_noise(at.errors):
             break
+        if problem.together and len(found) == 1 and (grown := by_growing(inference, rounds[0], at, others)):
+            break
         if problem.settings > 1 and not inference.is_settled(at.errors) and inference.over(at) < FURTHER:
             break
         rounds.append(inference.round(at.fit, at.floor, found))
-    others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
     if len(found) < 3 and not hurried:
-        by, pair = two_effects(inference, rounds, found, at, others)
+        by, pair = grown or two_effects(inference, rounds, found, at, others)
         if by is not inference:
             inference, start = by, pair[0].plain or starts[tried.index(by)]
         if pair:

@@ -17,8 +17,9 @@ AGAIN, MOST_AGAIN = 2, 4
 while a parameter of the problem's own follows the amounts."""
 HORIZONS = (0.25, 0.4, 0.6, 0.8)
 """Shares of the time of the fitted recordings that a growing fit reads, one after the other, before all of it."""
-STEPWISE = 6
-"""Iterations at each of these, at the most."""
+STEPWISE, STEPWISE_ONE_BY_ONE = 6, 16
+"""Iterations at each of these, at the most; the second where every point costs, and an iteration is one point or two: of twelve pairs of
+effects that turn a phase six of them find four there, sixteen ten for a fifth more points."""
 ELSEWHERE = 1.0
 """Coordinates that the base fit stands apart from where the declared model fits the first horizon, to be taken for led astray."""
 ASTRAY = 1.05
@@ -36,13 +37,18 @@ class BaseFits(Laboratory):
             starts = [min(short, key=lambda f: f.cost).point]
         return self.fits([self.request(free, starts[0], **options)], floor)[0]
 
+    @property
+    def stepwise(self) -> int:
+        """Iterations at a horizon, at the most."""
+        return STEPWISE if self.problem.together else STEPWISE_ONE_BY_ONE
+
     def early(self, floor: Floor, share: float) -> Floor:
         """`Floor.early` of this problem."""
         return floor.early(self.problem, self.parts, share)
 
     def first_part(self, free: Sequence[Parameter], point: Point, floor: Floor) -> Point:
         """Where a fit of parameters from a point to the first horizon ends."""
-        (fit,) = self.fits([self.request(free, point, iterations=STEPWISE)], self.early(floor, HORIZONS[0]))
+        (fit,) = self.fits([self.request(free, point, iterations=self.stepwise)], self.early(floor, HORIZONS[0]))
         return fit.point
 
     def grown(
@@ -67,7 +73,7 @@ class BaseFits(Laboratory):
         for share in (*HORIZONS[1:], 1.0):
             if not live or (ended and self.deadline.past(until)):
                 break
-            options = {} if share == 1.0 else {"iterations": STEPWISE}
+            options = {} if share == 1.0 else {"iterations": self.stepwise}
             requests = [self.request(entries[i][0], point, until=until, sizes=sizes[i] if sizes else (), **options) for i, point in live]
             fits = self.fits(requests, self.early(floor, share))
             least = min(fit.cost for fit in fits)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neuido.discrepancy.base_fits import ELSEWHERE, HORIZONS, STEPWISE
+from neuido.discrepancy.base_fits import ELSEWHERE, HORIZONS
 from neuido.discrepancy.contests import IN_REACH, MANY, Contests
 from neuido.discrepancy.fit import Fit
 from neuido.discrepancy.floors import Floor
@@ -84,7 +84,7 @@ class Growing(Contests):
         wide = self.early(floor, HORIZONS[1])
         firsts = self.leading(self.at_first(free, self.at_declared(base), floor), small, wide, free)[:firsts_kept]
         self.tell(f"growing pairs beside {', '.join(c.key for c, _ in firsts)}")
-        requests = [self.request((*free, *c.parameters), point, iterations=STEPWISE) for c, point in firsts]
+        requests = [self.request((*free, *c.parameters), point, iterations=self.stepwise) for c, point in firsts]
         fits = self.fits(requests, self.early(floor, HORIZONS[0]))
         begun: dict[frozenset[str], tuple[tuple[Candidate, Candidate], Point]] = {}
         for (c, _), fit in zip(firsts, fits, strict=True):

@@ -86,7 +86,8 @@ class Instead(Refining):
     ) -> dict[str, tuple[Candidate, Fit]]:
         """Fits of the candidates that act on the data as the leading one does, from its fit, with the sizes that do as much.
 
-        A fit that started far from there may have been given up, and a class would lack one of its members.
+        A fit that started far from there may have been given up, and a class would lack one of its members. One of many parameters is
+        among them if the leading one is a limit of it and leaves more than noise.
         """
         top = leader(best)
         if top is None:
@@ -101,8 +102,10 @@ class Instead(Refining):
             return {}
         requests, of = [], []
         without = {k: v for k, v in fit.point.items() if k not in start}
+        enough = self.is_noise(self.mean_squares([fit.point], floor)[0])
         for c in candidates:
-            if c is lead or not c.linear or len(c.parameters) > MANY or not is_behind(c, best, fit):
+            wider = lead.name in LIMITS.get(c.name, ()) and not enough
+            if c is lead or not c.linear or not (wider or len(c.parameters) <= MANY) or not is_behind(c, best, fit):
                 continue
             for i, shape in enumerate(c.starts):
                 A = past(columns[c.key, i])

@@ -79,9 +79,19 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         far: float = 0.0,
         beside: Mapping[str, float] | None = None,
         takes: Sequence[str] = (),
+        saturates: bool = False,
     ):
         made = tuple(
-            Parameter(f"{name}.{key}", unit, 0.0 if not sizes or key in sizes.split() else starts[0][key], scale, low, high, log=log)
+            Parameter(
+                f"{name}.{key}",
+                unit,
+                0.0 if not sizes or key in sizes.split() else starts[0][key],
+                scale,
+                low,
+                high,
+                log=log,
+                saturates=saturates,
+            )
             for key, unit, scale, low, high, log in parameters
         )
         named = tuple({f"{name}.{k}": v for k, v in start.items()} for start in starts)
@@ -149,7 +159,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         rates = [0.02 / s.step, 0.2 / s.step]
         rate = ("rate", "1/s", 1.0, 1e-4 / s.step, 200 / s.step, True)
         for name in ("stick", "restitution"):
-            add(name, "contact", [{"rate": r} for r in rates], rate, sizes="rate", linear=False)
+            add(name, "contact", [{"rate": r} for r in rates], rate, sizes="rate", linear=False, saturates=True)
     if plastic == "identity":
         # at large yield stresses nothing flows and the slope is zero: the fit starts where something does
         starts = [{"inverse": 1.0 / (f * s.young)} for f in (0.2, 0.08, 0.03, 0.012)]

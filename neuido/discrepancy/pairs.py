@@ -27,6 +27,8 @@ BESIDE = 3
 """Members of a class beside which a second effect is looked for."""
 GROWN = 3
 """Pairs that grew together whose ends are weighed."""
+IN_TIME = 0.6
+"""Share of the search's time past which no pairs grow where every point costs: what is left is for what takes less."""
 IN_PLACE = 5
 """Effects that are fitted in the place of a first one beside the best that was tried beside it."""
 CLOSE = 2.5
@@ -86,9 +88,10 @@ def two_effects(
 ) -> tuple[Inference, list[Round]]:
     """Where more than noise is left: two effects, if any, as their rounds, and the method that they are found by.
 
-    Two that grow together come first, and are all that is tried where nothing was named. The other method comes before what else its own
-    has, for it need not be the right one: of nine pairs that five blind seeds missed, seven were looked for by the wrong one. What it
-    finds is taken where that leaves nothing but noise, or clearly less than its own. Where two were found already it alone is asked.
+    Two that grow together come first, unless that was tried before a second one was looked for (where a launch of several points costs as
+    one), and are all that is tried where nothing was named. The other method comes before what else its own has, for it need not be the
+    right one: of nine pairs that five blind seeds missed, seven were looked for by the wrong one. What it finds is taken where that leaves
+    nothing but noise, or clearly less than its own. Where two were found already it alone is asked.
 
     Args:
         inference: The one that named an effect.
@@ -97,7 +100,8 @@ def two_effects(
         at: Where these stand.
         others: The other methods, with their first rounds.
     """
-    grown = by_growing(inference, rounds[0], at, others) if len(found) < 2 else None
+    tried = bool(found) and inference.problem.together
+    grown = by_growing(inference, rounds[0], at, others) if len(found) < 2 and not tried else None
     if grown is not None or not found:
         return grown or (inference, [])
     elsewhere = by_another_method(others, inference, at, found, within=len(rounds) == 1)
@@ -112,7 +116,7 @@ def two_effects(
 
 
 def by_growing(inference: Inference, first: Round, at: Stand, others: Mapping[Inference, Round]) -> tuple[Inference, list[Round]] | None:
-    """Where much is left and a launch of several points costs as one: two effects that grew together, and the method they are found by.
+    """Where much is left: two effects that grew together, and the method that they are found by.
 
     The round of the second one begins where both ended, and says whether it is one. All methods are asked until two leave noise alone.
     Where nothing was named they are looked for if what is left is more than the discretisation, and must come down to that.
@@ -123,9 +127,9 @@ def by_growing(inference: Inference, first: Round, at: Stand, others: Mapping[In
     least = LEAST_GAIN if named else 2.0 * LEAST_GAIN
     made: list[tuple[Inference, list[Round]]] = []
     for method, own in {inference: first, **others}.items():
-        if not method.problem.together or not method.leaves_much([at.errors]):
+        if not method.leaves_much([at.errors]):
             continue
-        if method.deadline.skips("two effects that grow together"):
+        if method.deadline.skips("two effects that grow together", 1.0 if method.problem.together else IN_TIME):
             break
         with method.quickly(own.base, own.floor):
             pairs = method.growing_pairs(own.base, own.floor)[:GROWN]

@@ -35,11 +35,13 @@ class Parameter:
     """A typical step: relative where `log`, else in the unit."""
     lower: float
     upper: float
-    """Physical range, inclusive; a fit that ends at a bound of an effect counts as unphysical."""
+    """Physical range, inclusive; a fit that ends at a bound of an effect counts as unphysical, unless it `saturates`."""
     log: bool = False
     """The fit moves the logarithm."""
     prior: float | None = None
     """Standard deviation of a Gaussian prior about `value`, in the coordinate of the fit; none: flat."""
+    saturates: bool = False
+    """At its upper bound an effect does all that it can: a fit that ends there is physical."""
 
     def coordinate(self, value: float) -> float:
         """The coordinate of the fit, of order one for a typical change."""

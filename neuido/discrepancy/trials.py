@@ -130,7 +130,7 @@ def unphysical(c: Candidate, point: Point) -> str:
     """Why a fitted candidate cannot be: at the edge of its range, or zero; empty where it can."""
     for p in c.size_parameters:
         value = point[p.name]
-        for bound in (p.lower, p.upper):
+        for bound in (p.lower,) if p.saturates else (p.lower, p.upper):
             zero = abs(bound) < 1e-12
             if (zero and abs(value) < 1e-3 * p.scale and len(c.size_parameters) == 1 and not p.log) or (
                 not zero and abs(value - bound) < 1e-6 * abs(bound)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neuido.discrepancy import contests, growing, pairs, rounds
+from neuido.discrepancy import attribution, base_fits, contests, growing, pairs, rounds
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import Inference
@@ -198,14 +198,37 @@ def test_two_effects_grow_together_where_neither_is_named_alone(monkeypatch):
     assert alone.answer == "unknown" and not alone.effects
 
 
-def test_pairs_do_not_grow_where_every_point_costs_or_little_is_left(monkeypatch):
+def test_two_that_grow_together_take_the_place_of_one_that_was_named(monkeypatch):
+    truth = {"a": 1.23, "chirp.c": -17.0, "jerk.c": -17.6}
+    problem = Swing(truth, together=True, jerk=True)
+    found = diagnose(problem, draws=39)
+    assert {t.candidate.name for t in found.effects} == {"chirp", "jerk"}
+    monkeypatch.setattr(attribution, "by_growing", lambda *_: None)
+    assert [t.candidate.name for t in diagnose(problem, draws=39).effects] == ["chirp"]
+
+
+def test_pairs_do_not_grow_where_little_is_left_or_late(monkeypatch):
     def fail(self, *_):
         raise AssertionError
 
     monkeypatch.setattr(Inference, "growing_pairs", fail)
-    assert diagnose(Swing(PAIR, jerk=True), draws=39).answer == "unknown"
     found = diagnose(Swing({"a": 1.2, "chirp.c": 20.0}, together=True, jerk=True), draws=39)
     assert [t.candidate.name for t in found.effects] == ["chirp"]
+    monkeypatch.setattr(pairs, "IN_TIME", -1.0)
+    monkeypatch.setattr(base_fits, "STEPWISE_ONE_BY_ONE", 6)
+    late = diagnose(Swing(PAIR, jerk=True), draws=39, seconds=1e6)
+    assert late.answer == "unknown" and "two effects that grow together" in late.left_out
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_enough_iterations_at_a_horizon_follow_two_effects(together):
+    problem = Swing(PAIR, together=together, jerk=True)
+    inference = Inference(problem)
+    base = inference.start()
+    made = inference.growing_pairs({**base.fit.point, "a": 1.0}, base.floor)
+    assert {c.name for c in made[0].candidates} == {"chirp", "jerk"} and inference.is_noise(
+        inference.mean_squares([made[0].fit.point], base.floor)[0]
+    )
 
 
 def test_pairs_that_cost_least_go_on(monkeypatch):

@@ -13,11 +13,11 @@ from neuido.discrepancy.attribution import UNEXPLAINED, WITHIN, diagnose, drop
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit, Race, levenberg_marquardt, run
 from neuido.discrepancy.intervals import intervals
-from neuido.discrepancy.judging import FORETELLS, GAIN_IN_FLOOR, GAIN_TO_NOISE
+from neuido.discrepancy.judging import BACK_GAIN, FORETELLS, GAIN_AT_FLOOR, GAIN_IN_FLOOR, GAIN_TO_NOISE
 from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.rounds import Inference, Look, Promising
-from neuido.discrepancy.trials import Round, Stand, Trial
+from neuido.discrepancy.trials import Round, Stand, Trial, unphysical
 
 T = np.linspace(0.0, 1.0, 120)
 NOISE = 0.01
@@ -149,14 +149,24 @@ def test_what_brings_the_declared_values_back_need_not_pass_the_floor():
     start = inference.start()
     young = Parameter("young", "Pa", 1e5, 1.0, 1e3, 1e7, log=True)
     inference.problem.__dict__["declared"] = (young,)
-    r = choosing.unsearched(replace(start, errors=np.full(2, 100.0) * NOISE**2), np.full(2, 400.0) * NOISE**2)
 
-    def takes(base, there):
+    def takes(base, there, over=0.8):
+        r = choosing.unsearched(replace(start, errors=np.full(2, 100.0) * NOISE**2), np.full(2, 100.0) * (NOISE / over) ** 2)
         trial = SimpleNamespace(errors=np.full(2, 9.0) * NOISE**2, fit=SimpleNamespace(point={"young": there}))
         return inference.least_gain(replace(r, base={"young": base}), trial)
 
     assert takes(5e5, 8e4) == takes(2e4, 1.3e5) == LEAST_GAIN
-    assert takes(5e5, 2e5) == takes(2e5, 1e5) == pytest.approx(GAIN_IN_FLOOR)
+    assert takes(5e5, 2e5) == takes(2e5, 1e5) > GAIN_AT_FLOOR
+    assert takes(5e5, 8e4, over=1.2) == BACK_GAIN, "above the floor it is an effect, and says which"
+    assert takes(5e5, 8e4, over=0.4) == GAIN_IN_FLOOR, "well within it grids lead as far away"
+
+
+def test_what_does_all_that_it_can_at_a_bound_is_physical():
+    rate = Parameter("rate", "1/s", 1.0, 1.0, 1e-3, 1e5, log=True)
+    candidate = Candidate("restitution", (rate,), ({"rate": 1e2},), "contact")
+    dead = Candidate("restitution", (replace(rate, saturates=True),), ({"rate": 1e2},), "contact")
+    assert "edge" in unphysical(candidate, {"rate": 1e5}) and not unphysical(dead, {"rate": 1e5})
+    assert "edge" in unphysical(dead, {"rate": 1e-3})
 
 
 def test_what_leads_all_others_by_far_need_not_pass_the_floor():
@@ -583,6 +593,28 @@ def test_a_member_of_a_class_is_fitted_from_its_leader():
     assert inference.alike(problem.declared, best | more, candidates, {"low": 0, "high": 0}, columns, slopes, start.floor) == {}
 
 
+def test_what_the_leading_one_is_a_limit_of_is_fitted_from_it_where_that_leaves_more_than_noise(monkeypatch):
+    monkeypatch.setattr(instead, "MANY", 0)  # of too many parameters otherwise
+    monkeypatch.setitem(instead.LIMITS, "high", ("low",))
+    problem = Tones(lambda t: 3.0 * t + 0.5 * np.sin(40 * t), "low", "high")
+    problem.__dict__["candidates"] = tuple(c for c in problem.candidates if c.name in ("low", "high"))
+    inference = Inference(problem)
+    start = inference.start()
+    low, high = problem.candidates
+    columns, slopes = inference.columns(start.fit.point, (low, high), [0]), inference.slopes(problem.declared, start.fit.point, [0])
+    columns["high", 0] = columns["low", 0]
+    monkeypatch.setattr(instead, "leader", lambda best: best["low"])
+
+    def asked(size):
+        (cost,) = inference.costs([point := {"a": 3.0, "low.c": size}], start.floor)
+        fit = Fit(point, ("a", "low.c"), cost, np.zeros(1), 1, True)
+        return list(inference.alike(problem.declared, {"low": (low, fit)}, (low, high), {"low": 0}, columns, slopes, start.floor))
+
+    assert asked(0.4) == ["high"] and asked(0.5) == []
+    monkeypatch.setitem(instead.LIMITS, "high", ())
+    assert asked(0.4) == []
+
+
 class Tuned(Line):
     """A tone whose pitch goes with `a`, and one that stays and stands in for it where `a` is 3."""
 
@@ -854,6 +886,7 @@ def names(found):
 
 def test_what_fits_alone_and_foretells_nothing_is_tried_with_a_second_effect(monkeypatch):
     """In the fitted recording one tone stands for both effects; in the other one they go apart."""
+    monkeypatch.setattr(Inference, "growing_pairs", lambda *_: [])  # they would find them before
     one, two, three = (np.sin(w * T) for w in (40, 62, 87))
     shapes = {"low": (one, one), "high": (0.9 * one + 0.3 * two, -three)}
     problem = Mixed(shapes, {"low": 0.5, "high": 0.5})
@@ -873,6 +906,7 @@ def test_what_fits_alone_and_foretells_nothing_is_tried_with_a_second_effect(mon
 
 def test_a_second_effect_is_looked_for_beside_each_member_of_a_class(monkeypatch):
     """`mix` comes nearest alone, and is neither of the two effects that are there."""
+    monkeypatch.setattr(Inference, "growing_pairs", lambda *_: [])  # they would find them before
     one, two, three = (np.sin(w * T) for w in (40, 62, 87))
     shapes = {"low": one, "high": two, "mix": 0.9 * one + 0.2 * two + 0.15 * three}
     problem = Mixed({name: (shape, shape) for name, shape in shapes.items()}, {"low": 0.9, "high": 0.3})
@@ -901,6 +935,7 @@ def test_a_neighbour_takes_the_place_of_an_effect_once_the_other_one_was_found(m
 
 def test_what_fits_beside_the_wrong_effect_is_tried_beside_the_others(monkeypatch):
     """`mix` leads alone, and `high` fits beside it but foretells nothing: it belongs beside `low`."""
+    monkeypatch.setattr(Inference, "growing_pairs", lambda *_: [])  # they would find them before
     one, two, three = (np.sin(w * T) for w in (40, 62, 87))
     shapes = {"low": (one, one), "high": (two, two), "mix": (one + 0.3 * two, 0.8 * one + 0.45 * two - 0.25 * three)}
     problem = Mixed(shapes, {"low": 0.9, "high": 0.4})
@@ -1040,6 +1075,7 @@ def test_what_another_method_names_with_as_much_left_is_in_the_class(unnamed):
 
 
 def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
+    monkeypatch.setattr(Inference, "growing_pairs", lambda *_: [])  # they would find them before
     real = choosing.first_rounds
 
     def other_one(tried, starts):
