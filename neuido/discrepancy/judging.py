@@ -35,7 +35,8 @@ BROUGHT_BACK = 1.5
 changed one answer, to a right one. Well within the floor it needs what all need there: grids led one null's base fit 36-fold away."""
 BACK_GAIN = math.log(1.4)
 GAIN_TO_NOISE = math.log(2.0)
-"""What it takes where noise alone is left, for a candidate can take the place of what the grid does; and of one that `stands_alone`."""
+"""What it takes where noise alone is left, for a candidate can take the place of what the grid does; of one that `stands_alone`; and above
+the floor where the base fit is led away, as none of 40 nulls' was."""
 FIT_GAIN, FIT_LEAD, FEW = math.log(4.0), math.log(2.0), 3
 """An effect is told by the fitted recordings where it leaves noise alone there, gains the first, leads every other by the second and has
 no more parameters than the third. In a blind seed ten of eleven like that were named, all rightly, and none came up on its twenty nulls."""
@@ -151,7 +152,8 @@ class Judging(Instead):
             return BACK_GAIN if r.over > 1.0 else LEAST_GAIN
         steps = [math.log(WITHIN), 0.0, math.log(1.5)]
         at_least = float(np.interp(math.log(r.over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
-        return min(at_least, GAIN_TO_NOISE) if stands_alone(r, t) else at_least
+        sure = stands_alone(r, t) or (r.over > 1.0 and self.moved(r.base) > LED_AWAY)
+        return min(at_least, GAIN_TO_NOISE) if sure else at_least
 
     def is_told_by_fit(self, r: Round, t: Trial) -> bool:
         """Whether an effect of few parameters, and no other one by far, brings the fitted recordings from far above the noise down to it.

@@ -158,6 +158,7 @@ def test_what_brings_the_declared_values_back_need_not_pass_the_floor():
     assert takes(5e5, 8e4) == takes(2e4, 1.3e5) == LEAST_GAIN
     assert takes(5e5, 2e5) == takes(2e5, 1e5) > GAIN_AT_FLOOR
     assert takes(5e5, 8e4, over=1.2) == BACK_GAIN, "above the floor it is an effect, and says which"
+    assert takes(5e5, 2e5, over=1.1) == GAIN_TO_NOISE < takes(2e5, 1e5, over=1.1), "or that it is one"
     assert takes(5e5, 8e4, over=0.4) == GAIN_IN_FLOOR, "well within it grids lead as far away"
 
 
