@@ -242,6 +242,7 @@ def test_what_naming_takes_is_what_the_code_asks():
         judging.GAIN_IN_FLOOR,
         judging.GAIN_TO_NOISE,
         LEAST_GAIN,
+        judging.BACK_GAIN,
         judging.FORETELLS,
         judging.LEAST_GAIN_EXACT,
     ]
