@@ -33,10 +33,11 @@ def told_exactly(inference: Inference, start: Stand) -> bool:
     """Whether a method names an effect with which one simulation leaves nothing but noise: no other one is asked then.
 
     Looked for where the residual is above the floor, and the first fits come down to noise; `first_rounds` takes the round that it took.
+    Where every point costs, none grow before the other method was asked: by the wrong one all leave much.
     """
     if inference.problem.settings == 1 or inference.over(start) < EARLY:
         return False
-    look = inference.look(start.fit, start.floor, until=LOOKS[0])
+    look = inference.look(start.fit, start.floor, until=LOOKS[0], grows=inference.problem.together)
     if not look.least or not inference.is_noise(look.least[0]):
         return False
     first = inference.round(start.fit, start.floor, [])
@@ -124,14 +125,16 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     Asked of another one where the first in the order promises an effect, or its residual is above the floor, and its fits leave more than
     what may be noise once it is refined: what a method leaves of the declared model says little of how well it fits with the effect, and
     to refine by the wrong one takes long. By another one those are fitted that led by the first, from where their fits ended too, and the
-    few that its own directions add.
+    few that its own directions add. Where every point costs, fits grow after these alone, by the method that leaves least, and by the
+    others while that leaves much.
     """
     first, *others = order
+    at_once = tried[first].problem.together
     limit = score(starts[first].errors) + handicap[first] + 2.0 * math.log(WORSE)
     others = [i for i in others if at_best(tried[i], starts[i]) + handicap[i] <= limit]
     if not others:
         return {}
-    look = tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0])
+    look = tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0], grows=at_once)
     least = min([*look.least, starts[first].errors], key=score)
     if tried[first].gain(starts[first].errors, least) < LEAST_GAIN and tried[first].over(starts[first]) < 1.0:
         return {}
@@ -142,6 +145,11 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
         if tried[i].deadline.skips("first fits by the other method", LOOKS[1]):
             break
         beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
-        there = tried[i].look(starts[i].fit, starts[i].floor, led=look.led, beyond=beyond, until=LOOKS[1])
+        there = tried[i].look(starts[i].fit, starts[i].floor, led=look.led, beyond=beyond, until=LOOKS[1], grows=at_once)
         left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
+    for i in [] if at_once else sorted(left, key=lambda i: left[i]):
+        there = tried[i].look(starts[i].fit, starts[i].floor, until=LOOKS[1])
+        left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
+        if not tried[i].leaves_much(there.least):
+            break
     return left

@@ -231,13 +231,17 @@ class Inference(Judging):
         most: float = math.inf,
         beyond: float = math.inf,
         until: float = 1.0,
+        grows: bool = True,
     ) -> Look:
         """Screen the candidates, and fit the best; arguments as those of `round`. A base that was looked at last is not looked at again.
 
         `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
-        which there are no others; `until`: share of the search's time past which there are none.
+        which there are no others; `until`: share of the search's time past which there are none; `grows`: whether fits grow where these
+        leave much, in a base that was looked at without as well.
         """
         if not found and self.seen is not None and self.seen.base is base:
+            if grows and not self.seen.grown:
+                self.seen = self.grown_on(self.seen, floor, until)
             return self.seen
         with self.quickly(base.point, floor):
             asked = self.promising(base, floor, found, led, most=most, until=until)
@@ -251,7 +255,8 @@ class Inference(Judging):
             grown: list[tuple[Candidate, Fit]] = []
 
             def grow(remains: Sequence[np.ndarray]) -> Sequence[tuple[Candidate, Fit]]:
-                if len(found) < 2 and not grown and self.leaves_much(remains) and not self.deadline.skips("growing fits", until):
+                able = grows and len(found) < 2 and not grown
+                if able and self.leaves_much(remains) and not self.deadline.skips("growing fits", until):
                     grown.extend(self.growing(base, floor, candidates, found, until=until).values())
                     return grown
                 return ()
@@ -261,14 +266,29 @@ class Inference(Judging):
 
             contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until, between=between)
             left = self.left_by(contest.best, floor)
-            if further := grow(left[:1]):
-                whole = self.wholly(free, further, floor, until)
-                contest = contest._replace(best={**contest.best, **better(whole, contest.best)})
-                left = self.left_by(contest.best, floor)
+            further = grow(left[:1])
         look = Look(base, asked, contest, left[:1], bool(grown))
+        if further:
+            look = self.with_grown(look, further, floor, until)
         if not found:
             self.seen = look
         return look
+
+    def grown_on(self, look: Look, floor: Floor, until: float) -> Look:
+        """A look for a first effect with fits that grow, where its own leave much."""
+        if not self.leaves_much(look.least) or self.deadline.skips("growing fits", until):
+            return look
+        with self.quickly(look.base.point, floor):
+            further = list(self.growing(look.base, floor, look.asked.candidates, until=until).values())
+        return self.with_grown(look, further, floor, until)
+
+    def with_grown(self, look: Look, further: Sequence[tuple[Candidate, Fit]], floor: Floor, until: float) -> Look:
+        """A look with fits that grew, once more under the own setting."""
+        with self.quickly(look.base.point, floor):
+            whole = self.wholly(look.asked.free, further, floor, until)
+            best = {**look.contest.best, **better(whole, look.contest.best)}
+            left = self.left_by(best, floor)
+        return look._replace(contest=look.contest._replace(best=best), least=left[:1], grown=True)
 
     def left_by(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[np.ndarray]:
         """What the fits under the own setting leave, mean squares of the parts, the least first."""

@@ -242,3 +242,16 @@ def test_pairs_that_cost_least_go_on(monkeypatch):
     firsts, together, *later = asked
     assert firsts == 3 and together == 3 and max(later) <= 2, "three small candidates and as many pairs, each once"
     assert {c.name for c in made[0].candidates} == {"chirp", "jerk"} and made[0].fit.cost == min(pair.fit.cost for pair in made)
+
+
+def test_a_base_that_was_looked_at_without_growing_fits_grows_once_when_it_is_asked_again(monkeypatch):
+    inference = Inference(Swing({"a": 1.2, "chirp.c": 20.0}))
+    base = inference.start()
+    grown, grow = [], Inference.growing
+    monkeypatch.setattr(Inference, "growing", lambda self, *args, **o: grown.append(1) or grow(self, *args, **o))
+    first = inference.look(base.fit, base.floor, grows=False)
+    assert not first.grown and not grown and not inference.is_noise(first.least[0])
+    again = inference.look(base.fit, base.floor)
+    assert again.grown and grown == [1] and inference.is_noise(again.least[0])
+    assert again.contest.best["chirp"][1].point["chirp.c"] == pytest.approx(20.0, abs=0.2)
+    assert inference.look(base.fit, base.floor) is again

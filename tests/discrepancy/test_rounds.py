@@ -74,13 +74,15 @@ def clipped(t):
 class Method:
     """A method of prediction as `first_rounds` asks it: nothing that it leaves is noise alone, and each of its rounds is `result`."""
 
+    problem = SimpleNamespace(together=True)
+
     def __init__(self, result=None):
         self.result, self.deadline, self.asked, self.seen = result, Deadline(), None, None
 
     def is_noise(self, errors):
         return False
 
-    def look(self, fit, floor, led=None, beyond=np.inf, until=1.0):
+    def look(self, fit, floor, led=None, beyond=np.inf, until=1.0, grows=True):
         return SimpleNamespace(least=[])
 
     def gain(self, before, after):
@@ -1400,7 +1402,7 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, over, th
         def over(self, at):
             return over
 
-        def look(self, fit, floor, led=None, beyond=np.inf, until=1.0):
+        def look(self, fit, floor, led=None, beyond=np.inf, until=1.0, grows=True):
             asked.append(led)
             return SimpleNamespace(least=[np.full(2, self.result**2)], led=self.result)
 
@@ -1414,6 +1416,36 @@ def test_the_method_whose_first_fits_leave_least_is_refined_first(left, over, th
     asked.clear()
     far = 2.0 * np.log(pairs.WORSE) + 0.1
     assert choosing.by_first_fits(methods, starts, [0, 1], [0.0, far]) == {} and not asked
+
+
+@pytest.mark.parametrize(
+    ("together", "left", "there", "looks"),
+    [
+        (True, 0.5, 0.2, [(0.5, True), (0.2, True)]),
+        (False, 0.5, 0.2, [(0.5, False), (0.2, False), (0.2, True), (0.5, True)]),
+        (False, 0.2, 0.5, [(0.2, False), (0.5, False), (0.2, True), (0.5, True)]),
+        (False, 0.5, 0.02, [(0.5, False), (0.02, False), (0.02, True)]),
+    ],
+)
+def test_where_every_point_costs_fits_grow_after_both_methods_were_asked(together, left, there, looks):
+    """By the one that leaves least, and by the other one while that leaves much."""
+    asked = []
+
+    class Looking(Method):
+        problem = SimpleNamespace(together=together)
+
+        def over(self, at):
+            return 1.5
+
+        def leaves_much(self, errors):
+            return errors[0][0] > 0.03**2
+
+        def look(self, fit, floor, led=None, beyond=np.inf, until=1.0, grows=True):
+            asked.append((self.result, grows))
+            return SimpleNamespace(least=[np.full(2, self.result**2)], led=None)
+
+    choosing.by_first_fits([Looking(left), Looking(there)], [stood(1.0)] * 2, [0, 1], [0.0, 0.1])
+    assert asked == looks
 
 
 @pytest.mark.parametrize("together", [True, False])
