@@ -19,10 +19,23 @@ ABOVE = 2.5
 SIDE_BY_SIDE, ONE_BY_ONE = 8, 4
 """Candidates that grow, where a launch of several points costs as one, one of them of more than `MANY` parameters, and where every point
 costs, none of those."""
-FIRSTS, SECONDS, PAIRS = 10, 4, 12
-"""Candidates beside which a second one grows, how many beside each, and how many pairs go on past the second horizon."""
-FEW_FIRSTS, FEW_SECONDS, FEW_PAIRS, FEW = 5, 3, 4, 4
-"""The same where every point costs, and the most parameters of a candidate there."""
+
+
+class Breadth(NamedTuple):
+    """How many pairs of effects grow."""
+
+    firsts: int
+    """Candidates beside which a second one grows."""
+    seconds: int
+    """Beside each of these."""
+    pairs: int
+    """That go on past the second horizon."""
+    parameters: int
+    """Of a candidate, at the most."""
+
+
+PAIRS, PAIRS_ONE_BY_ONE = Breadth(10, 4, 12, MANY), Breadth(5, 3, 4, 4)
+"""Where a launch of several points costs as one, and where every point costs."""
 
 
 class Pair(NamedTuple):
@@ -76,13 +89,10 @@ class Growing(Contests):
         In the first part of the recordings many a single effect does about as well as the right ones, whichever they are; a little later
         the second one shows beside it. What one effect alone leaves of the whole says little of that.
         """
-        free = self.problem.declared
-        firsts_kept, seconds_kept, pairs_kept, most = FIRSTS, SECONDS, PAIRS, MANY
-        if not self.problem.together:
-            firsts_kept, seconds_kept, pairs_kept, most = FEW_FIRSTS, FEW_SECONDS, FEW_PAIRS, FEW
-        small = [c for c in self.problem.candidates if len(c.parameters) <= most]
+        free, breadth = self.problem.declared, PAIRS if self.problem.together else PAIRS_ONE_BY_ONE
+        small = [c for c in self.problem.candidates if len(c.parameters) <= breadth.parameters]
         wide = self.early(floor, HORIZONS[1])
-        firsts = self.leading(self.at_first(free, self.at_declared(base), floor), small, wide, free)[:firsts_kept]
+        firsts = self.leading(self.at_first(free, self.at_declared(base), floor), small, wide, free)[: breadth.firsts]
         self.tell(f"growing pairs beside {', '.join(c.key for c, _ in firsts)}")
         requests = [self.request((*free, *c.parameters), point, iterations=self.stepwise) for c, point in firsts]
         fits = self.fits(requests, self.early(floor, HORIZONS[0]))
@@ -90,12 +100,12 @@ class Growing(Contests):
         for (c, _), fit in zip(firsts, fits, strict=True):
             if np.isfinite(fit.cost):
                 beside = [other for other in small if other.name != c.name]
-                for other, point in self.leading(fit.point, beside, wide, (*free, *c.parameters))[:seconds_kept]:
+                for other, point in self.leading(fit.point, beside, wide, (*free, *c.parameters))[: breadth.seconds]:
                     begun.setdefault(frozenset((c.key, other.key)), ((c, other), point))
         live = list(begun.values())
         entries = [((*free, *c.parameters, *other.parameters), point) for (c, other), point in live]
         sizes = [[p.name for p in other.size_parameters] if other.linear else [] for (_, other), _ in live]
-        ended = self.grown(entries, floor, reach=IN_REACH, most=pairs_kept, sizes=sizes)
+        ended = self.grown(entries, floor, reach=IN_REACH, most=breadth.pairs, sizes=sizes)
         made = [Pair(live[i][0], fit) for i, fit in ended if np.isfinite(fit.cost)]
         return sorted(made, key=lambda pair: pair.fit.cost)
 

@@ -232,7 +232,7 @@ def test_enough_iterations_at_a_horizon_follow_two_effects(together):
 
 
 def test_pairs_that_cost_least_go_on(monkeypatch):
-    monkeypatch.setattr(growing, "PAIRS", 2)
+    monkeypatch.setattr(growing, "PAIRS", growing.PAIRS._replace(pairs=2))
     problem = Swing(PAIR, together=True, jerk=True)
     inference = Inference(problem)
     base = inference.start()
