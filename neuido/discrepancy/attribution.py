@@ -148,7 +148,10 @@ def diagnose(
         if problem.settings > 1 and not inference.is_settled(at.errors) and inference.over(at) < FURTHER:
             break
         rounds.append(inference.round(at.fit, at.floor, found))
-    if len(found) < 3 and not hurried:
+    # where every point costs pairs grow after what takes less, and where nothing was named last of all
+    if not hurried and (not found or (len(found) == 1 and not problem.together)):
+        grown = by_growing(inference, rounds[0], at, others)
+    if grown or (0 < len(found) < 3 and not hurried):
         by, pair = grown or two_effects(inference, rounds, found, at, others)
         if by is not inference:
             inference, start = by, pair[0].plain or starts[tried.index(by)]

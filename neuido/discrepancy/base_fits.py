@@ -65,8 +65,8 @@ class BaseFits(Laboratory):
 
         What a body does after it has bounced has many valleys, and what it does before has few: each horizon begins where the one before
         it ended, near enough for the next bounce. What costs more than `reach` times the least at a horizon is given up, and all but the
-        `most` that cost least; past the share `until` of the time they are where they are. Each with its place among the entries.
-        `sizes`: of each entry, what begins smaller where its point does not run.
+        `most` that cost least; past the share `until` of the time they are where they are. Each with its place among the entries, the least
+        cost first. `sizes`: of each entry, what begins smaller where its point does not run.
         """
         ended: list[tuple[int, Fit]] = []
         live = [(i, point) for i, (_, point) in enumerate(entries)]
@@ -76,9 +76,8 @@ class BaseFits(Laboratory):
             options = {} if share == 1.0 else {"iterations": self.stepwise}
             requests = [self.request(entries[i][0], point, until=until, sizes=sizes[i] if sizes else (), **options) for i, point in live]
             fits = self.fits(requests, self.early(floor, share))
-            least = min(fit.cost for fit in fits)
-            ended = [(i, fit) for (i, _), fit in zip(live, fits, strict=True) if fit.cost <= reach * least]
-            ended = sorted(ended, key=lambda entry: entry[1].cost)[:most]
+            ranked = sorted(zip((i for i, _ in live), fits, strict=True), key=lambda entry: entry[1].cost)
+            ended = [(i, fit) for i, fit in ranked[:most] if fit.cost <= reach * ranked[0][1].cost]
             live = [(i, fit.point) for i, fit in ended]
         return ended
 

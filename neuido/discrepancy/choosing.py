@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -139,17 +140,21 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     if tried[first].gain(starts[first].errors, least) < LEAST_GAIN and tried[first].over(starts[first]) < 1.0:
         return {}
     left = {first: score(least) + handicap[first]}
+
+    def least_by(i: int, **options: Any) -> list[np.ndarray]:
+        """What a look by a method leaves at the least, which is put down."""
+        there = tried[i].look(starts[i].fit, starts[i].floor, until=LOOKS[1], **options).least
+        left[i] = score(there[0]) + handicap[i] if there else math.inf
+        return there
+
     if tried[first].is_noise(least / NEARLY**2):
         return left
     for i in others:
         if tried[i].deadline.skips("first fits by the other method", LOOKS[1]):
             break
         beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
-        there = tried[i].look(starts[i].fit, starts[i].floor, led=look.led, beyond=beyond, until=LOOKS[1], grows=at_once)
-        left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
+        least_by(i, led=look.led, beyond=beyond, grows=at_once)
     for i in [] if at_once else sorted(left, key=lambda i: left[i]):
-        there = tried[i].look(starts[i].fit, starts[i].floor, until=LOOKS[1])
-        left[i] = score(there.least[0]) + handicap[i] if there.least else math.inf
-        if not tried[i].leaves_much(there.least):
+        if not tried[i].leaves_much(least_by(i)):
             break
     return left

@@ -106,8 +106,7 @@ class Growing(Contests):
         entries = [((*free, *c.parameters, *other.parameters), point) for (c, other), point in live]
         sizes = [[p.name for p in other.size_parameters] if other.linear else [] for (_, other), _ in live]
         ended = self.grown(entries, floor, reach=IN_REACH, most=breadth.pairs, sizes=sizes)
-        made = [Pair(live[i][0], fit) for i, fit in ended if np.isfinite(fit.cost)]
-        return sorted(made, key=lambda pair: pair.fit.cost)
+        return [Pair(live[i][0], fit) for i, fit in ended if np.isfinite(fit.cost)]
 
     def at_first(self, free: Sequence[Parameter], point: Point, floor: Floor, found: Sequence[Trial] = ()) -> Point:
         """`first_part`, which is kept where no effect was found yet."""

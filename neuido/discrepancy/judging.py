@@ -148,12 +148,12 @@ class Judging(Instead):
             return GAIN_TO_NOISE
         if self.is_told_by_fit(r, t):
             return FORETELLS
-        if r.over > WITHIN and self.moved(r.base) > LED_AWAY and self.moved(t.fit.point) < BROUGHT_BACK:
+        away = self.moved(r.base) > LED_AWAY
+        if away and r.over > WITHIN and self.moved(t.fit.point) < BROUGHT_BACK:
             return BACK_GAIN if r.over > 1.0 else LEAST_GAIN
         steps = [math.log(WITHIN), 0.0, math.log(1.5)]
         at_least = float(np.interp(math.log(r.over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
-        sure = stands_alone(r, t) or (r.over > 1.0 and self.moved(r.base) > LED_AWAY)
-        return min(at_least, GAIN_TO_NOISE) if sure else at_least
+        return min(at_least, GAIN_TO_NOISE) if (away and r.over > 1.0) or stands_alone(r, t) else at_least
 
     def is_told_by_fit(self, r: Round, t: Trial) -> bool:
         """Whether an effect of few parameters, and no other one by far, brings the fitted recordings from far above the noise down to it.

@@ -81,17 +81,11 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         takes: Sequence[str] = (),
         saturates: bool = False,
     ):
+        def absent(key: str) -> float:
+            return 0.0 if not sizes or key in sizes.split() else starts[0][key]
+
         made = tuple(
-            Parameter(
-                f"{name}.{key}",
-                unit,
-                0.0 if not sizes or key in sizes.split() else starts[0][key],
-                scale,
-                low,
-                high,
-                log=log,
-                saturates=saturates,
-            )
+            Parameter(f"{name}.{key}", unit, absent(key), scale, low, high, log=log, saturates=saturates)
             for key, unit, scale, low, high, log in parameters
         )
         named = tuple({f"{name}.{k}": v for k, v in start.items()} for start in starts)

@@ -88,10 +88,9 @@ def two_effects(
 ) -> tuple[Inference, list[Round]]:
     """Where more than noise is left: two effects, if any, as their rounds, and the method that they are found by.
 
-    Two that grow together come first, unless that was tried before a second one was looked for (where a launch of several points costs as
-    one), and are all that is tried where nothing was named. The other method comes before what else its own has, for it need not be the
-    right one: of nine pairs that five blind seeds missed, seven were looked for by the wrong one. What it finds is taken where that leaves
-    nothing but noise, or clearly less than its own. Where two were found already it alone is asked.
+    The other method comes before what else its own has, for it need not be the right one: of nine pairs that five blind seeds missed, seven
+    were looked for by the wrong one. What it finds is taken where that leaves nothing but noise, or clearly less than its own. Where two
+    were found already it alone is asked.
 
     Args:
         inference: The one that named an effect.
@@ -100,10 +99,6 @@ def two_effects(
         at: Where these stand.
         others: The other methods, with their first rounds.
     """
-    tried = bool(found) and inference.problem.together
-    grown = by_growing(inference, rounds[0], at, others) if len(found) < 2 and not tried else None
-    if grown is not None or not found:
-        return grown or (inference, [])
     elsewhere = by_another_method(others, inference, at, found, within=len(rounds) == 1)
     if elsewhere is not None and elsewhere[0].is_noise(elsewhere[1][-1].chosen.errors):
         return elsewhere
@@ -122,21 +117,20 @@ def by_growing(inference: Inference, first: Round, at: Stand, others: Mapping[In
     Where nothing was named they are looked for if what is left is more than the discretisation, and must come down to that.
     """
     named = first.chosen is not None
-    if not named and not (first.trials and inference.is_unexplained(first)):
+    if not inference.leaves_much([at.errors]) or not (named or (first.trials and inference.is_unexplained(first))):
         return None
-    least = LEAST_GAIN if named else 2.0 * LEAST_GAIN
+    least, until = LEAST_GAIN if named else 2.0 * LEAST_GAIN, 1.0 if inference.problem.together else IN_TIME
     made: list[tuple[Inference, list[Round]]] = []
     for method, own in {inference: first, **others}.items():
-        if not method.leaves_much([at.errors]):
-            continue
-        if method.deadline.skips("two effects that grow together", 1.0 if method.problem.together else IN_TIME):
+        if method.deadline.skips("two effects that grow together", until):
             break
         with method.quickly(own.base, own.floor):
             pairs = method.growing_pairs(own.base, own.floor)[:GROWN]
         free = method.problem.declared
         starts = [method.request((*free, *a.parameters, *b.parameters), fit.point) for (a, b), fit in pairs]
         fits = method.fits(starts, own.floor)
-        ends = [(pair.candidates, fit) for pair, fit in zip(pairs, fits, strict=True) if method.runs(fit.point)]
+        able = method.which_run([fit.point for fit in fits])
+        ends = [(pair.candidates, fit) for pair, fit, runs in zip(pairs, fits, able, strict=True) if runs]
         stands = [(both, Stand(fit, *method.stand(fit.point, like=own.floor))) for both, fit in ends]
         for both, there in sorted(stands, key=lambda entry: score(entry[1].errors)):
             pair = as_rounds(method, own, both, there, at.errors, least)
@@ -162,11 +156,24 @@ def as_rounds(
     t = able[0]
     (second,) = (c for c in both if c.key != t.candidate.key)
     here = from_there(inference, t, there.fit.point)
-    led = replace(first, chosen=None, members=[], trials=[Trial(second, there, inference.gain(here.errors, there.errors))])
-    again = inference.round(here.fit, here.floor, [t], led, most=MANY)
+    pair = fitted_with(inference, first, t, here, Trial(second, there, inference.gain(here.errors, there.errors)), errors, least)
+    if pair:
+        t.stand, t.gain = here, inference.gain(first.errors, here.errors)
+    return pair
+
+
+def fitted_with(
+    inference: Inference, first: Round, t: Trial, alone: Stand, second: Trial, errors: np.ndarray, least: float = LEAST_GAIN
+) -> list[Round]:
+    """A first effect, and the round beside it that begins where it was fitted with a second one.
+
+    Nothing where none is named, or the two gain less than `least` beside `errors`.
+    """
+    led = replace(first, chosen=None, members=[], trials=[second])
+    again = inference.round(alone.fit, alone.floor, [t], led, most=MANY)
     if again.chosen is None or inference.gain(errors, again.chosen.errors) < least:
         return []
-    t.stand, t.gain, t.reason = here, inference.gain(first.errors, here.errors), ""
+    t.reason = ""
     return [replace(first, chosen=t, members=[t]), again]
 
 
@@ -309,13 +316,7 @@ def in_its_place(inference: Inference, first: Round, second: Round, errors: np.n
     best, there = min(stands, key=lambda entry: score(entry[1].errors))
     if inference.gain(errors, there.errors) < LEAST_GAIN:
         return []
-    alone = at_its_end(inference, best)
-    led = replace(second, chosen=None, members=[], trials=[replace(lead, stand=there)])
-    again = inference.round(alone.fit, alone.floor, [best], led, most=MANY)
-    if again.chosen is None or inference.gain(errors, again.chosen.errors) < LEAST_GAIN:
-        return []
-    best.reason = ""
-    return [replace(first, chosen=best, members=[best]), again]
+    return fitted_with(inference, first, best, at_its_end(inference, best), replace(lead, stand=there), errors)
 
 
 def simpler(r: Round, chosen: Trial) -> list[Trial]:

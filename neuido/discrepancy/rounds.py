@@ -240,8 +240,8 @@ class Inference(Judging):
         leave much, in a base that was looked at without as well.
         """
         if not found and self.seen is not None and self.seen.base is base:
-            if grows and not self.seen.grown:
-                self.seen = self.grown_on(self.seen, floor, until)
+            if grows:
+                self.seen = self.grown_on(self.seen, floor, found, until)
             return self.seen
         with self.quickly(base.point, floor):
             asked = self.promising(base, floor, found, led, most=most, until=until)
@@ -254,37 +254,27 @@ class Inference(Judging):
 
             grown: list[tuple[Candidate, Fit]] = []
 
-            def grow(remains: Sequence[np.ndarray]) -> Sequence[tuple[Candidate, Fit]]:
-                able = grows and len(found) < 2 and not grown
-                if able and self.leaves_much(remains) and not self.deadline.skips("growing fits", until):
-                    grown.extend(self.growing(base, floor, candidates, found, until=until).values())
-                    return grown
-                return ()
-
             def between(remains: np.ndarray) -> Sequence[tuple[Candidate, Fit]]:
-                return grow([remains]) if not found and self.is_astray(base, floor) else ()
+                astray = grows and not found and self.is_astray(base, floor) and self.leaves_much([remains])
+                if astray and not self.deadline.skips("growing fits", until):
+                    grown.extend(self.growing(base, floor, candidates, until=until).values())
+                return grown
 
             contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until, between=between)
             left = self.left_by(contest.best, floor)
-            further = grow(left[:1])
         look = Look(base, asked, contest, left[:1], bool(grown))
-        if further:
-            look = self.with_grown(look, further, floor, until)
+        if grows and len(found) < 2:
+            look = self.grown_on(look, floor, found, until)
         if not found:
             self.seen = look
         return look
 
-    def grown_on(self, look: Look, floor: Floor, until: float) -> Look:
-        """A look for a first effect with fits that grow, where its own leave much."""
-        if not self.leaves_much(look.least) or self.deadline.skips("growing fits", until):
+    def grown_on(self, look: Look, floor: Floor, found: Sequence[Trial], until: float) -> Look:
+        """A look with fits that grow, once more under the own setting, where none did and its own leave much."""
+        if look.grown or not self.leaves_much(look.least) or self.deadline.skips("growing fits", until):
             return look
         with self.quickly(look.base.point, floor):
-            further = list(self.growing(look.base, floor, look.asked.candidates, until=until).values())
-        return self.with_grown(look, further, floor, until)
-
-    def with_grown(self, look: Look, further: Sequence[tuple[Candidate, Fit]], floor: Floor, until: float) -> Look:
-        """A look with fits that grew, once more under the own setting."""
-        with self.quickly(look.base.point, floor):
+            further = list(self.growing(look.base, floor, look.asked.candidates, found, until=until).values())
             whole = self.wholly(look.asked.free, further, floor, until)
             best = {**look.contest.best, **better(whole, look.contest.best)}
             left = self.left_by(best, floor)

@@ -193,7 +193,7 @@ def test_two_effects_grow_together_where_neither_is_named_alone(monkeypatch):
     assert {t.candidate.name for t in found.effects} == {"chirp", "jerk"}
     assert dict(found.after) == pytest.approx(PAIR, rel=0.02)
     assert Inference(problem).is_noise(np.square(list(found.errors["after"].values())))
-    monkeypatch.setattr(pairs, "by_growing", lambda *_: None)
+    monkeypatch.setattr(attribution, "by_growing", lambda *_: None)
     alone = diagnose(problem, draws=39)
     assert alone.answer == "unknown" and not alone.effects
 
