@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from neuido.discrepancy.contests import NEARLY
 from neuido.discrepancy.judging import WITHIN
 from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.pairs import WORSE, look_ahead
@@ -18,8 +19,6 @@ CLEARLY = 1.5
 """Times the error of another method's first fits at which those of the suggested one are refined first all the same."""
 LOOKS = (0.5, 0.8)
 """Shares of the time for the search at which the first fits by the first method end, and those by others: the rest is for refining."""
-NEARLY = 2.5
-"""Times the noise up to which what the first fits leave is refined before another method is asked: it may be noise then."""
 AS_SURE = 2.0
 """Times the noise up to which what a named effect leaves is no reason to ask another method: in five blind seeds none of eight that were
 asked there took its place, of three that left 2.3 to 2.4 times as much all."""
@@ -70,7 +69,8 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
         named = [rounds[0] for rounds in firsts.values() if rounds[0].chosen]
         if firsts and not named and at_best(tried[i], starts[i]) + handicap[i] - base[order[0]] > 2.0 * math.log(WORSE):
             continue
-        if any(r.chosen and seen.get(i, -math.inf) > r.chosen.score + handicap[i] + 2.0 * math.log(BEYOND) for r in named):
+        at_first = -math.inf if waits(tried[i]) else seen.get(i, -math.inf)
+        if any(r.chosen and at_first > r.chosen.score + handicap[i] + 2.0 * math.log(BEYOND) for r in named):
             continue
         if firsts and tried[i].deadline.skips("effects by the other method"):
             unasked = True
@@ -111,6 +111,11 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
 def unsearched(start: Stand, floors: np.ndarray) -> Round:
     """The round of a declared model beside which no effect was looked for."""
     return Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)
+
+
+def waits(inference: Inference) -> bool:
+    """Whether most of the first fits by a method were put off: what the others leave says little of it."""
+    return inference.seen is not None and inference.seen.contest.put_off is not None
 
 
 def at_best(inference: Inference, start: Stand) -> float:

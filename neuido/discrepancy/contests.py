@@ -22,11 +22,20 @@ CLOSELY = 8
 """Quick fits, at the most, that are made once more under the own setting."""
 AT_MOST = 6
 """Iterations of these."""
+NEARLY = 2.5
+"""Times the noise up to which what the first fits leave is refined before another method is asked: it may be noise then."""
 
 NO_TIME = "there was no time for its fit"
 FAR_BEHIND = "by the method that fits best it was not fitted, by the other one the first few fits leave far more"
 FEWER_DO = "an effect of fewer parameters leaves nothing but noise"
 OTHERS_DO = "another effect leaves nothing but noise, and its direction in the data promises little"
+
+
+class PutOff(NamedTuple):
+    """Candidates whose fits wait until another method was asked, and the fits that were made before them."""
+
+    ended: tuple[tuple[Candidate, Fit], ...]
+    starts: tuple[Start, ...]
 
 
 class Contest(NamedTuple):
@@ -38,6 +47,8 @@ class Contest(NamedTuple):
     """The leading candidate's of the other sign."""
     unfitted: dict[str, str]
     """Why a candidate got no fit, by its key."""
+    put_off: PutOff | None = None
+    """What goes on later."""
 
 
 def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candidate, Fit]]) -> dict[str, tuple[Candidate, Fit]]:
@@ -63,6 +74,8 @@ class Contests(Starting):
         beyond: float = math.inf,
         until: float = 1.0,
         between: Callable[[np.ndarray], Iterable[tuple[Candidate, Fit]]] = lambda remains: (),
+        puts_off: bool = False,
+        begun: PutOff | None = None,
     ) -> Contest:
         """Fit the candidates side by side; fits that cannot catch up with the best one stop.
 
@@ -80,11 +93,13 @@ class Contests(Starting):
             beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
             until: Share of the time for the search at which fits end where they are and no others begin: the rest is for other steps.
             between: Further fits after the first ones, given what the leading one of these leaves, where there are others to come.
+            puts_off: Whether the others wait where the first ones leave more than may be noise: it may be the wrong method.
+            begun: What was put off; `starts` are those of it then.
         """
-        best: dict[str, tuple[Candidate, Fit]] = {}
-        ended: list[tuple[Candidate, Fit]] = []
+        ended: list[tuple[Candidate, Fit]] = [] if begun is None else list(begun.ended)
+        best = better(ended, {})
         unfitted: dict[str, str] = {}
-        race = Race()
+        race = Race(min((fit.cost for _, fit in ended), default=math.inf))
 
         def fitted(own: Sequence[Start]) -> None:
             requests = []
@@ -95,14 +110,13 @@ class Contests(Starting):
             ended.extend(fits)
             best.update(better(fits, best))
 
-        def left() -> np.ndarray:
-            leading = min(best.values(), key=lambda entry: entry[1].cost)
-            ((_, fit),) = self.wholly(free, [leading], floor, until)
+        def left() -> tuple[tuple[Candidate, Fit], np.ndarray]:
+            (leading,) = self.wholly(free, [min(best.values(), key=lambda entry: entry[1].cost)], floor, until)
             with self.under(self.own):
-                return self.mean_squares([fit.point], floor)[0]
+                return leading, self.mean_squares([leading[1].point], floor)[0]
 
         small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
-        first = list(dict.fromkeys(small))[:LEADERS]
+        first = list(dict.fromkeys(small))[:LEADERS] if begun is None else []
         waves: list[list[Start]] = [[], [], []]
         for entry in starts:
             key = entry[0].key
@@ -111,14 +125,18 @@ class Contests(Starting):
             if best and own and self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}", until):
                 unfitted |= {c.key: NO_TIME for wave in waves[i:] for c, *_ in wave}
                 break
-            remains = left() if own and best else None
+            leading, remains = left() if own and best else (None, None)
             if remains is not None and i == 1 and (further := better(between(remains), best)):
                 best |= further
                 race.best = min(race.best, *(fit.cost for _, fit in further.values()))
-                remains = left()
+                leading, remains = left()
             if remains is not None and score(remains) > beyond:
                 unfitted = {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave}
                 return Contest(*self.closely(free, best, None, floor, until), unfitted)
+            if puts_off and remains is not None and not self.is_noise(remains / NEARLY**2):
+                waiting = tuple(start for wave in waves[i:] for start in wave)
+                unfitted = {c.key: NO_TIME for c, *_ in waiting}
+                return Contest({**best, leading[0].key: leading}, None, unfitted, PutOff(tuple(ended), waiting))
             if remains is not None and self.is_noise(remains):
                 if own is waves[2]:
                     unfitted |= {c.key: FEWER_DO for c, *_ in own}

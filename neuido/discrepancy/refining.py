@@ -23,6 +23,8 @@ BEYOND = 8.0
 MEASURED, NEAR = 6, 4.0
 """Fits whose errors are measured with the differences of the settings where they end: so many of the best, or all, within this factor of
 their errors."""
+BY_FAR = 0.5
+"""Share of the least cost of a candidate of few parameters below which one of many is refined."""
 ONWARD = 3
 """Further fits of a candidate, each with the differences of the settings where the last one ended: while each gains `SOME_GAIN` or has
 not come to its end."""
@@ -85,6 +87,26 @@ class Refining(Growing):
                 least[c.key] = left
                 out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
         return out
+
+    def widened(
+        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """The fit of many parameters that leads all of few by far, once more with the floor where it stands, as `polish` does for those.
+
+        What another grid does where the model is wrong is then in its many parameters: a force in time came to the noise by the weights of
+        the base, 53 mm off, and left more than a uniform one of what was held out.
+        """
+        ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
+        few = min((fit.cost for c, fit in ranked if len(c.parameters) <= MANY), default=math.inf)
+        if self.problem.settings == 1 or not ranked or ranked[0][1].cost >= BY_FAR * few or len(ranked[0][0].parameters) <= MANY:
+            return {}
+        lead, fit = ranked[0]
+        if not self.runs(fit.point) or self.deadline.skips(f"refining {lead.key}"):
+            return {}
+        self.tell(f"refining {lead.key}")
+        ((found, own),) = self.onward([((*free, *lead.parameters), fit, [fit.point])], floor)
+        left, there = (score(self.mean_squares([point], own, fitted=True)[0]) for point in (fit.point, found.point))
+        return {lead.key: (lead, replace(found, cost=self.costs([found.point], floor)[0]))} if there < left else {}
 
     def able(self, fits: Sequence[tuple[Candidate, Fit]]) -> list[tuple[Candidate, Fit]]:
         """Those that end where every recording runs."""

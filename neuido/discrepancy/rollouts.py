@@ -93,6 +93,9 @@ EVERY = SETTINGS + QUICK
 """The settings by their numbers: those whose differences are measured, and those of a search."""
 SOLVERS = tuple(next(i for i, s in enumerate(SETTINGS) if s.solver == name) for name in ("material_points", "finite_elements"))
 """The settings that are methods of their own."""
+AFFORDED = 16
+"""Times the inner steps of the declared model that finite elements may take: viscosities at the edge of their range ask for 70 to 360, and
+of fits on a GPU, which share their launches, all wait for the slowest one."""
 COARSE = SETTINGS.index(Setting(1.0, 1.0, "finite_elements", elements=0.6))
 """What finite elements are searched with."""
 CONTACT_HEIGHT = "contact_height"
@@ -111,7 +114,7 @@ class BodyRollouts(Problem):
     measured: tuple[Measured, ...] = ()
     device: str = "cpu"
     _simulators: dict[Any, Simulator | FiniteElements] = field(default_factory=dict, repr=False)
-    _still: dict[int, Simulator] = field(default_factory=dict, repr=False)
+    _still: dict[int, Simulator | FiniteElements] = field(default_factory=dict, repr=False)
     """By setting, one scene a recording, on the CPU: what is asked for its step alone."""
     _meshes: dict[tuple[int, float, int], Mesh] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
@@ -122,9 +125,7 @@ class BodyRollouts(Problem):
         return float(len(r.body.x) * substeps(r, r.scene.dt * EVERY[setting].dt)[1])
 
     def margin(self, point: Point, setting: int = 0) -> float:
-        """Of the explicit step, in the recording that bears least; finite elements shorten theirs as they need."""
-        if EVERY[setting].solver == "finite_elements":
-            return math.inf
+        """Of the explicit step, in the recording that bears least, or of the inner steps that finite elements may take (`AFFORDED`)."""
         recordings = range(len(self.measured))
         full = [self._full(point)] * len(recordings)
         try:
@@ -193,7 +194,8 @@ class BodyRollouts(Problem):
         failed = []
         for (points, _), frames in zip(runs, moved, strict=True):
             broken = (~torch.isfinite(frames.x[-1]).flatten(1).all(dim=1)).tolist()
-            failed.append([i for i, point in enumerate(points) if broken[i] and finer < len(_finer(self._full(point)))])
+            live = [i for i, point in enumerate(points) if broken[i] and finer < len(_finer(self._full(point)))]
+            failed.append([i for i in live if self.margin(points[i], setting) >= 0.0])
         live = [k for k, own in enumerate(failed) if own]
         if not live:
             return
@@ -314,7 +316,12 @@ class BodyRollouts(Problem):
             meshes += [self._mesh(n, s.elements, s.tetrahedra)] * count if s.solver == "finite_elements" else []
         density = self.experiment.model["density"]
         if meshes:
-            return FiniteElements(scenes, bodies, density=density, device=device, meshes=meshes)
+            elements = FiniteElements(scenes, bodies, density=density, device=device, meshes=meshes)
+            declared = [self._full({})] * len(scenes)
+            effects = self._effects(elements, declared, [n for n in recordings for _ in range(count)], ())
+            needed = elements.most_inner / elements.step_margin(1, *self.laws(declared), effects=effects)
+            elements.most_inner = min(math.ceil(AFFORDED * max(needed, 1.0)), elements.most_inner)
+            return elements
         return Simulator(scenes, bodies, density=density, device=device)
 
     def _mesh(self, recording: int, elements: float, tetrahedra: int) -> Mesh:

@@ -66,6 +66,11 @@ class Promising(NamedTuple):
     promise: dict[str, float]
     """The least share of the misfit that a candidate leaves, predicted by the screening or by one simulation."""
 
+    @property
+    def hopeful(self) -> set[str]:
+        """Keys of the candidates that could take something off."""
+        return {c.key for c in self.candidates if self.promise.get(c.key, math.inf) < HOPELESS or not c.linear}
+
 
 class Look(NamedTuple):
     """The first fits of a step."""
@@ -80,9 +85,11 @@ class Look(NamedTuple):
 
     @property
     def led(self) -> Led:
-        """The candidates of the least costs."""
+        """The candidates of the least costs, and after them what was put off."""
         fits = sorted(self.contest.best.values(), key=lambda entry: entry[1].cost)
-        return Led([c.key for c, _ in fits[:LED_BY]], {c.key: fit.point for c, fit in fits}, self.asked.chosen)
+        begun = self.contest.put_off
+        waiting = dict.fromkeys(c.key for c, *_ in begun.starts) if begun else ()
+        return Led([*(c.key for c, _ in fits), *waiting][:LED_BY], {c.key: fit.point for c, fit in fits}, self.asked.chosen)
 
 
 class Inference(Judging):
@@ -142,6 +149,7 @@ class Inference(Judging):
             best |= self.limits(free, best, candidates, floor)
             best |= self.polish(free, best, base, floor, rival, other)
             best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
+            best |= self.widened(free, best, floor)
             if not found:
                 best |= self.instead(free, best, candidates, base, floor)
         floors = self.floors(base.point, free, floor)
@@ -241,12 +249,11 @@ class Inference(Judging):
         """
         if not found and self.seen is not None and self.seen.base is base:
             if grows:
-                self.seen = self.grown_on(self.seen, floor, found, until)
+                self.seen = self.grown_on(self.whole(self.seen, floor, until), floor, found, until)
             return self.seen
         with self.quickly(base.point, floor):
             asked = self.promising(base, floor, found, led, most=most, until=until)
-            candidates, free, *_, starts, promise = asked
-            hopeful = {c.key for c in candidates if promise.get(c.key, math.inf) < HOPELESS or not c.linear}
+            candidates, free, *_, starts, _ = asked
             self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
 
             def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
@@ -260,7 +267,8 @@ class Inference(Judging):
                     grown.extend(self.growing(base, floor, candidates, until=until).values())
                 return grown
 
-            contest = self.contest(free, starts, floor, hopeful, without, beyond=beyond, until=until, between=between)
+            options = {"beyond": beyond, "until": until, "between": between, "puts_off": not grows}
+            contest = self.contest(free, starts, floor, asked.hopeful, without, **options)
             left = self.left_by(contest.best, floor)
         look = Look(base, asked, contest, left[:1], bool(grown))
         if grows and len(found) < 2:
@@ -268,6 +276,21 @@ class Inference(Judging):
         if not found:
             self.seen = look
         return look
+
+    def whole(self, look: Look, floor: Floor, until: float) -> Look:
+        """A look for a first effect with the fits that were put off."""
+        begun = look.contest.put_off
+        if begun is None or self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in begun.starts))}", until):
+            return look
+        asked, point = look.asked, look.base.point
+
+        def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
+            return self.without_own(point, asked.starts, (), ended)
+
+        with self.quickly(point, floor):
+            contest = self.contest(asked.free, begun.starts, floor, asked.hopeful, without, until=until, begun=begun)
+            left = self.left_by(contest.best, floor)
+        return look._replace(contest=contest, least=left[:1])
 
     def grown_on(self, look: Look, floor: Floor, found: Sequence[Trial], until: float) -> Look:
         """A look with fits that grow, once more under the own setting, where none did and its own leave much."""

@@ -27,7 +27,7 @@ from neuido.types import Body, ParticleState, Scene
 SAFETY = 0.5
 """Inner step over the stable step of the undeformed mesh: elements get thinner while a body is pressed."""
 MOST_INNER = 2000
-"""Inner steps a step at most; more is an error."""
+"""Inner steps a step, at the most, where nothing else is said."""
 
 
 class FiniteElements:
@@ -46,6 +46,7 @@ class FiniteElements:
         smoothing: `none`, or `nodal`: the volume change of an element is the mean of its nodes' means, against the locking of
             nearly incompressible bodies (average nodal pressure, Bonet and Burton 1998).
         meshes: Meshes in place of the ones made here, one a body or one for all.
+        most_inner: Inner steps a step, at the most; what needs more is an error.
 
     Raises:
         UserError: As `mpm.Simulator`, and a body that cannot be meshed.
@@ -72,6 +73,7 @@ class FiniteElements:
         tetrahedra: int = 5,
         smoothing: Literal["none", "nodal"] = "none",
         meshes: Mesh | Sequence[Mesh] | None = None,
+        most_inner: int = MOST_INNER,
     ) -> None:
         if smoothing not in ("none", "nodal"):
             raise UserError(f"smoothing is {smoothing!r}; choose none or nodal")
@@ -79,7 +81,7 @@ class FiniteElements:
         self.scenes, self.device, self.dtype, self.smoothing = loaded.scenes, loaded.device, loaded.dtype, smoothing
         self.particles, self.state, self.mass, self.volume = loaded.particles, loaded.state, loaded.mass, loaded.volume
         self.dt, self.gravity, self.colliders = loaded.dt, loaded.gravity, loaded.colliders
-        self.graphs = graphs and self.device.type == "cuda"
+        self.graphs, self.most_inner = graphs and self.device.type == "cuda", most_inner
         self.held = loaded.held.bool()
         self.kernels = element_kernels.build(real_of(dtype))
         bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
@@ -127,15 +129,33 @@ class FiniteElements:
             viscosity: `Effects.viscosity` [Pa s], (S, 2), or None; it acts with the velocity of half a step before.
             mass: Particle masses [kg], (P,).
             stiffening: What effects add to each scene's modulus [Pa], and the largest factor on the sum, (S,) each.
-            refused: Gets the scenes that need more than `MOST_INNER`, in place of an error; they get no more than the others.
+            refused: Gets the scenes that need more than `most_inner`, in place of an error; they get no more than the others.
 
         Raises:
-            UserError: A modulus that is negative, or more than `MOST_INNER`.
+            UserError: A modulus that is negative, or more than `most_inner`.
         """
+        needs = [math.ceil(need - 1e-9) for need in self._needs(elasticity, viscosity, mass, stiffening)]
+        out = []
+        for assembly in self.assemblies:
+            most = 1
+            for s in range(assembly.a, assembly.b):
+                if needs[s] <= self.most_inner:
+                    most = max(most, needs[s])
+                elif refused is not None:
+                    refused.append(s)
+                else:
+                    raise UserError(f"dt of scene {s} needs {needs[s]} inner steps of its smallest element, more than {self.most_inner}; "
+                                    "lower the stiffness, the viscosity or `elements`")  # fmt: skip
+            out += [most] * (assembly.b - assembly.a)
+        return out
+
+    def _needs(
+        self, elasticity: ElasticLaw, viscosity: Tensor | None, mass: Tensor | None, stiffening: tuple[Tensor, Tensor] | None
+    ) -> list[float]:
+        """Step over the stable one of each scene; arguments are those of `inner_steps`."""
         bounds = inputs.waves(self, elasticity, mass, stiffening)
         out = []
         for assembly in self.assemblies:
-            need = 1
             for s in range(assembly.a, assembly.b):
                 modulus, density = bounds[s]
                 steep = float(assembly.pieces[s - assembly.a].steepest.max())
@@ -146,16 +166,20 @@ class FiniteElements:
                     damping = 4.0 * steep * (4.0 / 3.0 * eta + zeta) / density
                 # the root of (omega dt)^2 + 2 damping dt = 4
                 step = 4.0 / (damping + math.sqrt(damping**2 + 4.0 * omega**2)) if omega + damping > 0 else math.inf
-                own = math.ceil(self.scenes[s].dt / (SAFETY * step) - 1e-9)
-                if own <= MOST_INNER:
-                    need = max(need, own)
-                elif refused is not None:
-                    refused.append(s)
-                else:
-                    raise UserError(f"dt of scene {s} needs {own} inner steps of its smallest element; lower the stiffness, the viscosity "
-                                    "or `elements`")  # fmt: skip
-            out += [need] * (assembly.b - assembly.a)
+                out.append(self.scenes[s].dt / (SAFETY * step))
         return out
+
+    def step_margin(
+        self, steps: int, elasticity: ElasticLaw, plasticity: PlasticLaw | None = None, *, effects: Effects | None = None
+    ) -> float:
+        """`most_inner` over the inner steps in need, of the scene that has least to spare; below 1 a `rollout` of these refuses.
+
+        Raises:
+            UserError: As `rollout`, but for the inner steps.
+        """
+        none = dict.fromkeys(("state", "gravity", "friction", "mass"))
+        given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects, **none)
+        return self.most_inner / max(self._needs(elasticity, given.viscosity, given.mass, given.stiffening(self)))
 
     def rollout(
         self,

@@ -857,14 +857,14 @@ def test_the_other_sign_of_the_leading_candidate_is_followed_to_its_end(monkeypa
     inference = Inference(Folded(lambda t: 3.0 * t + 1.5 * t**3))
     start, fold, free = inference.start(), inference.problem.fold, inference.problem.declared
     starts = [(fold, {"a": 2.5, "fold.c": 2.1}, None), (fold, {"a": 3.5, "fold.c": -0.1}, None)]
-    best, other, _ = inference.contest(free, starts, start.floor)
+    best, other, *_ = inference.contest(free, starts, start.floor)
     # the one that leads while the other has hardly begun gives its place up to it
     assert other[1].point["fold.c"] > 0
     assert best["fold"][1].point["fold.c"] == pytest.approx(-1.5, abs=0.05)
     assert best["fold"][1].cost < 0.5 * other[1].cost
     refined = inference.polish(free, {"fold": other}, start.fit, start.floor, other=best["fold"])
     assert refined["fold"][1].point["fold.c"] == pytest.approx(-1.5, abs=0.05)
-    alone, none, _ = inference.contest(free, starts[:1], start.floor)
+    alone, none, *_ = inference.contest(free, starts[:1], start.floor)
     assert alone["fold"][1].point["fold.c"] > 0 and none is None
 
 
@@ -1332,7 +1332,7 @@ def test_candidates_are_fitted_without_the_problems_own_parameters_too(found, mo
     ended = replace(moved.fit, point={**moved.fit.point, "a": 2.2, "square.c": 0.7})
     asked = []
 
-    def contest(self, free, starts, floor, hopeful, then, beyond, until, between):
+    def contest(self, free, starts, floor, hopeful, then, beyond, until, between, puts_off):
         asked.extend([*starts, *then([(square, ended)])])
         return contests.Contest({}, None, {})
 
@@ -1371,7 +1371,7 @@ def test_where_the_first_fits_leave_noise_alone_only_the_hopeful_are_fitted(monk
             return request(self, parameters, start, **options)
 
         monkeypatch.setattr(Inference, "request", seen)
-        best, _, unfitted = inference.contest(
+        best, _, unfitted, _ = inference.contest(
             inference.problem.declared, starts, base.floor, {"square", "cube"}, lambda led, starts=starts: starts[:1]
         )
         monkeypatch.setattr(Inference, "request", request)
@@ -1462,6 +1462,73 @@ def test_there_are_no_further_fits_where_another_method_does_far_better(together
         assert contest.unfitted == dict.fromkeys({"square", "cube", "clip"} - fitted, contests.FAR_BEHIND)
 
 
+def test_fits_beside_the_first_ones_wait_until_another_method_was_asked(monkeypatch):
+    """Where these leave more than may be noise; what goes on then comes to what fits in one go come to."""
+    monkeypatch.setattr(contests, "LEADERS", 1)
+    for law, waits in ((lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t), {"cube", "clip"}), (lambda t: 3.0 * t + 2.0 * t**2, set())):
+        inference = Inference(Line(law, wiggle=0.0, together=False))
+        base, free = inference.start(), inference.problem.declared
+        by_key = {c.key: c for c in inference.problem.candidates}
+        starts = [(by_key[key], {**base.fit.point, **by_key[key].starts[-1]}, None) for key in ("square", "cube", "clip")]
+        first = inference.contest(free, starts, base.floor, puts_off=True)
+        if not waits:
+            assert first.put_off is None and set(first.best) == {"square", "cube", "clip"}
+            continue
+        assert {c.key for c, *_ in first.put_off.starts} == waits and set(first.best) == {"square"}
+        assert first.unfitted == dict.fromkeys(waits, contests.NO_TIME)
+        assert first.best["square"][1].setting == inference.own and inference.left_by(first.best, base.floor)
+        later = inference.contest(free, first.put_off.starts, base.floor, begun=first.put_off)
+        at_once = inference.contest(free, starts, base.floor)
+        assert later.put_off is None and not later.unfitted
+        assert {key: fit.cost for key, (_, fit) in later.best.items()} == {key: fit.cost for key, (_, fit) in at_once.best.items()}
+
+
+def test_a_look_that_was_put_off_goes_on_when_it_is_asked_again(monkeypatch):
+    monkeypatch.setattr(contests, "LEADERS", 1)
+    monkeypatch.setattr(Inference, "leaves_much", lambda self, errors: False)
+    inference = Inference(Line(lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t), wiggle=0.0, together=False))
+    base = inference.start()
+    first = inference.look(base.fit, base.floor, grows=False)
+    waiting = list(dict.fromkeys(c.key for c, *_ in first.contest.put_off.starts))
+    (lead,) = first.contest.best
+    assert first.led.keys == [lead, *waiting] and set(first.led.ends) == {lead}
+    assert inference.look(base.fit, base.floor, grows=False) is first
+    whole = inference.look(base.fit, base.floor)
+    assert whole.contest.put_off is None and set(whole.contest.best) == {lead, *waiting}
+    assert inference.look(base.fit, base.floor) is whole
+    inference.seen, told = first, []
+    monkeypatch.setattr(inference.deadline, "skips", lambda what, until=1.0: told.append(what) or True)
+    assert inference.look(base.fit, base.floor) is first
+    assert told == [f"fits of {', '.join(waiting)}"]
+
+
+@pytest.mark.parametrize(("cost", "settings", "refined"), [(4.0, 2, True), (6.0, 2, False), (4.0, 1, False)])
+def test_an_effect_of_many_parameters_that_leads_by_far_is_refined(cost, settings, refined, monkeypatch):
+    inference = Inference(Line(lambda t: 3.0 * t + 2.0 * t**2, wiggle=0.1))
+    base = inference.start()
+    inference.problem.__dict__["settings"] = settings
+    square = next(c for c in inference.problem.candidates if c.key == "square")
+    knots = tuple(Parameter(f"wide.c{i}", "1", 0.0, 0.1, -5.0, 5.0) for i in range(contests.MANY + 1))
+    wide = Candidate("wide", knots, ({p.name: 0.1 for p in knots},), "flight")
+    fits = {"square": (square, replace(base.fit, cost=10.0)), "wide": (wide, replace(base.fit, cost=cost))}
+    there = replace(base.fit, point={**base.fit.point, "a": 3.4})
+    asked = []
+
+    def onward(entries, floor):
+        asked.extend(entries)
+        return [(there, floor)]
+
+    monkeypatch.setattr(inference, "onward", onward)
+    monkeypatch.setattr(inference, "costs", lambda points, floor: [1.0 for _ in points])
+    errors = {True: [np.array([0.1])], False: [np.array([0.3])]}
+    monkeypatch.setattr(inference, "mean_squares", lambda points, floor, fitted=False: errors[points[0] is there.point])
+    found = inference.widened(inference.problem.declared, fits, base.floor)
+    assert {key: (c, fit.point, fit.cost) for key, (c, fit) in found.items()} == ({"wide": (wide, there.point, 1.0)} if refined else {})
+    assert [fit.cost for _, fit, _ in asked] == [cost] * refined
+    errors[True] = [np.array([0.4])]
+    assert inference.widened(inference.problem.declared, fits, base.floor) == {}
+
+
 def test_what_leaves_far_more_than_the_best_is_not_refined(monkeypatch):
     """However near its cost: what is held out tells them apart."""
     inference = Inference(Line(lambda t: 3.0 * t + 2.0 * t**2, wiggle=0.0))
@@ -1505,7 +1572,7 @@ def test_a_method_that_is_far_worse_without_effects_is_asked_where_with_one_it_i
 
     methods = [Asked(0), Asked(1)]
     for method, start, least in zip(methods, starts, (left, 0.8), strict=True):
-        method.seen = SimpleNamespace(base=start.fit, least=[np.full(2, least**2)], led=None)
+        method.seen = SimpleNamespace(base=start.fit, least=[np.full(2, least**2)], led=None, contest=SimpleNamespace(put_off=None))
     monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: [first])
     choosing.first_rounds(methods, starts)
     assert asked == rounds_of
@@ -1515,8 +1582,9 @@ def test_a_method_that_is_far_worse_without_effects_is_asked_where_with_one_it_i
     assert asked == [1]
 
 
-@pytest.mark.parametrize(("there", "rounds_of"), [(0.5, [0, 1]), (0.9, [0])])
-def test_a_method_whose_first_fits_are_far_from_what_was_named_is_not_asked_further(there, rounds_of, monkeypatch):
+@pytest.mark.parametrize(("there", "waits", "rounds_of"), [(0.5, False, [0, 1]), (0.9, False, [0]), (0.9, True, [0, 1])])
+def test_a_method_whose_first_fits_are_far_from_what_was_named_is_not_asked_further(there, waits, rounds_of, monkeypatch):
+    """Unless most of these were put off."""
     asked = []
 
     class Asked(Method):
@@ -1526,7 +1594,9 @@ def test_a_method_whose_first_fits_are_far_from_what_was_named_is_not_asked_furt
 
     monkeypatch.setattr(choosing, "look_ahead", lambda inference, first: [first])
     monkeypatch.setattr(choosing, "by_first_fits", lambda *_: {0: 2 * np.log(0.1), 1: 2 * np.log(there) + np.log(1.2)})
-    choosing.first_rounds([Asked(0), Asked(1)], [stood(1.0)] * 2)
+    methods = [Asked(0), Asked(1)]
+    methods[1].seen = SimpleNamespace(contest=SimpleNamespace(put_off=() if waits else None), base=None)
+    choosing.first_rounds(methods, [stood(1.0)] * 2)
     assert asked == rounds_of
 
 

@@ -359,11 +359,34 @@ def test_steps_are_cut_as_the_stiffness_asks():
         sim.rollout(3, FixedCorotated(1e13, 0.3))
     viscous = sim.inner_steps(FixedCorotated(1e4, 0.3), torch.tensor([[2000.0, 0.0]]))[0]
     assert viscous > 3
+    with pytest.raises(UserError, match=r"needs \d+ inner steps of its smallest element, more than 3;"):
+        solver(FREE, body, most_inner=3).rollout(3, FixedCorotated(1e4, 0.3), effects=Effects(viscosity_shear=2000.0))
     body = body._replace(v=body.v + 2.0 * (body.x - body.x.mean(dim=0)))
     with pytest.raises(UserError, match="not finite from step 0 of 60"):
         solver(FREE, body).rollout(60, FixedCorotated(1e8, 0.3), every=10, inner=1)
     out = solver(FREE, body).rollout(100, FixedCorotated(1e4, 0.3), effects=Effects(viscosity_shear=2000.0), every=50)
     assert float((out.x[-1] - out.x[0]).norm(dim=1).max()) < 0.2
+
+
+@pytest.mark.parametrize("effects", [Effects(), Effects(viscosity_shear=400.0), Effects(fibre=3e6, fibre_direction=(1.0, 0.0, 0.0))])
+def test_the_margin_is_where_a_rollout_refuses(effects):
+    """Of two bodies, the stiffer one's; and it is no whole number, so that it has a slope."""
+    body = block((0.3, 0.3, 0.3), (0.6, 0.5, 0.5), (6, 4, 4))
+    law = FixedCorotated(torch.tensor([1e5, 1e8]), torch.full((2,), 0.3))
+
+    def bodies(most):
+        return FiniteElements([FREE] * 2, [body] * 2, most_inner=most)
+
+    margin = bodies(1000).step_margin(5, law, effects=effects)
+    needed = math.ceil(1000 / margin)
+    assert 1000 / margin > needed - 1 and needed > 5
+    bodies(needed).rollout(5, law, effects=effects)
+    assert bodies(needed).step_margin(5, law, effects=effects) >= 1.0 > bodies(needed - 1).step_margin(5, law, effects=effects)
+    with pytest.raises(UserError, match=f"scene 1 needs {needed} inner steps"):
+        bodies(needed - 1).rollout(5, law, effects=effects)
+    out = bodies(needed - 1).rollout(5, law, effects=effects, lenient=True)
+    refused = out.x[-1].isnan().any(dim=1).reshape(2, -1)
+    assert not refused[0].any() and refused[1].all()
 
 
 def test_wrong_options_are_named():
