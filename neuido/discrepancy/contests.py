@@ -37,6 +37,11 @@ class PutOff(NamedTuple):
     ended: tuple[tuple[Candidate, Fit], ...]
     starts: tuple[Start, ...]
 
+    @property
+    def keys(self) -> list[str]:
+        """Of the candidates that wait."""
+        return list(dict.fromkeys(c.key for c, *_ in self.starts))
+
 
 class Contest(NamedTuple):
     """What fits of candidates came to; those that came close ended under the own setting, others may be quick ones (`Fit.setting`)."""
@@ -75,7 +80,7 @@ class Contests(Starting):
         until: float = 1.0,
         between: Callable[[np.ndarray], Iterable[tuple[Candidate, Fit]]] = lambda remains: (),
         puts_off: bool = False,
-        begun: PutOff | None = None,
+        before: Sequence[tuple[Candidate, Fit]] = (),
     ) -> Contest:
         """Fit the candidates side by side; fits that cannot catch up with the best one stop.
 
@@ -94,9 +99,9 @@ class Contests(Starting):
             until: Share of the time for the search at which fits end where they are and no others begin: the rest is for other steps.
             between: Further fits after the first ones, given what the leading one of these leaves, where there are others to come.
             puts_off: Whether the others wait where the first ones leave more than may be noise: it may be the wrong method.
-            begun: What was put off; `starts` are those of it then.
+            before: Fits that were made before `starts` were put off (`PutOff.ended`).
         """
-        ended: list[tuple[Candidate, Fit]] = [] if begun is None else list(begun.ended)
+        ended = list(before)
         best = better(ended, {})
         unfitted: dict[str, str] = {}
         race = Race(min((fit.cost for _, fit in ended), default=math.inf))
@@ -116,7 +121,7 @@ class Contests(Starting):
                 return leading, self.mean_squares([leading[1].point], floor)[0]
 
         small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
-        first = list(dict.fromkeys(small))[:LEADERS] if begun is None else []
+        first = list(dict.fromkeys(small))[:LEADERS] if not before else []
         waves: list[list[Start]] = [[], [], []]
         for entry in starts:
             key = entry[0].key

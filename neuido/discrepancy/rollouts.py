@@ -194,8 +194,8 @@ class BodyRollouts(Problem):
         failed = []
         for (points, _), frames in zip(runs, moved, strict=True):
             broken = (~torch.isfinite(frames.x[-1]).flatten(1).all(dim=1)).tolist()
-            live = [i for i, point in enumerate(points) if broken[i] and finer < len(_finer(self._full(point)))]
-            failed.append([i for i in live if self.margin(points[i], setting) >= 0.0])
+            worth = [i for i, point in enumerate(points) if broken[i] and finer < len(_finer(self._full(point)))]
+            failed.append([i for i in worth if self.margin(points[i], setting) >= 0.0])
         live = [k for k, own in enumerate(failed) if own]
         if not live:
             return

@@ -8,6 +8,7 @@ recordings that were held out against a parametric bootstrap of the largest gain
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +89,7 @@ class Look(NamedTuple):
         """The candidates of the least costs, and after them what was put off."""
         fits = sorted(self.contest.best.values(), key=lambda entry: entry[1].cost)
         begun = self.contest.put_off
-        waiting = dict.fromkeys(c.key for c, *_ in begun.starts) if begun else ()
+        waiting = begun.keys if begun else []
         return Led([*(c.key for c, _ in fits), *waiting][:LED_BY], {c.key: fit.point for c, fit in fits}, self.asked.chosen)
 
 
@@ -255,10 +256,7 @@ class Inference(Judging):
             asked = self.promising(base, floor, found, led, most=most, until=until)
             candidates, free, *_, starts, _ = asked
             self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
-
-            def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
-                return self.without_own(base.point, starts, found, ended)
-
+            without = partial(self.without_own, base.point, starts, found)
             grown: list[tuple[Candidate, Fit]] = []
 
             def between(remains: np.ndarray) -> Sequence[tuple[Candidate, Fit]]:
@@ -280,15 +278,12 @@ class Inference(Judging):
     def whole(self, look: Look, floor: Floor, until: float) -> Look:
         """A look for a first effect with the fits that were put off."""
         begun = look.contest.put_off
-        if begun is None or self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in begun.starts))}", until):
+        if begun is None or self.deadline.skips(f"fits of {', '.join(begun.keys)}", until):
             return look
         asked, point = look.asked, look.base.point
-
-        def without(ended: Sequence[tuple[Candidate, Fit]]) -> list[Start]:
-            return self.without_own(point, asked.starts, (), ended)
-
+        without = partial(self.without_own, point, asked.starts, ())
         with self.quickly(point, floor):
-            contest = self.contest(asked.free, begun.starts, floor, asked.hopeful, without, until=until, begun=begun)
+            contest = self.contest(asked.free, begun.starts, floor, asked.hopeful, without, until=until, before=begun.ended)
             left = self.left_by(contest.best, floor)
         return look._replace(contest=contest, least=left[:1])
 

@@ -177,8 +177,7 @@ class FiniteElements:
         Raises:
             UserError: As `rollout`, but for the inner steps.
         """
-        none = dict.fromkeys(("state", "gravity", "friction", "mass"))
-        given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects, **none)
+        given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
         return self.most_inner / max(self._needs(elasticity, given.viscosity, given.mass, given.stiffening(self)))
 
     def rollout(

@@ -83,11 +83,11 @@ def prepare(
     elasticity: ElasticLaw,
     plasticity: PlasticLaw | None,
     *,
-    state: ParticleState | None,
-    effects: Effects | None,
-    gravity: Tensor | None,
-    friction: Tensor | None,
-    mass: Tensor | None,
+    state: ParticleState | None = None,
+    effects: Effects | None = None,
+    gravity: Tensor | None = None,
+    friction: Tensor | None = None,
+    mass: Tensor | None = None,
 ) -> RolloutInputs:
     """What `steps` steps read, differentiable in everything given; the arguments are those of `mpm.Simulator.rollout`.
 

@@ -257,8 +257,7 @@ class Simulator:
         Raises:
             UserError: As `rollout`, but for the step.
         """
-        none = dict.fromkeys(("state", "gravity", "friction", "mass"))
-        given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects, **none)
+        given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
         limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
         return min(min(limit) / scene.dt for limit, scene in zip(limits, self.scenes))
 

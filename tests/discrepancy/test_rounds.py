@@ -1477,7 +1477,7 @@ def test_fits_beside_the_first_ones_wait_until_another_method_was_asked(monkeypa
         assert {c.key for c, *_ in first.put_off.starts} == waits and set(first.best) == {"square"}
         assert first.unfitted == dict.fromkeys(waits, contests.NO_TIME)
         assert first.best["square"][1].setting == inference.own and inference.left_by(first.best, base.floor)
-        later = inference.contest(free, first.put_off.starts, base.floor, begun=first.put_off)
+        later = inference.contest(free, first.put_off.starts, base.floor, before=first.put_off.ended)
         at_once = inference.contest(free, starts, base.floor)
         assert later.put_off is None and not later.unfitted
         assert {key: fit.cost for key, (_, fit) in later.best.items()} == {key: fit.cost for key, (_, fit) in at_once.best.items()}
