@@ -170,6 +170,20 @@ def test_a_case_whose_making_fails_leaves_the_others(tmp_path, monkeypatch):
     assert seeds == [7, 100_007], "what is too little is drawn again, what fails is not"
 
 
+@pytest.mark.parametrize(("kind", "ends"), [("friction+yield", "same"), ("yield", "elements")])
+def test_a_pair_that_its_solver_does_not_allow_is_made_by_the_suggested_one(tmp_path, monkeypatch, kind, ends):
+    solvers = []
+
+    def barred(seed, *_, case, **__):
+        solvers.append(case.solver)
+        raise UserError("too little moves")
+
+    monkeypatch.setattr(blind, "make_undeclared", barred)
+    assert blind.make_one("case-000", 7, Case(kind=kind, solver="elements"), str(tmp_path), "cpu") == "too little moves"
+    half = blind.ATTEMPTS // 2
+    assert solvers == ["elements"] * half + [ends] * (blind.ATTEMPTS - half)
+
+
 def test_from_a_case_to_its_score(case):
     folder, out = case
     place = out / "answers" / "none" / folder.name
