@@ -77,10 +77,10 @@ def plan(cases: int, curves: int, seed: int, *, particles: int = 0, seconds: flo
 def make_one(name: str, seed: int, case: Case, folder: str, device: str) -> str:
     """One case, or what failed; a seed that gives none is followed by others, and from half the attempts on by the suggested solver.
 
-    What another solver does to some pairs is more than their effects can be.
+    What another solver does to some bodies is more than their effects can be.
     """
     for attempt in range(ATTEMPTS):
-        if 2 * attempt == ATTEMPTS and "+" in (case.kind or ""):
+        if 2 * attempt == ATTEMPTS:
             case = dataclasses.replace(case, solver=SOLVERS[0])
         try:
             make_undeclared(seed + 100_000 * attempt, str(Path(folder) / name), case=case, device=device, progress=False)
