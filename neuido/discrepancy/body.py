@@ -78,7 +78,7 @@ class BodyProblem(BodyRollouts):
     """Nuisances that change what is seen of a motion, and not the motion."""
     tracked: bool = True
     """Whether the data are positions of points."""
-    _maps: dict[int, Any] = field(default_factory=dict, repr=False)
+    _maps: dict[int, Any] = field(default_factory=dict, init=False, repr=False)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         (rows,) = self.predict_several([(points, recording, setting)])

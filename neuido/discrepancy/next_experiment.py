@@ -132,9 +132,7 @@ def _bodies(problem: Problem, point: Point, setting: int) -> Iterator[tuple[str,
     noise = problem.recordings[n].noise or 1e-3
     _, frame = np.unique(problem.recordings[n].times, return_inverse=True)
     for name, changed in changes(base, problem.experiment.model["density"]):
-        made = replace(
-            problem, measured=(changed,), recordings=(problem.recordings[n],), nuisances=(), _simulators={}, _meshes={}, _maps={}
-        )
+        made = replace(problem, measured=(changed,), recordings=(problem.recordings[n],), nuisances=())
 
         def sigma(rows: np.ndarray, made: Problem = made) -> np.ndarray:
             other = made.predict([point], 0, 0 if setting else 1)[0] if made.settings > 1 else rows[0]

@@ -113,11 +113,12 @@ class BodyRollouts(Problem):
     experiment: Experiment = None  # type: ignore[assignment]
     measured: tuple[Measured, ...] = ()
     device: str = "cpu"
-    _simulators: dict[Any, Simulator | FiniteElements] = field(default_factory=dict, repr=False)
-    _still: dict[int, Simulator | FiniteElements] = field(default_factory=dict, repr=False)
+    # of these recordings: a copy with others (`replace`) starts with none
+    _simulators: dict[Any, Simulator | FiniteElements] = field(default_factory=dict, init=False, repr=False)
+    _still: dict[int, Simulator | FiniteElements] = field(default_factory=dict, init=False, repr=False)
     """By setting, one scene a recording, on the CPU: what is asked for its step alone."""
-    _meshes: dict[tuple[int, float, int], Mesh] = field(default_factory=dict, repr=False)
-    _lock: Any = field(default_factory=threading.RLock, repr=False)
+    _meshes: dict[tuple[int, float, int], Mesh] = field(default_factory=dict, init=False, repr=False)
+    _lock: Any = field(default_factory=threading.RLock, init=False, repr=False)
 
     def effort(self, recording: int, setting: int = 0) -> float:
         """Particle-substeps; inner steps of the finite elements count as one."""

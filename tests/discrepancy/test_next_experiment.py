@@ -88,6 +88,15 @@ def test_rivals_that_a_longer_step_does_not_bear_are_told_apart_with_the_suggest
     assert next_experiment.propose(d)["tells_apart"] == ["viscosity_shear", "drag_linear"]
 
 
+def test_a_change_has_margins_of_its_own(body):
+    """What was made for the steps of both recordings was kept for the changed one: a motion of elements that failed had no margin."""
+    elements = body.solvers[1]
+    margin = body.margin({}, elements)
+    _, changed, _ = next(next_experiment._bodies(body, {}, elements))
+    assert len(changed.measured) < len(body.measured)
+    assert changed.margin({}, elements) == pytest.approx(margin)
+
+
 def test_changes_do_what_they_say(body):
     r = body.measured[0]
     found = dict(next_experiment.changes(r, 1000.0))
