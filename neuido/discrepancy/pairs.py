@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neuido.discrepancy.contests import MANY
+from neuido.discrepancy.contests import MANY, NEARLY
 from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Candidate, Point
 from neuido.discrepancy.rounds import Inference
@@ -113,7 +113,9 @@ def two_effects(
 def by_growing(inference: Inference, first: Round, at: Stand, others: Mapping[Inference, Round]) -> tuple[Inference, list[Round]] | None:
     """Where much is left: two effects that grew together, and the method that they are found by.
 
-    The round of the second one begins where both ended, and says whether it is one. All methods are asked until two leave noise alone.
+    The round of the second one begins where both ended, and says whether it is one. All methods are asked until two leave noise alone, the
+    suggested one first, whichever goes on: one effect chose it, and of three pairs of a blind seed for which it chose finite elements all
+    were the suggested one's.
     Where nothing was named they are looked for if what is left is more than the discretisation, and must come down to that.
     """
     named = first.chosen is not None
@@ -121,7 +123,7 @@ def by_growing(inference: Inference, first: Round, at: Stand, others: Mapping[In
         return None
     least, until = LEAST_GAIN if named else 2.0 * LEAST_GAIN, 1.0 if inference.problem.together else IN_TIME
     made: list[tuple[Inference, list[Round]]] = []
-    for method, own in {inference: first, **others}.items():
+    for method, own in sorted({inference: first, **others}.items(), key=lambda entry: entry[0].own):
         if method.deadline.skips("two effects that grow together", until):
             break
         with method.quickly(own.base, own.floor):
@@ -216,7 +218,8 @@ def by_another_method(
         inference: The one that named an effect.
         at: Where what it named stands.
         found: The effects that it named.
-        within: It lies within its floor, where no second one was looked for: two effects must show a promise, and leave noise alone.
+        within: It lies within its floor, where no second one was looked for: two effects must show a promise, and leave what may be noise
+            once they are refined.
     """
     if inference.is_settled(at.errors):
         return None
@@ -233,7 +236,7 @@ def by_another_method(
         here = from_there(other, lead, at.fit.point)
         own = first if lead is first.chosen else replace(first, chosen=lead, members=[lead])
         pair = second_beside(other, own, few(own.members), at.errors, at=here, sure=None if within else lead)
-        if pair and (not within or other.is_noise(pair[-1].chosen.errors)):
+        if pair and (not within or other.is_noise(pair[-1].chosen.errors / NEARLY**2)):
             lead.stand, lead.gain, lead.reason = here, other.gain(first.errors, here.errors), ""
             made.append((other, pair))
     return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)

@@ -1013,14 +1013,29 @@ def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left
         assert other.is_noise(both[1][-1].chosen.errors)
 
 
-def test_beside_what_lies_within_its_floor_two_effects_by_another_method_leave_noise_alone(monkeypatch):
+@pytest.mark.parametrize(("above", "within", "found"), [(2.0, True, True), (3.0, True, False), (3.0, False, True)])
+def test_beside_what_lies_within_its_floor_two_effects_by_another_method_leave_about_noise(above, within, found, monkeypatch):
+    """`above`: times the noise that the two leave before they are refined."""
     problem = Apart()
     inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
     start = other.start()
     first = other.round(start.fit, start.floor, [])
-    monkeypatch.setattr(other, "is_noise", lambda *_, **__: False)
-    assert pairs.by_another_method({other: first}, inference, first.chosen.stand, [first.chosen])
-    assert not pairs.by_another_method({other: first}, inference, first.chosen.stand, [first.chosen], within=True)
+    _, (_, second) = pairs.by_another_method({other: first}, inference, first.chosen.stand, [first.chosen])
+    limit = 1.001 * second.chosen.errors / above**2
+    monkeypatch.setattr(other, "is_noise", lambda squares, **_: bool(np.all(squares < limit)))
+    assert bool(pairs.by_another_method({other: first}, inference, first.chosen.stand, [first.chosen], within=within)) is found
+
+
+def test_pairs_grow_by_the_suggested_method_first(monkeypatch):
+    problem = Apart()
+    inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
+    start = other.start()
+    first = other.round(start.fit, start.floor, [])
+    asked = []
+    monkeypatch.setattr(Inference, "growing_pairs", lambda self, *_: asked.append(self.own) or [])
+    monkeypatch.setattr(inference, "leaves_much", lambda errors: True)
+    assert pairs.by_growing(inference, first, first.chosen.stand, {other: first}) is None
+    assert asked == [0, 1]
 
 
 @pytest.fixture
