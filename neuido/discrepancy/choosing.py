@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from neuido.discrepancy.contests import NEARLY
 from neuido.discrepancy.judging import WITHIN
 from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.pairs import WORSE, look_ahead
@@ -152,7 +151,7 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
         left[i] = score(there[0]) + handicap[i] if there else math.inf
         return there
 
-    if tried[first].is_noise(least / NEARLY**2):
+    if tried[first].may_be_noise(least):
         return left
     for i in others:
         if tried[i].deadline.skips("first fits by the other method", LOOKS[1]):

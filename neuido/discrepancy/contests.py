@@ -22,8 +22,6 @@ CLOSELY = 8
 """Quick fits, at the most, that are made once more under the own setting."""
 AT_MOST = 6
 """Iterations of these."""
-NEARLY = 2.5
-"""Times the noise up to which what the first fits leave is refined before another method is asked: it may be noise then."""
 
 NO_TIME = "there was no time for its fit"
 FAR_BEHIND = "by the method that fits best it was not fitted, by the other one the first few fits leave far more"
@@ -138,7 +136,7 @@ class Contests(Starting):
             if remains is not None and score(remains) > beyond:
                 unfitted = {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave}
                 return Contest(*self.closely(free, best, None, floor, until), unfitted)
-            if puts_off and remains is not None and not self.is_noise(remains / NEARLY**2):
+            if puts_off and remains is not None and not self.may_be_noise(remains):
                 waiting = tuple(start for wave in waves[i:] for start in wave)
                 unfitted = {c.key: NO_TIME for c, *_ in waiting}
                 return Contest({**best, leading[0].key: leading}, None, unfitted, PutOff(tuple(ended), waiting))

@@ -20,6 +20,8 @@ from neuido.discrepancy.trials import score
 
 LEAST_GAIN = math.log(1.7)
 """Smaller gains are no reason to name anything: other solvers differ by as much in ways that no setting of one solver shows."""
+NEARLY = 2.5
+"""Times the noise up to which what first fits leave is refined before another method is asked: it may be noise then."""
 ROUGH = 0.02
 """Relative gain that ends a fit which only says where floors are to be found, or what they are."""
 UNSEEN = 0.1
@@ -270,6 +272,10 @@ class Laboratory:
     def is_noise(self, errors: np.ndarray, *, fitted: bool = False) -> bool:
         """Whether nothing but noise is left in any part, or in those of the fitted ones that are given."""
         return bool(np.all(errors < NOISE_ALONE * (self.noise_squares[self.fitted] if fitted else self.noise_squares)))
+
+    def may_be_noise(self, errors: np.ndarray) -> bool:
+        """Whether what a fit leaves in any part is so near the noise that it may be that once it is refined."""
+        return self.is_noise(errors / NEARLY**2)
 
     def is_settled(self, errors: np.ndarray) -> bool:
         """Whether no effect could be named any more: nothing is left but noise, or too little above it for any gain to be enough."""

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neuido.discrepancy.contests import MANY, NEARLY
+from neuido.discrepancy.contests import MANY
 from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Candidate, Point
 from neuido.discrepancy.rounds import Inference
@@ -115,8 +115,8 @@ def by_growing(inference: Inference, first: Round, at: Stand, others: Mapping[In
 
     The round of the second one begins where both ended, and says whether it is one. All methods are asked until two leave noise alone, the
     suggested one first, whichever goes on: one effect chose it, and of three pairs of a blind seed for which it chose finite elements all
-    were the suggested one's.
-    Where nothing was named they are looked for if what is left is more than the discretisation, and must come down to that.
+    were the suggested one's. Where nothing was named they are looked for if what is left is more than the discretisation, and must come
+    down to that.
     """
     named = first.chosen is not None
     if not inference.leaves_much([at.errors]) or not (named or (first.trials and inference.is_unexplained(first))):
@@ -236,7 +236,7 @@ def by_another_method(
         here = from_there(other, lead, at.fit.point)
         own = first if lead is first.chosen else replace(first, chosen=lead, members=[lead])
         pair = second_beside(other, own, few(own.members), at.errors, at=here, sure=None if within else lead)
-        if pair and (not within or other.is_noise(pair[-1].chosen.errors / NEARLY**2)):
+        if pair and (not within or other.may_be_noise(pair[-1].chosen.errors)):
             lead.stand, lead.gain, lead.reason = here, other.gain(first.errors, here.errors), ""
             made.append((other, pair))
     return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)

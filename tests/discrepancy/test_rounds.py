@@ -82,6 +82,8 @@ class Method:
     def is_noise(self, errors):
         return False
 
+    may_be_noise = Inference.may_be_noise
+
     def look(self, fit, floor, led=None, beyond=np.inf, until=1.0, grows=True):
         return SimpleNamespace(least=[])
 
@@ -995,14 +997,20 @@ class Apart(Mixed):
         return rows
 
 
-@pytest.mark.parametrize("within", [False, True])
-@pytest.mark.parametrize(("left", "found"), [(1.0, True), (0.4, True), (0.2, False), (0.05, False)])
-def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left, found, within):
-    """`left`: what the chosen method leaves of what one effect leaves by this one; 0.05 is noise, 0.2 too far away."""
+@pytest.fixture
+def methods():
+    """The chosen method, and another one with its first round."""
     problem = Apart()
     inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
     start = other.start()
-    first = other.round(start.fit, start.floor, [])
+    return inference, other, other.round(start.fit, start.floor, [])
+
+
+@pytest.mark.parametrize("within", [False, True])
+@pytest.mark.parametrize(("left", "found"), [(1.0, True), (0.4, True), (0.2, False), (0.05, False)])
+def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left, found, within, methods):
+    """`left`: what the chosen method leaves of what one effect leaves by this one; 0.05 is noise, 0.2 too far away."""
+    inference, other, first = methods
     assert first.chosen.candidate.name == "low"
     at = replace(first.chosen.stand, errors=left**2 * first.chosen.errors)
     both = pairs.by_another_method({other: first}, inference, at, [first.chosen], within=within)
@@ -1014,23 +1022,17 @@ def test_another_method_is_asked_for_two_effects_where_its_first_comes_near(left
 
 
 @pytest.mark.parametrize(("above", "within", "found"), [(2.0, True, True), (3.0, True, False), (3.0, False, True)])
-def test_beside_what_lies_within_its_floor_two_effects_by_another_method_leave_about_noise(above, within, found, monkeypatch):
+def test_beside_what_lies_within_its_floor_two_effects_by_another_method_leave_about_noise(above, within, found, methods, monkeypatch):
     """`above`: times the noise that the two leave before they are refined."""
-    problem = Apart()
-    inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
-    start = other.start()
-    first = other.round(start.fit, start.floor, [])
+    inference, other, first = methods
     _, (_, second) = pairs.by_another_method({other: first}, inference, first.chosen.stand, [first.chosen])
     limit = 1.001 * second.chosen.errors / above**2
     monkeypatch.setattr(other, "is_noise", lambda squares, **_: bool(np.all(squares < limit)))
     assert bool(pairs.by_another_method({other: first}, inference, first.chosen.stand, [first.chosen], within=within)) is found
 
 
-def test_pairs_grow_by_the_suggested_method_first(monkeypatch):
-    problem = Apart()
-    inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
-    start = other.start()
-    first = other.round(start.fit, start.floor, [])
+def test_pairs_grow_by_the_suggested_method_first(methods, monkeypatch):
+    inference, other, first = methods
     asked = []
     monkeypatch.setattr(Inference, "growing_pairs", lambda self, *_: asked.append(self.own) or [])
     monkeypatch.setattr(inference, "leaves_much", lambda errors: True)
@@ -1039,12 +1041,9 @@ def test_pairs_grow_by_the_suggested_method_first(monkeypatch):
 
 
 @pytest.fixture
-def unnamed():
+def unnamed(methods):
     """The chosen method, another one with its first round which named nothing, and the trial there of what the chosen one named."""
-    problem = Apart()
-    inference, other = Inference(problem, setting=1), Inference(problem, setting=0)
-    start = other.start()
-    first = other.round(start.fit, start.floor, [])
+    inference, other, first = methods
     low = first.chosen
     low.reason = "too little"
     return inference, other, replace(first, chosen=None, members=[]), low
