@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 from rollout import bodies, neural
 
-from neuido.physics.law import Engine
-from neuido.physics.mpm import Simulator
+from neuido.physics.laws.base import Engine
+from neuido.physics.mpm.simulator import Simulator
 
 
 def main() -> None:

@@ -35,10 +35,10 @@ import yaml
 sys.path.insert(0, str(Path(__file__).parent))
 import blind_scores
 
-from neuido.data.scenes import read_yaml
-from neuido.data.storage import write
+from neuido.data.bodies.scene_files import read_yaml
+from neuido.data.files.storage import write
 from neuido.data.undeclared import Case, make_undeclared
-from neuido.data.undeclared.effects import KINDS, OUTSIDE
+from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.errors import UserError
 
 RERUN = ("single-recording", "no-discretisation")

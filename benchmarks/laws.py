@@ -17,12 +17,12 @@ from pathlib import Path
 
 import torch
 
-from neuido.data.families import PUBLISHED, laws
-from neuido.data.scenes import load_scene, scene_names
+from neuido.data.bodies.families import PUBLISHED, laws
+from neuido.data.bodies.scene_files import load_scene, scene_names
 from neuido.errors import UserError
-from neuido.models.baselines import nclaw
-from neuido.models.operator import IntrinsicDynamicsOperator
-from neuido.physics.mpm import Simulator
+from neuido.models.baselines.learned import nclaw
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.physics.mpm.simulator import Simulator
 
 COURANT = 0.6
 

@@ -18,10 +18,10 @@ import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics.device import start_warp, torch_stream
-from neuido.physics.grid_kernels import SEPARATE
-from neuido.physics.law import ElasticLaw, PlasticLaw
-from neuido.physics.mpm import Simulator
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.mpm.grid import SEPARATE
+from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.device import start_warp, torch_stream
 from neuido.types import ParticleState
 
 

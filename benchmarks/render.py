@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from neuido.models.splatting import rasterize
+from neuido.models.render.splatting import rasterize
 
 
 @dataclass

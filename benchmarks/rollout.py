@@ -24,12 +24,12 @@ from pathlib import Path
 import plain
 import torch
 
-from neuido.data.scenes import load_scene
-from neuido.data.shapes import ball
-from neuido.physics.invariants import InvariantElastic, InvariantPlastic
-from neuido.physics.laws import FixedCorotated, NeoHookean
-from neuido.physics.mpm import Simulator
-from neuido.physics.networks import ObjectiveElastic, ObjectivePlastic
+from neuido.data.bodies.scene_files import load_scene
+from neuido.data.bodies.shapes import ball
+from neuido.physics.laws.classical import FixedCorotated, NeoHookean
+from neuido.physics.laws.neural.invariants import InvariantElastic, InvariantPlastic
+from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Scene, Walls
 
 SIX = {"bouncy-ball": 25744, "clay-cat": 23554, "honey-bottle": 20777, "jelly-duck": 23419, "rubber-pawn": 15907, "sand-fish": 24894}

@@ -28,7 +28,7 @@ from rollout import neural, timed
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from neuido.physics.mpm import Simulator
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Scene
 
 FIGURES = ("forward ms", "forward + backward ms", "forward MB", "forward + backward MB")

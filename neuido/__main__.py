@@ -1,6 +1,6 @@
 """`python -m neuido` is the `neuido` command."""
 
-from neuido.cli import main
+from neuido.commands.main import main
 
 if __name__ == "__main__":
     main()

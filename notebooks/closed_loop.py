@@ -29,7 +29,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from neuido.demo_loop import record
+from neuido.commands.demo.closed_loop import record
 from neuido.discrepancy.command import diagnose
 
 out = Path(os.environ.get("NEUIDO_NOTEBOOK_OUT", "runs/notebooks/closed_loop"))
@@ -134,7 +134,7 @@ else:
     for effect in content["effects"]:
         print(" or ".join(effect["class"]), {name: float(f"{p['value']:.3g}") for name, p in effect["parameters"].items()})
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
-    from neuido.data.material_tests import read_material_tests
+    from neuido.data.measured.material_test import read_material_tests
 
     for test in read_material_tests(rubber).tests:
         with np.load(out / "rubber" / "predicted" / f"{test.name}.npz") as archive:

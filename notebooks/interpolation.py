@@ -28,8 +28,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from neuido.data.tables import read_rows
-from neuido.latents import latents
+from neuido.commands.latents import latents
+from neuido.data.files.score_tables import read_rows
 
 out = Path(os.environ.get("NEUIDO_NOTEBOOK_OUT", "runs/notebooks/interpolation"))
 operator = os.environ.get("NEUIDO_OPERATOR", "pretrained-family")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from neuido.cli import main
+from neuido.commands.main import main
 
 
 def run(capsys, *args) -> tuple[int, str, str]:

@@ -7,9 +7,9 @@ import matplotlib.image
 import pytest
 import torch
 
-from neuido.data.shapes import ball
+from neuido.data.bodies.shapes import ball
 from neuido.errors import UserError
-from neuido.physics.mpm import Simulator
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Scene, Walls
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"

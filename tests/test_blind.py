@@ -140,7 +140,7 @@ def test_lesser_machineries():
 
 
 def test_plan_is_even():
-    from neuido.data.undeclared.effects import KINDS, OUTSIDE
+    from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 
     cases = [case for _, _, case in blind.plan(60, 4, 0)]
     bodies = [case for case in cases if case.measured == "body"]

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 import neuido
-from neuido import cli
-from neuido.cli import main
-from neuido.simulate import simulate
+from neuido.commands import main as cli
+from neuido.commands.main import main
+from neuido.commands.simulate import simulate
 from tests.command import run
 
 ROOT = Path(neuido.__file__).parents[1]
@@ -34,7 +34,7 @@ def test_help_loads_no_torch(name):
     code = f"""
 import atexit, sys
 atexit.register(lambda: print("LOADED", sorted({{"torch", "lightning", "warp"}} & set(sys.modules))))
-from neuido.cli import main
+from neuido.commands.main import main
 main({name.split()!r})
 """
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
@@ -72,7 +72,7 @@ def test_a_device_without_memory_is_one_line(capsys, monkeypatch):
     def full(**options):
         raise RuntimeError("CUDA error: out of memory\nFor debugging consider passing CUDA_LAUNCH_BLOCKING=1")
 
-    monkeypatch.setattr("neuido.simulate.simulate", full)
+    monkeypatch.setattr("neuido.commands.simulate.simulate", full)
     assert_one_line(capsys, ["simulate", "--out", "x"], "no memory left", "CUDA error: out of memory)", "CPU")
 
 
@@ -188,7 +188,7 @@ class TestLightning:
     def test_wrong_trainer_type(self, capsys):
         assert_one_line(capsys, ["fit", "--config", STAGE1, "--trainer.max_epochs", "many"], "--trainer.max_epochs", "many")
 
-    @pytest.mark.parametrize("name", ["Nowhere", "neuido.models.pretrain.Nowhere", "nowhere.Model"])
+    @pytest.mark.parametrize("name", ["Nowhere", "neuido.models.stages.pretrain.Nowhere", "nowhere.Model"])
     def test_unknown_class(self, capsys, name):
         assert_one_line(capsys, ["fit", "--model", name, "--data", "TrajectoryDataModule"], "owhere")
 

@@ -9,15 +9,15 @@ import pytest
 import yaml
 
 import neuido
-from neuido import cli
-from neuido.data.simulate import simulate as trajectories
-from neuido.data.tables import read_rows
+from neuido.commands import main as cli
+from neuido.commands.film import film
+from neuido.commands.latents import latents
+from neuido.commands.simulate import simulate
+from neuido.commands.sweep_file import command_of as sweep_command
+from neuido.commands.sweep_file import read_sweep, runs_of
+from neuido.data.files.score_tables import read_rows
+from neuido.data.trajectories.options import simulate as trajectories
 from neuido.discrepancy.command import diagnose
-from neuido.latents import latents
-from neuido.models.film import film
-from neuido.simulate import simulate
-from neuido.sweep_file import command_of as sweep_command
-from neuido.sweep_file import read_sweep, runs_of
 
 ROOT = neuido.configs_root()
 CONFIGS = sorted(ROOT.rglob("*.yaml"))

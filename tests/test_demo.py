@@ -9,8 +9,10 @@ import pytest
 import yaml
 
 import neuido
-from neuido import demo, demo_laws, demo_loop
-from neuido.demo_video import Adapted, SceneResult, VideoResult
+from neuido.commands.demo import closed_loop as demo_loop
+from neuido.commands.demo import demo
+from neuido.commands.demo import learned_laws as demo_laws
+from neuido.commands.demo.law_from_video import Adapted, SceneResult, VideoResult
 from neuido.errors import UserError
 
 TINY = {"instances": 1, "held_out": 0, "particles_per_side": 4, "steps": 60, "device": "cpu", "progress": False}

@@ -3,7 +3,7 @@
 import matplotlib.image
 import pytest
 
-from neuido import demo_video
+from neuido.commands.demo import law_from_video as demo_video
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from neuido.losses import relative_errors, relative_lp
+from neuido.models.scoring.losses import relative_errors, relative_lp
 
 
 def test_relative_loss_by_hand():

@@ -1,8 +1,15 @@
 import pytest
 import torch
 
-from neuido.metrics import ChamferDistance, MatchedRMSE, MedianRelativeError, chamfer_distance, nearest_squared, resampling_floor
-from neuido.physics.nearest import nearest_by_pairs
+from neuido.models.scoring.metrics import (
+    ChamferDistance,
+    MatchedRMSE,
+    MedianRelativeError,
+    chamfer_distance,
+    nearest_squared,
+    resampling_floor,
+)
+from neuido.physics.linalg.nearest import nearest_by_pairs
 
 
 def points(count, seed):

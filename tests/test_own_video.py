@@ -10,13 +10,13 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from neuido.cli import main
-from neuido.data.multiview import UP
-from neuido.data.simulate import Film
-from neuido.data.synthetic import make_scenes
-from neuido.data.visual import read_truth
-from neuido.models.results import load_law
-from neuido.models.splatting import rasterize
+from neuido.commands.main import main
+from neuido.data.scenes.filmed_scene import read_truth
+from neuido.data.scenes.multiview import UP
+from neuido.data.scenes.synthetic import make_scenes
+from neuido.data.trajectories.options import Film
+from neuido.models.inference.outputs import load_law
+from neuido.models.render.splatting import rasterize
 
 BOX = {
     "name": "Box",

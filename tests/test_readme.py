@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import neuido
-from neuido import cli
+from neuido.commands import main as cli
 from neuido.discrepancy import judging
 from neuido.discrepancy.laboratory import LEAST_GAIN
 

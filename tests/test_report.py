@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuido.cli import main
-from neuido.data.tables import read_rows, write_rows
+from neuido.commands.main import main
+from neuido.commands.report import report
+from neuido.data.files.html_page import Best, table, webm
+from neuido.data.files.run_results import open_runs
+from neuido.data.files.score_tables import read_rows, write_rows
 from neuido.errors import UserError
-from neuido.models.results import write_video
-from neuido.page import Best, table, webm
-from neuido.report import report
-from neuido.runs import open_runs
+from neuido.models.inference.outputs import write_video
 
 
 class Cells(HTMLParser):
@@ -144,7 +144,7 @@ def test_the_papers_rows_are_never_best(tmp_path):
 
 
 def test_spread_over_seeds(tmp_path):
-    from neuido.sweep import FORMAT
+    from neuido.commands.sweep import FORMAT
 
     for seed, cd in enumerate((1.0, 1.1, 1.2)):
         run = tmp_path / "sweep" / f"seed-{seed}"

@@ -13,12 +13,12 @@ import pytest
 import yaml
 
 import neuido
-from neuido.cli import main
-from neuido.data.tables import write_rows
+from neuido.commands.main import main
+from neuido.commands.sweep import scored, sweep
+from neuido.commands.sweep_file import command_of, read_sweep, runs_of
+from neuido.data.files.run_folder import own_folder, redirect
+from neuido.data.files.score_tables import write_rows
 from neuido.errors import UserError
-from neuido.run_folder import own_folder, redirect
-from neuido.sweep import scored, sweep
-from neuido.sweep_file import command_of, read_sweep, runs_of
 
 ROOT = Path(neuido.__file__).parents[1]
 SWEEPS = sorted(path for path in neuido.configs_root().rglob("*.yaml") if "parameters" in yaml.safe_load(path.read_text()))
@@ -243,7 +243,7 @@ def test_run_that_another_process_holds_is_left_alone(tmp_path):
     (tmp_path / "prog.py").write_text("import time, sys; print('running', flush=True); time.sleep(30)")
     path = write(tmp_path, command=[sys.executable, str(tmp_path / "prog.py"), "${args}"], parameters={"a": {"values": [1]}})
     out = tmp_path / "out"
-    code = f"from neuido.sweep import sweep; sweep({path!r}, out={str(out)!r})"
+    code = f"from neuido.commands.sweep import sweep; sweep({path!r}, out={str(out)!r})"
     first = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True, stdout=subprocess.DEVNULL)
     try:
         log, until = out / "a-1" / "log.txt", time.monotonic() + 60

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 import neuido
-from neuido.data.storage import write as write_text
+from neuido.data.files.storage import write as write_text
 from neuido.discrepancy import ceiling, next_experiment, report, residual
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.believed import beside

@@ -13,19 +13,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neuido.data.experiments import Experiment, read_belief
-from neuido.data.scenes import read_yaml
-from neuido.data.storage import publish
+from neuido.data.bodies.scene_files import read_yaml
+from neuido.data.files.storage import publish
+from neuido.data.measured.experiment import Experiment, read_belief
 from neuido.discrepancy.library import effects_of
 from neuido.errors import UserError
-from neuido.models.results import load_law
-from neuido.physics.effect_library import KNOTS
-from neuido.physics.effect_tables import shear_modulus
-from neuido.physics.effects import Effects
-from neuido.physics.finite_elements import FiniteElements
-from neuido.physics.law import ElasticLaw, PlasticLaw
-from neuido.physics.laws import material
-from neuido.physics.mpm import Simulator
+from neuido.models.inference.outputs import load_law
+from neuido.physics.effects.coefficients import shear_modulus
+from neuido.physics.effects.library import KNOTS
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.fem.finite_elements import FiniteElements
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.laws.classical import material
+from neuido.physics.mpm.simulator import Simulator
 
 CLASSICAL = {
     name: "the law is a neural one, whose flow has no such parameter"

@@ -15,19 +15,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.experiments import Experiment
-from neuido.data.experiments import Recording as Measured
+from neuido.data.measured.experiment import Experiment
+from neuido.data.measured.experiment import Recording as Measured
 from neuido.discrepancy.believed import CLASSICAL, classical
 from neuido.discrepancy.declared import declared
 from neuido.discrepancy.library import body_candidates, present
 from neuido.discrepancy.problem import Ask, Parameter, Point, Recording, Rows
 from neuido.discrepancy.rollouts import EVERY, SETTINGS, SOLVERS, BodyRollouts, Motions, substeps
 from neuido.errors import UserError, is_out_of_memory
-from neuido.physics import effect_kernels, law_kernels
-from neuido.physics.device import real_of
-from neuido.physics.effect_library import KNOTS
-from neuido.physics.meshing import follow
-from neuido.physics.threads import one_thread_each, pool
+from neuido.physics.effects import stress_kernels as effect_kernels
+from neuido.physics.effects.library import KNOTS
+from neuido.physics.fem.meshing import follow
+from neuido.physics.laws import classical_kernels as law_kernels
+from neuido.physics.mpm.threads import one_thread_each, pool
+from neuido.physics.runtime.device import real_of
 
 POISSON = 0.0, 0.495
 """What the simulators take: waves grow without bound towards 0.5."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
-    from neuido.data.experiments import Experiment
+    from neuido.data.measured.experiment import Experiment
     from neuido.discrepancy.attribution import Diagnosis
     from neuido.discrepancy.body import BodyProblem
     from neuido.discrepancy.memo import Work
@@ -141,18 +141,18 @@ def problems_of(
 
     given = None if model is None else read_model_file(model)
     if kind == "experiment":
-        from neuido.data.experiments import read_experiment
+        from neuido.data.measured.experiment import read_experiment
 
         found = read_experiment(folder, model=given)
         return [experiment_problem(found if law is None else with_law(found, law), data, device)]
     if law is not None or data != "auto":
         raise UserError(f"{'law' if law is not None else 'data'} is for experiments, and {folder} is a {kind}: leave it out")
     if kind == "material test":
-        from neuido.data.material_tests import read_material_tests
+        from neuido.data.measured.material_test import read_material_tests
         from neuido.discrepancy.material import MaterialProblem
 
         return [MaterialProblem(read_material_tests(folder, model=given))]
-    from neuido.data.tracks import read_tracks
+    from neuido.data.measured.track import read_tracks
     from neuido.discrepancy.track import TrackProblem, track_problems
 
     if given is None or set(given) != {"bodies"}:
@@ -210,7 +210,7 @@ def restricted(problem: "Problem", effects: str | None) -> "Problem":
     """
     if effects is None:
         return problem
-    from neuido.physics.effect_library import LIBRARY
+    from neuido.physics.effects.library import LIBRARY
 
     names = [name.strip() for name in effects.split(",") if name.strip()]
     known = [entry.name for entry in LIBRARY]

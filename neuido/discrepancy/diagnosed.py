@@ -1,10 +1,10 @@
 """What a diagnosis has found, for a law that is fitted to images: the effects of its `model_after.yaml` act on top of the law."""
 
 from neuido.discrepancy.believed import read_model_file, ready
-from neuido.models.pipeline import Prepared
-from neuido.models.scene_fit import EffectSource
-from neuido.physics.effects import Effects
-from neuido.physics.mpm import Simulator
+from neuido.models.fewshot.scene_fit import EffectSource
+from neuido.models.inference.pipeline import Prepared
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.mpm.simulator import Simulator
 
 
 class DiagnosedEffects(EffectSource):

@@ -7,16 +7,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import project
-from neuido.data.experiments import Experiment, Recording
-from neuido.data.multiview import SceneViews
-from neuido.data.shapes import rigid_velocity
-from neuido.data.visual import RECONSTRUCTION, from_background, read_body, read_motion
+from neuido.data.measured.experiment import Experiment, Recording
+from neuido.data.scenes.filmed_scene import RECONSTRUCTION, from_background, read_body, read_motion
+from neuido.data.scenes.multiview import SceneViews
 from neuido.discrepancy.silhouettes import LEVEL, usable
 from neuido.errors import UserError
-from neuido.models.filling import fill, visual_hull
-from neuido.models.gaussians import bind, deform, load_ply
-from neuido.models.splatting import rasterize
+from neuido.models.reconstruct.filling import fill, visual_hull
+from neuido.models.render.gaussians import bind, deform, load_ply
+from neuido.models.render.splatting import rasterize
 from neuido.types import Body, Cameras, ParticleState
 
 SIDE = 128

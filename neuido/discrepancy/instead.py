@@ -13,7 +13,7 @@ from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Candidate, Parameter, Point
 from neuido.discrepancy.refining import Refining
 from neuido.discrepancy.starting import SMALL
-from neuido.physics.effect_library import LIMITS
+from neuido.physics.effects.library import LIMITS
 
 NEAR_IT = 1.5
 """Times the cost of the leading fit from which on a candidate is behind it."""

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from neuido.data.experiments import Experiment
+from neuido.data.measured.experiment import Experiment
 from neuido.discrepancy.problem import Candidate, Parameter
-from neuido.physics.effect_library import KNOTS
-from neuido.physics.effects import Effects
+from neuido.physics.effects.library import KNOTS
+from neuido.physics.effects.parameters import Effects
 
 REST = {"maxwell.time": 1.0, "stiffness_gradient.radius": 1e-6, "time_force.frequency": 0.0}
 """What parameters of shape take in a launch beside points that lack the effect."""

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuido.data.material_tests import MaterialTest, MaterialTests, read_material_tests
+from neuido.data.measured.material_test import MaterialTest, MaterialTests, read_material_tests
 from neuido.discrepancy.declared import declared
 from neuido.discrepancy.noise import high_pass, monotone_pieces
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem, Recording
 from neuido.errors import UserError
-from neuido.physics.effects import LIBRARY, Effects
-from neuido.physics.laws import material
-from neuido.physics.material_point import Specimen, stress_along, turn
+from neuido.physics.effects.parameters import LIBRARY, Effects
+from neuido.physics.laws.classical import material
+from neuido.physics.points.material_point import Specimen, stress_along, turn
 
 STAGES = {
     "strain_stiffening": "large strain",

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from neuido.data.experiments import Recording as Measured
+from neuido.data.measured.experiment import Recording as Measured
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.problem import Point, Problem
 from neuido.errors import UserError
@@ -216,7 +216,7 @@ class _Launches(Problem):
         self.inner, self.velocity, self.t = problem, velocity, t
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
-        from neuido.physics.point_mass import fly
+        from neuido.physics.points.point_mass import fly
 
         track = self.inner._flights[self.inner.roles["fit"][0]]
         count = len(points)
@@ -249,7 +249,7 @@ class _Loads(Problem):
         self.inner, self.mode, self.path, self.time = problem, mode, path, time
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
-        from neuido.physics.material_point import stress_along
+        from neuido.physics.points.material_point import stress_along
 
         path = torch.from_numpy(self.path)
         time = None if self.time is None else torch.from_numpy(self.time)

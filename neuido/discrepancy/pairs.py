@@ -11,7 +11,7 @@ from neuido.discrepancy.laboratory import LEAST_GAIN
 from neuido.discrepancy.problem import Candidate, Point
 from neuido.discrepancy.rounds import Inference
 from neuido.discrepancy.trials import Round, Stand, Trial, score, times_over, unphysical
-from neuido.physics.effect_library import LIMITS
+from neuido.physics.effects.library import LIMITS
 
 WORSE = 3.0
 """Times the error of the better method at which the other one is not asked any more: where that found nothing, and for two effects."""

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from neuido.data.tracks import AXES, Track
+from neuido.data.measured.track import AXES, Track
 from neuido.discrepancy.noise import SeriesError
 from neuido.discrepancy.problem import Parameter
-from neuido.physics.point_mass import Forces, fly
+from neuido.physics.points.point_mass import Forces, fly
 
 RANGE = 2.0
 """How far a nuisance of the folder may be off, in its standard deviations."""

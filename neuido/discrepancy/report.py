@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from neuido.data.files.html_page import escaped, table
+from neuido.data.files.html_page import page as html_page
 from neuido.discrepancy import next_experiment
 from neuido.discrepancy import report_figures as draw
 from neuido.discrepancy import report_silhouettes as pictures
@@ -14,8 +16,6 @@ from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.ceiling import Ceiling
 from neuido.discrepancy.judging import ALPHA
 from neuido.discrepancy.residual import Series
-from neuido.page import escaped, table
-from neuido.page import page as html_page
 
 STYLE = """h2{font-size:1.15em}
 .answer{font-size:1.2em;padding:.6em 1em;background:#f3f6f9;border-left:4px solid #1f77b4}

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from neuido.data.files.html_page import figure, small, svg
 from neuido.discrepancy.residual import Series
-from neuido.page import figure, small, svg
 
 INK, BEFORE, AFTER = "#333333", "#c0392b", "#1f77b4"
 MOST_POINTS, MOST_FRAMES = 400, 60

@@ -6,8 +6,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from neuido.data.files.html_page import escaped, png, table
 from neuido.discrepancy.silhouettes import distances
-from neuido.page import escaped, png, table
 
 BEFORE, AFTER = (192, 57, 43), (31, 119, 180)
 """Red and blue of the report, RGB."""

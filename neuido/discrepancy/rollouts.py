@@ -15,16 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.experiments import Experiment
-from neuido.data.experiments import Recording as Measured
+from neuido.data.measured.experiment import Experiment
+from neuido.data.measured.experiment import Recording as Measured
 from neuido.discrepancy.believed import laws_of
 from neuido.discrepancy.library import effects_of
 from neuido.discrepancy.problem import Point, Problem
 from neuido.errors import UserError
-from neuido.physics.effects import Effects
-from neuido.physics.finite_elements import FiniteElements
-from neuido.physics.meshing import Mesh, mesh_body
-from neuido.physics.mpm import Simulator
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.fem.finite_elements import FiniteElements
+from neuido.physics.fem.meshing import Mesh, mesh_body
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import ParticleState
 
 SEGMENT = 200

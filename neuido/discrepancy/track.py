@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from neuido.data.tracks import AXES, Track, Tracks, read_tracks
+from neuido.data.measured.track import AXES, Track, Tracks, read_tracks
 from neuido.discrepancy.noise import SeriesError, correlation, high_pass
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem, Recording
 from neuido.discrepancy.released import Released, settle, settled_error
-from neuido.physics.effect_library import KNOTS
-from neuido.physics.effects import LIBRARY
-from neuido.physics.point_mass import Forces
+from neuido.physics.effects.library import KNOTS
+from neuido.physics.effects.parameters import LIBRARY
+from neuido.physics.points.point_mass import Forces
 
 SURROUNDINGS = ("gravity", "uniform_acceleration", "position_force", "time_force")
 """Effects of the surroundings, the same for all bodies of a folder; the others belong to a body."""

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from neuido.data.cameras import project
-from neuido.data.experiments import Experiment
-from neuido.data.experiments import Recording as Measured
+from neuido.data.measured.experiment import Experiment
+from neuido.data.measured.experiment import Recording as Measured
 from neuido.discrepancy import silhouettes
 from neuido.discrepancy.body import INSTRUMENTS, WINDOWS, BodyProblem, Run, body_problem
 from neuido.discrepancy.filmed import Film, Look, Splats, body_of, looks, read_film

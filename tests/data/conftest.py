@@ -1,6 +1,6 @@
 import pytest
 
-from neuido.data.simulate import simulate
+from neuido.data.trajectories.options import simulate
 
 TINY = {
     "instances": 3,

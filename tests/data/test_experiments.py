@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import torch
 
+from neuido.data.bodies.scene_files import scene_from_dict
 from neuido.data.cameras import project
-from neuido.data.experiments import Experiment, Recording, read_experiment, scene_to_dict, write_experiment
-from neuido.data.formats import read
-from neuido.data.multiview import SceneViews
-from neuido.data.scenes import scene_from_dict
+from neuido.data.measured.experiment import Experiment, Recording, read_experiment, scene_to_dict, write_experiment
+from neuido.data.scenes.multiview import SceneViews
+from neuido.data.scenes.readers import read
 from neuido.errors import UserError
-from neuido.physics.laws import material
-from neuido.physics.mpm import Simulator
+from neuido.physics.laws.classical import material
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
 from tests.data import samples
 from tests.data.refused import assert_refused

@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from neuido.data import cameras as convert
-from neuido.data.formats import FORMATS, MultiView, colmap, nerfstudio, neuma, read, springgaus
-from neuido.data.multiview import SceneViews
+from neuido.data.formats import colmap, nerfstudio, neuma, springgaus
+from neuido.data.formats.layout import MultiView
+from neuido.data.scenes.multiview import SceneViews
+from neuido.data.scenes.readers import FORMATS, read
 from neuido.errors import UserError
 from tests.data import samples
 

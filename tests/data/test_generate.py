@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.data import families, generate, storage
-from neuido.data.simulate import FAMILIES, simulate
+from neuido.data.bodies import families
+from neuido.data.files import storage
+from neuido.data.trajectories import generation as generate
+from neuido.data.trajectories.options import FAMILIES, simulate
 from neuido.errors import UserError
 
 from .conftest import TINY

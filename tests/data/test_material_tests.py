@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from neuido.data.material_tests import read_material_tests
+from neuido.data.measured.material_test import read_material_tests
 from neuido.errors import UserError
-from neuido.physics.laws import material
+from neuido.physics.laws.classical import material
 from tests.data.refused import assert_refused
 
 YAML = """format: neuido-material-test/1

@@ -5,8 +5,9 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 
 from neuido.data.cameras import project
-from neuido.data.formats import nerfstudio, read
-from neuido.data.multiview import MultiViewDataModule, MultiViewDataset, SceneViews
+from neuido.data.formats import nerfstudio
+from neuido.data.scenes.multiview import MultiViewDataModule, MultiViewDataset, SceneViews
+from neuido.data.scenes.readers import read
 from neuido.errors import UserError
 from neuido.types import Cameras, MultiViewBatch
 from tests.data import samples

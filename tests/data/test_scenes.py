@@ -5,9 +5,10 @@ import pytest
 import torch
 import yaml
 
-from neuido.data import scenes, shapes
+from neuido.data.bodies import scene_files as scenes
+from neuido.data.bodies import shapes
 from neuido.errors import UserError
-from neuido.physics.laws import material
+from neuido.physics.laws.classical import material
 from neuido.types import AttachedMass, Box, Plane, Scene, Walls
 
 # Particles, lowest and highest corner, velocity of VisionLaw's initial states (their init.pt, measured).

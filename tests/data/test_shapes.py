@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from neuido.data import shapes
+from neuido.data.bodies import shapes
 from neuido.errors import UserError
 
 

@@ -12,16 +12,18 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.data import scenes, synthetic, visual
+from neuido.commands.simulate import simulate
+from neuido.data.bodies import scene_files as scenes
 from neuido.data.cameras import project
-from neuido.data.experiments import read_experiment
-from neuido.data.simulate import Film
-from neuido.data.synthetic import make_scenes, plan_scene
+from neuido.data.measured.experiment import read_experiment
+from neuido.data.scenes import filmed_scene as visual
+from neuido.data.scenes import synthetic
+from neuido.data.scenes.synthetic import make_scenes, plan_scene
+from neuido.data.trajectories.options import Film
 from neuido.errors import UserError
-from neuido.models.splatting import rasterize
-from neuido.physics.laws import material
-from neuido.physics.mpm import Simulator
-from neuido.simulate import simulate
+from neuido.models.render.splatting import rasterize
+from neuido.physics.laws.classical import material
+from neuido.physics.mpm.simulator import Simulator
 
 BALL = {
     "name": "Ball",

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from neuido.data.tracks import read_tracks
+from neuido.data.measured.track import read_tracks
 from neuido.errors import UserError
 from tests.data.refused import assert_refused
 

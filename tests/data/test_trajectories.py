@@ -7,8 +7,8 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from neuido.data.sampling import Order
-from neuido.data.trajectories import TrajectoryDataModule
+from neuido.data.trajectories.sampling import Order
+from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
 from neuido.errors import UserError
 
 from .conftest import TINY

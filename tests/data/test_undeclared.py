@@ -7,18 +7,19 @@ import numpy as np
 import pytest
 import yaml
 
-from neuido.cli import main
-from neuido.data.experiments import read_experiment
-from neuido.data.material_tests import read_material_tests
-from neuido.data.tracks import read_tracks
-from neuido.data.undeclared import Case, bodies, make_undeclared
+from neuido.commands.main import main
+from neuido.data.measured.experiment import read_experiment
+from neuido.data.measured.material_test import read_material_tests
+from neuido.data.measured.track import read_tracks
+from neuido.data.undeclared import Case, make_undeclared
+from neuido.data.undeclared import random_bodies as bodies
 from neuido.data.undeclared.body_case import draw_kinds
-from neuido.data.undeclared.effects import KINDS, OUTSIDE, Scales, draw_effect, entry_of
+from neuido.data.undeclared.instruments import WRONG_NUISANCES
 from neuido.data.undeclared.motion import Motion, Solver, move
-from neuido.data.undeclared.recording import WRONG_NUISANCES
+from neuido.data.undeclared.random_effects import KINDS, OUTSIDE, Scales, draw_effect, entry_of
 from neuido.errors import UserError
-from neuido.physics.effects import LIBRARY
-from neuido.physics.meshing import follow
+from neuido.physics.effects.parameters import LIBRARY
+from neuido.physics.fem.meshing import follow
 from neuido.types import Plane, Scene
 
 SMALL = Case(particles=150, seconds=0.15, solver="same")

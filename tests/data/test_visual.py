@@ -3,9 +3,9 @@ import shutil
 import numpy as np
 import pytest
 
-from neuido.data import scenes
-from neuido.data.synthetic import JELLY
-from neuido.data.visual import Motion, Placing, Setting, read_motion, read_setting, read_truth, write_motion, write_setting
+from neuido.data.bodies import scene_files as scenes
+from neuido.data.scenes.filmed_scene import Motion, Placing, Setting, read_motion, read_setting, read_truth, write_motion, write_setting
+from neuido.data.scenes.synthetic import JELLY
 from neuido.errors import UserError
 from neuido.types import AttachedMass, Box, Plane, Scene, Walls
 from tests.data.refused import assert_refused

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.data.scenes import VARIABLE
-from neuido.data.visual_known import cropped, load_known
-from neuido.data.visual_module import VisualDataModule
+from neuido.data.bodies.scene_files import VARIABLE
+from neuido.data.scenes.filmed_scene_module import VisualDataModule
+from neuido.data.scenes.known_body import cropped, load_known
 from neuido.errors import UserError
-from neuido.models.pipeline import draw, prepare
-from neuido.models.scores import intersection_over_union
+from neuido.models.inference.pipeline import draw, prepare
+from neuido.models.scoring.motion_scores import intersection_over_union
 from neuido.types import ParticleState
 from tests.data.samples import Sample, experiment
 
@@ -100,7 +100,7 @@ def test_wrong_keys_are_named(folder, key, value):
 
 
 def test_the_silicone_video():
-    from neuido.data.scenes import data_root
+    from neuido.data.bodies.scene_files import data_root
 
     try:
         folder = data_root() / "measured" / "silicone-video"

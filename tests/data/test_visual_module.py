@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuido.data.visual_module import Turns, VisualDataModule, train_on
+from neuido.data.scenes.filmed_scene_module import Turns, VisualDataModule, train_on
 from neuido.errors import UserError
 from neuido.types import Cameras, MultiViewBatch
 

@@ -8,13 +8,13 @@ import torch
 import yaml
 
 from neuido.data.cameras import orbit
-from neuido.data.experiments import Experiment, Recording, write_experiment
 from neuido.data.formats import nerfstudio
-from neuido.data.synthetic import dress
-from neuido.models.splatting import rasterize
-from neuido.physics.effects import Effects
-from neuido.physics.laws import material
-from neuido.physics.mpm import Simulator
+from neuido.data.measured.experiment import Experiment, Recording, write_experiment
+from neuido.data.scenes.synthetic import dress
+from neuido.models.render.splatting import rasterize
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.classical import material
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Plane, Scene
 
 MODEL = {

@@ -14,8 +14,8 @@ import pytest
 import yaml
 
 import neuido
-from neuido.cli import main
-from neuido.data.experiments import read_experiment
+from neuido.commands.main import main
+from neuido.data.measured.experiment import read_experiment
 from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.command import solved_by
 from neuido.discrepancy.rollouts import SETTINGS
@@ -331,7 +331,7 @@ def test_experiment_closes_the_loop(folders, tmp_path, capsys):
 
 def test_declared_effects_are_simulated_and_are_the_candidates_start(folders):
     """What the model declares is in every prediction, as if the point had it; and a candidate of that name starts from it."""
-    from neuido.data.experiments import read_experiment
+    from neuido.data.measured.experiment import read_experiment
     from neuido.discrepancy.body import body_problem
 
     plain = read_experiment(folders["experiment"])

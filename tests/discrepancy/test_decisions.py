@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.data.experiments import Experiment
-from neuido.data.material_tests import read_material_tests
-from neuido.data.tracks import read_tracks
+from neuido.commands.demo.closed_loop import ELASTIC, Launch, record
+from neuido.data.measured.experiment import Experiment
+from neuido.data.measured.material_test import read_material_tests
+from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.motion import Solver, move
-from neuido.demo_loop import ELASTIC, Launch, record
 from neuido.discrepancy import answer, attribution, residual
 from neuido.discrepancy.answer import motions
 from neuido.discrepancy.attribution import Diagnosis

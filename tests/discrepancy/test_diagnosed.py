@@ -6,9 +6,9 @@ import yaml
 
 from neuido.discrepancy.diagnosed import DiagnosedEffects
 from neuido.errors import UserError
-from neuido.models.adapt import AdaptModule
-from neuido.models.adapter import LowRankAdaptation
-from neuido.physics.effects import Effects
+from neuido.models.fewshot.low_rank import LowRankAdaptation
+from neuido.models.stages.adapt import AdaptModule
+from neuido.physics.effects.parameters import Effects
 from tests.models.visual_samples import tiny_scene
 
 MODEL = {

@@ -10,8 +10,8 @@ from neuido.discrepancy import rollouts
 from neuido.discrepancy.body import BodyProblem, body_problem
 from neuido.discrepancy.rollouts import SETTINGS
 from neuido.errors import UserError
-from neuido.physics.finite_elements import FiniteElements
-from neuido.physics.mpm import Simulator
+from neuido.physics.fem.finite_elements import FiniteElements
+from neuido.physics.mpm.simulator import Simulator
 from tests.discrepancy import made
 
 CUDA = pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")])

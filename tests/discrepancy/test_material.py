@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from neuido.data.material_tests import read_material_tests
+from neuido.data.measured.material_test import read_material_tests
 from neuido.discrepancy.fit import levenberg_marquardt, run
 from neuido.discrepancy.material import MaterialProblem
 from neuido.discrepancy.noise import high_pass, monotone_pieces

@@ -8,12 +8,12 @@ import pytest
 import torch
 import yaml
 
-from neuido.data.experiments import read_experiment
+from neuido.data.measured.experiment import read_experiment
 from neuido.discrepancy.believed import classical, laws_of, ready, scaled, with_law
 from neuido.discrepancy.body import body_problem
-from neuido.models.operator import IntrinsicDynamicsOperator
-from neuido.models.results import load_law, save_law
-from neuido.physics.mpm import Simulator
+from neuido.models.inference.outputs import load_law, save_law
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.physics.mpm.simulator import Simulator
 from tests.command import run
 from tests.discrepancy import made
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.data.experiments import read_experiment
-from neuido.data.tracks import read_tracks
+from neuido.data.measured.experiment import read_experiment
+from neuido.data.measured.track import read_tracks
 from neuido.discrepancy import floors, next_experiment
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.body import body_problem

@@ -7,14 +7,14 @@ import pytest
 import torch
 import yaml
 
-from neuido.data.experiments import read_experiment
+from neuido.data.measured.experiment import read_experiment
 from neuido.discrepancy.believed import ready
 from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.resume import CachedProblem
 from neuido.discrepancy.rollouts import SEGMENT, segment_of
 from neuido.errors import UserError
-from neuido.physics.laws import FixedCorotated
-from neuido.physics.mpm import Simulator
+from neuido.physics.laws.classical import FixedCorotated
+from neuido.physics.mpm.simulator import Simulator
 from tests.command import run
 from tests.discrepancy import made
 

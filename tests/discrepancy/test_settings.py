@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from neuido.commands.demo.closed_loop import ELASTIC, record
 from neuido.data.undeclared.motion import Solver, move
-from neuido.demo_loop import ELASTIC, record
 from neuido.discrepancy import laboratory
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.body import body_problem

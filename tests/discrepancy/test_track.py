@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import yaml
 
-from neuido.data.tracks import read_tracks
+from neuido.data.measured.track import read_tracks
 from neuido.discrepancy.fit import levenberg_marquardt, run
 from neuido.discrepancy.noise import correlation
 from neuido.discrepancy.track import TrackProblem, flight_of, track_problems
-from neuido.physics.point_mass import Forces, fly
+from neuido.physics.points.point_mass import Forces, fly
 
 T = np.arange(0, 3.0, 1 / 15)
 

@@ -11,14 +11,14 @@ import pytest
 import torch
 import yaml
 
-from neuido.data.experiments import read_experiment
-from neuido.data.synthetic import dress
+from neuido.data.measured.experiment import read_experiment
+from neuido.data.scenes.synthetic import dress
 from neuido.discrepancy import silhouettes
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.filmed import Splats, looks, read_film
 from neuido.discrepancy.silhouettes import View
 from neuido.discrepancy.video import VideoProblem, video_problem
-from neuido.models.gaussians import harmonics_of, save_ply
+from neuido.models.render.gaussians import harmonics_of, save_ply
 from neuido.types import Gaussians, ParticleState
 from tests import command
 from tests.discrepancy import made

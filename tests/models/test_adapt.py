@@ -17,17 +17,17 @@ from lightning.pytorch.callbacks import LambdaCallback
 from safetensors.torch import load_file
 
 from neuido.errors import UserError
-from neuido.models.adapt import AdaptModule
-from neuido.models.adapter import LowRankAdaptation
-from neuido.models.baselines import KnownLaw
-from neuido.models.filmed import image_losses
-from neuido.models.methods import Method
-from neuido.models.operator import IntrinsicDynamicsOperator
-from neuido.models.pipeline import prepare
-from neuido.models.progress import RECOVERY, Progress
-from neuido.models.relative_density import RelativeDensity, lattice
-from neuido.models.scene_fit import EffectSource, SceneFit
-from neuido.physics.effects import Effects
+from neuido.models.baselines.learned import KnownLaw
+from neuido.models.fewshot.fit_progress import RECOVERY, Progress
+from neuido.models.fewshot.low_rank import LowRankAdaptation
+from neuido.models.fewshot.method import Method
+from neuido.models.fewshot.relative_density import RelativeDensity, lattice
+from neuido.models.fewshot.scene_fit import EffectSource, SceneFit
+from neuido.models.inference.pipeline import prepare
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.stages.adapt import AdaptModule
+from neuido.models.stages.image_module import image_losses
+from neuido.physics.effects.parameters import Effects
 from tests.models.visual_samples import TinyScenes, tiny_scene
 
 ROOT = Path(__file__).parents[2]
@@ -393,8 +393,8 @@ import sys, time
 import torch
 from lightning.pytorch import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
-from neuido.models.adapt import AdaptModule
-from neuido.models.adapter import LowRankAdaptation
+from neuido.models.stages.adapt import AdaptModule
+from neuido.models.fewshot.low_rank import LowRankAdaptation
 from tests.models.visual_samples import TinyScenes
 
 torch.set_num_threads(1)

@@ -9,10 +9,10 @@ from peft import PeftModel
 from safetensors.torch import load_file
 
 from neuido.errors import UserError
-from neuido.models.adapter import PEFT_FILES, LowRankAdaptation
-from neuido.models.operator import IntrinsicDynamicsOperator
-from neuido.models.pipeline import prepare
-from neuido.models.results import load_law
+from neuido.models.fewshot.low_rank import PEFT_FILES, LowRankAdaptation
+from neuido.models.inference.outputs import load_law
+from neuido.models.inference.pipeline import prepare
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from tests.models.visual_samples import tiny_scene
 
 

@@ -13,11 +13,11 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 
 from neuido.errors import UserError
-from neuido.models.align import AlignModule
-from neuido.models.branch import small_strain_modulus
-from neuido.models.encoder import DynamicsEncoder
-from neuido.models.filmed import some_views
-from neuido.models.flow_vae import FlowVAE
+from neuido.models.operator.branch import small_strain_modulus
+from neuido.models.stages.align import AlignModule
+from neuido.models.stages.image_module import some_views
+from neuido.models.video.encoder import DynamicsEncoder
+from neuido.models.video.flow_vae import FlowVAE
 from tests.models.visual_samples import TinyScenes, tiny_scene
 
 ROOT = Path(__file__).parents[2]
@@ -129,7 +129,7 @@ import sys, time
 import torch
 from lightning.pytorch import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
-from neuido.models.align import AlignModule
+from neuido.models.stages.align import AlignModule
 from tests.models.visual_samples import TinyScenes
 
 torch.set_num_threads(1)

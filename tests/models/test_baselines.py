@@ -8,14 +8,14 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 
 from neuido.errors import UserError
-from neuido.models.adapt import AdaptModule
-from neuido.models.baselines import PARTS, KnownLaw, MeanLatent, NCLaw, NeuMA, RandomLatent, UniPhy, nclaw, nclaw_weights
-from neuido.models.filmed import image_losses
-from neuido.models.pipeline import draw, prepare
-from neuido.models.springs import SpringMass, farthest_points, following
-from neuido.models.symbolic import SparseLaw
-from neuido.physics.effects import Effects
-from neuido.physics.laws import FixedCorotated, Sigma
+from neuido.models.baselines.learned import PARTS, KnownLaw, MeanLatent, NCLaw, NeuMA, RandomLatent, UniPhy, nclaw, nclaw_weights
+from neuido.models.baselines.sparse_law import SparseLaw
+from neuido.models.baselines.spring_gaus import SpringMass, farthest_points, following
+from neuido.models.inference.pipeline import draw, prepare
+from neuido.models.stages.adapt import AdaptModule
+from neuido.models.stages.image_module import image_losses
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.classical import FixedCorotated, Sigma
 from tests.models.visual_samples import TinyScenes, tiny_scene
 
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.models.encoder import DynamicsEncoder, Projector, conditions_of
-from neuido.models.flow import Velocities
-from neuido.models.flow_vae import FlowVAE
+from neuido.models.video.encoder import DynamicsEncoder, Projector, conditions_of
+from neuido.models.video.flow import Velocities
+from neuido.models.video.flow_vae import FlowVAE
 
 
 @pytest.fixture

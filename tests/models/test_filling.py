@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from neuido.data.cameras import orbit
 from neuido.errors import UserError
-from neuido.models.filling import Volume, fill, opacity_volume, visual_hull
+from neuido.models.reconstruct.filling import Volume, fill, opacity_volume, visual_hull
 from neuido.types import Gaussians
 
 RADIUS, CENTRE = 0.2, torch.tensor([0.5, 0.4, 0.55])

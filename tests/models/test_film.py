@@ -8,14 +8,14 @@ import pytest
 import torch
 from lightning.pytorch import Trainer, seed_everything
 
-from neuido.data.families import laws
-from neuido.data.films import FilmDataModule, read_clip
+from neuido.commands.film import film
+from neuido.data.bodies.families import laws
+from neuido.data.scenes.clips import FilmDataModule, read_clip
 from neuido.errors import UserError
-from neuido.models.encoder import DynamicsEncoder
-from neuido.models.film import film
-from neuido.models.flow_vae import FlowVAE
-from neuido.models.pretrain_vae import FlowVAEModule
-from neuido.models.warmup import WarmupModule, judge
+from neuido.models.stages.pretrain_vae import FlowVAEModule
+from neuido.models.stages.warmup import WarmupModule, judge
+from neuido.models.video.encoder import DynamicsEncoder
+from neuido.models.video.flow_vae import FlowVAE
 
 TINY = {"count": 9, "views": 2, "frames": 9, "frame_steps": 8, "dts": [2e-3, 1e-3], "cells": 12, "particles": 150, "width": 48,
         "flow_size": 32, "samples": 32, "device": "cpu", "progress": False}  # fmt: skip

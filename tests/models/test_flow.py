@@ -7,8 +7,8 @@ import torch
 
 from neuido.data.cameras import orbit
 from neuido.errors import UserError
-from neuido.models import flow as module
-from neuido.models.flow import (
+from neuido.models.video import flow as module
+from neuido.models.video.flow import (
     colour_wheel,
     encode_flow,
     flow_image,

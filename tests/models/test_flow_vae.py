@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.models.flow_vae import FlowVAE
-from neuido.models.video_vae import open_vae
+from neuido.models.video.flow_vae import FlowVAE
+from neuido.models.video.video_vae import open_vae
 
 
 @pytest.mark.parametrize("frames", [1, 2, 5, 8, 9, 16, 17])

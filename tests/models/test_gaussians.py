@@ -8,7 +8,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from neuido.errors import UserError
-from neuido.models.gaussians import (
+from neuido.models.render.gaussians import (
     Binding,
     bind,
     colours_of,

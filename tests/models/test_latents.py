@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.cli import main
-from neuido.data.tables import read_rows
+from neuido.commands.main import main
+from neuido.data.files.score_tables import read_rows
 from neuido.errors import UserError
-from neuido.models import latents
-from neuido.models.branch import small_strain_modulus
-from neuido.models.operator import PRETRAINED, IntrinsicDynamicsOperator
+from neuido.models.operator import latent_space as latents
+from neuido.models.operator.branch import small_strain_modulus
+from neuido.models.operator.dynamics_operator import PRETRAINED, IntrinsicDynamicsOperator
 
 
 @pytest.fixture(scope="module", params=PRETRAINED)

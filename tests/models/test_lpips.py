@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from neuido.errors import UserError
-from neuido.models.lpips import LPIPS, Absent, open_lpips
+from neuido.models.scoring.lpips import LPIPS, Absent, open_lpips
 
 
 def backbone(path, net="alex"):

@@ -5,9 +5,9 @@ import torch
 from torch import nn
 
 from neuido.errors import UserError
-from neuido.models import operator as module
-from neuido.models.operator import IntrinsicDynamicsOperator, affine
-from neuido.physics import networks
+from neuido.models.operator import dynamics_operator as module
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator, affine
+from neuido.physics.laws.neural import networks
 from neuido.types import Particles
 
 SMALL = {"latent_dim": 6, "basis_dim": 5, "hidden_dim": 16, "head_dim": 8}

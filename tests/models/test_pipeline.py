@@ -12,15 +12,15 @@ from plyfile import PlyData
 
 import neuido
 from neuido.errors import UserError
-from neuido.models.align import AlignModule
-from neuido.models.conditions import read_conditions, simulate_condition
-from neuido.models.encoder import DynamicsEncoder
-from neuido.models.flow_vae import FlowVAE
-from neuido.models.lpips import Absent
-from neuido.models.operator import IntrinsicDynamicsOperator
-from neuido.models.pipeline import draw, folder_of, infer, prepare, roll, track
-from neuido.models.results import load_law, save_law, write_plys
-from neuido.models.scores import score_images, score_motion
+from neuido.models.inference.outputs import load_law, save_law, write_plys
+from neuido.models.inference.pipeline import draw, folder_of, infer, prepare, roll, track
+from neuido.models.inference.transfer import read_conditions, simulate_condition
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.scoring.lpips import Absent
+from neuido.models.scoring.motion_scores import score_images, score_motion
+from neuido.models.stages.align import AlignModule
+from neuido.models.video.encoder import DynamicsEncoder
+from neuido.models.video.flow_vae import FlowVAE
 from tests.models.visual_samples import TinyScenes, tiny_scene
 
 TWO = """
@@ -49,7 +49,7 @@ def tools(tmp_path_factory):
 
 def test_the_true_law_scores_nearly_perfectly(tools):
     operator, _, (prepared, _) = tools
-    from neuido.physics.laws import material
+    from neuido.physics.laws.classical import material
 
     law = prepared.source.truth.law
     with torch.no_grad():

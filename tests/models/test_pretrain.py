@@ -10,12 +10,12 @@ import pytest
 import torch
 from lightning.pytorch import Trainer, seed_everything
 
-from neuido.data.simulate import simulate
-from neuido.data.trajectories import TrajectoryDataModule
+from neuido.data.trajectories.options import simulate
+from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
 from neuido.errors import UserError
-from neuido.models.operator import IntrinsicDynamicsOperator
-from neuido.models.pretrain import ConstitutiveMetrics, PretrainModule, answer, fit_latents
-from neuido.physics.laws import FixedCorotated, Sigma, VonMises
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.stages.pretrain import ConstitutiveMetrics, PretrainModule, answer, fit_latents
+from neuido.physics.laws.classical import FixedCorotated, Sigma, VonMises
 from neuido.types import TrajectoryBatch
 
 SMALL = {"latent_dim": 8, "basis_dim": 8, "hidden_dim": 16, "head_dim": 16}
@@ -135,8 +135,8 @@ RUN = """
 import sys, torch
 from lightning.pytorch import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint
-from neuido.data.trajectories import TrajectoryDataModule
-from neuido.models.pretrain import PretrainModule
+from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
+from neuido.models.stages.pretrain import PretrainModule
 
 root, out, resume = sys.argv[1], sys.argv[2], sys.argv[3:] or [None]
 torch.set_num_threads(1)

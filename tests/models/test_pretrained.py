@@ -5,9 +5,9 @@ import re
 import pytest
 import torch
 
-from neuido.data.families import PUBLISHED, laws
-from neuido.models.operator import PRETRAINED, IntrinsicDynamicsOperator
-from neuido.models.pretrain import PretrainModule
+from neuido.data.bodies.families import PUBLISHED, laws
+from neuido.models.operator.dynamics_operator import PRETRAINED, IntrinsicDynamicsOperator
+from neuido.models.stages.pretrain import PretrainModule
 
 FAMILY_OF = {name: family for family, (name, _) in PUBLISHED.items()}
 

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.cli import main
+from neuido.commands.main import main
+from neuido.commands.reconstruct import reconstruct
 from neuido.data import cameras as convert
 from neuido.data.formats import nerfstudio
-from neuido.data.simulate import Film
-from neuido.data.synthetic import make_scenes
-from neuido.data.visual import from_background, load_views, load_visual, read_body, read_setting, read_truth
+from neuido.data.scenes.filmed_scene import from_background, load_views, load_visual, read_body, read_setting, read_truth
+from neuido.data.scenes.synthetic import make_scenes
+from neuido.data.trajectories.options import Film
 from neuido.errors import UserError
-from neuido.metrics import chamfer_distance
-from neuido.models.gaussians import bind, load_ply
-from neuido.models.reconstruct import ReconstructModule
-from neuido.models.splatting import rasterize
-from neuido.physics.laws import material
-from neuido.physics.mpm import Simulator
-from neuido.reconstruct import reconstruct
+from neuido.models.reconstruct.gaussian_fit import ReconstructModule
+from neuido.models.render.gaussians import bind, load_ply
+from neuido.models.render.splatting import rasterize
+from neuido.models.scoring.metrics import chamfer_distance
+from neuido.physics.laws.classical import material
+from neuido.physics.mpm.simulator import Simulator
 
 BOX = {
     "name": "Box",

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.models import splat_reference, splatting
-from neuido.models.gaussians import deform, harmonics_of
-from neuido.models.splatting import Splatting, rasterize, render
+from neuido.models.render import splat_reference, splatting
+from neuido.models.render.gaussians import deform, harmonics_of
+from neuido.models.render.splatting import Splatting, rasterize, render
 from neuido.types import Cameras, Gaussians
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]

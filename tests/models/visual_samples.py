@@ -7,15 +7,15 @@ from pathlib import Path
 import torch
 from lightning.pytorch import LightningDataModule
 
+from neuido.data.bodies.shapes import ball, box
 from neuido.data.cameras import orbit
-from neuido.data.shapes import ball, box
-from neuido.data.visual import Truth, VisualScene
-from neuido.data.visual_module import OneByOne, Turns, in_order
-from neuido.models.gaussians import deform, harmonics_of, save_ply
-from neuido.models.splatting import render
-from neuido.physics.effects import Effects
-from neuido.physics.laws import material
-from neuido.physics.mpm import Simulator
+from neuido.data.scenes.filmed_scene import Truth, VisualScene
+from neuido.data.scenes.filmed_scene_module import OneByOne, Turns, in_order
+from neuido.models.render.gaussians import deform, harmonics_of, save_ply
+from neuido.models.render.splatting import render
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.classical import material
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Gaussians, MultiViewBatch, Scene, Walls
 
 

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from neuido.data.shapes import cube
+from neuido.data.bodies.shapes import cube
 from neuido.errors import UserError
-from neuido.physics.composite import by_body
-from neuido.physics.laws import FixedCorotated, Identity, Sigma, VonMises
-from neuido.physics.mpm import Simulator
+from neuido.physics.laws.classical import FixedCorotated, Identity, Sigma, VonMises
+from neuido.physics.laws.composite import by_body
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Scene
 
 

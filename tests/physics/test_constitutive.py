@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics.constitutive import Constitutive, deviator, expm, hencky
-from neuido.physics.effect_tables import BAND, shear_modulus
-from neuido.physics.effects import Effects
-from neuido.physics.laws import AutogradElastic, DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, lame
+from neuido.physics.effects.coefficients import BAND, shear_modulus
+from neuido.physics.effects.constitutive import Constitutive, deviator, expm, hencky
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.classical import AutogradElastic, DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, lame
 
 YOUNG, POISSON = 1e5, 0.3
 MU, LAM = (float(t) for t in lame(torch.tensor(YOUNG, dtype=torch.float64), torch.tensor(POISSON, dtype=torch.float64)))

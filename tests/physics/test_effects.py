@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics import reference
-from neuido.physics.effects import LIBRARY, Effects, ball_inclusion, linear_gradient
-from neuido.physics.laws import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
-from neuido.physics.mpm import Simulator
+from neuido.physics.effects.parameters import LIBRARY, Effects, ball_inclusion, linear_gradient
+from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
+from neuido.physics.mpm import reference
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import ParticleState, Plane, Scene
 from tests.physics.bodies import DEVICE, block, busy_scenes, same
 

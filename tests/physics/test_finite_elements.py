@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics import element_loop
-from neuido.physics.assembly import Assembly
-from neuido.physics.constitutive import Constitutive
-from neuido.physics.effects import Effects
-from neuido.physics.finite_elements import FiniteElements
-from neuido.physics.laws import DruckerPrager, FixedCorotated, Identity, NeoHookean, VonMises, lame
-from neuido.physics.meshing import mesh_body
-from neuido.physics.mpm import Simulator
+from neuido.physics.effects.constitutive import Constitutive
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.fem import element_loop
+from neuido.physics.fem.assembly import Assembly
+from neuido.physics.fem.finite_elements import FiniteElements
+from neuido.physics.fem.meshing import mesh_body
+from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identity, NeoHookean, VonMises, lame
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import AttachedMass, Body, Box, ParticleState, Plane, Scene
 from tests.physics.bodies import block
 

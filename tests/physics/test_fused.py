@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from neuido.physics.fused import FusedEngine
-from neuido.physics.law import Engine
-from neuido.physics.mpm import Simulator
-from neuido.physics.networks import ObjectiveElastic, ObjectivePlastic
+from neuido.physics.laws.base import Engine
+from neuido.physics.laws.neural.fused import FusedEngine
+from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Particles, Scene, Walls
 from tests.physics.bodies import block
 

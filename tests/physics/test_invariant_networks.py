@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics import linalg
-from neuido.physics.invariants import InvariantElastic, InvariantPlastic, features
-from neuido.physics.laws import AutogradElastic, AutogradPlastic
-from neuido.physics.mpm import Simulator
+from neuido.physics.laws.classical import AutogradElastic, AutogradPlastic
+from neuido.physics.laws.neural.invariants import InvariantElastic, InvariantPlastic, features
+from neuido.physics.linalg import decompositions as linalg
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Particles, Scene
 from tests.physics.bodies import DEVICES, block
 from tests.physics.test_networks import OFFSETS, deformations, particles, run

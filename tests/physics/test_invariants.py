@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics.effects import Effects
-from neuido.physics.laws import DruckerPrager, FixedCorotated, Identity, NeoHookean, Sigma, VonMises, stack
-from neuido.physics.mpm import Simulator, affine_velocity
-from neuido.physics.rollout import Plan
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identity, NeoHookean, Sigma, VonMises, stack
+from neuido.physics.mpm.rollout import Plan
+from neuido.physics.mpm.simulator import Simulator, affine_velocity
 from neuido.types import AttachedMass, Body, Box, ParticleState, Plane, Scene, Walls
 from tests.physics.bodies import DEVICE, DEVICES, block, busy_scenes, same
 

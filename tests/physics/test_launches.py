@@ -6,13 +6,13 @@ import pytest
 import torch
 import warp as wp
 
-from neuido.data.shapes import cube
-from neuido.physics import device
-from neuido.physics.effects import Effects
-from neuido.physics.finite_elements import FiniteElements
-from neuido.physics.laws import FixedCorotated, Sigma, VonMises
-from neuido.physics.mpm import Simulator
-from neuido.physics.recording import Stretches
+from neuido.data.bodies.shapes import cube
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.fem.finite_elements import FiniteElements
+from neuido.physics.laws.classical import FixedCorotated, Sigma, VonMises
+from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime import device
+from neuido.physics.runtime.launches import Stretches
 from neuido.types import Scene
 
 CPU = torch.device("cpu")
@@ -82,7 +82,7 @@ def test_planes_beyond_the_body_do_not_matter(monkeypatch, dtype):
         with torch.no_grad():
             return simulator.rollout(240, FixedCorotated(torch.tensor([2e4], dtype=dtype), 0.3), every=40)
 
-    from neuido.physics.rollout import Plan
+    from neuido.physics.mpm.rollout import Plan
 
     few = frames()
     monkeypatch.setattr(Plan, "reach", lambda self, x: slice(None))

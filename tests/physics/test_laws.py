@@ -7,8 +7,18 @@ import torch
 import warp as wp
 
 from neuido.errors import UserError
-from neuido.physics import law_kernels, laws
-from neuido.physics.laws import AutogradElastic, AutogradPlastic, DruckerPrager, FixedCorotated, Identity, NeoHookean, Sigma, VonMises
+from neuido.physics.laws import classical as laws
+from neuido.physics.laws import classical_kernels as law_kernels
+from neuido.physics.laws.classical import (
+    AutogradElastic,
+    AutogradPlastic,
+    DruckerPrager,
+    FixedCorotated,
+    Identity,
+    NeoHookean,
+    Sigma,
+    VonMises,
+)
 from neuido.types import Particles
 
 EYE = torch.eye(3, dtype=torch.float64)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuido.physics import linalg
+from neuido.physics.linalg import decompositions as linalg
 
 EYE = torch.eye(3, dtype=torch.float64)
 
@@ -156,8 +156,8 @@ def test_float32_and_leading_axes():
 
 def test_the_kernel_frame_decomposes_as_torch_does():
     """What CUDA uses in place of torch's SVD, run here on the CPU: same singular values, rotations, and product."""
-    from neuido.physics.device import launch, real_of
-    from neuido.physics.law_kernels import kernels
+    from neuido.physics.laws.classical_kernels import kernels
+    from neuido.physics.runtime.device import launch, real_of
 
     g = torch.Generator().manual_seed(5)
     F = torch.randn(200, 3, 3, generator=g, dtype=torch.float64)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics.mass_spring import MassSpring, Springs, connect
+from neuido.physics.springs.mass_spring import MassSpring, Springs, connect
 from neuido.types import Plane, Scene, Walls
 from tests.physics.bodies import DEVICES
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics.effects import Effects
-from neuido.physics.laws import FixedCorotated, NeoHookean, Sigma, VonMises
-from neuido.physics.material_point import Specimen, stress_along, turn
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, VonMises
+from neuido.physics.points.material_point import Specimen, stress_along, turn
 
 YOUNG = 1.2e6
 MU = YOUNG / (2 * 1.499)

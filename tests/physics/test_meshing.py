@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics.meshing import Mesh, box_axes, follow, lattice_of, locate, mesh_body, mesh_of_cells, oriented, tetrahedra_of
+from neuido.physics.fem.meshing import Mesh, box_axes, follow, lattice_of, locate, mesh_body, mesh_of_cells, oriented, tetrahedra_of
 from tests.physics.bodies import block
 
 

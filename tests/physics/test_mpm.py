@@ -5,11 +5,12 @@ import torch
 import warp as wp
 
 from neuido.errors import UserError
-from neuido.physics import kernels, reference
-from neuido.physics.effects import Effects
-from neuido.physics.laws import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
-from neuido.physics.mpm import Simulator
-from neuido.physics.rollout import Plan
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
+from neuido.physics.mpm import reference
+from neuido.physics.mpm import transfers as kernels
+from neuido.physics.mpm.rollout import Plan
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Box, ParticleState, Plane, Scene, Walls
 from tests.physics.bodies import DEVICE, DEVICES, block, busy_scenes, same
 
@@ -353,7 +354,7 @@ def test_a_step_that_blows_up_is_an_error_not_a_nan():
 
 
 def test_launches_do_not_hold_the_memory_of_their_tensors():
-    from neuido.physics.device import _array
+    from neuido.physics.runtime.device import _array
 
     assert _array(torch.zeros(7, 3), wp.vec3f)._ref is None
 

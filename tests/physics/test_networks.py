@@ -5,8 +5,8 @@ import torch
 import warp as wp
 
 from neuido.errors import UserError
-from neuido.physics import network_kernels, networks
-from neuido.physics.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
+from neuido.physics.laws.neural import network_kernels, networks
+from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 from neuido.types import Particles
 
 LAWS = [RawElastic, RawPlastic, ObjectiveElastic, ObjectivePlastic]

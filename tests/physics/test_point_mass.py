@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from neuido.errors import UserError
-from neuido.physics.point_mass import Forces, fly
+from neuido.physics.points.point_mass import Forces, fly
 
 T = np.linspace(0, 3, 31)
 ZERO = np.zeros((1, 3))

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics.laws import DruckerPrager, Sigma, VonMises, lame
-from neuido.physics.mpm import Simulator
-from neuido.physics.symbolic import SymbolicElastic, SymbolicPlastic, formula, generators, polynomial
+from neuido.physics.laws.classical import DruckerPrager, Sigma, VonMises, lame
+from neuido.physics.laws.neural.symbolic import SymbolicElastic, SymbolicPlastic, formula, generators, polynomial
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Scene
 from tests.physics.bodies import DEVICES, block
 from tests.physics.test_invariant_networks import adjoint, on, weights_of

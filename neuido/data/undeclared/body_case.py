@@ -9,11 +9,25 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuido.data.experiments import Experiment, Recording, read_experiment, write_experiment
-from neuido.data.undeclared import Case, bodies
-from neuido.data.undeclared.effects import ANY, ELASTIC, GRAINS, KINDS, OUTSIDE, PLASTIC, SOLID, Drawn, Kind, Scales, draw_effect, entry_of
+from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
+from neuido.data.undeclared import Case
+from neuido.data.undeclared import random_bodies as bodies
+from neuido.data.undeclared.instruments import Markers, fastest, recorded, vector, wrong_nuisances
 from neuido.data.undeclared.motion import Motion, Solver, move
-from neuido.data.undeclared.recording import Markers, fastest, recorded, vector, wrong_nuisances
+from neuido.data.undeclared.random_effects import (
+    ANY,
+    ELASTIC,
+    GRAINS,
+    KINDS,
+    OUTSIDE,
+    PLASTIC,
+    SOLID,
+    Drawn,
+    Kind,
+    Scales,
+    draw_effect,
+    entry_of,
+)
 from neuido.data.undeclared.sizing import LEAST, MOST, OVER_FLOOR, Again, rms, short, sized
 from neuido.errors import UserError
 from neuido.types import Body

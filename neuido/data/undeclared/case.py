@@ -11,15 +11,15 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from neuido.data.scenes import read_yaml
-from neuido.data.storage import publish_folder, write
+from neuido.data.bodies.scene_files import read_yaml
+from neuido.data.files.storage import publish_folder, write
 from neuido.data.undeclared import Case
 from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.curves import curve_case
-from neuido.data.undeclared.effects import KINDS, OUTSIDE
+from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.data.undeclared.sizing import LEAST, MOST, Again
 from neuido.errors import UserError
-from neuido.physics.device import choose_device
+from neuido.physics.runtime.device import choose_device
 
 TRIES = 12
 """Draws before a seed is given up."""

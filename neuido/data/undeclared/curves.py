@@ -11,16 +11,16 @@ import numpy as np
 import torch
 import yaml
 
-from neuido.data.material_tests import read_material_tests
-from neuido.data.tracks import read_tracks
+from neuido.data.measured.material_test import read_material_tests
+from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared import Case
-from neuido.data.undeclared.effects import ELASTIC, PLASTIC, Drawn, entry_of
+from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, entry_of
 from neuido.data.undeclared.sizing import Again, rms, short, sized
 from neuido.errors import UserError
-from neuido.physics.effects import Effects
-from neuido.physics.laws import material
-from neuido.physics.material_point import Specimen, stress_along
-from neuido.physics.point_mass import Forces, fly
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.classical import material
+from neuido.physics.points.material_point import Specimen, stress_along
+from neuido.physics.points.point_mass import Forces, fly
 from neuido.types import Vector
 
 Sizes = Mapping[str, tuple[Mapping[str, float], str, float, float]]

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.physics.effects import Effects, linear_gradient
-from neuido.physics.finite_elements import FiniteElements
-from neuido.physics.laws import material
-from neuido.physics.mpm import Simulator
+from neuido.physics.effects.parameters import Effects, linear_gradient
+from neuido.physics.fem.finite_elements import FiniteElements
+from neuido.physics.laws.classical import material
+from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, ParticleState, Scene
 
 SPLIT = 2e-3

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from neuido.data.undeclared.effects import Drawn
+from neuido.data.undeclared.random_effects import Drawn
 
 LEAST, MOST = 15.0, 150.0
 """Separation over noise that a case may have."""

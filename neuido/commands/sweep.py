@@ -1,0 +1,206 @@
+"""The `sweep` command: the runs of a wandb sweep file, one after the other and without a server."""
+
+import contextlib
+import fcntl
+import math
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from neuido.commands.config_files import find_config
+from neuido.commands.sweep_file import Metric, Run, SweepFile, command_of, read_sweep, runs_of
+from neuido.data.files.run_folder import FOLDER, FORMAT, note, status_of
+from neuido.data.files.score_tables import read_rows, write_rows
+from neuido.errors import UserError
+
+
+def sweep(
+    file: str, *, out: str | None = None, shard: int = 0, shards: int = 1, count: int | None = None, seed: int = 0, report: bool = True
+) -> int:
+    """Run a wandb sweep file (grid or random) without a server; wandb logs offline, and the results come into one CSV.
+
+    Each run has a folder of its own, <out>/<its parameters>: what it prints (log.txt), its logs and its results. Runs that are finished
+    are skipped when the same command is given again; one that failed or was killed starts anew. Several processes, or machines
+    with one file system, may share a sweep: each takes its shard, and a run that another process holds is left to it.
+    The same file runs under `wandb sweep` and `wandb agent`.
+
+    Args:
+        file: The sweep file, or the name of one that comes with neuido (`sweeps/views`).
+        out: Folder for the runs and results.csv; runs/sweeps/<name of the file> where absent.
+        shard: Which part of the runs, 0 to shards - 1.
+        shards: Number of parts.
+        count: Runs of a random sweep, or the first ones of a grid; run_cap of the file where absent.
+        seed: Of a random sweep.
+        report: Write <out>/report.html (`neuido report`) where runs have scores.
+
+    Returns:
+        Exit status: 1 where a run failed.
+
+    Raises:
+        UserError: A malformed file, a shard that there is not.
+    """
+    if not 0 <= shard < shards:
+        raise UserError(f"shard = {shard} of shards = {shards}: it must be from 0 to shards - 1")
+    if count is not None and count < 1:
+        raise UserError(f"count = {count}: at least 1 is needed")
+    path = Path(find_config(file, "FILE"))
+    plan = read_sweep(path)
+    if plan.early_terminate:
+        print("early_terminate is for wandb's server: all runs go to their end here", file=sys.stderr)
+    runs = runs_of(plan, count=count, seed=seed)
+    folder = Path(out or f"runs/sweeps/{plan.name}").absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    own = runs[shard::shards]
+    for i, run in enumerate(own, 1):
+        print(f"[{i}/{len(own)}] {run.name}: ", end="", flush=True)
+        print(_one(plan, run, folder / run.name), flush=True)
+        collect(plan, runs, folder)
+    rows = collect(plan, runs, folder)
+    _summarise(rows, plan.metric, folder)
+    if report and any(name.startswith("scores/") for row in rows for name in row):
+        _report(folder, path)
+    return int(any(row["status"] == "failed" for row in rows if row["run"] in {run.name for run in own}))
+
+
+def _one(plan: SweepFile, run: Run, folder: Path) -> str:
+    """Run one run unless it is finished or held elsewhere; how it went, as a word or two."""
+    folder.mkdir(exist_ok=True)
+    with _held(folder) as lock:
+        if lock is None:
+            return "another process runs it"
+        environment = _environment(plan, run, folder)
+        words = command_of(plan, run, environment)
+        before = status_of(folder)
+        if before.get("status") == "done" and before.get("command") == words:
+            return "done before"
+        _empty(folder)
+        state: dict[str, Any] = {"format": FORMAT, "run": run.name, "parameters": run.parameters, "command": words}
+        note(folder, {**state, "status": "started"})
+        start = time.monotonic()
+        code = _execute(words, environment, folder / "log.txt", lock)
+        state |= {"status": "done" if code == 0 else "failed", "seconds": round(time.monotonic() - start, 1)}
+        if code != 0:
+            state["error"] = _last_line(folder / "log.txt") or f"exit status {code}"
+        note(folder, state)
+    return f"{state['status']} in {state['seconds']:.0f} s{': ' + state['error'] if code else ''}"
+
+
+def _environment(plan: SweepFile, run: Run, folder: Path) -> dict[str, str]:
+    beside = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])  # so that `neuido` is this one
+    own = {FOLDER: str(folder), "WANDB_RUN_ID": run.name, "WANDB_RUN_GROUP": plan.name, "WANDB_DIR": str(folder)}
+    return {**os.environ, "PATH": beside, "WANDB_MODE": "offline", "PYTHONUNBUFFERED": "1", **own}
+
+
+def _execute(words: list[str], environment: Mapping[str, str], log: Path, lock: IO) -> int:
+    """Run a command and wait; its exit status. It inherits the lock, which so outlasts a sweep that is killed before it."""
+    with log.open("w") as file:
+        try:
+            process = subprocess.Popen(words, env=environment, stdout=file, stderr=subprocess.STDOUT, pass_fds=[lock.fileno()])
+        except OSError as error:
+            raise UserError(f"the command {words[0]!r} of the sweep cannot be run: {error.strerror}") from error
+        try:
+            return process.wait()
+        except BaseException:
+            process.terminate()
+            process.wait()
+            raise
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[IO | None]:
+    """The lock of a folder, or none where another process has it."""
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield None
+            return
+        yield file
+
+
+def _empty(folder: Path) -> None:
+    """Remove what an earlier try left; a folder that is no run of a sweep is left alone."""
+    there = [path for path in folder.iterdir() if path.name != ".lock"]
+    if there and not status_of(folder):
+        raise UserError(f"{folder} holds something that is no run of this sweep: give another folder by --out")
+    for path in sorted(there, key=lambda path: path.name == "run.json"):  # what tells whose folder it is goes last
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def _last_line(path: Path) -> str:
+    lines = [line.strip() for line in path.read_text(errors="replace").splitlines() if line.strip()]
+    return lines[-1][-300:] if lines else ""
+
+
+def logged(folder: Path) -> dict[str, float]:
+    """The last value of each column of the metrics.csv files below a folder, the newest file last."""
+    values: dict[str, float] = {}
+    for path in sorted(folder.rglob("metrics.csv"), key=lambda path: path.stat().st_mtime):
+        for row in read_rows(path):
+            values |= {name: value for name, value in row.items() if isinstance(value, float)}
+    return values
+
+
+def scored(folder: Path) -> dict[str, float]:
+    """Means over the scenes of each score below a folder, as `scores/...`; of a fit those after it, or of a later test.
+
+    `scores/failed` counts the scenes whose law could not run; their means are over the others.
+    """
+    from neuido.data.files.run_results import tables
+
+    values: dict[str, float] = {}
+    for rows in tables(folder).values():
+        stages = {row.get("stage") for row in rows}
+        stage = next((each for each in ("test", "after", "before") if each in stages), None)  # nothing fitted: there is but one
+        last = [row for row in rows if row.get("stage") == stage]
+        for name in dict.fromkeys(name for row in last for name in row):
+            own = [row[name] for row in last if isinstance(row.get(name), float)]
+            values |= {f"scores/{name}": sum(own) / len(own)} if own else {}
+        if failed := sum("failed" in row for row in last):
+            values["scores/failed"] = float(failed)
+    return values
+
+
+def collect(plan: SweepFile, runs: list[Run], folder: Path) -> list[dict[str, Any]]:
+    """Write results.csv, a row a run that was begun: name, status, seconds, parameters, the metric, then all that it logged and scored."""
+    first = [plan.metric.name] if plan.metric else []
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # of two shards the later one has all rows
+        rows = []
+        for run in runs:
+            state = status_of(folder / run.name)
+            if not state:
+                continue
+            row = {"run": run.name, "status": state["status"], "seconds": state.get("seconds", ""), **run.parameters}
+            own = folder / run.name
+            values = logged(own) | scored(own) if state["status"] == "done" else {}
+            row |= {name: "" for name in first} | values
+            rows.append(row | ({"error": state["error"]} if "error" in state else {}))
+        write_rows(folder / "results.csv", rows)
+    return rows
+
+
+def _summarise(rows: list[dict[str, Any]], metric: Metric | None, folder: Path) -> None:
+    if metric is not None:
+        told = [
+            (row[metric.name], row["run"]) for row in rows if isinstance(row.get(metric.name), float) and math.isfinite(row[metric.name])
+        ]
+        if told:
+            value, name = max(told) if metric.maximise else min(told)
+            print(f"best {metric.name}: {value:.6g} ({name})")
+        elif any(row["status"] == "done" for row in rows):
+            print(f"no run logged the metric {metric.name} into a metrics.csv below {folder}", file=sys.stderr)
+    counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "started")}
+    print(f"{', '.join(f'{n} {status}' for status, n in counts.items() if n) or 'no run'}; results: {folder / 'results.csv'}")
+
+
+def _report(folder: Path, path: Path) -> None:
+    from neuido.commands.report import report
+
+    beside = path.with_suffix(".paper.csv")
+    report([str(folder)], out=str(folder / "report.html"), paper=str(beside) if beside.is_file() else None)

@@ -1,0 +1,215 @@
+"""What the readers of measured data share: columns of a CSV file, effects that a model declares, roles. The files are not trusted."""
+
+import contextlib
+import csv
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from neuido.data.bodies import scene_files as scenes
+from neuido.data.formats.layout import inside, number
+from neuido.errors import UserError
+from neuido.physics.effects.parameters import LIBRARY, Effects
+
+Entry = TypeVar("Entry")
+ROLES = ("fit", "held_out")
+WAVES = ["frequency", *(f"{part}{a}" for part in "sc" for a in "xyz")]
+"""Parameters of a harmonic `time_force`, s sin(2 pi f t) + c cos(2 pi f t) [m/s^2], beside its knots."""
+
+
+def read_header(folder: Path, name: str, form: str) -> tuple[Path, dict[str, Any]]:
+    """The YAML file `name` of a folder (or given itself) and its content, whose `format` must be `form`.
+
+    Raises:
+        UserError: The file is missing, no YAML, or of another format.
+    """
+    given = Path(folder).expanduser()
+    file = given if given.is_file() else given / name
+    if not file.is_file():
+        raise UserError(f"{file} is missing: {given} is no folder of the format {form}")
+    try:
+        content = scenes.read_yaml(file)
+    except (UnicodeDecodeError, RecursionError, OverflowError) as error:
+        raise UserError(f"{file} is not valid YAML: {error}") from error
+    if content.get("format") != form:
+        raise UserError(f"{file}: format is {content.get('format')!r}, not {form!r}")
+    return file, content
+
+
+@contextlib.contextmanager
+def errors_of(file: Path) -> Iterator[None]:
+    """Say of what is wrong with its content which file it stands in."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from error
+    except OverflowError as error:
+        raise UserError(f"{file}: a number is too large: {error}") from error
+
+
+def read_entries(given: Any, key: str, what: str, read: Callable[[Any, str], Entry]) -> tuple[Entry, ...]:
+    """The entries of a list that is not empty, each of another name.
+
+    Args:
+        given: The list.
+        key: What it is called in an error.
+        what: What an entry is.
+        read: Of an entry and what it is called; its result has a `name`.
+
+    Raises:
+        UserError: No such list, or a name that comes twice.
+    """
+    if not isinstance(given, list) or not given:
+        raise UserError(f"{key} must be a list of at least one {what}, got {given!r}")
+    entries: list[Entry] = []
+    for i, entry in enumerate(given):
+        entries.append(read(entry, f"{key}[{i}]"))
+        if entries[-1].name in [other.name for other in entries[:-1]]:  # type: ignore[attr-defined]
+            raise UserError(f"{key}[{i}].name = {entries[-1].name!r} is taken by another {what}")  # type: ignore[attr-defined]
+    return tuple(entries)
+
+
+def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: Mapping[str, float]) -> tuple[dict[str, np.ndarray], range]:
+    """The columns that `entry` names of its CSV file.
+
+    Args:
+        folder: The folder that must hold the file.
+        entry: Has `file`, `columns` (key: the file's own column name) and perhaps `rows`, a half-open range of data rows.
+        where: What the entry is called in an error.
+        scale: Factors by key; 1 where absent.
+
+    Returns:
+        key -> (n,) float64, and which rows of the file they are.
+
+    Raises:
+        UserError: A missing file or column, a cell that is no finite number, rows that are not there.
+    """
+    path = inside(folder, entry["file"], f"{where}.file")
+    if not path.is_file():
+        raise UserError(f"{where}: the file {path} is missing")
+    columns = scenes._mapping(entry["columns"], f"{where}.columns")
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            header, *lines = (row for row in csv.reader(stream, strict=True) if row)
+    except ValueError as error:
+        reason = "is empty" if "unpack" in str(error) else f"is no CSV file: {error}"
+        raise UserError(f"{where}: {path} {reason}") from error
+    except (csv.Error, OSError) as error:
+        raise UserError(f"{where}: {path} is no CSV file: {error}") from error
+    header = [title.strip() for title in header]
+    rows = _rows(entry.get("rows"), len(lines), where)
+    out = {}
+    for key, title in columns.items():
+        if not isinstance(title, str) or title not in header:
+            raise UserError(f"{where}.columns.{key} = {title!r} is not in {path.name}, which has {', '.join(header)}")
+        if header.count(title) > 1:
+            raise UserError(f"{where}.columns.{key}: {path.name} has {header.count(title)} columns named {title!r}")
+        index = header.index(title)
+        cells = np.array([_cell(lines[i], index, f"{where}: {path.name}, data row {i}, {title}") for i in rows])
+        with np.errstate(over="ignore"):
+            out[key] = cells * scale.get(key, 1.0)
+        if not np.isfinite(out[key]).all():
+            raise UserError(f"{where}: {path.name}, {title}: a figure is too large once scaled")
+    return out, rows
+
+
+def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str, float]:
+    """Effects that a model declares, as flat figures, for example {"drag_quadratic.k": 0.01}.
+
+    Args:
+        given: "name.parameter" -> number, or name -> a mapping of its parameters, a list in their order, or a number where there is one
+            alone; what is left out is absent.
+        where: What it is called in an error.
+        known: Names of the effects that make sense there.
+
+    Raises:
+        UserError: An unknown name or parameter, no number, or a parameter that needs another beside it.
+    """
+    library = {entry.name: [parameter.name for parameter in entry.parameters] for entry in LIBRARY}
+    library["time_force"] += WAVES
+    flat: dict[str, float] = {}
+    for name, value in scenes._mapping({} if given is None else given, where).items():
+        name, _, part = str(name).partition(".")
+        value = {part: value} if part else value
+        if name not in known:
+            raise UserError(f"{where} has {name!r}, which is no effect here; one of {', '.join(known)}")
+        own = library[name]
+        if not isinstance(value, Mapping):
+            values = value if isinstance(value, list) else [value]
+            if len(values) > len(own) or (len(values) < len(own) and not own[0] == "x"):
+                raise UserError(f"{where}.{name} takes {', '.join(own)}, got {value!r}")
+            value = dict(zip(own, values))
+        scenes._keys(value, f"{where}.{name}", tuple(own), tuple(own))
+        for key, figure in value.items():
+            flat[f"{name}.{key}"] = number(figure, f"{where}.{name}.{key}")
+    try:
+        later = [f"time_force.{key}" for key in WAVES]  # `discrepancy.library` makes knots of them; a gradient needs a body
+        Effects.of({key: figure for key, figure in flat.items() if not key.startswith("stiffness_gradient.") and key not in later})
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error
+    return flat
+
+
+def read_free(given: Any, known: tuple[str, ...], where: str = "model.free") -> tuple[str, ...]:
+    """The figures of a model that are to be fitted."""
+    if not isinstance(given, list):
+        raise UserError(f"{where} must be a list of figures, got {given!r}")
+    for key in given:
+        if key not in known:
+            raise UserError(f"{where} has {key!r}, which the model lacks; one of {', '.join(known)}")
+    if len(set(given)) < len(given):
+        raise UserError(f"{where} names a figure twice: {given}")
+    return tuple(given)
+
+
+def read_text(given: Any, where: str) -> str:
+    """Text that is not blank."""
+    if not isinstance(given, str) or not given.strip():
+        raise UserError(f"{where} must be text, got {given!r}")
+    return given
+
+
+def read_role(given: Any, where: str) -> str:
+    """`fit` or `held_out`."""
+    if given not in ROLES:
+        raise UserError(f"{where}.role = {given!r} is not known; one of {', '.join(ROLES)}")
+    return given
+
+
+def rising(t: np.ndarray, where: str) -> np.ndarray:
+    """Times [s] (n,) that rise.
+
+    Raises:
+        UserError: They do not.
+    """
+    if (np.diff(t) <= 0).any():
+        i = int(np.argmax(np.diff(t) <= 0))
+        raise UserError(f"{where}: times must rise, got {t[i]:g} s and then {t[i + 1]:g} s")
+    return t
+
+
+def _rows(given: Any, count: int, where: str) -> range:
+    if given is None:
+        rows = range(count)
+    else:
+        whole = isinstance(given, list) and len(given) == 2 and all(isinstance(i, int) and not isinstance(i, bool) for i in given)
+        if not whole or not 0 <= given[0] < given[1]:
+            raise UserError(f"{where}.rows must be [first row, end], got {given!r}")
+        if given[1] > count:
+            raise UserError(f"{where}.rows = {given} ends after the last of {count} data rows")
+        rows = range(*given)
+    if len(rows) < 3:
+        raise UserError(f"{where} has {len(rows)} data rows; at least 3 are needed")
+    return rows
+
+
+def _cell(line: list[str], index: int, where: str) -> float:
+    try:
+        value = float(line[index])
+    except (IndexError, ValueError):
+        value = np.nan
+    if not np.isfinite(value):
+        raise UserError(f"{where} is {line[index]!r}, no finite number" if index < len(line) else f"{where} is missing")
+    return value

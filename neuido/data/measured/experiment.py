@@ -1,0 +1,338 @@
+"""Experiments: measured motion of one object, in the folder format `neuido-experiment/1`, read, checked and written."""
+
+import os
+import shutil
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+
+from neuido.data.bodies import scene_files as scenes
+from neuido.data.formats import nerfstudio
+from neuido.data.formats.layout import MultiView, inside, number
+from neuido.data.measured.columns import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
+from neuido.errors import UserError
+from neuido.physics.effects.parameters import LIBRARY
+from neuido.types import Body, Box, Plane, Scene, Walls
+
+FORMAT = "neuido-experiment/1"
+OVERRIDES = ("gravity", "attached_masses", "colliders")
+NEEDED, OPTIONAL = ("x", "t", "x0", "v0", "volume"), ("F0", "track", "anchor")
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One recorded motion: tracked points, images, or both; what was not recorded is none."""
+
+    name: str
+    role: str
+    """`fit`, or `held_out`: only ever scored."""
+    scene: Scene
+    """The experiment's scene with this recording's own gravity, colliders and attached masses."""
+    frame_interval: float
+    """Nominal time from one frame to the next [s]; `t` has the true times."""
+    noise: float | None = None
+    """Standard deviation of the position error [m]; none: not known."""
+    x: Tensor | None = None
+    """Position [m] of material point n in frame t, (T, N, 3) float32; NaN where it was not seen."""
+    t: Tensor | None = None
+    """Times [s] of the frames, (T,) float64, rising from 0."""
+    body: Body | None = None
+    """The particles at t = 0: x0, v0, volume and F0."""
+    track: Tensor | None = None
+    """The particle that point n follows, (N,) int64; -1 where that is not known."""
+    anchor: Tensor | None = None
+    """Or where in the body of t = 0 point n sits [m], (N, 3) float32."""
+    video: MultiView | None = None
+    """Cameras and images."""
+    gaussians: Path | None = None
+    """The first frame as a 3DGS PLY."""
+
+    @property
+    def seen(self) -> Tensor:
+        """Whether point n was seen in frame t, (T, N)."""
+        if self.x is None:
+            raise UserError(f"recording {self.name} has no tracked points: it lacks particles.npz")
+        return ~self.x[..., 0].isnan()
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One object of one material, recorded one or more times."""
+
+    name: str
+    folder: Path
+    scene: Scene
+    model: dict[str, Any]
+    """What the experimenter believes: density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them), and perhaps
+    `effects`, flat figures such as {"viscosity_shear.eta": 12.0}."""
+    free: tuple[str, ...]
+    """The parameters of the model that are to be fitted; every other figure is trusted."""
+    recordings: tuple[Recording, ...]
+
+    def __getitem__(self, name: str) -> Recording:
+        """The recording of a name."""
+        for recording in self.recordings:
+            if recording.name == name:
+                return recording
+        raise UserError(f"recording = {name!r} is not in {self.name}; one of {', '.join(r.name for r in self.recordings)}")
+
+    def of(self, role: str) -> tuple[Recording, ...]:
+        """The recordings of a role."""
+        return tuple(recording for recording in self.recordings if recording.role == role)
+
+
+def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None = None) -> Experiment:
+    """Read an experiment's folder, or its `experiment.yaml`.
+
+    Args:
+        path: The folder or the file.
+        model: Takes the place of the file's own key `model`.
+
+    Raises:
+        UserError: An unknown or missing key, a missing file, a figure outside its physical range, a shape that does not fit, a box
+            that picks no particle; one line that names the file and the key.
+    """
+    file, content = read_header(Path(path), "experiment.yaml", FORMAT)
+    folder = file.parent
+    with errors_of(file):
+        scenes._keys(content, "the file", ("format", "name", "scene", "model", "discretisation", "recordings"))
+        name = read_text(content["name"], "name")
+        scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
+        believed, free = read_belief(content["model"] if model is None else model, folder=folder)
+        recordings = read_entries(
+            content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, content, folder)
+        )
+    return Experiment(name, folder, scene, believed, free, recordings)
+
+
+def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
+    """Write an experiment's folder; images and Gaussians are copied from where they are.
+
+    Raises:
+        UserError: The folder has an experiment already, or what would be written could not be read again.
+    """
+    folder = Path(path).expanduser()
+    if (folder / "experiment.yaml").exists():
+        raise UserError(f"{folder} holds an experiment already: give another folder")
+    scene, discretisation = scene_to_dict(experiment.scene)
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "name": experiment.name,
+        "scene": scene,
+        "model": {**experiment.model, "free": list(experiment.free)},
+        "discretisation": discretisation,
+        "recordings": [],
+    }
+    for recording in experiment.recordings:
+        own, grid = scene_to_dict(recording.scene)
+        changed = {key: own[key] for key in OVERRIDES if own[key] != scene[key]}
+        if grid != discretisation or any(own[key] != scene[key] for key in own if key not in OVERRIDES):
+            raise UserError(f"recording {recording.name} differs from the experiment in more than {', '.join(OVERRIDES)}")
+        entry = {"name": recording.name, "role": recording.role, "frame_interval": recording.frame_interval, **changed}
+        content["recordings"].append(entry if recording.noise is None else {**entry, "noise": recording.noise})
+        inside(folder, recording.name, "name of the recording").mkdir(parents=True, exist_ok=True)
+        _write_files(recording, folder / recording.name)
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
+
+
+def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The keys `scene` and `discretisation` of an experiment, the inverse of `scenes.scene_from_dict`."""
+
+    def corners(box: Box) -> list[list[float]]:
+        return [list(box.lower), list(box.upper)]
+
+    def plane(p: Plane) -> dict[str, Any]:
+        return {"type": "plane", "point": list(p.point), "normal": list(p.normal), "contact": p.contact, "friction": p.friction}
+
+    out: dict[str, Any] = {
+        "domain": [list(scene.lower), list(scene.upper)],
+        "gravity": list(scene.gravity),
+        "colliders": [plane(p) for p in scene.colliders],
+        "clamps": [{"box": corners(box)} for box in scene.clamps],
+        "attached_masses": [{"box": corners(m.box), "mass": m.mass} for m in scene.attached_masses],
+    }
+    if scene.walls != Walls():
+        out["walls"] = scene.walls and {"contact": scene.walls.contact, "friction": scene.walls.friction, "inset": scene.walls.inset}
+    return out, {"grid": scene.cells, "dt": scene.dt}
+
+
+def read_belief(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """`read_model` for a body, whose model may have a key `law`: a neural law in place of elasticity and plasticity.
+
+    Args:
+        given: As `read_model` takes it, and `law`: a `file` and a factor on its stress, `stiffness`, which may be free.
+        folder: What the law's file is relative to.
+
+    Raises:
+        UserError: An unknown key, an impossible material, an unknown effect.
+    """
+    given = scenes._mapping(given, "model")
+    if "law" not in given:
+        return read_model(given)
+    law = scenes._mapping(given.pop("law"), "model.law")
+    scenes._keys(law, "model.law", ("file", "stiffness"), ("stiffness",))
+    file = folder / Path(read_text(law["file"], "model.law.file")).expanduser()
+    stiffness = number(law.get("stiffness", 1.0), "model.law.stiffness", above=0.0)
+    free = given.get("free", [])
+    scaled = isinstance(free, list) and "stiffness" in free
+    if scaled:
+        given["free"] = [name for name in free if name != "stiffness"]
+    model, own = read_model(given)
+    return {**model, "law": {"file": str(file), "stiffness": stiffness}}, ("stiffness", *own) if scaled else own
+
+
+def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The key `model` of a file: what is believed, and which of its figures are free."""
+    given = scenes._mapping(given, "model")
+    free = given.pop("free", [])
+    effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY))
+    for part in ("elasticity", "plasticity"):
+        if isinstance(given.get(part), Mapping):
+            read_text(given[part].get("law"), f"model.{part}.law")
+    model = scenes.model_from_dict(given)
+    known = ["density", *(key for part in ("elasticity", "plasticity") for key in model[part] if key != "law")]
+    free = read_free(free, tuple(known))
+    if effects:
+        model["effects"] = effects
+    return model, free
+
+
+def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path) -> Recording:
+    scenes._keys(entry, where, ("name", "role", "frame_interval", "noise", *OVERRIDES), ("noise", *OVERRIDES))
+    name = read_text(entry["name"], f"{where}.name")
+    where = f"{where} ({name})"
+    role = read_role(entry["role"], where)
+    interval = number(entry["frame_interval"], f"{where}.frame_interval", above=0.0)
+    noise = number(entry["noise"], f"{where}.noise", least=0.0) if entry.get("noise") is not None else None
+    merged = dict(content["scene"]) | {key: entry[key] for key in OVERRIDES if key in entry}
+    try:
+        scene = scenes.scene_from_dict(merged, content["discretisation"])
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error
+    own = inside(folder, name, f"{where}.name")
+    if own.resolve() == folder.resolve() or not own.is_dir():
+        raise UserError(f"{where}: the folder {own} is missing")
+    if not (own / "particles.npz").is_file() and not (own / "transforms.json").is_file():
+        raise UserError(f"{where}: {own} has neither particles.npz nor transforms.json")
+    fields: dict[str, Any] = {}
+    if (own / "particles.npz").is_file():
+        fields = _particles(own / "particles.npz", scene, interval)
+        _check_boxes(scene, fields["body"].x, where)
+    if (own / "transforms.json").is_file():
+        fields["video"] = nerfstudio.read(own)
+    gaussians = own / "gaussians.ply"
+    return Recording(
+        name=name,
+        role=role,
+        scene=scene,
+        frame_interval=interval,
+        noise=noise,
+        gaussians=gaussians if gaussians.is_file() else None,
+        **fields,
+    )
+
+
+def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
+    """The arrays of particles.npz, checked."""
+    arrays = _arrays(path)
+    shapes = {"x": ("T", "N", 3), "t": ("T",), "x0": ("P", 3), "v0": ("P", 3), "volume": ("P",), "F0": ("P", 3, 3), "track": ("N",),
+              "anchor": ("N", 3)}  # fmt: skip
+    sizes: dict[str, int] = {}
+    for key, shape in shapes.items():
+        if key not in arrays:
+            continue
+        array = arrays[key]
+        wanted = ", ".join(str(n) for n in shape)
+        if array.ndim != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, array.shape)):
+            raise UserError(f"{path}: {key} must have the shape ({wanted}), got {array.shape}")
+        for n, m in zip(shape, array.shape):
+            if isinstance(n, str) and sizes.setdefault(n, m) != m:
+                raise UserError(f"{path}: {key} has the shape {array.shape}; as ({wanted}) it does not fit {n} = {sizes[n]}")
+        if array.dtype.kind not in ("iu" if key == "track" else "f"):
+            raise UserError(f"{path}: {key} must hold {'whole numbers' if key == 'track' else 'floating-point numbers'}, got {array.dtype}")
+        if key != "x" and not np.isfinite(array).all():
+            raise UserError(f"{path}: {key} holds a NaN or an infinity")
+    if min(sizes.values()) < 1:
+        raise UserError(f"{path}: {', '.join(f'{n} = {m}' for n, m in sizes.items())}; none may be zero")
+    x, t = arrays["x"], arrays["t"]
+    if np.isinf(x).any() or (np.isnan(x).any(axis=2) != np.isnan(x).all(axis=2)).any():
+        raise UserError(f"{path}: x holds an infinity, or a point that is NaN in one coordinate only")
+    if t[0] != 0 or (np.diff(t) <= 0).any():
+        raise UserError(f"{path}: t must rise from 0, got {', '.join(f'{time:g}' for time in t[:4])}, ...")
+    if len(t) > 1 and not 0.5 < t[-1] / (len(t) - 1) / interval < 2:
+        raise UserError(f"{path}: t has a frame every {t[-1] / (len(t) - 1):.3g} s, but frame_interval is {interval:g} s")
+    lower, upper = np.array(scene.lower), np.array(scene.upper)
+    outside = ((arrays["x0"] < lower) | (arrays["x0"] > upper)).any(axis=1)
+    if outside.any():
+        raise UserError(f"{path}: {outside.sum()} particles of x0 lie outside scene.domain")
+    if not (arrays["volume"] > 0).all():
+        raise UserError(f"{path}: volume must be positive, got {arrays['volume'].min():g} m^3")
+    if arrays["volume"].sum(dtype=np.float64) > np.prod(upper - lower):
+        raise UserError(f"{path}: the volumes add up to {arrays['volume'].sum():.3g} m^3, more than the whole domain has")
+    if "F0" in arrays and not (np.linalg.det(arrays["F0"].astype(np.float64)) > 0).all():
+        raise UserError(f"{path}: F0 must have positive determinants; one is {np.linalg.det(arrays['F0']).min():.3g}")
+    if "track" in arrays and not ((arrays["track"] >= -1) & (arrays["track"] < sizes["P"])).all():
+        raise UserError(f"{path}: track must lie in -1..{sizes['P'] - 1}, got {arrays['track'].min()}..{arrays['track'].max()}")
+    tensors = {key: torch.from_numpy(array.astype(np.float32)) for key, array in arrays.items() if key not in ("t", "track")}
+    return {
+        "x": tensors["x"],
+        "t": torch.from_numpy(t.astype(np.float64)),
+        "body": Body(tensors["x0"], tensors["v0"], tensors["volume"], tensors.get("F0")),
+        "track": torch.from_numpy(arrays["track"].astype(np.int64)) if "track" in arrays else None,
+        "anchor": tensors.get("anchor"),
+    }
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            unknown = set(archive.files) - {*NEEDED, *OPTIONAL}
+            if unknown:
+                raise UserError(f"{path}: unknown array {sorted(unknown)[0]!r}; it takes {', '.join((*NEEDED, *OPTIONAL))}")
+            arrays = {key: archive[key] for key in archive.files}
+    except UserError:
+        raise
+    except (ValueError, AttributeError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path} is no archive of arrays: {error}") from error
+    for key in NEEDED:
+        if key not in arrays:
+            raise UserError(f"{path} lacks the array {key!r}")
+    if ("track" in arrays) == ("anchor" in arrays):
+        raise UserError(f"{path} must have either track or anchor, got {'both' if 'track' in arrays else 'neither'}")
+    return arrays
+
+
+def _check_boxes(scene: Scene, x: Tensor, where: str) -> None:
+    boxes = [(f"clamps[{i}]", box) for i, box in enumerate(scene.clamps)]
+    boxes += [(f"attached_masses[{i}]", attached.box) for i, attached in enumerate(scene.attached_masses)]
+    for key, box in boxes:
+        if not bool(((x >= x.new_tensor(box.lower)) & (x <= x.new_tensor(box.upper))).all(dim=1).any()):
+            raise UserError(f"{where}: {key}.box = {[list(box.lower), list(box.upper)]} picks no particle of x0")
+
+
+def _write_files(recording: Recording, folder: Path) -> None:
+    if recording.x is not None and recording.t is not None and recording.body is not None:
+        body = recording.body
+        arrays = {"x": recording.x, "t": recording.t, "x0": body.x, "v0": body.v, "volume": body.volume, "F0": body.F,
+                  "track": recording.track, "anchor": recording.anchor}  # fmt: skip
+        kinds = {"t": np.float64, "track": np.int32}
+        given = {key: array.numpy().astype(kinds.get(key, np.float32)) for key, array in arrays.items() if array is not None}
+        np.savez_compressed(folder / "particles.npz", **given)  # type: ignore[arg-type]
+    if recording.video is not None:
+        source = recording.video.folder
+        if not (source / "transforms.json").is_file():
+            raise UserError(f"the video of {recording.name} is no folder with transforms.json: write its images with nerfstudio.write")
+        for path in (path for grid in (recording.video.images, recording.video.masks or ()) for row in grid for path in row if path):
+            target = folder / path.relative_to(source)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target)
+        shutil.copyfile(source / "transforms.json", folder / "transforms.json")
+    if recording.gaussians is not None:
+        shutil.copyfile(recording.gaussians, folder / "gaussians.ply")

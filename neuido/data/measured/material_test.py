@@ -1,0 +1,184 @@
+"""Material tests: measured stress against stretch of one material, in the folder format `neuido-material-test/1`, read and checked."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuido.data.bodies import scene_files as scenes
+from neuido.data.formats.layout import number
+from neuido.data.measured.columns import errors_of, read_columns, read_effects, read_entries, read_header, read_role, read_text, rising
+from neuido.data.measured.experiment import read_model
+from neuido.errors import UserError
+from neuido.types import Vector
+
+FORMAT = "neuido-material-test/1"
+STRAINS = {"stretch": "log_strain", "stretch_1": "log_strain_1", "stretch_2": "log_strain_2"}
+STRESSES = {"nominal_stress": "true_stress", "nominal_stress_1": "true_stress_1", "nominal_stress_2": "true_stress_2"}
+MODES = {  # mode: what is prescribed, what was measured
+    "uniaxial": (("stretch",), ("nominal_stress",)),
+    "equibiaxial": (("stretch",), ("nominal_stress",)),
+    "pure_shear": (("stretch",), ("nominal_stress",)),
+    "biaxial": (("stretch_1", "stretch_2"), ("nominal_stress_1", "nominal_stress_2")),
+    "simple_shear": (("shear",), ("shear_stress",)),
+}
+EFFECTS = (
+    "viscosity_shear", "viscosity_bulk", "maxwell", "hysteresis", "strain_stiffening", "second_invariant", "tension_compression", "fibre",
+    "yield", "hardening", "softening", "kinematic_hardening", "rate_yield", "stiffness_change",
+)  # fmt: skip
+"""The effects of the vocabulary that act on a law itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialTest:
+    """One test of one specimen, n rows."""
+
+    name: str
+    role: str
+    """`fit`, or `held_out`: only ever scored."""
+    mode: str
+    """One of `MODES`."""
+    path: np.ndarray
+    """What was prescribed: stretches [-], or the amount of shear [-], (n, 1) or (n, 2), float64."""
+    stress: np.ndarray
+    """What was measured [Pa], (n, 1) or (n, 2)."""
+    true_stress: bool
+    """Whether `stress` is Cauchy's, not the nominal one."""
+    file: Path
+    columns: tuple[str, ...]
+    """The titles of the columns that were read."""
+    rows: range
+    """Which data rows of the file these are."""
+    time: np.ndarray | None = None
+    """Times [s], (n,), rising; none: a quasi-static path in the order of the rows."""
+    direction: Vector = (1.0, 0.0, 0.0)
+    """The loading axis in the material's own frame, a unit vector."""
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialTests:
+    """All tests of one material."""
+
+    name: str
+    folder: Path
+    model: dict[str, Any]
+    """What the experimenter believes: density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them)."""
+    free: tuple[str, ...]
+    """The figures of the model that are to be fitted; every other one is trusted."""
+    incompressible: bool
+    """Whether the lateral stress is zero by pressure."""
+    effects: dict[str, float]
+    """Effects that the model has already, as flat figures, for example {"strain_stiffening.k": 0.01}."""
+    tests: tuple[MaterialTest, ...]
+
+    def of(self, role: str) -> tuple[MaterialTest, ...]:
+        """The tests of a role."""
+        return tuple(test for test in self.tests if test.role == role)
+
+    def histories(self) -> tuple[tuple[int, ...], ...]:
+        """Which tests are one and the same specimen, in order, by index.
+
+        Tests of one file whose row ranges adjoin, with the same columns, mode and direction, are one loading history: the later one
+        starts in the state in which the earlier one ends. Every other test starts with a virgin specimen.
+        """
+
+        def specimen(test: MaterialTest) -> tuple:
+            return test.file, test.columns, test.mode, test.direction
+
+        after: dict[int, int] = {}
+        for i, test in enumerate(self.tests):
+            for j, later in enumerate(self.tests):
+                if specimen(test) == specimen(later) and test.rows.stop == later.rows.start and j not in after.values():
+                    after[i] = j
+                    break
+        chains = []
+        for i in range(len(self.tests)):
+            if i not in after.values():
+                chain = [i]
+                while chain[-1] in after:
+                    chain.append(after[chain[-1]])
+                chains.append(tuple(chain))
+        return tuple(chains)
+
+
+def read_material_tests(path: str | os.PathLike, *, model: Mapping[str, Any] | None = None) -> MaterialTests:
+    """Read a material test's folder, or its `test.yaml`; `model` takes the place of the file's own.
+
+    Raises:
+        UserError: An unknown or missing key, mode, law, column or file, a NaN, stretches that are not positive, times that do not rise;
+            one line that names the file and the key.
+    """
+    file, content = read_header(Path(path), "test.yaml", FORMAT)
+    folder = file.parent
+    with errors_of(file):
+        scenes._keys(content, "the file", ("format", "name", "model", "tests"))
+        name = read_text(content["name"], "name")
+        given = scenes._mapping(content["model"] if model is None else model, "model")
+        incompressible = given.pop("incompressible", False)
+        if not isinstance(incompressible, bool):
+            raise UserError(f"model.incompressible must be true or false, got {incompressible!r}")
+        effects = read_effects(given.pop("effects", None), "model.effects", known=EFFECTS)
+        believed, free = read_model(given)
+        tests = read_entries(content["tests"], "tests", "test", lambda entry, where: _test(entry, where, folder))
+        if not any(test.role == "fit" for test in tests):
+            raise UserError("tests has none whose role is fit")
+        if incompressible and believed["plasticity"]["law"] == "drucker_prager":
+            raise UserError("model.incompressible: drucker_prager depends on the pressure, which an incompressible law does not know")
+    return MaterialTests(name, folder, believed, free, incompressible, effects, tests)
+
+
+def _test(entry: Any, where: str, folder: Path) -> MaterialTest:
+    optional = ("scale", "rows", "direction")
+    scenes._keys(entry, where, ("name", "file", "mode", "columns", "role", *optional), optional)
+    name = read_text(entry["name"], f"{where}.name")
+    where = f"{where} ({name})"
+    if not isinstance(entry["mode"], str) or entry["mode"] not in MODES:
+        raise UserError(f"{where}.mode = {entry['mode']!r} is not known; one of {', '.join(MODES)}")
+    role = read_role(entry["role"], where)
+    path_keys, stress_keys = MODES[entry["mode"]]
+    columns = scenes._mapping(entry["columns"], f"{where}.columns")
+    path_keys, stress_keys = _choose(columns, path_keys, STRAINS, where), _choose(columns, stress_keys, STRESSES, where)
+    scenes._keys(columns, f"{where}.columns", (*path_keys, *stress_keys, "time"), ("time",))
+    scale = scenes._mapping(entry.get("scale", {}), f"{where}.scale")
+    for key, factor in scale.items():
+        if key not in columns:
+            raise UserError(f"unknown key {key!r} in {where}.scale; it takes {', '.join(columns)}")
+        scale[key] = number(factor, f"{where}.scale.{key}", above=0.0)
+    direction = entry.get("direction", [1, 0, 0])
+    direction = np.array(scenes._vector(direction, f"{where}.direction"))
+    if not np.linalg.norm(direction) > 0:
+        raise UserError(f"{where}.direction must not be zero")
+    data, rows = read_columns(folder, entry, where, scale=scale)
+    path = np.stack([data[key] for key in path_keys], 1)
+    if path_keys[0].startswith("log_strain"):
+        path = np.exp(path)
+    if entry["mode"] != "simple_shear" and not ((path > 0).all() and np.isfinite(path).all()):
+        bad = path[~((path > 0) & np.isfinite(path))][0]
+        raise UserError(f"{where}: stretches must be positive and finite, got {bad:g}")
+    return MaterialTest(
+        name=name,
+        role=role,
+        mode=entry["mode"],
+        path=path,
+        stress=np.stack([data[key] for key in stress_keys], 1),
+        true_stress=stress_keys[0].startswith("true"),
+        file=folder / entry["file"],
+        columns=tuple(columns.values()),
+        rows=rows,
+        time=rising(data["time"], where) if "time" in data else None,
+        direction=tuple((direction / np.linalg.norm(direction)).tolist()),
+    )
+
+
+def _choose(columns: Mapping[str, Any], keys: tuple[str, ...], others: Mapping[str, str], where: str) -> tuple[str, ...]:
+    """The keys, or their alternatives (logarithmic strain, true stress) where the columns have these."""
+    other = tuple(others.get(key, key) for key in keys)
+    if other == keys:
+        return keys
+    chosen = other if any(key in columns for key in other) else keys
+    if chosen == other and any(key in columns for key in keys):
+        raise UserError(f"{where}.columns has both {', '.join(k for k in (*keys, *other) if k in columns)}: give one kind")
+    return chosen

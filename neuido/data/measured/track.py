@@ -1,0 +1,149 @@
+"""Tracks: measured motion of bodies as points, in the folder format `neuido-track/1`, read and checked."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuido.data.bodies import scene_files as scenes
+from neuido.data.formats.layout import number
+from neuido.data.measured.columns import (
+    errors_of,
+    read_columns,
+    read_effects,
+    read_entries,
+    read_free,
+    read_header,
+    read_role,
+    read_text,
+    rising,
+)
+from neuido.errors import UserError
+from neuido.types import Vector
+
+FORMAT = "neuido-track/1"
+AXES = ("x", "y", "z")
+NUISANCES = ("release_time", "length_scale", "time_base")
+FIGURES = ("mass", "diameter")
+EFFECTS = (
+    "gravity", "uniform_acceleration", "drag_linear", "drag_quadratic", "magnus", "position_force", "time_force", "added_mass",
+)  # fmt: skip
+"""The effects of the vocabulary that act on a centre of mass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One recorded motion, n frames."""
+
+    name: str
+    body: str
+    role: str
+    """`fit`, or `held_out`: only ever scored."""
+    t: np.ndarray
+    """Times [s], (n,) float64, rising."""
+    x: np.ndarray
+    """Measured coordinates [m], (n, A)."""
+    axes: tuple[int, ...]
+    """Which coordinates those A are: 0, 1, 2 for x, y, z."""
+    spin: Vector | None = None
+    """Angular velocity at the start [rad/s]; none: not known."""
+    noise: float | None = None
+    """Standard deviation of the position error [m]; none: not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """All recordings of some bodies in the same surroundings."""
+
+    name: str
+    folder: Path
+    gravity: Vector
+    """[m/s^2]"""
+    effects: dict[str, float]
+    """Effects that the model has already, as flat figures, for example {"drag_quadratic.k": 0.01}."""
+    free: tuple[str, ...]
+    """The figures of the model that are to be fitted: `gravity` (its size) or one of `effects`."""
+    nuisances: dict[str, float]
+    """Standard deviation of what may be off in every recording: release_time [s], length_scale and time_base (relative)."""
+    bodies: dict[str, dict[str, float]]
+    """mass [kg] and diameter [m] of each body, where known."""
+    recordings: tuple[Track, ...]
+
+    def of(self, role: str, body: str | None = None) -> tuple[Track, ...]:
+        """The recordings of a role, of one body or of all."""
+        return tuple(track for track in self.recordings if track.role == role and body in (None, track.body))
+
+
+def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = None) -> Tracks:
+    """Read a track folder, or its `track.yaml`; `model` takes the place of the file's own.
+
+    Raises:
+        UserError: An unknown or missing key, body, effect, column or file, a NaN, times that do not rise, a figure outside its range;
+            one line that names the file and the key.
+    """
+    file, content = read_header(Path(path), "track.yaml", FORMAT)
+    with errors_of(file):
+        scenes._keys(content, "the file", ("format", "name", "model", "nuisances", "bodies", "recordings"), ("nuisances",))
+        name = read_text(content["name"], "name")
+        gravity, effects, free = _model(content["model"] if model is None else model)
+        nuisances = dict.fromkeys(NUISANCES, 0.0)
+        given = scenes._mapping(content.get("nuisances") or {}, "nuisances")
+        scenes._keys(given, "nuisances", NUISANCES, NUISANCES)
+        nuisances |= {key: number(value, f"nuisances.{key}", least=0.0) for key, value in given.items()}
+        bodies = _bodies(content["bodies"])
+        recordings = read_entries(
+            content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, bodies, file.parent)
+        )
+        for body in bodies:
+            if not any(track.body == body and track.role == "fit" for track in recordings):
+                raise UserError(f"recordings has none of the body {body!r} whose role is fit")
+    return Tracks(name, file.parent, gravity, effects, free, nuisances, bodies, recordings)
+
+
+def _model(given: Any) -> tuple[Vector, dict[str, float], tuple[str, ...]]:
+    scenes._keys(given, "model", ("gravity", "effects", "free"), ("effects", "free"))
+    gravity = scenes._vector(given["gravity"], "model.gravity")
+    effects = read_effects(given.get("effects"), "model.effects", known=EFFECTS)
+    return gravity, effects, read_free(given.get("free", []), ("gravity", *effects))
+
+
+def _bodies(given: Any) -> dict[str, dict[str, float]]:
+    bodies = scenes._mapping(given, "bodies")
+    if not bodies:
+        raise UserError("bodies names no body")
+    out = {}
+    for name, figures in bodies.items():
+        read_text(name, "the name of a body")
+        figures = scenes._mapping(figures or {}, f"bodies.{name}")
+        scenes._keys(figures, f"bodies.{name}", FIGURES, FIGURES)
+        out[name] = {key: number(value, f"bodies.{name}.{key}", above=0.0) for key, value in figures.items()}
+    return out
+
+
+def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) -> Track:
+    optional = ("rows", "spin", "noise")
+    scenes._keys(entry, where, ("name", "body", "file", "columns", "role", *optional), optional)
+    name = read_text(entry["name"], f"{where}.name")
+    where = f"{where} ({name})"
+    if not isinstance(entry["body"], str) or entry["body"] not in bodies:
+        raise UserError(f"{where}.body = {entry['body']!r} is not known; one of {', '.join(bodies)}")
+    role = read_role(entry["role"], where)
+    columns = scenes._mapping(entry["columns"], f"{where}.columns")
+    scenes._keys(columns, f"{where}.columns", ("t", *AXES), AXES)
+    axes = tuple(a for a, key in enumerate(AXES) if key in columns)
+    if not axes:
+        raise UserError(f"{where}.columns names none of {', '.join(AXES)}")
+    data, _ = read_columns(folder, entry, where, scale={})
+    return Track(
+        name=name,
+        body=entry["body"],
+        role=role,
+        t=rising(data["t"], where),
+        x=np.stack([data[AXES[a]] for a in axes], 1),
+        axes=axes,
+        spin=scenes._vector(entry["spin"], f"{where}.spin") if entry.get("spin") is not None else None,
+        noise=number(entry["noise"], f"{where}.noise", above=0.0) if entry.get("noise") is not None else None,
+    )

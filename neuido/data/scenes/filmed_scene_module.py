@@ -1,0 +1,225 @@
+"""Filmed and reconstructed bodies as data for Stage II, scoring and prediction: a batch is one scene."""
+
+import os
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import LightningDataModule
+from torch.utils.data import DataLoader, Dataset
+
+from neuido.data.bodies.scene_files import VARIABLE, data_root
+from neuido.data.scenes.filmed_scene import VisualScene, load_visual
+from neuido.data.scenes.known_body import load_known
+from neuido.data.trajectories.sampling import Resumable
+from neuido.errors import UserError
+from neuido.types import MultiViewBatch
+
+KEYS = {"reconstruction": ("reconstruction", "recording", "views"), "particles": ("recording", "views", "dt", "crop")}
+"""What a scene's mapping takes beside `path`, by where its body comes from (`body`)."""
+
+
+def in_order(scenes: Sequence[VisualScene], *, rank: int = 0, ranks: int = 1) -> DataLoader:
+    """Scenes as they stand, each by one of the processes."""
+    return DataLoader(_Listed(scenes[rank::ranks]), batch_size=1, collate_fn=_only)
+
+
+class _Listed(Dataset):
+    def __init__(self, scenes: Sequence[VisualScene]) -> None:
+        self.scenes = list(scenes)
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, index: int) -> VisualScene:
+        return self.scenes[index]
+
+
+def _only(samples: list[VisualScene]) -> VisualScene:
+    return samples[0]
+
+
+class Turns(Resumable[VisualScene]):
+    """Scenes one after the other, in an order that is a function of seed and epoch alone.
+
+    Args:
+        scenes: The scenes.
+        seed: Seed of the order.
+        rank: This process among those that share the scenes; where their number does not divide, the first scenes of the order come twice.
+        ranks: Number of processes.
+    """
+
+    def __init__(self, scenes: Sequence[VisualScene], *, seed: int = 0, rank: int = 0, ranks: int = 1) -> None:
+        super().__init__({"scenes": len(scenes), "ranks": ranks})
+        self.scenes, self.seed, self.rank, self.ranks = list(scenes), seed, rank, ranks
+
+    def __len__(self) -> int:
+        return -(-len(self.scenes) // self.ranks)
+
+    def batches(self, epoch: int, start: int) -> Iterable[VisualScene]:
+        count = len(self.scenes)
+        order = np.random.default_rng([self.seed, epoch]).permutation(count).tolist()
+        return (self.scenes[order[(k * self.ranks + self.rank) % count]] for k in range(start, len(self)))
+
+
+class OneByOne(Resumable[VisualScene]):
+    """Each scene for so many steps: an epoch is one scene, in the order given."""
+
+    def __init__(self, scenes: Sequence[VisualScene], *, steps: int) -> None:
+        super().__init__({"scenes": len(scenes), "steps": steps})
+        self.scenes, self.steps = list(scenes), steps
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def batches(self, epoch: int, start: int) -> Iterable[VisualScene]:
+        return [self.scenes[epoch]] * (self.steps - start) if epoch < len(self.scenes) else []
+
+
+def train_on(batch: MultiViewBatch, views: int | list[int]) -> MultiViewBatch:
+    """The batch without the views that training is not to see; those that are held out stay.
+
+    Args:
+        batch: Images of V views.
+        views: How many training views, taken evenly, or their numbers among those that are not held out.
+
+    Raises:
+        UserError: More views than there are, or a number that is none of theirs.
+    """
+    there = (~batch.held_out).nonzero()[:, 0].tolist()
+    if isinstance(views, int):
+        if not 0 < views <= len(there):
+            raise UserError(f"data.training_views = {views}: {batch.name} has {len(there)} views that are not held out")
+        chosen = torch.linspace(0, len(there) * (1 - 1 / views), views).round().long().tolist()
+    else:
+        chosen = sorted(set(views))
+        if not chosen or not all(0 <= view < len(there) for view in chosen):
+            raise UserError(f"data.training_views = {views}: {batch.name} has the training views 0 to {len(there) - 1}")
+    kept = sorted([*(there[i] for i in chosen), *batch.held_out.nonzero()[:, 0].tolist()])
+    cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats[kept], Ks=batch.cameras.Ks[kept])
+    return batch._replace(images=batch.images[kept], masks=batch.masks[kept], cameras=cameras, held_out=batch.held_out[kept])
+
+
+class VisualDataModule(LightningDataModule):
+    """Scenes of `neuido simulate` or of one's own, each with what `neuido reconstruct` made of it (`data.visual`).
+
+    Training and validation take `scenes`; test and predict take `scenes` and `unseen`. Under several processes each trains on its own.
+
+    Args:
+        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them); with
+            `body: particles` instead of `recording`, `views`, `dt`, `crop` (as `load_known` takes them).
+        unseen: Scenes that training never sees.
+        root: Folder to which the paths of scenes are relative; none: the current one, and what is not there is sought in NEUIDO_DATA.
+        reconstructions: Folder that holds a reconstruction for each scene under the name of the scene's folder; none: inside each scene.
+        frame_step: Take each n-th frame.
+        frame_count: Number of frames; none: all.
+        width: Width of the images [px]; none: as recorded.
+        background: `white` or `black`, where a mask is known.
+        training_views: How many of the views that are not held out training sees, taken evenly, or their numbers; none: all.
+        seed: Seed of the order of the scenes, which is another one in each epoch.
+    """
+
+    def __init__(
+        self,
+        scenes: list[str | dict[str, Any]],
+        *,
+        unseen: list[str | dict[str, Any]] | None = None,
+        root: str | None = None,
+        reconstructions: str | None = None,
+        frame_step: int = 1,
+        frame_count: int | None = None,
+        width: int | None = None,
+        background: str = "white",
+        training_views: int | list[int] | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if not scenes:
+            raise UserError("data.scenes is empty: name at least one folder")
+        self.given, self.given_unseen, self.seed = list(scenes), list(unseen or []), seed
+        self.root, self.reconstructions, self.training_views = root, reconstructions, training_views
+        self.options: dict[str, Any] = {"frame_step": frame_step, "frame_count": frame_count, "width": width, "background": background}
+        self.steps_in_a_row: int | None = None
+        """Set by a model that fits one scene after the other: how many steps each takes, and an epoch is then one scene."""
+
+    @cached_property
+    def scenes(self) -> list[VisualScene]:
+        """The scenes that training sees."""
+        return self._all(self.given, "data.scenes")
+
+    @cached_property
+    def unseen(self) -> list[VisualScene]:
+        """The scenes that it does not see."""
+        return self._all(self.given_unseen, "data.unseen")
+
+    @property
+    def unseen_names(self) -> list[str]:
+        return [scene.name for scene in self.unseen]
+
+    def setup(self, stage: str | None = None) -> None:
+        names = [scene.name for scene in [*self.scenes, *(self.unseen if stage in ("test", "predict") else [])]]
+        for name in names:
+            if names.count(name) > 1:
+                raise UserError(f"data.scenes: two scenes have the name {name}; give one of them another in its experiment.yaml")
+        for scene in self.scenes:
+            if bool(scene.batch.held_out.all()):
+                raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} are held out")
+
+    def train_dataloader(self) -> Turns | OneByOne:
+        if self.steps_in_a_row is not None:
+            return OneByOne(self.scenes, steps=self.steps_in_a_row)
+        return Turns(self.scenes, seed=self.seed, **self._share())
+
+    def val_dataloader(self) -> DataLoader:
+        return in_order(self.scenes, **self._share())
+
+    def test_dataloader(self) -> DataLoader:
+        return in_order([*self.scenes, *self.unseen], **self._share())
+
+    def _share(self) -> dict[str, int]:
+        return {} if self.trainer is None else {"rank": self.trainer.global_rank, "ranks": self.trainer.world_size}
+
+    def predict_dataloader(self) -> DataLoader:
+        return self.test_dataloader()
+
+    def __str__(self) -> str:
+        """Lightning's own opens all loaders to describe them, and takes a scene for a collection of them."""
+        return f"VisualDataModule({len(self.given)} scenes, {len(self.given_unseen)} unseen)"
+
+    def transfer_batch_to_device(self, batch: VisualScene, device: torch.device, dataloader_idx: int) -> VisualScene:
+        """Not here: the model brings a scene to the device once, and keeps it there."""
+        return batch
+
+    def _all(self, given: list[str | dict[str, Any]], where: str) -> list[VisualScene]:
+        scenes = [self._open(each, f"{where}[{i}]") for i, each in enumerate(given)]
+        if self.training_views is None:
+            return scenes
+        return [scene._replace(batch=train_on(scene.batch, self.training_views)) for scene in scenes]
+
+    def _find(self, path: Path) -> Path:
+        own = Path(self.root or ".") / path
+        if self.root is None and not own.exists() and os.environ.get(VARIABLE):
+            return data_root() / path
+        return own
+
+    def _open(self, given: str | dict[str, Any], where: str) -> VisualScene:
+        options: dict[str, Any] = dict(given) if isinstance(given, dict) else {"path": given}
+        if "path" not in options:
+            raise UserError(f"{where} lacks the key 'path'")
+        body = options.pop("body", "reconstruction")
+        if body not in KEYS:
+            raise UserError(f"{where}.body = {body!r}; one of {', '.join(KEYS)}")
+        known = ("path", "body", *KEYS[body])
+        for key in options:
+            if key not in known:
+                raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(known)}")
+        path = self._find(Path(options.pop("path")).expanduser())
+        if body == "reconstruction" and "reconstruction" not in options and self.reconstructions is not None:
+            options["reconstruction"] = Path(self.reconstructions) / path.resolve().name
+        try:
+            return (load_known if body == "particles" else load_visual)(path, **options, **self.options)
+        except UserError as error:
+            raise UserError(f"{where}: {error}") from error

@@ -1,0 +1,69 @@
+"""A filmed experiment whose body is known: its particles are those of `particles.npz`, and no reconstruction is needed."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+
+from neuido.data.measured.experiment import Recording, read_experiment
+from neuido.data.scenes.filmed_scene import VisualScene, load_views
+from neuido.errors import UserError
+from neuido.types import MultiViewBatch
+
+
+def load_known(
+    folder: str | os.PathLike,
+    *,
+    recording: str | None = None,
+    dt: float | None = None,
+    crop: Sequence[int] | None = None,
+    **options,
+) -> VisualScene:
+    """Read a recording of an experiment that has both images and particles.
+
+    The body is drawn by its particles, so that its silhouette can be compared and its colours cannot.
+
+    Args:
+        folder: The experiment's folder.
+        recording: Which recording; the only one with images where absent.
+        dt: Substep [s] in place of the experiment's suggestion.
+        crop: Part of the images that counts [px], left, top, right, bottom, after a change of their width.
+        options: `views`, `frame_step`, `frame_count`, `width`, `background` of `load_views`.
+
+    Raises:
+        UserError: No such recording, images or particles that are missing, an impossible step or crop.
+    """
+    experiment = read_experiment(folder)
+    filmed = [one.name for one in experiment.recordings if one.video is not None]
+    if recording is None and len(filmed) != 1:
+        raise UserError(f"{folder} has {len(filmed)} recordings with images ({', '.join(filmed)}): give the option recording")
+    chosen: Recording = experiment[recording or filmed[0]]
+    if chosen.body is None or chosen.video is None:
+        lacking = "particles.npz" if chosen.body is None else "transforms.json"
+        raise UserError(f"recording {chosen.name} of {folder} lacks {lacking}, which body: particles needs")
+    if dt is not None and not dt > 0:
+        raise UserError(f"dt = {dt}: it must be positive")
+    batch = load_views(experiment.folder, recording=chosen.name, **options)
+    scene = chosen.scene if dt is None else replace(chosen.scene, dt=dt)
+    if crop is not None:
+        batch = cropped(batch, crop)
+    return VisualScene(experiment.name, scene, experiment.model["density"], experiment.model, chosen.body, None, batch, None)
+
+
+def cropped(batch: MultiViewBatch, crop: Sequence[int]) -> MultiViewBatch:
+    """The part of the images from column `left` to before `right` and row `top` to before `bottom`, with cameras to match.
+
+    Raises:
+        UserError: No part of the images.
+    """
+    height, width = batch.images.shape[2:4]
+    if len(crop) != 4 or any(isinstance(n, bool) or not isinstance(n, int) for n in crop):
+        raise UserError(f"crop = {crop}: give left, top, right, bottom in whole pixels")
+    left, top, right, bottom = crop
+    if not (0 <= left < right <= width and 0 <= top < bottom <= height):
+        raise UserError(f"crop = {list(crop)}: it must lie in the images of {width} x {height} pixels")
+    Ks = batch.cameras.Ks.clone()
+    Ks[:, 0, 2] -= left
+    Ks[:, 1, 2] -= top
+    cameras = batch.cameras._replace(Ks=Ks, width=right - left, height=bottom - top)
+    images, masks = batch.images[:, :, top:bottom, left:right], batch.masks[:, :, top:bottom, left:right]
+    return batch._replace(images=images.contiguous(), masks=masks.contiguous(), cameras=cameras)

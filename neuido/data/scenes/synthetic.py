@@ -1,0 +1,359 @@
+"""Synthetic scenes: a body of known material moves, is filmed from several views, and is written with the truth beside.
+
+The images come from a denser set of Gaussians than any model is given: each particle carries several, coloured by a solid texture
+over the position at t = 0, and they move with its x and F. Each scene is an experiment folder with one recording, `drop`;
+`data.visual` says what lies where. A scene appears under its name only when it is whole, so a run that was killed goes on.
+"""
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+from tqdm import tqdm
+
+from neuido.data import cameras as convert
+from neuido.data.bodies import scene_files as scenes
+from neuido.data.bodies.shapes import rigid_velocity
+from neuido.data.files.storage import claim, publish_folder, write
+from neuido.data.formats import nerfstudio
+from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
+from neuido.data.scenes.filmed_scene import Motion, write_motion
+from neuido.data.trajectories.options import Film
+from neuido.errors import UserError
+from neuido.physics.laws.classical import material
+from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.device import choose_device
+from neuido.types import Body, Cameras, ParticleState, Scene
+
+FORMAT = "neuido-scenes/1"
+RECORDING = "drop"
+PARTS = ("scene", "model", "body", "discretisation")
+OWN = ("name", "base", "velocity", "angular_velocity", "shift", "belief", "split", "substeps")
+SPLITS = ("train", "unseen")
+JELLY = {"density": 1000.0, "elasticity": {"law": "fixed_corotated", "young": 1e5, "poisson": 0.2}, "plasticity": {"law": "identity"}}
+"""What the experimenter believes unless told otherwise: NCLaw's jelly, from which NeuMA starts too."""
+
+IMAGES_AT_ONCE = {"cpu": 8, "cuda": 80}
+WIDTH = 0.45
+"""Standard deviation of a Gaussian in spacings of the dense set: with those of the layers behind, they cover."""
+
+INSET = 0.8
+"""So many standard deviations the Gaussians keep within a particle's share of the body, so that the body looks as large as it is."""
+
+OPACITY = 0.9
+Draw = Callable[..., tuple[Tensor, Tensor]]
+"""`models.splatting.rasterize`, which `data` may not import."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One scene to be made."""
+
+    name: str
+    scene: Scene
+    body: Body
+    motion: Motion
+    law: dict[str, Any]
+    """The true density, elasticity and plasticity."""
+    belief: dict[str, Any]
+    """What experiment.yaml says of them."""
+    split: str
+    substeps: int
+    source: str
+
+
+class Dense(NamedTuple):
+    """The Gaussians that the images show, M of each of P particles."""
+
+    offset: Tensor
+    """From the particle at t = 0 [m], (P, M, 3)."""
+    spread: Tensor
+    """Standard deviation at t = 0, equal in all directions [m], (P,)."""
+    colour: Tensor
+    """RGB, (P M, 3)."""
+
+    def at(self, x: Tensor, F: Tensor) -> tuple[Tensor, Tensor]:
+        """Centres (T, P M, 3) [m] and covariances (T, P M, 3, 3) [m^2] where the particles are at x (T, P, 3) with F (T, P, 3, 3)."""
+        centres = x.unsqueeze(2) + torch.einsum("tpij,pmj->tpmi", F, self.offset)
+        covariances = self.spread.square()[:, None, None] * (F @ F.mT)
+        return centres.flatten(1, 2), covariances.repeat_interleave(self.offset.shape[1], dim=1)
+
+
+def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.PathLike | None = None) -> Plan:
+    """Read one entry of `scenes`.
+
+    Args:
+        given: `name`; the keys scene, model, body and discretisation of a scene file, or `base`, the name of one, with keys of the
+            four that differ; optional velocity [m/s] and angular_velocity [rad/s] of the whole body, shift [m], belief (a model),
+            split (train, unseen), substeps from frame to frame.
+        film: How it is filmed.
+        data_root: Folder of the particles.
+
+    Raises:
+        UserError: An unknown or missing key, a figure outside its range, a body outside the domain.
+    """
+    given = scenes._mapping(given, "a scene")
+    name = given.get("name")
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
+        raise UserError(f"scenes: a name must be letters, digits, - and _, got {name!r}")
+    try:
+        content, source = dict[str, Any](), ""
+        if "base" in given:
+            path = scenes._folder() / f"{given['base']}.yaml"
+            if given["base"] not in scenes.scene_names():
+                raise UserError(f"base = {given['base']!r} is no scene; known: {', '.join(scenes.scene_names())}")
+            content = scenes.read_yaml(path)
+            source = str(content.get("source", ""))
+        for part in PARTS:
+            own = scenes._mapping(given.get(part, {}), part)
+            content[part] = own if part == "body" and own else {**content.get(part, {}), **own}
+        scenes._keys(given, "the scene", (*OWN, *PARTS), (*OWN[1:], *PARTS))
+        scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
+        law = scenes.model_from_dict(content["model"])
+        belief = scenes.model_from_dict(given.get("belief") or {**JELLY, "density": law["density"]})
+        body = scenes._body(content["body"], data_root)
+        if "shift" in given:
+            body = body._replace(x=body.x + torch.tensor(scenes._vector(given["shift"], "shift")))
+        body, motion = _set_off(body, given)
+        split, substeps = given.get("split", "train"), given.get("substeps", film.substeps)
+        if split not in SPLITS:
+            raise UserError(f"split = {split!r}; one of {', '.join(SPLITS)}")
+        if not isinstance(substeps, int) or substeps < 1:
+            raise UserError(f"substeps must be a positive whole number, got {substeps!r}")
+        if bool(((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any()):
+            raise UserError("particles of the body lie outside scene.domain")
+        Simulator(scene, body, density=law["density"]).check_step(material(law["elasticity"], law["plasticity"])[0])
+    except UserError as error:
+        raise UserError(f"scenes: {name}: {error}") from error
+    return Plan(name, scene, body, motion, law, belief, split, substeps, source)
+
+
+def make_scenes(
+    entries: list[dict[str, Any]],
+    film: Film,
+    out: str | os.PathLike,
+    *,
+    draw: Draw,
+    data_root: str | os.PathLike | None = None,
+    device: str = "auto",
+    progress: bool = True,
+) -> list[Path]:
+    """Make the scenes that are missing, and `index.json` when none is missing any more.
+
+    Args:
+        entries: As `plan_scene` takes them.
+        film: How they are filmed.
+        out: Folder; each scene becomes a folder in it.
+        draw: The renderer, `models.splatting.rasterize`.
+        data_root: Folder of the particles; NEUIDO_DATA where absent.
+        device: auto, cpu or cuda.
+        progress: Show a progress bar.
+
+    Returns:
+        The scenes' folders.
+
+    Raises:
+        UserError: What `plan_scene` and the simulator refuse, or a folder that holds other scenes.
+    """
+    _check(film)
+    chosen = choose_device(device)
+    plans = [plan_scene(entry, film, data_root=data_root) for entry in entries]
+    if not plans or len({plan.name for plan in plans}) < len(plans):
+        raise UserError("scenes must name at least one scene, and each once")
+    folder = Path(out).expanduser()
+    text = json.dumps({"format": FORMAT, "film": asdict(film), "scenes": entries}, indent=1, default=list) + "\n"
+    claim(folder, text, "other scenes, or the same filmed otherwise")
+    paths = [folder / plan.name for plan in plans]
+    missing = [(plan, path) for plan, path in zip(plans, paths) if not (path / "experiment.yaml").is_file()]
+    images = film.views * film.frames
+    with tqdm(total=images * len(plans), initial=images * (len(plans) - len(missing)), unit="image", disable=not progress) as bar:
+        for plan, path in missing:
+            bar.set_description(plan.name)
+            hidden = folder / f".{plan.name}.tmp"
+            shutil.rmtree(hidden, ignore_errors=True)
+            try:
+                make_scene(plan, film, hidden, draw=draw, device=chosen, advance=bar.update)
+            except UserError as error:
+                raise UserError(f"scenes: {plan.name}: {error}") from error
+            publish_folder(hidden, path)
+    index = [{"name": p.name, "split": p.split, "law": p.law, "particles": len(p.body.x), "substeps": p.substeps} for p in plans]
+    write(folder / "index.json", json.dumps({"format": FORMAT, "scenes": index}, indent=1) + "\n")
+    return paths
+
+
+def make_scene(
+    plan: Plan, film: Film, folder: Path, *, draw: Draw, device: torch.device, advance: Callable[[int], Any] = lambda images: None
+) -> None:
+    """Simulate, film and write one scene; `advance` is called with the number of images done."""
+    frames = move(plan, film, device)
+    times = torch.arange(film.frames, dtype=torch.float64) * plan.substeps * plan.scene.dt
+    cameras = orbit(film)
+    recording = folder / RECORDING
+    nerfstudio.write_transforms(recording, cameras, times, held_out=film.held_out)
+    dense = dress(plan.body, film.density, seed=plan.name, device=device)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        previews = _film(dense, frames, cameras, film, recording, draw, pool, advance)
+    _write_preview(previews, folder / "preview.png")
+    x = frames.x.cpu().numpy()
+    np.savez(folder / "truth.npz", x=x, x0=x[0], volume=plan.body.volume.numpy(), times=times.numpy())
+    truth = {"format": "neuido-truth/1", "name": plan.name, "law": plan.law, "split": plan.split, "substeps": plan.substeps}
+    truth |= {"dt": plan.scene.dt, "particles": len(plan.body.x), "gaussians": len(dense.colour), "source": plan.source}
+    (folder / "truth.yaml").write_text(yaml.safe_dump(truth, sort_keys=False, default_flow_style=None))
+    write_motion(plan.motion, folder)
+    interval = plan.substeps * plan.scene.dt
+    free = tuple(key for part in ("elasticity", "plasticity") for key in plan.belief[part] if key != "law")
+    recorded = Recording(RECORDING, "fit", plan.scene, interval)
+    write_experiment(Experiment(plan.name, folder, plan.scene, plan.belief, free, (recorded,)), folder)
+    read_experiment(folder)  # what cannot be read again is not published
+
+
+def move(plan: Plan, film: Film, device: torch.device) -> ParticleState:
+    """The true motion, frames x (T, P, 3) and F (T, P, 3, 3) first of all."""
+    simulator = Simulator(plan.scene, plan.body, density=plan.law["density"], device=device)
+    if film.frames == 1:
+        return ParticleState(*(part[None] for part in simulator.state))
+    laws = material(plan.law["elasticity"], plan.law["plasticity"])
+    with torch.no_grad():
+        return simulator.rollout((film.frames - 1) * plan.substeps, *laws, every=plan.substeps)
+
+
+def orbit(film: Film) -> Cameras:
+    """The cameras of a film."""
+    options = {"target": film.target, "radius": film.radius, "elevations": film.elevations, "angle": film.angle}
+    return convert.orbit(film.views, width=film.width, height=film.height, start=18.0, **options)
+
+
+def dress(body: Body, density: int, *, seed: str, device: torch.device | str = "cpu") -> Dense:
+    """Gaussians around the particles of a body, with the texture of this seed."""
+    generator = np.random.default_rng(list(seed.encode()))
+    edge = body.volume.double().pow(1 / 3).numpy()
+    spread = WIDTH * edge / density ** (1 / 3)
+    offset = generator.uniform(-1, 1, (len(edge), density, 3)) * (0.5 * edge - INSET * spread).clip(0)[:, None, None]
+    colour = texture((body.x.double().numpy()[:, None] + offset).reshape(-1, 3), generator)
+    parts = (offset, spread, colour)
+    return Dense(*(torch.from_numpy(part).float().to(device) for part in parts))
+
+
+def texture(x: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """A solid texture: RGB in 0..1 (N, 3) of points x (N, 3), patches of four colours with a fine grain.
+
+    The patches are some tenths of the body's size wide, so that optical flow finds something to follow everywhere.
+    """
+    size = float(np.ptp(x, axis=0).max())
+    hue = generator.uniform(0, 1) + np.array([0.0, 0.18, 0.5, 0.68])
+    palette = np.stack([0.5 + 0.42 * np.cos(2 * np.pi * (hue - shift)) for shift in (0.0, 1 / 3, 2 / 3)], 1) * [
+        [0.95],
+        [0.6],
+        [0.8],
+        [0.45],
+    ]
+    fields = [_waves(x, generator, 0.3 * size) for _ in palette]
+    weight = np.exp(5 * np.stack(fields, 1))
+    colour = weight @ palette / weight.sum(1, keepdims=True)
+    return np.clip(colour * (1 + 0.2 * _waves(x, generator, 0.1 * size))[:, None], 0.02, 0.98)
+
+
+def _waves(x: np.ndarray, generator: np.random.Generator, length: float, count: int = 8) -> np.ndarray:
+    """A random field of mean square one half: waves of about this length in all directions."""
+    k = generator.normal(size=(count, 3))
+    k *= 2 * np.pi / (length * generator.uniform(0.7, 1.4, (count, 1)) * np.linalg.norm(k, axis=1, keepdims=True))
+    return np.sin(x @ k.T + generator.uniform(0, 2 * np.pi, count)).sum(1) / np.sqrt(count)
+
+
+def _film(
+    dense: Dense,
+    frames: ParticleState,
+    cameras: Cameras,
+    film: Film,
+    folder: Path,
+    draw: Draw,
+    pool: ThreadPoolExecutor,
+    advance: Callable[[int], Any],
+) -> np.ndarray:
+    """Draw and write all images; returns those of the first view at eight times and of a second one (2, 8, H, W, 4)."""
+    device = frames.x.device
+    opacity = torch.full((len(dense.colour),), OPACITY, device=device)
+    viewmats, Ks = cameras.viewmats.to(device), cameras.Ks.to(device)
+    shown = np.linspace(0, film.frames - 1, 8).round().astype(int)
+    kept: dict[tuple[int, int], np.ndarray] = {}
+    size = max(1, IMAGES_AT_ONCE[device.type] // film.views)
+    waiting = []
+    for start in range(0, film.frames, size):
+        some = slice(start, start + size)
+        means, covariances = dense.at(frames.x[some], frames.F[some])
+        with torch.no_grad():
+            images, alphas = draw(means, covariances, opacity, dense.colour, viewmats, Ks, film.width, film.height)
+        straight = images / alphas.unsqueeze(-1).clamp(min=1 / 255)  # PNG wants colours that are not multiplied by alpha
+        pixels = torch.cat([straight, alphas.unsqueeze(-1)], -1).clamp(0, 1).mul(255).round().byte().cpu().numpy()
+        for t, v in np.ndindex(*pixels.shape[:2]):
+            path = folder / "images" / f"{v}_{start + t:03d}.png"
+            waiting.append(pool.submit(_write_png, path, pixels[t, v], film.compression))
+            if v in (0, film.views // 4) and start + t in shown:
+                kept[v, start + t] = pixels[t, v]
+        while len(waiting) > 2 * IMAGES_AT_ONCE["cuda"]:
+            waiting.pop(0).result()
+            advance(1)
+    for one in waiting:
+        one.result()
+        advance(1)
+    return np.array([[kept[v, t] for t in shown] for v in (0, film.views // 4)])
+
+
+def _write_png(path: Path, rgba: np.ndarray, compression: int) -> None:
+    if not cv2.imwrite(str(path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, compression]):
+        raise UserError(f"cannot write the image {path}")
+
+
+def _write_preview(images: np.ndarray, path: Path, side: int = 160) -> None:
+    """A sheet of two views over time, on white."""
+    rows = []
+    for row in images:
+        rgb = [(i[..., :3] * (i[..., 3:] / 255) + 255 - i[..., 3:]).astype(np.uint8) for i in row]
+        rows.append(np.concatenate([cv2.resize(i, (side, side), interpolation=cv2.INTER_AREA) for i in rgb], 1))
+    nerfstudio.write_image(path, np.concatenate(rows, 0))
+
+
+def _set_off(body: Body, given: Mapping[str, Any]) -> tuple[Body, Motion]:
+    """The body with the velocity that the entry gives, else with its own, and that motion, which must be rigid."""
+    centre = tuple(round(c, 6) for c in body.x.double().mean(0).tolist())
+    if "velocity" in given or "angular_velocity" in given:
+        velocity = scenes._vector(given.get("velocity", [0.0, 0.0, 0.0]), "velocity")
+        spin = scenes._vector(given.get("angular_velocity", [0.0, 0.0, 0.0]), "angular_velocity")
+    else:
+        velocity, spin = _rigid(body, centre)
+    motion = Motion(velocity, spin, centre)  # type: ignore[arg-type]
+    v = rigid_velocity(body.x.double(), centre=centre, velocity=velocity, angular_velocity=spin).float()  # type: ignore[arg-type]
+    return body._replace(v=v), motion
+
+
+def _rigid(body: Body, centre: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Velocity of the centre and angular velocity of a body that moves as a rigid one."""
+    r, v = body.x.double() - torch.tensor(centre, dtype=torch.float64), body.v.double()
+    mean = v.mean(0)
+    inertia = r.square().sum() * torch.eye(3, dtype=torch.float64) - r.T @ r
+    spin = torch.linalg.solve(inertia, torch.linalg.cross(r, v - mean).sum(0))
+    rest = (v - mean - torch.linalg.cross(spin.expand_as(r), r)).norm(dim=1).max()
+    if rest > 1e-3 * v.norm(dim=1).max() + 1e-9:
+        raise UserError("the body does not start as a rigid one: give velocity and angular_velocity")
+    return tuple(round(c, 6) for c in mean.tolist()), tuple(round(c, 6) for c in spin.tolist())
+
+
+def _check(film: Film) -> None:
+    for name in ("views", "width", "height", "frames", "substeps", "density"):
+        if getattr(film, name) < 1:
+            raise UserError(f"film.{name} must be at least 1, got {getattr(film, name)}")
+    if any(not 0 <= v < film.views for v in film.held_out) or len(set(film.held_out)) >= film.views:
+        raise UserError(f"film.held_out = {list(film.held_out)} must name some of the views 0..{film.views - 1}, not all")
+    if not 0 <= film.compression <= 9:
+        raise UserError(f"film.compression must lie in 0..9, got {film.compression}")

@@ -1,0 +1,227 @@
+"""The generation of the Stage I trajectories behind `neuido simulate`: plan, simulation, files.
+
+`storage.py` says what the folder holds.
+"""
+
+import contextlib
+import json
+import math
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, evaluate, laws
+from neuido.data.bodies.shapes import cube
+from neuido.data.files.storage import COLUMNS, FORMAT, claim, complete, publish, write
+from neuido.errors import UserError
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.device import choose_device
+from neuido.types import Body, ParticleState, Scene, Vector, Walls
+
+SEGMENT = 100  # substeps held in memory at a time
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What decides the content of the files; `neuido simulate` documents each figure."""
+
+    families: dict[str, dict[str, tuple[float, float]]]
+    instances: int
+    held_out: int
+    seed: int
+    length: float
+    particles_per_side: int
+    velocity: Vector
+    angular_velocity: Vector
+    density: float
+    gravity: Vector
+    cells: int
+    wall_inset: float
+    dt: float
+    steps: int
+    record_every: int
+
+    def __post_init__(self) -> None:
+        for name, lowest in (("instances", 1), ("held_out", 0), ("seed", 0), ("cells", 4), ("steps", 1), ("record_every", 1)):
+            if getattr(self, name) < lowest:
+                raise UserError(f"{name} must be at least {lowest}, got {getattr(self, name)}")
+        for name in ("density", "dt"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise UserError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.record_every > self.steps:
+            raise UserError(f"record_every {self.record_every} leaves nothing of {self.steps} steps: lower it or raise steps")
+        if not self.families:
+            raise UserError(f"families is empty: name at least one of {', '.join(PARAMETERS)}")
+        for family, ranges in self.families.items():
+            check_ranges(family, ranges)
+
+    @property
+    def scene(self) -> Scene:
+        """The box into which the cube is thrown."""
+        walls = Walls(contact="separate", friction=0.0, inset=self.wall_inset)
+        return Scene(cells=self.cells, dt=self.dt, gravity=self.gravity, walls=walls)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of a trajectory's array: recorded substeps, particles, columns."""
+        return self.steps // self.record_every, self.particles_per_side**3, COLUMNS
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One trajectory to be made."""
+
+    name: str
+    family: str
+    parameters: dict[str, float]
+    split: str
+
+
+def plan(setup: Setup) -> list[Instance]:
+    """All trajectories in their order: the training instances family by family, then the held-out ones."""
+    made = []
+    for split, numbers in (
+        ("train", range(setup.instances)),
+        ("held_out", range(setup.instances, setup.instances + setup.held_out)),
+    ):
+        made += [_instance(setup, family, number, split) for family in PARAMETERS if family in setup.families for number in numbers]
+    return made
+
+
+def generate(
+    setup: Setup, out: str | os.PathLike, *, shard: int = 0, shards: int = 1, device: str = "auto", batch: int = 0, progress: bool = True
+) -> None:
+    """Make what is missing of one shard, and the index when no trajectory is missing any more.
+
+    Raises:
+        UserError: A shard outside the shards, an unknown device, a folder that cannot be one or that holds another set-up, and
+            what the simulator refuses (a step above the stability limit, a NaN).
+    """
+    if not 0 <= shard < shards:
+        raise UserError(f"shard must lie in 0..{shards - 1} (shards = {shards}), got {shard}")
+    if batch < 0:
+        raise UserError(f"batch must be 0 (automatic) or positive, got {batch}")
+    chosen = choose_device(device)
+    everything = plan(setup)
+    _check_steps(setup, everything)
+    folder = Path(out)
+    content = {"format": FORMAT, "setup": asdict(setup), "trajectories": [asdict(instance) for instance in everything]}
+    claim(folder, _json(content), "trajectories of another set-up", compared="setup")
+    files = {instance.name: folder / f"{instance.name}.npy" for instance in everything}
+
+    mine = [instance for i, instance in enumerate(everything) if i % shards == shard]
+    missing = [instance for instance in mine if not complete(files[instance.name], setup.shape)]
+    size = batch or (10 if chosen.type == "cuda" else 1)
+    with tqdm(total=len(mine), initial=len(mine) - len(missing), unit="trajectory", disable=not progress) as bar:
+        for family in PARAMETERS:
+            wanted = [instance for instance in missing if instance.family == family]
+            for start in range(0, len(wanted), size):
+                group = wanted[start : start + size]
+                _simulate(setup, group, [files[instance.name] for instance in group], chosen)
+                bar.update(len(group))
+
+    if missing or not (folder / "index.json").exists():
+        if all(complete(path, setup.shape) for path in files.values()):
+            _write_index(folder, setup, everything)
+
+
+def _body(setup: Setup) -> Body:
+    return cube(
+        length=setup.length,
+        particles_per_side=setup.particles_per_side,
+        velocity=setup.velocity,
+        angular_velocity=setup.angular_velocity,
+    )
+
+
+def _check_steps(setup: Setup, wanted: list[Instance]) -> None:
+    """Refuse an unstable step of the last instance before the first one is simulated."""
+    simulator = Simulator(setup.scene, _body(setup), density=setup.density)
+    for instance in wanted:
+        try:
+            simulator.check_step(laws(instance.family, [instance.parameters])[0])
+        except UserError as error:
+            raise UserError(f"{instance.name}: {error}") from error
+
+
+def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: torch.device) -> None:
+    """Simulate instances of one family in one launch and write their files, a segment of substeps at a time."""
+    frames, count, _ = setup.shape
+    body = _body(setup)
+    elastic, plastic = laws(group[0].family, [instance.parameters for instance in group])
+    exact = [laws(instance.family, [instance.parameters]) for instance in group]
+    segment = max(setup.record_every, SEGMENT // setup.record_every * setup.record_every)
+    names = group[0].name if len(group) == 1 else f"{group[0].name} .. {group[-1].name}"
+    hidden = [path.with_name(f".{path.name}.tmp") for path in paths]
+    header = {"descr": "<f4", "fortran_order": False, "shape": setup.shape}
+    try:
+        simulator = Simulator([setup.scene] * len(group), [body] * len(group), density=setup.density, device=device)
+        state = simulator.state
+        with torch.no_grad(), contextlib.ExitStack() as stack:
+            files = [stack.enter_context(path.open("wb")) for path in hidden]
+            for file in files:
+                np.lib.format.write_array_header_1_0(file, header)
+            for start in range(0, frames * setup.record_every, segment):
+                steps = min(segment, frames * setup.record_every - start)
+                out = simulator.rollout(steps, elastic, plastic, state=state)
+                state = ParticleState(*(part[-1].clone() for part in out))
+                for k, file in enumerate(files):
+                    mine = slice(k * count, (k + 1) * count)
+                    file.write(_samples(setup, out.F[:, mine], out.C[:, mine], *exact[k]).cpu().numpy().tobytes())
+    except UserError as error:
+        raise UserError(f"{names}: {error}") from error
+    except OSError as error:
+        raise UserError(f"{names}: cannot write to {paths[0].parent}: {error.strerror}; give another out") from error
+    for part, path in zip(hidden, paths, strict=True):
+        publish(part, path)
+
+
+def _samples(setup: Setup, F: Tensor, C: Tensor, elastic: ElasticLaw, plastic: PlasticLaw) -> Tensor:
+    """The recorded columns (T, P, 27) of a rollout's frames F, C (K, P, 3, 3).
+
+    The targets are the laws in float64 of the float32 inputs that are stored, so that they are exact for them; the rollout's own
+    F differs from them by its rounding.
+    """
+    last = torch.arange(setup.record_every, len(F), setup.record_every, device=F.device)
+    trial = (F[last - 1].double() + setup.dt * C[last].double() @ F[last - 1].double()).float()
+    corrected = evaluate(plastic, trial)
+    stress = evaluate(elastic, corrected)
+    return torch.cat([part.flatten(-2) for part in (trial, corrected, stress)], dim=-1)
+
+
+def _instance(setup: Setup, family: str, number: int, split: str) -> Instance:
+    if number == 0:
+        name, parameters = PUBLISHED[family]
+        return Instance(name, family, dict(parameters), split)
+    random = np.random.default_rng([setup.seed, list(PARAMETERS).index(family), number])
+    return Instance(f"{family}-{number:03d}", family, draw_parameters(family, setup.families[family], random), split)
+
+
+def _write_index(folder: Path, setup: Setup, everything: list[Instance]) -> None:
+    from neuido import __version__
+
+    entries = [{**asdict(instance), **_statistics(folder / f"{instance.name}.npy")} for instance in everything]
+    write(folder / "index.json", _json({"format": FORMAT, "version": __version__, "setup": asdict(setup), "trajectories": entries}))
+
+
+def _statistics(path: Path) -> dict[str, float]:
+    """Root mean square over the samples of the Frobenius norms of the stress [Pa] and of the plastic correction F_hat - F_tr [-]."""
+    array = np.load(path, mmap_mode="r")
+    stress = residual = 0.0
+    for rows in np.array_split(array, max(1, len(array) // 100)):
+        rows = rows.astype(np.float64)
+        stress += float(np.square(rows[..., 18:]).sum())
+        residual += float(np.square(rows[..., 9:18] - rows[..., :9]).sum())
+    count = array.shape[0] * array.shape[1]
+    return {"stress_rms": math.sqrt(stress / count), "residual_rms": math.sqrt(residual / count)}
+
+
+def _json(content: dict[str, Any]) -> str:
+    return json.dumps(content, indent=1) + "\n"

@@ -1,0 +1,123 @@
+"""The options of the `simulate` command: signatures and help alone, so that `--help` loads no torch."""
+
+from dataclasses import dataclass
+
+Range = tuple[float, float]
+
+FAMILIES: dict[str, dict[str, Range]] = {
+    "elastic": {"young": (3e4, 1e6), "poisson": (0.1, 0.4)},
+    "plasticine": {"young": (1e5, 1e6), "poisson": (0.1, 0.4), "yield_stress": (1e3, 2e4)},
+    "sand": {"young": (1e5, 1e6), "poisson": (0.1, 0.4), "friction_angle": (15.0, 45.0)},
+}
+"""Parameter ranges: young and yield_stress [Pa] drawn log-uniformly, poisson [-] and friction_angle [degrees] uniformly."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """How scenes are filmed.
+
+    Args:
+        views: Cameras, evenly around the middle of the scene.
+        held_out: Which of them are for scoring only.
+        width: Width of the images, px.
+        height: Height of the images, px.
+        frames: Frames, the first at t = 0.
+        substeps: Substeps from one frame to the next; the paper takes one frame of five.
+        radius: Distance of the cameras from the point they look at, m.
+        target: The point they look at, m.
+        elevations: Heights of the cameras above the horizon, degrees, taken in turn.
+        angle: Horizontal angle of view, degrees.
+        density: Gaussians for each particle; the images come from these, and no model is given them.
+        compression: Of the PNG files, 0 to 9.
+    """
+
+    views: int = 10
+    held_out: tuple[int, ...] = (3, 8)
+    width: int = 400
+    height: int = 400
+    frames: int = 80
+    substeps: int = 5
+    radius: float = 2.2
+    target: tuple[float, float, float] = (0.5, 0.35, 0.5)
+    elevations: tuple[float, ...] = (12.0, 32.0)
+    angle: float = 36.0
+    density: int = 4
+    compression: int = 1
+
+
+def simulate(
+    out: str,
+    *,
+    families: dict[str, dict[str, Range]] = FAMILIES,
+    instances: int = 30,
+    held_out: int = 10,
+    seed: int = 0,
+    length: float = 0.5,
+    particles_per_side: int = 10,
+    velocity: tuple[float, float, float] = (1.0, -1.5, -2.0),
+    angular_velocity: tuple[float, float, float] = (4.0, 4.0, 4.0),
+    density: float = 1000.0,
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0),
+    cells: int = 20,
+    wall_inset: float = 2.0,
+    dt: float = 5e-4,
+    steps: int = 1000,
+    record_every: int = 1,
+    shard: int = 0,
+    shards: int = 1,
+    device: str = "auto",
+    batch: int = 0,
+    progress: bool = True,
+) -> None:
+    """Simulate the constitutive trajectories of Stage I: a spinning cube thrown into a box, for many materials.
+
+    The set-up is NCLaw's; its three published materials are instance 0 of their families. A run that was interrupted goes on
+    where it stopped when the same command is given again. On the CPU the files are equal byte for byte however they are sharded.
+
+    Args:
+        out: Folder to write: one .npy file per trajectory, plan.json at the start and index.json when all are there.
+        families: Parameter ranges of each family (elastic, plasticine, sand): young and yield_stress in Pa (log-uniform),
+            poisson and friction_angle in degrees (uniform).
+        instances: Training instances of each family.
+        held_out: Further instances of each family that are never trained on.
+        seed: Seed of the parameters; each trajectory's depend on the seed, its family and its number alone.
+        length: Edge of the cube, m; it starts in the middle of the unit cube.
+        particles_per_side: Particles along an edge.
+        velocity: Velocity of the cube at the start, m/s.
+        angular_velocity: Angular velocity of the cube at the start, rad/s.
+        density: Density, kg/m^3.
+        gravity: Gravity, m/s^2.
+        cells: Grid cells along the unit cube.
+        wall_inset: Distance of the frictionless walls from the domain's faces, in cells.
+        dt: Substep, s.
+        steps: Substeps of a trajectory.
+        record_every: Record every n-th substep.
+        shard: Which share of the trajectories to simulate, counted from 0.
+        shards: Number of shares; trajectory i belongs to share i mod shards.
+        device: auto, cpu or cuda.
+        batch: Trajectories simulated in one launch; 0 chooses 1 on the CPU and 10 on a GPU.
+        progress: Show a progress bar.
+
+    Raises:
+        UserError: An impossible material, a reversed range, a step above the stability limit, a folder that holds another set-up.
+    """
+    from neuido.data.trajectories.generation import Setup, generate
+
+    setup = Setup(
+        families={family: {name: tuple(bounds) for name, bounds in ranges.items()} for family, ranges in families.items()},
+        instances=instances,
+        held_out=held_out,
+        seed=seed,
+        length=length,
+        particles_per_side=particles_per_side,
+        velocity=tuple(velocity),
+        angular_velocity=tuple(angular_velocity),
+        density=density,
+        gravity=tuple(gravity),
+        cells=cells,
+        wall_inset=wall_inset,
+        dt=dt,
+        steps=steps,
+        record_every=record_every,
+    )
+    generate(setup, out, shard=shard, shards=shards, device=device, batch=batch, progress=progress)

@@ -1,0 +1,274 @@
+"""The Stage I samples (F_tr, F_hat, stress, trajectory) in balanced batches from the files of `neuido simulate`."""
+
+import inspect
+import json
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningDataModule
+from torch import Tensor
+
+from neuido.data.files.storage import COLUMNS, FORMAT, Files, complete, split
+from neuido.data.trajectories.options import simulate
+from neuido.data.trajectories.sampling import Batches, Order, Step, Steps
+from neuido.errors import UserError
+from neuido.types import TrajectoryBatch
+
+BLOCKS = 50
+"""Held-out steps are whole blocks of time, so that a held-out sample has no neighbour one substep away in the training set."""
+
+
+class TrajectoryDataModule(LightningDataModule):
+    """Samples of the constitutive trajectories of Stage I (paper, "Training on constitutive trajectories").
+
+    Training takes the training instances without the held-out particles and without the held-out steps; validation and test take
+    a fixed number of exactly those. `instance_batches` gives the held-out instances: one half to fit a latent, one to score it.
+
+    Args:
+        root: Folder written by `neuido simulate`.
+        batch_size: Samples of a batch, shared equally by the trajectories: each gets batch_size // M (the paper's 10^4).
+        held_out_particles: Fraction of the particles that is held out, the same ones in each trajectory.
+        held_out_steps: Fraction of the steps that is held out, in whole blocks of time.
+        validation_samples: Held-out samples of each training trajectory in a validation.
+        instance_samples: Samples of each held-out instance in each half.
+        seed: Seed of the split and of the order.
+        preload: Whether the training set is put on the trainer's device (fast); false reads memory-mapped files instead, and
+            `auto` decides by the memory there is.
+        num_workers: Worker processes that read when the training set is not preloaded.
+        drop_last: Leave out the last batch of an epoch if it would be smaller than the others.
+        generate: Options of `neuido simulate` with which the folder is made if it is missing; none: a missing folder is an error.
+
+    Attributes:
+        trajectory_count, names, families, parameters: Of the training instances, in the order of the trajectory index.
+        stress_rms, residual_rms: (M,) float32, root mean squares of the Frobenius norms of stress [Pa] and F_hat - F_tr [-].
+        instance_names, instance_families, instance_parameters, instance_stress_rms, instance_residual_rms: Of the held-out ones.
+    """
+
+    def __init__(
+        self,
+        root: str = "data/trajectories",
+        *,
+        batch_size: int = 10_000,
+        held_out_particles: float = 0.1,
+        held_out_steps: float = 0.1,
+        validation_samples: int = 1000,
+        instance_samples: int = 2000,
+        seed: int = 0,
+        preload: bool | str = "auto",
+        num_workers: int = 0,
+        drop_last: bool = False,
+        generate: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        for name, fraction in (("held_out_particles", held_out_particles), ("held_out_steps", held_out_steps)):
+            if not 0 < fraction < 1:
+                raise UserError(f"{name} must be a fraction between 0 and 1, got {fraction}")
+        for name, count in (("batch_size", batch_size), ("validation_samples", validation_samples), ("instance_samples", instance_samples)):
+            if count < 1:
+                raise UserError(f"{name} must be at least 1, got {count}")
+        if preload not in (True, False, "auto"):
+            raise UserError(f"preload must be true, false or auto, got {preload!r}")
+        unknown = set(generate or {}) - set(inspect.signature(simulate).parameters)
+        if unknown:
+            raise UserError(f"data.generate has the unknown option {sorted(unknown)[0]!r}: `neuido simulate --help` lists them")
+        self.root = Path(root)
+        self.batch_size, self.seed, self.preload, self.num_workers, self.drop_last = batch_size, seed, preload, num_workers, drop_last
+        self.held_out_particles, self.held_out_steps = held_out_particles, held_out_steps
+        self.validation_samples, self.instance_samples = validation_samples, instance_samples
+        self.generate = generate
+        self._resident: Tensor | None = None
+
+    # What there is, from index.json; no torch data is read for it.
+
+    @cached_property
+    def index(self) -> dict[str, Any]:
+        """The content of index.json.
+
+        Raises:
+            UserError: The folder is missing, incomplete or of another format.
+        """
+        if self.generate is not None:
+            self.prepare_data()
+        path = self.root / "index.json"
+        command = f"neuido simulate --config configs/trajectories.yaml --out {self.root}"
+        if not path.is_file():
+            state = "is not complete" if (self.root / "plan.json").is_file() else "holds no trajectories"
+            raise UserError(f"data.root = {self.root} {state} (no index.json): make it with `{command}`")
+        content = json.loads(path.read_text())
+        if content.get("format") != FORMAT:
+            raise UserError(f"{path} has format {content.get('format')!r}, not {FORMAT!r}: make it anew with `{command}`")
+        for entry in content["trajectories"]:
+            if not complete(self.root / f"{entry['name']}.npy", self._shape(content)):
+                raise UserError(f"{self.root / entry['name']}.npy is missing or cut short: repair it with `{command}`")
+        return content
+
+    @property
+    def trajectory_count(self) -> int:
+        return len(self._of("train"))
+
+    @property
+    def names(self) -> list[str]:
+        return [entry["name"] for entry in self._of("train")]
+
+    @property
+    def families(self) -> list[str]:
+        return [entry["family"] for entry in self._of("train")]
+
+    @property
+    def parameters(self) -> list[dict[str, float]]:
+        return [entry["parameters"] for entry in self._of("train")]
+
+    @property
+    def stress_rms(self) -> Tensor:
+        return torch.tensor([entry["stress_rms"] for entry in self._of("train")])
+
+    @property
+    def residual_rms(self) -> Tensor:
+        return torch.tensor([entry["residual_rms"] for entry in self._of("train")])
+
+    @property
+    def instance_names(self) -> list[str]:
+        return [entry["name"] for entry in self._of("held_out")]
+
+    @property
+    def instance_families(self) -> list[str]:
+        return [entry["family"] for entry in self._of("held_out")]
+
+    @property
+    def instance_parameters(self) -> list[dict[str, float]]:
+        return [entry["parameters"] for entry in self._of("held_out")]
+
+    @property
+    def instance_stress_rms(self) -> Tensor:
+        return torch.tensor([entry["stress_rms"] for entry in self._of("held_out")])
+
+    @property
+    def instance_residual_rms(self) -> Tensor:
+        return torch.tensor([entry["residual_rms"] for entry in self._of("held_out")])
+
+    def _of(self, split: str) -> list[dict[str, Any]]:
+        return [entry for entry in self.index["trajectories"] if entry["split"] == split]
+
+    @staticmethod
+    def _shape(content: dict[str, Any]) -> tuple[int, int, int]:
+        setup = content["setup"]
+        return setup["steps"] // setup["record_every"], setup["particles_per_side"] ** 3, COLUMNS
+
+    def _files(self, split: str) -> Files:
+        return Files([self.root / f"{entry['name']}.npy" for entry in self._of(split)])
+
+    # The split.
+
+    @cached_property
+    def held_out(self) -> tuple[Tensor, Tensor]:
+        """Held-out steps (T,) and particles (P,), boolean, the same for all trajectories."""
+        steps, particles, _ = self._shape(self.index)
+        generator = torch.Generator().manual_seed(self.seed)
+        blocks = min(BLOCKS, steps)
+        chosen = torch.randperm(blocks, generator=generator)[: max(1, round(self.held_out_steps * blocks))]
+        block = torch.arange(steps) * blocks // steps
+        points = torch.zeros(particles, dtype=torch.bool)
+        points[torch.randperm(particles, generator=generator)[: max(1, round(self.held_out_particles * particles))]] = True
+        return torch.isin(block, chosen), points
+
+    def rows(self, part: str) -> Tensor:
+        """Row numbers t P + p of a part of each trajectory: `train`, or held out by `particles`, or else by `steps`."""
+        late, points = (m for m in self.held_out)
+        masks = {
+            "train": ~late[:, None] & ~points,
+            "particles": points.expand(len(late), -1),
+            "steps": late[:, None] & ~points,
+        }
+        return masks[part].flatten().nonzero().squeeze(1)
+
+    # Lightning's hooks.
+
+    def prepare_data(self) -> None:
+        if self.generate is not None and not (self.root / "index.json").is_file():
+            simulate(str(self.root), **self.generate)
+
+    def setup(self, stage: str | None = None) -> None:
+        samples = self.batch_size // self.trajectory_count
+        if samples == 0:
+            raise UserError(f"batch_size = {self.batch_size} is less than one sample for each of {self.trajectory_count} trajectories")
+        self.files = self._files("train")
+        self.order = Order(self.rows("train"), self.trajectory_count, samples, seed=self.seed, drop_last=self.drop_last)
+
+    def train_dataloader(self) -> Steps:
+        trainer = self.trainer
+        rank, ranks = (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
+        resident = trainer is not None and self._preload(trainer.strategy.root_device)
+        return Steps(self.order, None if resident else self.gather, workers=self.num_workers, rank=rank, ranks=ranks)
+
+    def val_dataloader(self) -> Batches:
+        return self._validation
+
+    def test_dataloader(self) -> Batches:
+        return self._validation
+
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
+        if not isinstance(batch, Step):
+            return batch
+        if self._resident is None:
+            raise RuntimeError("a Step was handed out and the training set is not on the device")
+        rows = self.order(*batch, self._resident.device)
+        rows = rows + self._resident.shape[1] * torch.arange(len(rows), device=rows.device)[:, None]
+        picked = self._resident.view(-1, self._resident.shape[-1]).index_select(0, rows.view(-1))
+        return split(picked.view(*rows.shape, -1))
+
+    def teardown(self, stage: str) -> None:
+        self._resident = None
+
+    # Samples.
+
+    def gather(self, epoch: int, step: int) -> TrajectoryBatch:
+        """The training batch of a step, read from the files: M n samples sorted by trajectory."""
+        return self.files.gather(self.order(epoch, step, torch.device("cpu")))
+
+    def instance_batches(self) -> tuple[TrajectoryBatch, TrajectoryBatch]:
+        """Samples of the held-out instances: (to fit a latent with, to score it with).
+
+        The first come from the steps and particles that training uses, the second from the held-out ones. Both are sorted by
+        instance (`trajectory` counts the held-out instances from 0) with min(instance_samples, all there are) samples each.
+
+        Raises:
+            UserError: The folder was made without held-out instances.
+        """
+        files = self._files("held_out")
+        if not files.paths:
+            raise UserError(f"{self.root} has no held-out instances: make it with `neuido simulate --held_out 10 ...`")
+        fit = self._draw(self.rows("train"), self.instance_samples, len(files.paths), salt=1)
+        return files.gather(fit), files.gather(self._held_out_rows(self.instance_samples, len(files.paths), salt=2))
+
+    @cached_property
+    def _validation(self) -> Batches:
+        rows = self._held_out_rows(self.validation_samples, self.trajectory_count, salt=3)
+        files, samples = self._files("train"), max(1, self.batch_size // self.trajectory_count)
+        return Batches([files.gather(part) for part in rows.split(samples, dim=1)])
+
+    def _held_out_rows(self, samples: int, trajectories: int, *, salt: int) -> Tensor:
+        """Half from the held-out particles, half from the held-out steps, (trajectories, <= samples)."""
+        points = self._draw(self.rows("particles"), (samples + 1) // 2, trajectories, salt=salt)
+        late = self._draw(self.rows("steps"), samples // 2, trajectories, salt=salt + 100)
+        return torch.cat([points, late], dim=1)
+
+    def _draw(self, rows: Tensor, samples: int, trajectories: int, *, salt: int) -> Tensor:
+        generator = torch.Generator().manual_seed(self.seed * 1000 + salt)
+        return torch.stack([rows[torch.randperm(len(rows), generator=generator)[:samples]] for _ in range(trajectories)])
+
+    def _preload(self, device: torch.device) -> bool:
+        """Put the training set on the device if that is wished and possible; whether it is there."""
+        if self.preload is False:
+            return False
+        if self._resident is not None and self._resident.device == device:
+            return True
+        steps, particles, columns = self._shape(self.index)
+        wanted = self.trajectory_count * steps * particles * columns * 4
+        if self.preload == "auto":
+            free = torch.cuda.mem_get_info(device)[0] // 2 if device.type == "cuda" else 2 * 2**30
+            if wanted > free:
+                return False
+        self._resident = self.files.load(device)
+        return True

@@ -1,0 +1,255 @@
+"""The effects that a case may leave undeclared: the whole library, and some that are outside it. Which figures, and how large."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from neuido.physics.effects.parameters import LIBRARY
+
+ELASTIC, PLASTIC, GRAINS = "identity", "von_mises", "drucker_prager"
+ANY, SOLID = (ELASTIC, PLASTIC, GRAINS), (ELASTIC, PLASTIC)
+KNOTS = 5
+
+
+class Scales(NamedTuple):
+    """Typical sizes of a case, from which an effect's size starts."""
+
+    young: float
+    density: float
+    length: float
+    """Largest extent of the body [m]."""
+    half: np.ndarray
+    """Half its extents [m], (3,)."""
+    centre: np.ndarray
+    """Of the first recording's body at the start [m], (3,)."""
+    duration: float
+    speed: float
+    dt: float
+    dx: float
+    yield_stress: float
+
+    @property
+    def wave(self) -> float:
+        """Time of a shear wave through the body [s]."""
+        return self.length * math.sqrt(2.6 * self.density / self.young)
+
+
+class Drawn(NamedTuple):
+    """An effect with all its figures."""
+
+    kind: str
+    values: dict[str, float]
+    """Flat names."""
+    sizes: tuple[str, ...]
+    """Those that are zero where the effect is absent; they are scaled together."""
+    least: float
+    most: float
+    """Factors on the sizes as drawn."""
+
+    def times(self, factor: float) -> "Drawn":
+        """With sizes `factor` as large."""
+        values = {name: value * factor if name in self.sizes else value for name, value in self.values.items()}
+        return self._replace(values=values, least=self.least / factor, most=self.most / factor)
+
+    def rounded(self, digits: int = 4) -> "Drawn":
+        """With figures that a person could read."""
+        return self._replace(values={name: float(f"{value:.{digits}g}") for name, value in self.values.items()})
+
+
+class Kind(NamedTuple):
+    """One sort of effect."""
+
+    draw: Callable[[np.random.Generator, Scales], tuple[dict[str, float], str, float, float]]
+    """Figures without the effect's name, which of them are sizes (space between), and the factors' range."""
+    models: tuple[str, ...]
+    """Declared plasticities that it can be added to."""
+    stage: str
+    """flight, contact or material."""
+    names: tuple[str, ...]
+    """What a diagnosis may call it: the same motion to the last digit."""
+    meaning: str
+    directed: bool = False
+    """Whether it has a direction in the material."""
+    outside: bool = False
+    near: tuple[str, ...] = ()
+    """Of an effect outside the library: which effects of it come near."""
+    grid: bool = False
+    """Whether it acts through the grid, or between steps, so that finite elements do not have it alike."""
+    units: Mapping[str, str] = {}
+
+
+def _direction(rng: np.random.Generator, *, level: bool = False) -> np.ndarray:
+    d = rng.normal(size=3) * ([1.0, 0.25, 1.0] if level else 1.0)
+    return d / np.linalg.norm(d)
+
+
+def _sign(rng: np.random.Generator, negative: float = 0.5) -> float:
+    return -1.0 if rng.random() < negative else 1.0
+
+
+def _xyz(v: np.ndarray, names: str = "xyz") -> dict[str, float]:
+    return dict(zip(names.split() if " " in names else names, map(float, v), strict=True))
+
+
+def _vector(size: Callable[[Scales], float], most: float, *, level: bool = False):
+    return lambda rng, s: (_xyz(size(s) * _direction(rng, level=level)), "x y z", 0.05, most)
+
+
+def _scalar(name: str, size: Callable[[Scales], float], most: float, *, least: float = 0.02, negative: float = 0.0, low: float = 1.0):
+    """`low` is the share of `most` that a negative size may reach."""
+
+    def draw(rng: np.random.Generator, s: Scales):
+        sign = _sign(rng, negative) if negative else 1.0
+        return {name: sign * size(s)}, name, least, most * (low if sign < 0 else 1.0)
+
+    return draw
+
+
+def _place(rng: np.random.Generator, s: Scales):
+    offset = _direction(rng) * rng.uniform(0.15, 0.35)
+    return {"k": _sign(rng, 0.3) * 4.0 / s.duration**2, **_xyz(s.centre + offset)}, "k", 0.02, 4.0
+
+
+def _pulse(rng: np.random.Generator, s: Scales):
+    waves = rng.choice([1.0, 1.5, 2.0])
+    d = 2.0 * _direction(rng, level=True)
+    knots = {f"{a}{j}": float(d[i] * math.sin(math.pi * waves * (j + 0.5) / KNOTS)) for j in range(KNOTS) for i, a in enumerate("xyz")}
+    return {**knots, "interval": s.duration / (KNOTS - 1)}, " ".join(knots), 0.02, 4.0
+
+
+def _viscous(name: str, share: float, relative: float):
+    def draw(rng: np.random.Generator, s: Scales):
+        largest = relative * s.density * s.dx**2 / s.dt  # of an explicit step, on finer cells too
+        size = min(share * s.young * s.wave, 0.5 * largest)
+        return {name: size}, name, 0.01, largest / size
+
+    return draw
+
+
+def _maxwell(rng: np.random.Generator, s: Scales):
+    return {"ratio": 0.5, "time": s.wave * 10 ** rng.uniform(-0.4, 0.5)}, "ratio", 0.05, 6.0
+
+
+def _gradient(rng: np.random.Generator, s: Scales):
+    return _xyz(_direction(rng)), "x y z", 0.2, 2.6
+
+
+def _inclusion(rng: np.random.Generator, s: Scales):
+    centre = rng.uniform(-0.5, 0.5, 3) * s.half
+    log = {"log_ratio": _sign(rng, 0.3)}
+    return {**log, **_xyz(centre, "cx cy cz"), "radius": rng.uniform(0.25, 0.36) * s.length, "width": 0.0}, "log_ratio", 0.3, 2.7
+
+
+def _fibre(rng: np.random.Generator, s: Scales):
+    d = _direction(rng)
+    angles = {"azimuth": math.atan2(d[2], d[0]), "elevation": math.asin(np.clip(d[1], -1, 1))}
+    return {"c": 0.5 * s.young, **angles}, "c", 0.05, 10.0
+
+
+def _magnet(rng: np.random.Generator, s: Scales):
+    place = s.centre + np.array([rng.uniform(-0.1, 0.1), -s.half[1] - rng.uniform(0.15, 0.25), rng.uniform(-0.1, 0.1)])
+    return {"m": _sign(rng, 0.3) * 0.02, **_xyz(place)}, "m", 0.02, 8.0
+
+
+def _delayed(rng: np.random.Generator, s: Scales):
+    offset = _direction(rng, level=True) * rng.uniform(0.05, 0.12)
+    return {"k": 6.0 / s.duration**2, "delay": rng.uniform(0.06, 0.12), **_xyz(s.centre + offset)}, "k", 0.02, 8.0
+
+
+def _floor(rng: np.random.Generator, s: Scales):
+    return {"amplitude": 0.005, "frequency": rng.uniform(3.0, 9.0)}, "amplitude", 0.1, 5.0
+
+
+GRAVITY_ALIKE = ("gravity", "uniform_acceleration")
+KINDS: dict[str, Kind] = {
+    "gravity": Kind(_scalar("g", lambda s: 1.0, 4.0, negative=0.5), ANY, "flight", GRAVITY_ALIKE, "the size of gravity is another"),
+    "uniform_acceleration": Kind(_vector(lambda s: 1.0, 3.5, level=True), ANY, "flight", ("uniform_acceleration",), "wind or tilt"),
+    "drag_linear": Kind(_scalar("k", lambda s: 0.4 / s.duration, 8.0), ANY, "flight", ("drag_linear",), "acceleration -k v"),
+    "drag_quadratic": Kind(_scalar("k", lambda s: 0.4 / (s.duration * s.speed), 8.0), ANY, "flight", ("drag_quadratic",), "-k |v| v"),
+    "magnus": Kind(_vector(lambda s: 0.5 / s.duration, 6.0), ANY, "flight", ("magnus",), "acceleration w x v"),
+    "position_force": Kind(_place, ANY, "flight", ("position_force",), "acceleration -k (x - centre)"),
+    "time_force": Kind(_pulse, ANY, "flight", ("time_force",), "an acceleration that varies with time, linear between knots"),
+    "added_mass": Kind(_scalar("c", lambda s: 0.2, 4.0, negative=0.3, low=0.35), ANY, "flight", ("added_mass",), "inertia (1 + c) fold"),
+    "viscosity_shear": Kind(_viscous("eta", 0.03, 0.2), ANY, "material", ("viscosity_shear",), "Cauchy stress 2 eta D"),
+    "viscosity_bulk": Kind(_viscous("zeta", 0.2, 0.4), ANY, "material", ("viscosity_bulk",), "Cauchy stress zeta tr(D) I"),
+    "maxwell": Kind(_maxwell, SOLID, "material", ("maxwell",), "a parallel branch that relaxes"),
+    "hysteresis": Kind(_scalar("eta", lambda s: 0.2, 3.0, least=0.1), SOLID, "material", ("hysteresis",), "loss at any rate"),
+    "strain_stiffening": Kind(_scalar("k", lambda s: 2.0, 10.0), (ELASTIC,), "material", ("strain_stiffening",), "stiffer at large strain"),
+    "second_invariant": Kind(_scalar("c", lambda s: 0.5, 6.0), (ELASTIC,), "material", ("second_invariant",), "Mooney's second term"),
+    "tension_compression": Kind(_scalar("r", lambda s: 0.5, 8.0, negative=0.3, low=0.15), (ELASTIC,), "material", ("tension_compression",),
+                                "another stiffness in compression"),
+    "fibre": Kind(_fibre, (ELASTIC,), "material", ("fibre",), "one direction is stiffer", directed=True),
+    "yield": Kind(_scalar("inverse", lambda s: 1 / (0.1 * s.young), 12.0, least=0.2), (ELASTIC,), "material", ("yield",), "von Mises flow"),
+    "hardening": Kind(_scalar("h", lambda s: 0.3 * s.young, 8.0), (PLASTIC,), "material", ("hardening",), "yield stress + h alpha"),
+    "kinematic_hardening": Kind(_scalar("h", lambda s: 0.3 * s.young, 8.0), (PLASTIC,), "material", ("kinematic_hardening",), "backstress"),
+    "softening": Kind(_scalar("s", lambda s: 1.0, 12.0), SOLID, "material", ("softening",), "softer after large strain"),
+    "rate_yield": Kind(_scalar("eta", lambda s: 0.1 * s.yield_stress * s.duration, 12.0), (PLASTIC,), "material", ("rate_yield",),
+                       "overstress"),
+    "stiffness_gradient": Kind(_gradient, (ELASTIC,), "material", ("stiffness_gradient",), "elastic stress times exp(s . (X - mean) / L)",
+                               directed=True),
+    "stiffness_gradient:inclusion": Kind(_inclusion, (ELASTIC,), "material", ("stiffness_gradient",), "a stiffer ball", directed=True),
+    "stiffness_change": Kind(_scalar("rate", lambda s: 0.6 / s.duration, 4.0, negative=0.5, low=0.8), (ELASTIC,), "material",
+                             ("stiffness_change",), "elastic stress times exp(rate t)"),
+    "friction": Kind(_scalar("mu", lambda s: 0.2, 4.0, least=0.1), ANY, "contact", ("friction",), "added to the declared coefficient"),
+    "stick": Kind(_scalar("rate", lambda s: 0.1 / s.dt, 50.0), SOLID, "contact", ("stick",), "velocity at the floor decays", grid=True),
+    "restitution": Kind(_scalar("rate", lambda s: 0.5 / s.dt, 30.0), SOLID, "contact", ("restitution",), "its normal part alone",
+                        grid=True),
+    "cohesion": Kind(_scalar("c", lambda s: 0.3 * s.density * 9.8 * s.length, 10.0), (GRAINS,), "material", ("cohesion",), "Coulomb's c"),
+}  # fmt: skip
+"""The library, by name and form."""
+
+OUTSIDE: dict[str, Kind] = {
+    "dry_drag": Kind(_scalar("c", lambda s: 1.5, 5.0), SOLID, "flight", (), "acceleration -c v / |v|", outside=True,
+                     grid=True,
+                     near=("drag_linear", "drag_quadratic"), units={"c": "m/s^2"}),
+    "moving_floor": Kind(_floor, SOLID, "contact", (), "the floor is at amplitude (1 - cos(2 pi frequency t))", outside=True,
+                         near=("restitution", "time_force"), units={"amplitude": "m", "frequency": "Hz"}),
+    "delayed_spring": Kind(_delayed, SOLID, "flight", (), "acceleration -k (x(t - delay) - place) of the centre of mass", outside=True,
+                     grid=True,
+                           near=("position_force", "time_force"), units={"k": "1/s^2", "delay": "s", "x": "m", "y": "m", "z": "m"}),
+    "swelling": Kind(_scalar("rate", lambda s: 1.0, 4.0, negative=0.4), SOLID, "material", (), "the natural volume grows as exp(rate t)",
+                     outside=True, grid=True, units={"rate": "1/s"}),
+    "magnet": Kind(_magnet, SOLID, "flight", (), "acceleration -m (x - place) / |x - place|^5, |x - place| at least 0.08 m", outside=True,
+                     grid=True,
+                   near=("position_force", "gravity", "uniform_acceleration"), units={"m": "m^4/s^2", "x": "m", "y": "m", "z": "m"}),
+    "density_gradient": Kind(_gradient, (ELASTIC,), "material", (), "density times exp(s . (X - mean) / L), the same mass", outside=True,
+                             directed=True, near=("stiffness_gradient",), units={"x": "1", "y": "1", "z": "1"}),
+    "spin_decay": Kind(_scalar("k", lambda s: 1.0, 10.0), SOLID, "flight", (), "acceleration -k (v - mean v)", outside=True,
+                     grid=True,
+                       near=("drag_linear", "viscosity_shear", "maxwell"), units={"k": "1/s"}),
+}  # fmt: skip
+"""What no parameter of the library can say."""
+
+
+def draw_effect(kind: str, rng: np.random.Generator, scales: Scales) -> Drawn:
+    """An effect of a kind with figures of a usual size."""
+    entry = KINDS[kind] if kind in KINDS else OUTSIDE[kind]
+    values, sizes, least, most = entry.draw(rng, scales)
+    name = kind.partition(":")[0]
+    return Drawn(
+        kind, {f"{name}.{key}": value for key, value in values.items()}, tuple(f"{name}.{key}" for key in sizes.split()), least, most
+    )
+
+
+def entry_of(drawn: Drawn, *, free: tuple[str, ...] = ()) -> dict:
+    """What the key says of an effect, in the form of an experiment's `undeclared` list."""
+    kind = KINDS[drawn.kind] if drawn.kind in KINDS else OUTSIDE[drawn.kind]
+    name = drawn.kind.partition(":")[0]
+    values = {key.partition(".")[2]: value for key, value in drawn.values.items()}
+    known = {p.name: p.unit for entry in LIBRARY if entry.name == name for p in entry.parameters}
+    units = {key: kind.units.get(key) or known.get(key) or known.get(f"{key[0]}0", "1") for key in values}
+    names = kind.names
+    if name == "added_mass" and "young" in free:  # the modulus takes up the inertia: what stays is a smaller weight
+        names = (*names, *GRAVITY_ALIKE)
+    return {
+        "kind": drawn.kind,
+        "diagnosis_names": list(names),
+        "parameters": values,
+        "sizes": [key.partition(".")[2] for key in drawn.sizes],
+        "units": units,
+        "meaning": kind.meaning,
+        "outside_library": kind.outside,
+        "near": list(kind.near),
+    }

@@ -1,0 +1,176 @@
+"""Spring-Gaus: the body as masses and springs whose stiffness is fitted to the images (Zhong et al. 2024), as a `Method`."""
+
+import math
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from neuido.errors import UserError
+from neuido.models.baselines.learned import positive
+from neuido.models.fewshot.method import Laws, Method
+from neuido.models.inference.pipeline import Prepared
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.springs.mass_spring import MassSpring, connect
+from neuido.types import ParticleState
+
+
+class SpringMass(Method):
+    """Anchors among the particles carry the mass, springs join them, and all other particles follow the anchors near them.
+
+    Spring-Gaus's parameters: k = 10^a / L with an a for each anchor (a spring has the mean of its ends), for each spring, or one for
+    all; the springs beyond a mass's nearest `firm` ones weaken with their rank, by how much is learned; damping 10^b m / L; and the share
+    of the tangential velocity that the ground leaves. Gaussians move with the particles and keep their shape. What differs: springs act
+    on both ends, the stiffness starts from a modulus, and particles follow by their anchors' displacement, so that the first frame is
+    exact.
+
+    Args:
+        anchors: Masses, picked among the particles by farthest points; at most as many as there are.
+        neighbours: Springs from each.
+        binding: Anchors that a particle follows, weighted by one over the square root of the distance.
+        per: What has a stiffness of its own: `anchor`, `spring`, or `body`.
+        firm: Nearest neighbours whose springs do not weaken.
+        power: p of the force (`spring_kernels`).
+        young: Young's modulus [Pa] that the body starts with (`modulus`).
+        damping: 10^b at the start, for a mass m of one anchor [m/s]; 0: none.
+        fit_damping: Whether b is fitted.
+        stiffness_rate, other_rate: Rates of a, and of all others.
+
+    Raises:
+        UserError: A size below one, a number that is not positive.
+    """
+
+    steps = 300
+
+    def __init__(
+        self,
+        anchors: int = 2048,
+        neighbours: int = 256,
+        binding: int = 16,
+        per: Literal["anchor", "spring", "body"] = "anchor",
+        firm: int = 16,
+        power: float = 0.5,
+        young: float = 1e5,
+        damping: float = 0.1,
+        fit_damping: bool = False,
+        stiffness_rate: float = 0.01,
+        other_rate: float = 0.01,
+    ):
+        super().__init__()
+        sizes = {"anchors": anchors - 1, "neighbours": neighbours, "binding": binding, "firm": firm}
+        for name, value in sizes.items():
+            if value < 1:
+                raise UserError(f"model.method.{name} = {value + (name == 'anchors')}: at least {1 + (name == 'anchors')} is needed")
+        positive(young=young, stiffness_rate=stiffness_rate, other_rate=other_rate, **({} if damping == 0 else {"damping": damping}))
+        self.count, self.neighbours, self.nearest, self.per, self.firm = anchors, neighbours, binding, per, firm
+        self.power, self.young, self.fit_damping = power, young, fit_damping
+        self.damping_start, self.stiffness_rate, self.other_rate = damping, stiffness_rate, other_rate
+
+    def build(self, scene: Prepared) -> None:
+        simulator = scene.simulator
+        x = simulator.state.x
+        self.index = farthest_points(x, self.count)
+        self.network = connect(x[self.index], self.neighbours)
+        mass = (simulator.mass.sum() / len(self.index)).expand(len(self.index))
+        self.body = MassSpring(scene.source.scene, self.network, mass, power=self.power)
+        self.follow = following(x, x[self.index], self.nearest)
+        self.volume = float(simulator.volume.sum())
+        device, one = x.device, torch.ones(1, device=x.device)
+        size = {"anchor": len(self.index), "spring": len(self.network.rest), "body": 1}[self.per]
+        start = math.log10(self.damping_start) if self.damping_start else 0.0
+        self.soft, self.slide = nn.Parameter(0.0 * one), nn.Parameter(-one)
+        self.damping = nn.Parameter(start * one, requires_grad=self.fit_damping and self.damping_start > 0)
+        self.stiffness = nn.Parameter(torch.zeros(size, device=device))
+        with torch.no_grad():  # the modulus is linear in the stiffness
+            self.stiffness += math.log10(self.young / float(self.modulus(self.springs()[0])))
+
+    def springs(self) -> tuple[Tensor, Tensor]:
+        """Stiffness [N/m] and damping [N s/m] of each spring, (N,)."""
+        level = self.stiffness
+        if self.per == "anchor":
+            level = level[self.network.pairs].mean(1)
+        rest = self.body.rest
+        rank = ((self.network.rank - self.firm).clamp(min=0) / max(1, self.neighbours - self.firm)).to(rest)
+        weak = (2 - nn.functional.softplus(self.soft).exp() ** rank).clamp(0, 1)
+        damping = 10**self.damping * self.body.mass[0] / rest if self.damping_start else torch.zeros_like(rest)
+        return 10**level * weak / rest, damping
+
+    def modulus(self, stiffness: Tensor) -> Tensor:
+        """Young's modulus [Pa] of springs in all directions alike, E = sum k L^2 / (6 V), with Poisson's ratio 1/4 (Cauchy), ()."""
+        return (stiffness * self.body.rest.square()).sum() / (6 * self.volume)
+
+    def grip(self) -> Tensor:
+        """Share of the tangential velocity that a step on the ground leaves (Spring-Gaus, `fric_k`), (1,)."""
+        return (1.2 * self.slide.sigmoid() - 0.1).clamp(0, 1)
+
+    def laws(self, scene: Prepared) -> Laws:
+        raise UserError("model.method = SpringMass has no law of F: leave condition_files out")
+
+    def roll(
+        self,
+        scene: Prepared,
+        frames: int,
+        *,
+        state: ParticleState | None = None,
+        effects: Effects | None = None,
+        segment: int = 0,
+    ) -> ParticleState:
+        """As `Method.roll`; F stays the identity, and `segment` has no use, since a state here is small.
+
+        Raises:
+            UserError: Effects are given; the motion is not finite.
+        """
+        if effects is not None and effects != Effects():
+            raise UserError("model.effects, estimate_density: SpringMass takes no effects and no density, they act on an MPM law")
+        state = scene.simulator.state if state is None else state
+        stiffness, damping = self.springs()
+        dt = scene.simulator.scenes[0].dt
+        parts = self.body.substeps(stiffness, damping, dt)
+        start = (state.x[self.index], state.v[self.index])
+        every = scene.every * parts
+        x, v = self.body.rollout(scene.substeps(frames) * parts, dt / parts, *start, stiffness, damping, self.grip(), every=every)
+        wanted = slice(frames) if scene.picks is None else list(scene.picks[:frames])
+        x, v = x[wanted], v[wanted]
+        both = torch.cat([x - x[:1], v - v[:1]], -1).transpose(0, 1)  # (A, K, 6)
+        moved = torch.sparse.mm(self.follow, both.flatten(1)).view(len(state.x), frames, 6).transpose(0, 1)
+        eye = torch.eye(3, device=x.device, dtype=x.dtype).expand(frames, len(state.x), 3, 3)
+        return ParticleState(state.x + moved[..., :3], state.v + moved[..., 3:], torch.zeros_like(eye), eye)
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        others = [p for p in (self.soft, self.slide, self.damping) if p.requires_grad]
+        return [{"params": [self.stiffness], "lr": self.stiffness_rate}, {"params": others, "lr": self.other_rate}]
+
+    def describe(self) -> dict[str, Any]:
+        with torch.no_grad():
+            stiffness, _ = self.springs()
+            found = {"young": self.modulus(stiffness), "grip": self.grip()[0], "damping": 10 ** self.damping[0], "soft": self.soft[0]}
+        found["damping"] = found["damping"] if self.damping_start else torch.zeros(())
+        return {"anchors": len(self.index), "springs": len(stiffness), **{name: float(value) for name, value in found.items()}}
+
+
+def farthest_points(x: Tensor, count: int) -> Tensor:
+    """Indices of points (P, 3) of which each is the farthest from those before; the first is nearest to their mean. (min(count, P),)."""
+    count = min(count, len(x))
+    distance = (x - x.mean(0)).square().sum(1)
+    found = torch.empty(count, dtype=torch.int64, device=x.device)
+    found[0] = distance.argmin()
+    distance = torch.full_like(distance, torch.inf)
+    for n in range(count):
+        if n:
+            found[n] = distance.argmax()
+        distance = torch.minimum(distance, (x - x[found[n]]).square().sum(1))
+    return found
+
+
+def following(x: Tensor, anchors: Tensor, nearest: int) -> Tensor:
+    """How points (P, 3) follow anchors (A, 3): sparse weights (P, A), one over the square root of the distance (Spring-Gaus)."""
+    from scipy.spatial import cKDTree
+
+    nearest = min(nearest, len(anchors))
+    distance, index = cKDTree(anchors.detach().double().cpu().numpy()).query(x.detach().double().cpu().numpy(), k=nearest)
+    distance, index = (torch.as_tensor(part).reshape(len(x), nearest) for part in (distance, index))
+    weight = 1 / (distance.sqrt() + 1e-14)
+    weight = (weight / weight.sum(1, keepdim=True)).to(x)
+    rows = torch.arange(len(x)).repeat_interleave(nearest)
+    place = torch.stack([rows, index.flatten()]).to(x.device)
+    return torch.sparse_coo_tensor(place, weight.flatten(), (len(x), len(anchors)), check_invariants=True).coalesce()

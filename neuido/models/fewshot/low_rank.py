@@ -1,0 +1,226 @@
+"""Ours, few-shot: LoRA on both trunks, and the latent refined with it (paper, "Few-Shot Dynamics Adaptation").
+
+The adapter is PEFT's: `save` writes `adapter_model.safetensors` and `adapter_config.json` as PEFT does, and any tool that reads these reads
+ours. Before a rollout the adapter is merged into the effective networks, so that it costs nothing there.
+"""
+
+import copy
+import hashlib
+import os
+import uuid
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from neuido.errors import UserError
+from neuido.models.fewshot.method import Method, read_tensors, write_tensors
+from neuido.models.inference.outputs import FORMAT as LAW_FORMAT
+from neuido.models.inference.outputs import save_law
+from neuido.models.inference.pipeline import Laws, Prepared, infer
+from neuido.models.operator.branch import implausibility, small_strain_modulus
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.video.encoder import DynamicsEncoder
+from neuido.models.video.flow_vae import read_weights
+
+TARGETS = r"(elastic|plastic)_trunk\.(fc1|fc2|out)"
+LATENT, LAW = "latent.safetensors", "law.safetensors"
+PEFT_FILES = ("adapter_config.json", "adapter_model.safetensors")
+
+
+class LowRankAdaptation(Method):
+    """LoRA on both trunks, jointly with the scene's latent z.
+
+    Args:
+        operator: File of the operator, or `pretrained`; all of it stays frozen.
+        start: Where z starts: `encoder` (its zero-shot value), `mean` (of Stage I's latents), a family of these (`elastic`: their mean) or
+            the name of one, or a law file of `neuido predict`.
+        init_from: The encoder, a file or `pretrained`; read only for `start: encoder`.
+        rank: r of LoRA (paper: 16); 0: no adapter, z alone is refined.
+        alpha: Of LoRA (paper: 16); the adapter's product is scaled with alpha / r.
+        lr: Rate of the adapter.
+        latent_lr: Rate of z.
+        prior_weight: Pulls z to its start, per squared unit: the mean over z's components.
+        plausibility_weight: Keeps the elastic law where it can run (`branch.implausibility`); paper: 0.
+        seed: Of the adapter's random half; the other half is zero, so that fitting starts at the law of the start.
+    """
+
+    def __init__(
+        self,
+        operator: str = "pretrained",
+        start: str = "encoder",
+        init_from: str = "pretrained",
+        rank: int = 16,
+        alpha: float = 16.0,
+        lr: float = 3e-3,
+        latent_lr: float = 3e-2,
+        prior_weight: float = 0.0,
+        plausibility_weight: float = 1.0,
+        seed: int = 0,
+    ):
+        super().__init__()
+        for name, value in {"rank": rank, "prior_weight": prior_weight, "plausibility_weight": plausibility_weight, "lr": lr,
+                            "latent_lr": latent_lr}.items():  # fmt: skip
+            if not value >= 0:
+                raise UserError(f"model.method.{name} = {value}: it must not be negative")
+        if not alpha > 0:
+            raise UserError(f"model.method.alpha = {alpha}: it must be positive")
+        self.start, self.rank, self.alpha, self.lr, self.latent_lr, self.seed = start, rank, alpha, lr, latent_lr, seed
+        self.prior_weight, self.plausibility_weight = prior_weight, plausibility_weight
+        self.tuned: nn.Module = IntrinsicDynamicsOperator.load(operator).eval().requires_grad_(False)
+        self.fingerprint = fingerprint(self.tuned)
+        if start == "encoder":
+            encoder = DynamicsEncoder.load(init_from).requires_grad_(False)
+            given, wanted = encoder.projector.config["latent_dim"], self.operator.latent_dim
+            if given != wanted:
+                raise UserError(
+                    f"model.method.init_from = {init_from} gives latents of {given} numbers, operator = {operator} takes {wanted}"
+                )
+            object.__setattr__(self, "encoder", encoder)  # shared by all scenes, and no part of a checkpoint
+        else:
+            self._named_start()
+
+    @property
+    def operator(self) -> IntrinsicDynamicsOperator:
+        """The operator, with the adapter's layers in its trunks."""
+        return self.tuned if isinstance(self.tuned, IntrinsicDynamicsOperator) else self.tuned.get_base_model()
+
+    def _named_start(self) -> Tensor:
+        """The latent of `mean`, of a family, of a Stage I trajectory, or of a law file."""
+        latents = self.operator.latents
+        own = [i for i, family in enumerate(self.operator.latent_families) if self.start in ("mean", family)]
+        if own:
+            return latents[own].mean(0)
+        if not self.start.endswith(".safetensors"):
+            if self.start not in self.operator.latent_names:
+                known = ", ".join(["encoder", "mean", *sorted(set(self.operator.latent_families)), *self.operator.latent_names[:3]])
+                raise UserError(f"model.method.start = {self.start!r}: one of {known}, ..., or a law file (.safetensors)")
+            return self.operator.latent(self.start)
+        _, tensors, _ = read_weights(self.start, (LAW_FORMAT,), "model.method.start")
+        if "z" not in tensors or tensors["z"].shape != (self.operator.latent_dim,):
+            raise UserError(f"model.method.start = {self.start} holds no latent of {self.operator.latent_dim} numbers")
+        return tensors["z"]
+
+    def build(self, scene: Prepared) -> None:
+        """z at its start, and the adapter, whose product is zero."""
+        device = scene.images.device
+        self.tuned.to(device)
+        if self.encoder is not None:
+            z = infer(self.encoder.to(device), self.operator, scene, repeat=1).z
+        else:
+            z = self._named_start()
+        self.z = nn.Parameter(z.detach().clone().to(device))
+        self.register_buffer("origin", self.z.detach().clone())
+        if self.rank:
+            from peft import LoraConfig, get_peft_model
+
+            config = LoraConfig(r=self.rank, lora_alpha=self.alpha, target_modules=TARGETS)  # type: ignore[arg-type]
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(self.seed)
+                self.tuned = get_peft_model(self.tuned.cpu(), config)
+
+    def laws(self, scene: Prepared) -> Laws:
+        return self.operator.laws(self.z)
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        adapter = [p for name, p in self.trainable().items() if name != "z"]
+        groups = [{"params": adapter, "lr": self.lr}, {"params": [self.z], "lr": self.latent_lr}]
+        return [group for group in groups if group["params"]]
+
+    def regulariser(self) -> Tensor | float:
+        total = self.prior_weight * (self.z - self.origin).square().mean()
+        if self.plausibility_weight:
+            total = total + self.plausibility_weight * implausibility(self.operator, self.z)
+        return total
+
+    def retreat(self) -> Tensor:
+        """Towards the mean latent of Stage I, whose law runs, and an adapter of zero."""
+        haven = self.operator.latents.mean(0).to(self.z) if len(self.operator.latents) else torch.zeros_like(self.z)
+        adapter = [p.square().mean() for name, p in self.trainable().items() if "lora_B" in name]
+        return (self.z - haven).square().mean() + sum(adapter)
+
+    def merged(self) -> IntrinsicDynamicsOperator:
+        """A plain operator with the adapter added to its weights, by PEFT."""
+        tuned = copy.deepcopy(self.tuned)
+        return tuned if isinstance(tuned, IntrinsicDynamicsOperator) else tuned.merge_and_unload()
+
+    @torch.no_grad()
+    def describe(self) -> dict[str, Any]:
+        modulus = small_strain_modulus(self.operator, torch.stack([self.origin, self.z]))
+        moved = float((self.z - self.origin).norm())
+        return {"modulus": float(modulus[1]), "latent_moved": moved, "rank": self.rank, "latent": self.z.tolist()}
+
+    def save(self, folder: Path) -> None:
+        """Write PEFT's two files, z, the law (`results.save_law`), and `method.json`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        if self.rank:
+            hidden = folder / f".{uuid.uuid4().hex}.tmp"
+            self.tuned.save_pretrained(str(hidden), save_embedding_layers=False)
+            for name in PEFT_FILES:
+                os.replace(hidden / name, folder / name)
+            for rest in hidden.iterdir():  # a model card without content
+                rest.unlink()
+            hidden.rmdir()
+        write_tensors(folder / LATENT, {"z": self.z.detach().cpu().clone(), "origin": self.origin.cpu().clone()})
+        save_law(folder / LAW, self.operator, self.z.detach())
+        self.write_card(folder)
+
+    def card(self) -> dict[str, Any]:
+        return super().card() | {"operator": self.fingerprint}
+
+    def load(self, folder: Path) -> None:
+        """Take what `save` wrote; the rank may differ from the option.
+
+        Raises:
+            UserError: A file that is missing or damaged, an adapter of another operator.
+        """
+        content = self.check_card(folder)
+        if content.get("operator") != self.fingerprint:
+            raise UserError(f"model.adapter: {folder} belongs to another operator ({content.get('operator')}, not {self.fingerprint})")
+        latent = read_tensors(folder / LATENT)
+        for name in ("z", "origin"):
+            if name not in latent or latent[name].shape != self.z.shape:
+                raise UserError(f"model.adapter: {folder / LATENT} holds no {name} of {len(self.z)} numbers")
+        device = self.z.device
+        with torch.no_grad():
+            self.z.copy_(latent["z"])
+            self.origin.copy_(latent["origin"])
+        plain = copy.deepcopy(self.tuned)
+        if not isinstance(plain, IntrinsicDynamicsOperator):
+            plain = plain.unload()
+            vars(plain).pop("peft_config", None)  # or PEFT would take it for a second adapter
+        self.rank = 0
+        self.tuned = plain
+        if (folder / PEFT_FILES[0]).exists() or content.get("found", {}).get("rank"):
+            self.tuned = load_adapter(plain, folder).to(device)
+            self.rank = int(self.tuned.peft_config["default"].r)
+
+
+def load_adapter(operator: IntrinsicDynamicsOperator, folder: Path) -> nn.Module:
+    """The operator with an adapter in PEFT's format.
+
+    Raises:
+        UserError: A file that is missing, damaged, or for other layers.
+    """
+    from peft import PeftModel
+
+    for name in PEFT_FILES:  # PEFT would look for them on a server
+        if not (folder / name).is_file():
+            raise UserError(f"model.adapter: {folder / name} is missing")
+    try:
+        return PeftModel.from_pretrained(operator, str(folder), is_trainable=True, torch_device="cpu")
+    except (ValueError, RuntimeError, KeyError, TypeError, OSError) as error:
+        raise UserError(f"model.adapter: {folder} holds no LoRA of this operator: {str(error).splitlines()[0]}") from error
+    except Exception as error:
+        if type(error).__name__ != "SafetensorError":
+            raise
+        raise UserError(f"model.adapter: {folder / PEFT_FILES[1]} is not a safetensors file: {error}") from error
+
+
+def fingerprint(operator: nn.Module) -> str:
+    """Twelve hexadecimal digits of the weights' SHA-256: an adapter is of use with the weights that it was fitted on alone."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(operator.state_dict().items()):
+        digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:12]

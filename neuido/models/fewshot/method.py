@@ -1,0 +1,185 @@
+"""Ways to fit the law of one scene to its images, behind one interface: ours (`adapter`) and those of the peers (`baselines`).
+
+`AdaptModule` trains any of them: it draws the motion of `Method.roll`, compares images, and steps over the method's parameters.
+"""
+
+import copy
+import json
+import math
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from neuido.data.files.storage import publish, write
+from neuido.errors import UserError
+from neuido.models.inference.pipeline import Laws, Prepared, roll_laws
+from neuido.models.video.encoder import DynamicsEncoder
+from neuido.physics.effects.parameters import Effects
+from neuido.types import ParticleState
+
+FORMAT = "neuido-method/1"
+PARAMETERS, CARD = "parameters.safetensors", "method.json"
+
+
+class Method(nn.Module):
+    """How a law is fitted to the images of a scene.
+
+    What YAML constructs (`class_path`, and primitives as `init_args`) is a plan; `for_scene` makes a copy of it for one scene, with that
+    scene's parameters. A subclass writes `build` and `laws`, and of the rest what differs; one that is no MPM law writes `roll`.
+
+    Attributes:
+        steps: Optimiser steps a scene takes unless told otherwise; 0: nothing is learned, the scene is only scored.
+        lr: Rate of the one group of parameters of the default `parameter_groups`.
+        encoder: What embeds a scene's flow (`Prepared.volume`); none: the method needs no flow.
+    """
+
+    steps: int = 100
+    lr: float = 1e-3
+    encoder: DynamicsEncoder | None = None
+
+    def for_scene(self, scene: Prepared) -> Self:
+        """A copy with the parameters of a scene, on its device; the encoder is shared."""
+        own = copy.deepcopy(self, {id(self.encoder): self.encoder})
+        own.build(scene)
+        own.to(scene.images.device)
+        own._start = [p.detach().clone() for p in own.trainable().values()]
+        return own
+
+    def build(self, scene: Prepared) -> None:
+        """Make the scene's parameters, with the values from which they start; the same ones each time (seed what is random)."""
+
+    def laws(self, scene: Prepared) -> Laws:
+        """The elastic and the plastic law for a rollout of the scene; their tensors are graph nodes of the parameters."""
+        raise NotImplementedError
+
+    def roll(
+        self,
+        scene: Prepared,
+        frames: int,
+        *,
+        state: ParticleState | None = None,
+        effects: Effects | None = None,
+        segment: int = 0,
+    ) -> ParticleState:
+        """The motion over the first `frames` frames, differentiable in parameters and `state`; another kind of simulation overrides it.
+
+        Args:
+            scene: The scene; its step may be finer than that of `build` (`pipeline.roll_surely`).
+            frames: Number of frames K, the start included.
+            state: Start, (P, ...); the scene's body where absent.
+            effects: Effects that act on top of the laws.
+            segment: As `pipeline.roll_laws`, in frames.
+
+        Returns:
+            x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3).
+
+        Raises:
+            UserError: As `Simulator.rollout`.
+        """
+        return roll_laws(scene, self.laws(scene), frames, segment=segment, state=state, effects=effects)
+
+    def trainable(self) -> dict[str, nn.Parameter]:
+        """The parameters that are fitted, by name."""
+        return {name: p for name, p in self.named_parameters() if p.requires_grad}
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Groups for the optimiser, each with `params` and its rate `lr`."""
+        return [{"params": list(self.trainable().values()), "lr": self.lr}] if self.trainable() else []
+
+    def optimizer(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
+        """The optimiser over the groups of all scenes."""
+        return torch.optim.AdamW(groups, weight_decay=0.0)
+
+    def rate(self, done: float) -> float:
+        """Factor on the rates when the share `done` of a scene's steps is done: a cosine to zero."""
+        return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+
+    def regulariser(self) -> Tensor | float:
+        """What is added to the loss of the images."""
+        return 0.0
+
+    def retreat(self) -> Tensor:
+        """The loss of a step whose law could not run: the mean square of the way from the start."""
+        parts = [(p - start.to(p)).square().sum() for p, start in zip(self.trainable().values(), self._start)]
+        return torch.stack(parts).sum() / max(1, sum(start.numel() for start in self._start))
+
+    def describe(self) -> dict[str, Any]:
+        """What was identified, as numbers, words and lists of numbers: parameters in SI units, moduli, the latent."""
+        return {}
+
+    def save(self, folder: Path) -> None:
+        """Write what was fitted to a folder: parameters as safetensors, `describe` as JSON."""
+        tensors = {name: p.detach().cpu().contiguous().clone() for name, p in self.trainable().items()}
+        write_tensors(folder / PARAMETERS, tensors)
+        self.write_card(folder)
+
+    def card(self) -> dict[str, Any]:
+        """What `method.json` says: the method's name and `describe`."""
+        return {"format": FORMAT, "method": type(self).__name__, "found": self.describe()}
+
+    def write_card(self, folder: Path) -> None:
+        """Write `method.json`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        write(folder / CARD, json.dumps(self.card(), indent=1) + "\n")
+
+    def load(self, folder: Path) -> None:
+        """Take what `save` wrote.
+
+        Raises:
+            UserError: A file that is missing or of another method, a tensor that is missing or of another shape.
+        """
+        self.check_card(folder)
+        given = read_tensors(folder / PARAMETERS)
+        for name, p in self.trainable().items():
+            if name not in given or given[name].shape != p.shape:
+                found = tuple(given[name].shape) if name in given else "missing"
+                raise UserError(f"model.adapter: {folder / PARAMETERS}: {name} is {found}, needed {tuple(p.shape)}")
+            with torch.no_grad():
+                p.copy_(given[name])
+
+    def check_card(self, folder: Path) -> dict[str, Any]:
+        """The content of `method.json`.
+
+        Raises:
+            UserError: It is missing, or another method wrote it.
+        """
+        path = folder / CARD
+        try:
+            content = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise UserError(f"model.adapter: {path} is missing or no JSON: {error}") from error
+        if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("method") != type(self).__name__:
+            found = content.get("method") if isinstance(content, dict) else None
+            raise UserError(f"model.adapter: {path} is of method {found!r}, model.method is {type(self).__name__}")
+        return content
+
+
+def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
+    """Write a safetensors file, all at once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hidden = path.with_name(f".{path.name}.tmp")
+    save_file(tensors, hidden)
+    publish(hidden, path)
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Read a safetensors file.
+
+    Raises:
+        UserError: It is missing or damaged.
+    """
+    if not path.is_file():
+        raise UserError(f"model.adapter: {path} is missing")
+    try:
+        return load_file(path)
+    except SafetensorError as error:
+        raise UserError(f"model.adapter: {path} is not a safetensors file: {error}") from error
+
+
+def scalars(found: dict[str, Any]) -> dict[str, Any]:
+    """Those entries of `describe` that fit into a table: numbers and words."""
+    return {name: value for name, value in found.items() if isinstance(value, int | float | str)}

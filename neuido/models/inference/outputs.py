@@ -1,0 +1,119 @@
+"""What zero-shot inference leaves behind: a law file, particles as a PLY sequence, a video."""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.models.operator.dynamics_operator import LAWS, IntrinsicDynamicsOperator
+from neuido.models.video.flow_vae import read_weights, write_weights
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.types import ParticleState
+
+FORMAT = "neuido-law/1"
+WEIGHTS = ("W1", "b1", "W2", "b2", "W3", "b3")
+
+
+def save_law(path: str | os.PathLike, operator: IntrinsicDynamicsOperator, z: Tensor, card: Mapping[str, Any] | None = None) -> None:
+    """Write the law of z (d,): the effective networks, z and lambda, as safetensors, and what a person wants to know beside it as JSON.
+
+    Args:
+        path: File to write, ending in .safetensors; the JSON gets the same name.
+        operator: The operator.
+        z: Latent.
+        card: Further entries of the JSON: where the law comes from.
+    """
+    with torch.no_grad():
+        elastic, plastic = operator.laws(z)
+        tensors = {f"elastic.{name}": t for name, t in zip(WEIGHTS, elastic.tensors())}
+        tensors |= {f"plastic.{name}": t for name, t in zip(WEIGHTS, plastic.tensors())}
+        lambdas = operator.coefficients(z[None])
+        tensors |= {"z": z, "lambda_elastic": lambdas[0][0], "lambda_plastic": lambdas[1][0]}
+        modulus = float(elastic.modulus()[0])
+    config = {"trunk": operator.trunk, "elastic_scale": elastic.scale, "plastic_scale": plastic.scale}
+    card = {"date": date.today().isoformat(), "modulus": modulus, **(card or {})}
+    write_weights(path, FORMAT, config, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, card)
+    text = json.dumps({"format": FORMAT, **config, "unit": "Kirchhoff stress in Pa", **card}, indent=1)
+    Path(path).with_suffix(".json").write_text(text + "\n")
+
+
+def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
+    """The laws of a file of `save_law`, for a rollout; the operator is not needed.
+
+    Raises:
+        UserError: No such file, or not one of this kind.
+    """
+    config, tensors, _ = read_weights(path, (FORMAT,), "law")
+    if config.get("trunk") not in LAWS:
+        raise UserError(f"law: {path} has the trunk {config.get('trunk')!r}; one of {', '.join(LAWS)}")
+    elastic, plastic = LAWS[config["trunk"]]
+    try:
+        parts = [[tensors[f"{kind}.{name}"] for name in WEIGHTS] for kind in ("elastic", "plastic")]
+    except KeyError as error:
+        raise UserError(f"law: {path} lacks the tensor {error}") from error
+    return elastic(*parts[0], scale=config["elastic_scale"]), plastic(*parts[1], scale=config["plastic_scale"])
+
+
+def write_plys(folder: str | os.PathLike, motion: ParticleState) -> None:
+    """Write `000.ply`, `001.ply`, ...: particles of each frame with x, y, z [m] and vx, vy, vz [m/s]."""
+    from plyfile import PlyData, PlyElement
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    x, v = motion.x.detach().cpu().numpy(), motion.v.detach().cpu().numpy()
+    digits = max(3, len(str(len(x) - 1)))
+    for k, (position, velocity) in enumerate(zip(x, v)):
+        vertices = np.empty(len(position), [(name, "f4") for name in ("x", "y", "z", "vx", "vy", "vz")])
+        for name, column in zip(vertices.dtype.names, np.concatenate([position, velocity], 1).T):
+            vertices[name] = column
+        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(folder / f"{k:0{digits}d}.ply"))
+    for old in folder.glob("*.ply"):  # of a longer run before
+        if old.stem.isdigit() and int(old.stem) >= len(x):
+            old.unlink()
+
+
+def write_video(path: str | os.PathLike, images: Tensor, *, rate: float = 20.0) -> None:
+    """Write an MP4 file, all at once.
+
+    Args:
+        path: File, ending in .mp4.
+        images: RGB in [0, 1], (K, H, W, 3).
+        rate: Frames a second.
+
+    Raises:
+        UserError: OpenCV cannot write there.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hidden = path.with_name(f".{path.stem}.tmp.mp4")
+    frames = (255 * images.detach().clamp(0, 1)).round().to(torch.uint8).cpu().numpy()
+    height, width = (n - n % 2 for n in frames.shape[1:3])  # the codec wants even sides
+    writer = cv2.VideoWriter(str(hidden), cv2.VideoWriter_fourcc(*"mp4v"), rate, (width, height))
+    if not writer.isOpened():
+        raise UserError(f"OpenCV cannot write the video {path}")
+    for frame in frames:
+        writer.write(cv2.cvtColor(np.ascontiguousarray(frame[:height, :width]), cv2.COLOR_RGB2BGR))
+    writer.release()
+    os.replace(hidden, path)
+
+
+def contact_sheet(path: str | os.PathLike, rows: Sequence[Tensor], *, columns: int = 8) -> None:
+    """Write rows of images (K, H, W, 3) in [0, 1] as one PNG: some frames of each, evenly taken, one row below the other."""
+    bands = []
+    for row in rows:
+        pick = torch.linspace(0, len(row) - 1, min(columns, len(row))).round().long()
+        bands.append(torch.cat(list(row[pick].detach().clamp(0, 1).cpu()), 1))
+    width = min(band.shape[1] for band in bands)
+    sheet = torch.cat([band[:, :width] for band in bands])
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    image = cv2.cvtColor((255 * sheet).round().to(torch.uint8).numpy(), cv2.COLOR_RGB2BGR)
+    if not cv2.imwrite(str(path), image):
+        raise UserError(f"cannot write the picture {path}")

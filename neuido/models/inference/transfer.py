@@ -1,0 +1,196 @@
+"""The laws that were read from videos, under other conditions: another velocity, another shape, two bodies in contact (paper, transfer).
+
+A file of conditions, `neuido-conditions/1`:
+
+    format: neuido-conditions/1
+    name: thrown
+    frames: 80               # optional; of the first body's recording
+    bodies:                  # one, or several that share the first one's scene, each with the law of its own video
+      - of: 0                # number or name of the predicted scene whose law, body and look this is
+        velocity: [0.0, -3.0, 0.0]          # optional, instead of the recorded one [m/s]
+        angular_velocity: [0.0, 0.0, 4.0]   # optional [rad/s]
+        shift: [0.0, 0.1, 0.0]              # optional [m]
+        shape: {shape: ball, ...}           # optional: another body, as in a scene file's `body`
+"""
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from neuido.data.bodies import scene_files as scenes
+from neuido.data.bodies.shapes import rigid_velocity
+from neuido.errors import UserError
+from neuido.models.inference import outputs as results
+from neuido.models.inference.pipeline import Laws, Prepared, folder_of
+from neuido.models.render.gaussians import bind, colours_of, deform, dress
+from neuido.models.render.splatting import render
+from neuido.physics.laws.composite import by_body
+from neuido.physics.mpm.simulator import Simulator
+from neuido.types import Body, Gaussians, ParticleState, Vector
+
+FORMAT = "neuido-conditions/1"
+ZERO = (0.0, 0.0, 0.0)
+
+
+class BodyCondition(NamedTuple):
+    """One body of a condition."""
+
+    of: int | str
+    velocity: Vector | None = None
+    angular_velocity: Vector = ZERO
+    shift: Vector = ZERO
+    shape: Body | None = None
+
+
+class Condition(NamedTuple):
+    """A file of conditions."""
+
+    name: str
+    bodies: tuple[BodyCondition, ...]
+    frames: int | None = None
+
+
+def read_conditions(path: str | os.PathLike) -> Condition:
+    """Read a file of conditions, by its path or by its name in configs/conditions.
+
+    Raises:
+        UserError: No such file, an unknown or missing key, a value of the wrong kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        own = scenes._folder().parent / "conditions" / f"{path.name.removesuffix('.yaml')}.yaml"
+        if not own.is_file():
+            raise UserError(f"condition_files: there is no file {path}, neither here nor in {own.parent}")
+        path = own
+    content = scenes.read_yaml(path)
+    try:
+        scenes._keys(content, "the file", ("format", "name", "frames", "bodies"), ("frames",))
+        if content["format"] != FORMAT:
+            raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
+        frames = content.get("frames")
+        if frames is not None and (not isinstance(frames, int) or frames < 2):
+            raise UserError(f"frames must be a whole number of at least 2, got {frames!r}")
+        given = content["bodies"]
+        if not isinstance(given, list) or not given:
+            raise UserError(f"bodies must be a list of at least one body, got {given!r}")
+        bodies = tuple(_body(entry, f"bodies[{i}]") for i, entry in enumerate(given))
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    return Condition(str(content["name"]), bodies, frames)
+
+
+def _body(entry: Any, where: str) -> BodyCondition:
+    optional = ("velocity", "angular_velocity", "shift", "shape")
+    scenes._keys(entry, where, ("of", *optional), optional)
+    if isinstance(entry["of"], bool) or not isinstance(entry["of"], int | str):
+        raise UserError(f"{where}.of must be the number or the name of a scene, got {entry['of']!r}")
+    vectors = {key: scenes._vector(entry[key], f"{where}.{key}") for key in optional[:3] if key in entry}
+    shape = scenes._body(entry["shape"], None) if "shape" in entry else None
+    return BodyCondition(entry["of"], **vectors, shape=shape)
+
+
+def simulate_condition(condition: Condition, known: list[tuple[Prepared, Laws]]) -> tuple[ParticleState, Gaussians, Prepared]:
+    """Roll a condition out.
+
+    Args:
+        condition: The condition.
+        known: Scenes that were predicted, with their laws.
+
+    Returns:
+        Frames of all particles, all Gaussians in these frames, and the scene that lends its surroundings and cameras.
+
+    Raises:
+        UserError: A scene that was not predicted, bodies that overlap or leave the domain, and what a rollout refuses.
+    """
+    try:
+        chosen = [_find(known, body.of) for body in condition.bodies]
+        first = chosen[0][0]
+        placed = [_place(body, prepared) for body, (prepared, _) in zip(condition.bodies, chosen)]
+        _apart([body for body, _ in placed], first.source.scene.dx)
+        joined = Body(*(torch.cat([getattr(body, name) for body, _ in placed]) for name in ("x", "v", "volume")))
+        device = first.volume.device
+        density = first.source.density
+        if any(prepared.source.density != density for prepared, _ in chosen):
+            raise UserError("the bodies have different densities; one scene takes one")
+        simulator = Simulator(first.source.scene, joined, density=density, device=device, graphs=len(chosen) == 1)
+        steps = ((condition.frames or first.frames) - 1) * first.stride
+        pairs = [laws for _, laws in chosen]
+        if len(pairs) == 1:
+            laws = pairs[0]
+        else:
+            laws = by_body([e for e, _ in pairs], [p for _, p in pairs], [len(body.x) for body, _ in placed], simulator.order)
+        with torch.no_grad():
+            motion = simulator.rollout(steps, *laws, every=first.stride)
+    except UserError as error:
+        raise UserError(f"condition {condition.name}: {error}") from error
+    parts, at = [], 0
+    for body, gaussians in placed:
+        own, at = slice(at, at + len(body.x)), at + len(body.x)
+        binding = bind(gaussians, body.x.to(device))
+        parts.append(deform(gaussians, motion.F[:, own], motion.x[:, own], binding))
+    together = Gaussians(
+        torch.cat([g.means for g in parts], 1),
+        torch.cat([g.covariances for g in parts], 1),
+        torch.cat([g.opacities for g in parts]),
+        torch.cat([g.harmonics[:, :1] for g in parts]),
+    )
+    return motion, together, first
+
+
+def run_condition(condition: Condition, known: list[tuple[Prepared, Laws]], out: str | os.PathLike) -> Path:
+    """`simulate_condition`, and write its particles, video and picture; the folder."""
+    motion, gaussians, first = simulate_condition(condition, known)
+    with torch.no_grad():
+        images = render(gaussians, first.views([first.scoring[0]]), background=first.background)[0][:, 0]
+    folder = folder_of(out, f"condition-{condition.name}")
+    results.write_plys(folder / "particles", motion)
+    results.write_video(folder / "video.mp4", images)
+    results.contact_sheet(folder / "video.png", [images])
+    return folder
+
+
+def _find(known: list[tuple[Prepared, Laws]], of: int | str) -> tuple[Prepared, Laws]:
+    names = [prepared.source.name for prepared, _ in known]
+    if isinstance(of, str):
+        if of not in names:
+            raise UserError(f"no scene {of!r} was predicted; there are {', '.join(names)}")
+        return known[names.index(of)]
+    if not 0 <= of < len(known):
+        raise UserError(f"there is no scene number {of}; {len(known)} were predicted: {', '.join(names)}")
+    return known[of]
+
+
+def _place(body: BodyCondition, prepared: Prepared) -> tuple[Body, Gaussians]:
+    """The body and its Gaussians at t = 0."""
+    own, gaussians = prepared.source.body, prepared.gaussians
+    if body.shape is not None:
+        shape = body.shape
+        spread = 0.6 * float(shape.volume.mean()) ** (1 / 3)
+        # stripes of the two commonest shades of the recorded body, so that a motion can be seen
+        shades = colours_of(gaussians.harmonics, None, degree=0).cpu().clamp(0, 1)
+        order = shades.mean(1).argsort()
+        dark, light = shades[order[: len(order) // 2]].mean(0), shades[order[len(order) // 2 :]].mean(0)
+        stripe = ((shape.x - shape.x.mean(0)) / (4 * spread)).floor().long().sum(1) % 2
+        colours = torch.where(stripe[:, None] == 0, 0.8 * dark, light)
+        like = gaussians.means
+        dressed = dress(shape.x, shape.volume, colours, spread=0.6)
+        own, gaussians = shape, Gaussians(*(None if t is None else t.to(like) for t in dressed))
+    shift = torch.tensor(body.shift, dtype=own.x.dtype)
+    x, v = own.x + shift, own.v
+    if body.velocity is not None or body.angular_velocity != ZERO:
+        velocity = body.velocity if body.velocity is not None else tuple(own.v.mean(0).tolist())
+        v = rigid_velocity(x, centre=tuple(x.mean(0).tolist()), velocity=velocity, angular_velocity=body.angular_velocity)
+    return Body(x, v.to(x), own.volume), gaussians._replace(means=gaussians.means + shift.to(gaussians.means))
+
+
+def _apart(bodies: list[Body], dx: float) -> None:
+    """Refuse bodies whose particles are closer than half a cell: they would start as one body."""
+    from scipy.spatial import cKDTree
+
+    for i in range(len(bodies)):
+        for j in range(i):
+            nearest = float(cKDTree(bodies[i].x.numpy()).query(bodies[j].x.numpy())[0].min())
+            if nearest < 0.5 * dx:
+                raise UserError(f"bodies {j} and {i} start {nearest:.3g} m apart, less than half a cell of {dx:.3g} m; change their shift")

@@ -1,0 +1,244 @@
+"""The neural intrinsic dynamics operator: branch heads and trunks, without the video encoder (paper, "Intrinsic Dynamics Operator").
+
+A latent z in R^d indexes a material. Two heads turn it into coefficients lambda in R^D, two trunks turn a deformation gradient into
+D basis functions, and the law is their linear combination. Since lambda is constant for a material, the combination is made of the
+trunk's last layer once (exact), and what a rollout runs is a small effective network (`neuido.physics.laws.neural.networks`).
+"""
+
+import json
+from datetime import date
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+from neuido.errors import UserError
+from neuido.physics.laws.neural import networks
+from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
+
+FORMAT = "neuido-operator/1"
+PRETRAINED = {
+    "pretrained": Path(__file__).parents[1] / "weights" / "stage1.safetensors",
+    "pretrained-family": Path(__file__).parents[1] / "weights" / "stage1_family.safetensors",
+}
+LAWS = {"raw": (RawElastic, RawPlastic), "objective": (ObjectiveElastic, ObjectivePlastic)}
+
+
+class Trunk(nn.Module):
+    """Three-layer MLP from nine features of F to D basis functions of n outputs each; the last layer is linear.
+
+    Args:
+        basis_dim: Number of basis functions D.
+        hidden_dim: Width of the two hidden layers.
+        outputs: n; nine components (raw), or the coefficients of the objective read-outs.
+    """
+
+    def __init__(self, basis_dim: int, hidden_dim: int, outputs: int):
+        super().__init__()
+        self.basis_dim, self.outputs = basis_dim, outputs
+        self.fc1 = nn.Linear(9, hidden_dim)
+        self.fc2 = nn.Linear(hidden_dim, hidden_dim)
+        self.out = nn.Linear(hidden_dim, basis_dim * outputs)
+
+    def hidden(self, features: Tensor) -> Tensor:
+        """(..., 9) -> (..., hidden_dim)."""
+        return functional.silu(self.fc2(functional.silu(self.fc1(features))))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """The basis functions, (..., 9) -> (..., D, n)."""
+        return self.out(self.hidden(features)).unflatten(-1, (self.basis_dim, self.outputs))
+
+    def contract(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """The last layer of the effective networks of S materials: lambda (S, D) -> W3 (S, n, hidden_dim), b3 (S, n)."""
+        weight, bias = affine(self.out)
+        weight = weight.reshape(self.basis_dim, -1)
+        return (coefficients @ weight).view(-1, self.outputs, self.out.in_features), coefficients @ bias.view(self.basis_dim, -1)
+
+
+class Head(nn.Sequential):
+    """Lightweight MLP from a latent z (S, d) to the coefficients lambda (S, D)."""
+
+    def __init__(self, latent_dim: int, head_dim: int, basis_dim: int):
+        super().__init__(nn.Linear(latent_dim, head_dim), nn.SiLU(), nn.Linear(head_dim, basis_dim))
+
+
+def affine(layer: nn.Module) -> tuple[Tensor, Tensor]:
+    """Weight and bias of a linear layer, also of one that an adapter wraps (found by applying it to the unit vectors)."""
+    if type(layer) is nn.Linear:
+        return layer.weight, layer.bias
+    like = next(layer.parameters())
+    units = torch.eye(layer.in_features, dtype=like.dtype, device=like.device)
+    rows = layer(torch.cat([torch.zeros_like(units[:1]), units]))
+    return (rows[1:] - rows[0]).T, rows[0]
+
+
+class IntrinsicDynamicsOperator(nn.Module):
+    """Latent z -> (elastic law, plastic law).
+
+    Args:
+        trunk: `raw` (the paper's: F in, nine components out) or `objective` (invariants in, coefficients of an isotropic,
+            frame-indifferent law out).
+        latent_dim: d (paper: 128).
+        basis_dim: D (the paper does not say).
+        hidden_dim: Width of the trunks (the paper does not say; 64 suits a fused kernel).
+        head_dim: Width of the heads.
+
+    Attributes:
+        latents: (M, d), the latents of the training trajectories; empty until `name_latents` or `load`.
+        latent_names, latent_families: M names and families; NCLaw's materials are `jelly`, `plasticine` and `sand`.
+        card: What the weights file says about their making.
+
+    Raises:
+        UserError: an unknown trunk, or a size below one.
+    """
+
+    def __init__(
+        self,
+        trunk: Literal["raw", "objective"] = "objective",
+        latent_dim: int = 128,
+        basis_dim: int = 64,
+        hidden_dim: int = 64,
+        head_dim: int = 128,
+    ):
+        super().__init__()
+        if trunk not in LAWS:
+            raise UserError(f"trunk = {trunk!r}: choose raw or objective")
+        self.config = {
+            "trunk": trunk,
+            "latent_dim": latent_dim,
+            "basis_dim": basis_dim,
+            "hidden_dim": hidden_dim,
+            "head_dim": head_dim,
+        }
+        for name, value in self.config.items():
+            if name != "trunk" and value < 1:
+                raise UserError(f"{name} = {value}: at least 1 is needed")
+        self.trunk, self.latent_dim = trunk, latent_dim
+        self._elastic_law, self._plastic_law = LAWS[trunk]
+        self.elastic_trunk = Trunk(basis_dim, hidden_dim, self._elastic_law.outputs)
+        self.plastic_trunk = Trunk(basis_dim, hidden_dim, self._plastic_law.outputs)
+        self.elastic_head = Head(latent_dim, head_dim, basis_dim)
+        self.plastic_head = Head(latent_dim, head_dim, basis_dim)
+        self.name_latents(torch.zeros(0, latent_dim), [], [])
+        self.card: dict[str, Any] = {}
+
+    def name_latents(self, latents: Tensor, names: list[str], families: list[str]) -> None:
+        """Keep the latents of the training trajectories, for `save` and `latent`."""
+        self.latents, self.latent_names, self.latent_families = latents.detach().clone(), list(names), list(families)
+
+    def latent(self, name: str) -> Tensor:
+        """The latent (d,) of a training trajectory.
+
+        Raises:
+            UserError: no trajectory has this name.
+        """
+        if name not in self.latent_names:
+            raise UserError(f"no latent is named {name!r}; there are {', '.join(self.latent_names) or 'none'}")
+        return self.latents[self.latent_names.index(name)].to(self.elastic_trunk.fc1.weight)
+
+    def random_latents(self, count: int, generator: torch.Generator) -> Tensor:
+        """Latents (count, d) from a normal distribution with the mean and, component by component, the deviation of the trained ones."""
+        mean, deviation = self.latents.mean(0), self.latents.std(0)
+        return mean + deviation * torch.randn(count, self.latent_dim, generator=generator).to(mean)
+
+    def coefficients(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """lambda^E and lambda^P, (S, D) each, of z (S, d)."""
+        return self.elastic_head(z), self.plastic_head(z)
+
+    def features(self, F: Tensor) -> Tensor:
+        """What the trunks see of F (..., 3, 3): (..., 9)."""
+        if self.trunk == "raw":
+            return networks.raw_features(F)
+        if F.requires_grad:
+            return networks.strain_features(*networks.hencky_strain(F))
+        return networks.compute_strain_features(F.reshape(-1, 3, 3)).view(*F.shape[:-2], 9)
+
+    def basis(self, F: Tensor) -> tuple[Tensor, Tensor]:
+        """The elastic and the plastic basis functions at F (..., 3, 3), (..., D, n) each."""
+        features = self.features(F)
+        return self.elastic_trunk(features), self.plastic_trunk(features)
+
+    def elastic(self, z: Tensor, F: Tensor) -> Tensor:
+        """Kirchhoff stress [Pa] (S, n, 3, 3) of n deformation gradients F (S, n, 3, 3) for each of S latents z (S, d)."""
+        y = self._outputs(self.elastic_trunk, self.elastic_head(z), F)
+        if self.trunk == "raw":
+            return networks.RAW_STRESS_SCALE * y.unflatten(-1, (3, 3))
+        if F.requires_grad:
+            return networks.isotropic_stress(F, y)
+        return networks.StressReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRESS_SCALE).view(F.shape)
+
+    def plastic(self, z: Tensor, F: Tensor) -> Tensor:
+        """Corrected deformation gradient (S, n, 3, 3) of trial ones F (S, n, 3, 3) for each of S latents z (S, d)."""
+        y = self._outputs(self.plastic_trunk, self.plastic_head(z), F)
+        if self.trunk == "raw":
+            return F + networks.STRAIN_SCALE * y.unflatten(-1, (3, 3))
+        if F.requires_grad:
+            return networks.return_map(F, y)
+        return networks.CorrectionReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRAIN_SCALE).view(F.shape)
+
+    def _outputs(self, trunk: Trunk, coefficients: Tensor, F: Tensor) -> Tensor:
+        weight, bias = trunk.contract(coefficients)
+        return torch.baddbmm(bias.unsqueeze(1), trunk.hidden(self.features(F)), weight.mT)
+
+    def laws(self, z: Tensor) -> tuple[RawElastic | ObjectiveElastic, RawPlastic | ObjectivePlastic]:
+        """The laws of S scenes for a rollout, from z (S, d) or (d,); their tensors are graph nodes of z and of all weights."""
+        elastic, plastic = self.coefficients(z.reshape(-1, self.latent_dim))
+        return self._elastic_law(*_effective(self.elastic_trunk, elastic)), self._plastic_law(*_effective(self.plastic_trunk, plastic))
+
+    def save(self, path: str | Path, card: dict[str, Any] | None = None) -> None:
+        """Write weights, latents and card to a safetensors file.
+
+        Args:
+            path: File to write, all at once.
+            card: What a reader should know: data, figures; today's date is added.
+        """
+        tensors = {name: tensor.detach().contiguous().cpu() for name, tensor in self.state_dict().items()}
+        tensors["latents"] = self.latents.detach().contiguous().cpu()
+        metadata = {
+            "format": FORMAT,
+            "config": json.dumps(self.config),
+            "latents": json.dumps({"names": self.latent_names, "families": self.latent_families}),
+            "card": json.dumps({"date": date.today().isoformat(), **(card or {})}),
+        }
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        hidden = path.with_name(f".{path.name}.tmp")
+        save_file(tensors, hidden, metadata=metadata)
+        hidden.replace(path)
+
+    @classmethod
+    def load(cls, path: str | Path = "pretrained") -> Self:
+        """Read a file of `save`. `pretrained` comes with the package, and the encoders are made for it; so does `pretrained-family`, fitted
+        with a prior that gathers the latents of each family.
+
+        Raises:
+            UserError: the file is missing or is not one of `save`.
+        """
+        named = PRETRAINED.get(str(path))
+        path = named or Path(path)
+        if not path.is_file():
+            advice = " (make it: neuido fit --config configs/stage1.yaml, then `save_to`)" if named else ""
+            raise UserError(f"init_from: the weights {path} are missing{advice}")
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}
+        except SafetensorError as error:
+            raise UserError(f"init_from: {path} is not a safetensors file: {error}") from error
+        if metadata.get("format") != FORMAT:
+            raise UserError(f"init_from: {path} has format {metadata.get('format')!r}, not {FORMAT!r}")
+        operator = cls(**json.loads(metadata["config"]))
+        latents = json.loads(metadata["latents"])
+        operator.name_latents(tensors.pop("latents"), latents["names"], latents["families"])
+        operator.load_state_dict(tensors)
+        operator.card = json.loads(metadata["card"])
+        return operator
+
+
+def _effective(trunk: Trunk, coefficients: Tensor) -> list[Tensor]:
+    shared = [t[None] for layer in (trunk.fc1, trunk.fc2) for t in affine(layer)]
+    return [*shared, *trunk.contract(coefficients)]

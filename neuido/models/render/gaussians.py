@@ -1,0 +1,249 @@
+"""Gaussians as a body wears them: harmonics, 3DGS PLY files, and motion with the particles that carry them."""
+
+import functools
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.linalg.decompositions import polar
+from neuido.types import Gaussians
+
+C0 = 0.28209479177387814
+"""The constant harmonic, 1 / sqrt(4 pi)."""
+
+REACH = 7.815
+"""Squared Mahalanobis distance within which a Gaussian holds 95 % of its mass (chi squared, three degrees of freedom; NeuMA)."""
+
+
+def degree_of(harmonics: Tensor) -> int:
+    """Degree of harmonics (N, K, 3)."""
+    degree = {1: 0, 4: 1, 9: 2, 16: 3}.get(harmonics.shape[-2])
+    if degree is None:
+        raise UserError(f"harmonics have {harmonics.shape[-2]} coefficients; needed 1, 4, 9 or 16")
+    return degree
+
+
+def harmonic_basis(directions: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics with the signs of 3DGS: unit vectors (..., 3) -> (..., (degree + 1)^2)."""
+    if degree not in (0, 1, 2, 3):
+        raise UserError(f"sh_degree is {degree}; needed 0 to 3")
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, C0)]
+    if degree > 0:
+        c = 0.4886025119029199
+        basis += [-c * y, c * z, -c * x]
+    xx, yy, zz = x * x, y * y, z * z
+    if degree > 1:
+        c = 1.0925484305920792
+        basis += [c * x * y, -c * y * z, 0.31539156525252005 * (2 * zz - xx - yy), -c * x * z, c / 2 * (xx - yy)]
+    if degree > 2:
+        a, b = 0.5900435899266435, 0.4570457994644658
+        basis += [-a * y * (3 * xx - yy), 2.890611442640554 * x * y * z, -b * y * (4 * zz - xx - yy)]
+        basis += [0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy), -b * x * (4 * zz - xx - yy)]
+        basis += [1.445305721320277 * z * (xx - yy), -a * x * (xx - 3 * yy)]
+    return torch.stack(basis, -1)
+
+
+def colours_of(harmonics: Tensor, directions: Tensor | None, *, degree: int) -> Tensor:
+    """RGB of Gaussians seen from a direction, max(0, 1/2 + harmonics).
+
+    Args:
+        harmonics: (N, K, 3), of which the first (degree + 1)^2 count.
+        directions: From the camera to the Gaussian, of any length, (..., N, 3); not needed at degree 0.
+        degree: 0 to 3.
+
+    Returns:
+        (..., N, 3), or (N, 3) at degree 0.
+    """
+    used = (degree + 1) ** 2
+    if harmonics.shape[-2] < used:
+        raise UserError(f"sh_degree {degree} needs {used} coefficients; the harmonics have {harmonics.shape[-2]}")
+    if degree == 0:
+        return (0.5 + C0 * harmonics[..., 0, :]).clamp(min=0)
+    basis = harmonic_basis(torch.nn.functional.normalize(directions, dim=-1), degree)
+    return (0.5 + torch.einsum("...nk,nkc->...nc", basis, harmonics[..., :used, :])).clamp(min=0)
+
+
+def harmonics_of(colours: Tensor) -> Tensor:
+    """Harmonics of degree 0, (N, 1, 3), of RGB (N, 3)."""
+    return ((colours - 0.5) / C0).unsqueeze(-2)
+
+
+def dress(x: Tensor, volume: Tensor, colours: Tensor | None = None, *, spread: float = 0.3, opacity: float = 0.95) -> Gaussians:
+    """A body's particles as Gaussians, one each.
+
+    Args:
+        x: Positions [m], (P, 3).
+        volume: Volumes [m^3], (P,).
+        colours: RGB, (P, 3); black where absent.
+        spread: Standard deviation in units of the cube root of the mean volume; at 0.3 the outline of a body that is some particles thick
+            lies 0.15 of that root outside its surface, and no hole shows.
+        opacity: Of each.
+    """
+    side = float(volume.mean()) ** (1 / 3)
+    covariances = ((spread * side) ** 2 * torch.eye(3).to(x)).expand(len(x), 3, 3).contiguous()
+    colours = torch.zeros_like(x) if colours is None else colours
+    return Gaussians(x, covariances, torch.full_like(x[:, 0], opacity), harmonics_of(colours))
+
+
+class Binding(NamedTuple):
+    """Which particles carry each Gaussian."""
+
+    index: Tensor
+    """Particles, (N, k) int64."""
+    weight: Tensor
+    """Their weights, which sum to one; zero where there are fewer than k, (N, k)."""
+    rest: Tensor
+    """Weighted mean of their positions at t = 0 [m], (N, 3)."""
+
+    def average(self, values: Tensor) -> Tensor:
+        """Weighted mean over the particles of each Gaussian: (..., P, m) -> (..., N, m)."""
+        index = self.index.to(values.device)
+        parts = (values.index_select(-2, index[:, j]) * w[:, None] for j, w in enumerate(self.weight.to(values).unbind(1)))
+        return functools.reduce(torch.add, parts)
+
+
+def bind(gaussians: Gaussians, x: Tensor, *, nearest: int = 10, reach: float = REACH) -> Binding:
+    """Bind Gaussians to particles: the uniform mean of at most `nearest` within the 95 % ellipsoid (NeuMA), or the nearest particle alone.
+
+    Args:
+        gaussians: At t = 0.
+        x: Particles at t = 0 [m], (P, 3).
+        nearest: Most particles of one Gaussian.
+        reach: Largest squared Mahalanobis distance [-].
+    """
+    from scipy.spatial import cKDTree
+
+    means, covariances = gaussians.means.detach().double().cpu(), gaussians.covariances.detach().double().cpu()
+    points = x.detach().double().cpu()
+    many = min(4 * nearest, len(points))
+    _, index = cKDTree(points.numpy()).query(means.numpy(), k=many)
+    index = torch.as_tensor(np.asarray(index).reshape(len(means), many))
+    d = points[index] - means[:, None]
+    small = 1e-12 * covariances.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=1e-30)
+    conic = torch.linalg.inv(covariances + small[:, None, None] * torch.eye(3, dtype=torch.float64))
+    distance = torch.einsum("nki,nij,nkj->nk", d, conic, d)
+    distance, order = distance.sort(1)
+    chosen, inside = index.gather(1, order)[:, :nearest].clone(), distance[:, :nearest] <= reach
+    lonely = ~inside.any(1)
+    chosen[lonely, 0], inside[lonely, 0] = index[lonely, 0], True
+    weight = inside.double() / inside.sum(1, keepdim=True)
+    rest = (points[chosen] * weight[..., None]).sum(1)
+    like = gaussians.means
+    return Binding(chosen.to(like.device), weight.to(like), rest.to(like))
+
+
+def deform(gaussians: Gaussians, F: Tensor, x: Tensor, binding: Binding | None = None) -> Gaussians:
+    """Gaussians carried by particles: means with x, covariance F A F^T with the first frame's A, harmonics with the polar part of F.
+
+    The gradient reaches F and x through means, covariances and the direction of view. Colours turn as in PhysGaussian: not the
+    harmonics but the direction of view is rotated, by R^T.
+
+    Args:
+        gaussians: At t = 0.
+        F: Deformation gradient of the particles [-], (..., P, 3, 3).
+        x: Their positions [m], (..., P, 3).
+        binding: See `bind`; absent: Gaussian i is particle i.
+    """
+    if binding is None:
+        if F.shape[-3] != len(gaussians.means):
+            raise UserError(f"{F.shape[-3]} particles carry {len(gaussians.means)} Gaussians; give a binding")
+        means, G = x, F
+    else:
+        both = binding.average(torch.cat([x, F.flatten(-2)], -1))
+        means, G = gaussians.means + both[..., :3] - binding.rest, both[..., 3:].unflatten(-1, (3, 3))
+    rotations = None
+    if degree_of(gaussians.harmonics) > 0:
+        rotations = polar(G)[0]
+        if gaussians.rotations is not None:
+            rotations = rotations @ gaussians.rotations
+    return gaussians._replace(means=means, covariances=G @ gaussians.covariances @ G.mT, rotations=rotations)
+
+
+def covariances_of(scales: Tensor, quaternions: Tensor) -> Tensor:
+    """R diag(s^2) R^T [m^2] (..., 3, 3) from standard deviations [m] (..., 3) and quaternions w, x, y, z (..., 4) of any length."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
+    entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    entries += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    entries += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    M = torch.stack(entries, -1).unflatten(-1, (3, 3)) * scales.unsqueeze(-2)
+    return M @ M.mT
+
+
+def scales_and_quaternions(covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse of `covariances_of`: standard deviations (N, 3), smallest first, and unit quaternions (N, 4)."""
+    from scipy.spatial.transform import Rotation
+
+    values, vectors = torch.linalg.eigh(covariances.detach().double().cpu())
+    vectors = vectors * torch.linalg.det(vectors).sign()[..., None, None]
+    quaternions = torch.from_numpy(Rotation.from_matrix(vectors.numpy()).as_quat())[:, [3, 0, 1, 2]]
+    return values.clamp(min=0).sqrt().to(covariances), quaternions.to(covariances)
+
+
+def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
+    """Write a 3DGS PLY file (`point_cloud.ply`): logit of opacity, log of scale, quaternion w, x, y, z, harmonics channel by channel.
+
+    Raises:
+        UserError: Several frames, or Gaussians that are rotated against their harmonics, which the format cannot hold.
+    """
+    from plyfile import PlyData, PlyElement
+
+    if gaussians.means.dim() != 2:
+        raise UserError(f"means have shape {tuple(gaussians.means.shape)}; a PLY file holds one frame, (N, 3)")
+    if gaussians.rotations is not None and degree_of(gaussians.harmonics) > 0:
+        raise UserError("a PLY file cannot hold rotated harmonics; save degree 0, harmonics[:, :1]")
+    scales, quaternions = scales_and_quaternions(gaussians.covariances)
+    opacities = gaussians.opacities.detach().double().clamp(1e-7, 1 - 1e-7).logit()
+    base, rest = gaussians.harmonics[:, 0], gaussians.harmonics[:, 1:].mT.flatten(1)
+    shape = [opacities[:, None], scales.clamp(min=1e-12).log(), quaternions]
+    columns = [gaussians.means, torch.zeros_like(gaussians.means), base, rest, *shape]
+    table = torch.cat([c.detach().double().cpu() for c in columns], 1).numpy().astype(np.float32)
+    vertices = np.empty(len(table), [(name, "f4") for name in _names(rest.shape[1])])
+    for name, column in zip(vertices.dtype.names, table.T, strict=True):
+        vertices[name] = column
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
+
+
+def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu") -> Gaussians:
+    """Read a 3DGS PLY file.
+
+    Raises:
+        UserError: No such file, not a PLY file, or one whose vertices lack what a Gaussian needs.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    if not Path(path).is_file():
+        raise UserError(f"no PLY file {path}")
+    try:
+        content = PlyData.read(str(path))
+        vertices = content["vertex"].data
+    except (PlyParseError, KeyError) as error:
+        raise UserError(f"{path} is not a PLY file with vertices: {error}") from error
+    rest = sum(name.startswith("f_rest_") for name in vertices.dtype.names)
+    needed = [name for name in _names(rest) if not name.startswith("n")]
+    if missing := [name for name in needed if name not in vertices.dtype.names]:
+        raise UserError(f"{path} is not a 3DGS file: its vertices lack {', '.join(missing)}")
+    if rest not in (0, 9, 24, 45):
+        raise UserError(f"{path} has {rest} f_rest columns; needed 0, 9, 24 or 45")
+
+    def columns(*names: str) -> Tensor:
+        return torch.from_numpy(np.stack([vertices[name].astype(np.float64) for name in names], 1))
+
+    harmonics = columns("f_dc_0", "f_dc_1", "f_dc_2").unsqueeze(1)
+    if rest:
+        harmonics = torch.cat([harmonics, columns(*(f"f_rest_{i}" for i in range(rest))).unflatten(1, (3, rest // 3)).mT], 1)
+    quaternions = columns("rot_0", "rot_1", "rot_2", "rot_3")
+    covariances = covariances_of(columns("scale_0", "scale_1", "scale_2").exp(), quaternions)
+    parts = (columns("x", "y", "z"), covariances, columns("opacity").squeeze(1).sigmoid(), harmonics)
+    return Gaussians(*(part.to(device, dtype) for part in parts))
+
+
+def _names(rest: int) -> list[str]:
+    """Columns of a 3DGS file with `rest` harmonics above degree 0."""
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity"]
+    return [*names, *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]

@@ -1,0 +1,347 @@
+"""Differentiable Gaussian splatting with gsplat's conventions, frames and views in one call.
+
+Images of 3D Gaussians (Kerbl et al. 2023) by gsplat's rules: OpenCV cameras, pixel centres at +0.5, `eps2d` added to the covariance in
+pixels, alpha between 1/255 and 0.999, a pixel finished at a transmittance of 1e-4, no antialiasing. Gaussians are drawn in the order of
+the depth of their centres; their tiles hold every pixel where they count, so tiles leave no trace.
+
+Three back ends behind one call: `warp` (own kernels, CPU and CUDA), `torch` (the slow twin), and `gsplat`, where it is installed.
+"""
+
+import math
+
+import torch
+import warp as wp
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from neuido.errors import UserError
+from neuido.models.render import compose_kernels, splat_reference
+from neuido.models.render.gaussians import colours_of, degree_of
+from neuido.models.render.splat_kernels import ROWS, build
+from neuido.physics.runtime.device import launch, real_of, torch_stream
+from neuido.types import Cameras, Gaussians
+
+BACKENDS = ("auto", "warp", "torch", "gsplat")
+TILE = {"cpu": 8, "cuda": 16}
+"""Side of a tile: small ones cost least where there is no shared memory to fill."""
+
+LARGEST = 2**31 - 1
+"""Indices in the kernels are 32 bits."""
+
+
+def by_tile(device: torch.device) -> bool:
+    """Whether a thread does a whole tile, splat by splat (CPU), or one pixel (CUDA)."""
+    return device.type == "cpu"
+
+
+def rasterize(
+    means: Tensor,  # (..., N, 3)
+    covariances: Tensor,  # (..., N, 3, 3)
+    opacities: Tensor,  # (N,) or (..., N)
+    colours: Tensor,  # (N, 3) or (..., N, 3); with sh_degree (N, K, 3)
+    viewmats: Tensor,  # (V, 4, 4)
+    Ks: Tensor,  # (V, 3, 3)
+    width: int,
+    height: int,
+    *,
+    sh_degree: int | None = None,
+    rotations: Tensor | None = None,  # (..., N, 3, 3)
+    background: Tensor | None = None,  # (3,) or broadcastable to (..., V, H, W, 3)
+    near: float = 0.01,
+    far: float = 1e10,
+    eps2d: float = 0.3,
+    backend: str = "auto",
+    capacity: int | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Images of Gaussians, for all frames (the leading dimensions) and all views at once.
+
+    Differentiable with respect to means, covariances, opacities, colours, rotations and background; not to cameras. Gradients of
+    opacities and colours are computed where they are wanted, those of means and covariances always.
+
+    Args:
+        means: Centres [m].
+        covariances: [m^2]; the symmetric part counts.
+        opacities: In 0..1.
+        colours: RGB, or harmonics where `sh_degree` is given: then RGB = max(0, 1/2 + harmonics in the direction of view).
+        viewmats: World to camera, OpenCV.
+        Ks: Intrinsics [pixels]; skew is ignored.
+        width: Of the images [pixels].
+        height: Of the images [pixels].
+        sh_degree: 0 to 3.
+        rotations: Rotation of each Gaussian since its harmonics were fitted: the direction of view is rotated back.
+        background: RGB behind the Gaussians; black where absent.
+        near: Gaussians with centres closer than this [m] are not drawn.
+        far: Nor are those beyond this [m].
+        eps2d: Added to the diagonal of the covariance in pixels [pixels^2].
+        backend: `warp`, `torch`, `gsplat`, or `auto`: warp.
+        capacity: Most entries in the lists of all tiles together, for CUDA. Where it is given nothing waits for the device, so that the
+            call can be captured in a graph; images are NaN where it was too small. Otherwise the call reads one number back.
+
+    Returns:
+        Images (..., V, H, W, 3) and alphas (..., V, H, W), the share of each pixel that Gaussians cover.
+
+    Raises:
+        UserError: Shapes that do not fit, a number that is not finite, a back end that is not there.
+    """
+    frames, means, covariances, opacities = _frames(means, covariances, opacities, viewmats, Ks)
+    if backend not in BACKENDS:
+        raise UserError(f"backend is {backend!r}; one of {', '.join(BACKENDS)}")
+    if width < 1 or height < 1:
+        raise UserError(f"width and height are {width} and {height}; at least 1 each")
+    viewmats, Ks = viewmats.detach().to(means), Ks.detach().to(means)
+    tints = _tints(colours, means, viewmats, sh_degree, rotations, frames)
+    arguments = (means, covariances, opacities, tints, viewmats, Ks, width, height, near, far, eps2d)
+    if backend == "torch":
+        images, alphas = splat_reference.rasterize(*arguments)
+    elif backend == "gsplat":
+        images, alphas = _gsplat(*arguments)
+    else:
+        images, alphas = _Splat.apply(*arguments, capacity)
+    images, alphas = images.unflatten(0, frames) if frames else images[0], alphas.unflatten(0, frames) if frames else alphas[0]
+    if background is not None:
+        images = images + (1 - alphas).unsqueeze(-1) * background.to(images)
+    return images, alphas
+
+
+def render(gaussians: Gaussians, cameras: Cameras, **options) -> tuple[Tensor, Tensor]:
+    """`rasterize` of the two tuples; options are its keywords."""
+    degree = degree_of(gaussians.harmonics)
+    means, covariances, opacities, harmonics, rotations = gaussians
+    return rasterize(means, covariances, opacities, harmonics, *cameras, sh_degree=degree, rotations=rotations, **options)
+
+
+class Splatting(nn.Module):
+    """`render` as a module that keeps its options; arguments as in `rasterize`."""
+
+    def __init__(
+        self,
+        background: tuple[float, float, float] | None = None,
+        near: float = 0.01,
+        far: float = 1e10,
+        eps2d: float = 0.3,
+        backend: str = "auto",
+        capacity: int | None = None,
+    ):
+        super().__init__()
+        self.register_buffer("background", None if background is None else torch.tensor(background), persistent=False)
+        self.options = {"near": near, "far": far, "eps2d": eps2d, "backend": backend, "capacity": capacity}
+
+    def forward(self, gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
+        """Images (..., V, H, W, 3) and alphas (..., V, H, W)."""
+        return render(gaussians, cameras, background=self.background, **self.options)
+
+
+def _frames(means: Tensor, covariances: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor):
+    """Leading dimensions, and means (F, N, 3), covariances (F, N, 3, 3), opacities (1 or F, N)."""
+    if means.dim() < 2 or means.shape[-1] != 3:
+        raise UserError(f"means have shape {tuple(means.shape)}; needed (..., N, 3)")
+    if means.dtype not in (torch.float32, torch.float64):
+        raise UserError(f"means are {means.dtype}; needed float32 or float64")
+    frames, count = means.shape[:-2], means.shape[-2]
+    wanted = (
+        ("covariances", covariances, ((*frames, count, 3, 3), (count, 3, 3))),
+        ("opacities", opacities, ((*frames, count), (count,))),
+        ("viewmats", viewmats, ((len(viewmats), 4, 4),)),
+        ("Ks", Ks, ((len(viewmats), 3, 3),)),
+    )
+    for name, tensor, shapes in wanted:
+        if tuple(tensor.shape) not in shapes:
+            raise UserError(f"{name} have shape {tuple(tensor.shape)}; needed {' or '.join(map(str, dict.fromkeys(shapes)))}")
+        if tensor.device != means.device:
+            raise UserError(f"{name} are on {tensor.device} and means on {means.device}; needed on one device")
+    many = math.prod(frames)
+    covariances = covariances.to(means.dtype).expand(*frames, count, 3, 3).reshape(many, count, 3, 3)
+    opacities = opacities.to(means.dtype).reshape(many if opacities.dim() > 1 else 1, count)
+    return frames, means.reshape(many, count, 3), covariances, opacities
+
+
+def _tints(colours: Tensor, means: Tensor, viewmats: Tensor, sh_degree: int | None, rotations: Tensor | None, frames) -> Tensor:
+    """RGB of each Gaussian, (1 or F, 1 or V, N, 3)."""
+    count = means.shape[1]
+    if colours.device != means.device:
+        raise UserError(f"colours are on {colours.device} and means on {means.device}; needed on one device")
+    if sh_degree is None:
+        shapes = ((count, 3), (*frames, count, 3))
+        if tuple(colours.shape) not in shapes:
+            raise UserError(f"colours have shape {tuple(colours.shape)}; needed {' or '.join(map(str, dict.fromkeys(shapes)))}")
+        return colours.to(means.dtype).reshape(len(means) if colours.dim() > 2 else 1, 1, count, 3)
+    if colours.dim() != 3 or len(colours) != count or colours.shape[2] != 3:
+        raise UserError(f"harmonics have shape {tuple(colours.shape)}; needed ({count}, K, 3)")
+    colours = colours.to(means.dtype)
+    if sh_degree == 0:
+        return colours_of(colours, None, degree=0)[None, None]
+    eyes = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT
+    directions = means[:, None] - eyes
+    if rotations is not None:
+        directions = (rotations.reshape(len(means), 1, count, 3, 3).mT @ directions.unsqueeze(-1)).squeeze(-1)
+    return colours_of(colours, directions, degree=sh_degree)
+
+
+def _gsplat(means, covariances, opacities, colours, viewmats, Ks, width, height, near, far, eps2d) -> tuple[Tensor, Tensor]:
+    try:
+        from gsplat import rasterization  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise UserError("backend 'gsplat' is not installed: pip install 'neuido[gpu]', or take backend 'warp'") from error
+    if not means.is_cuda:
+        raise UserError(f"backend 'gsplat' needs CUDA tensors, got {means.device}; take backend 'warp'")
+    frames, views, count = len(means), len(viewmats), means.shape[1]
+    images, alphas, _ = rasterization(
+        means,
+        None,
+        None,
+        opacities.expand(frames, count).contiguous(),
+        colours.expand(frames, views, count, 3).contiguous(),
+        viewmats.expand(frames, views, 4, 4).contiguous(),
+        Ks.expand(frames, views, 3, 3).contiguous(),
+        width,
+        height,
+        near_plane=near,
+        far_plane=far,
+        eps2d=eps2d,
+        packed=False,
+        covars=(covariances + covariances.mT) / 2,
+    )
+    return images, alphas.squeeze(-1)
+
+
+class _Lists:
+    """Which splats each tile shows, front to back: `splats`, and `ranges` of it (C tiles, 2)."""
+
+    splats: Tensor
+    ranges: Tensor
+    broken: Tensor | None = None
+    """One bool on the device where nothing was read back: the capacity was too small, or a number not finite."""
+
+
+def _counted(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int) -> _Lists:
+    """Lists on the CPU: Gaussians in the order of depth, then a counting sort by tile."""
+    images, count = depth.shape
+    lists = _Lists()
+    length = torch.zeros(images * tiles, dtype=torch.int32)
+    launch(kernels.tally, images, [splat[2], count, columns, tiles, length], depth.device)
+    ends = length.cumsum(0)
+    _check(int(status), total := int(ends[-1]))
+    slot = (ends - length).int()
+    lists.ranges = torch.stack([slot, ends.int()], 1)
+    lists.splats = torch.empty(max(total, 1), dtype=torch.int32)
+    keys = torch.stack([depth, depth], 1)  # the sort needs room for as many again
+    order = torch.arange(count, dtype=torch.int32).repeat(images, 2, 1)
+    for k, o in zip(keys.flatten(1), order.flatten(1)):
+        wp.utils.radix_sort_pairs(wp.from_torch(k), wp.from_torch(o), count)
+    launch(kernels.fill, images, [splat[2], order.view(-1), count, columns, tiles, slot, lists.splats], depth.device)
+    return lists
+
+
+def _keyed(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int, capacity: int | None) -> _Lists:
+    """Lists on CUDA: one sort of keys of tile and depth."""
+    images, count = depth.shape
+    device = depth.device
+    lists = _Lists()
+    found = torch.empty(images * count, dtype=torch.int32, device=device)
+    launch(kernels.count, images * count, [*splat, found], device)
+    ends = found.cumsum(0)
+    if capacity is None:
+        bad, total = torch.stack([status[0].long(), ends[-1]]).tolist()  # the one round trip
+        _check(bad, total)
+    else:
+        total = capacity
+        lists.broken = (ends[-1] > capacity) | (status[0] > 0)
+    keys = torch.full((max(total, 1),), 2**63 - 1, dtype=torch.int64, device=device)
+    splats = torch.zeros(max(total, 1), dtype=torch.int32, device=device)
+    launch(kernels.emit, images * count, [*splat, depth.view(-1), ends, count, columns, tiles, keys, splats], device)
+    keys, order = torch.sort(keys, stable=True)
+    lists.splats = splats[order]
+    lists.ranges = torch.zeros(images * tiles, 2, dtype=torch.int32, device=device)
+    launch(kernels.ranges, len(keys), [keys, lists.ranges], device)
+    return lists
+
+
+def _check(bad: int, total: int) -> None:
+    if bad:
+        raise UserError(f"{bad} projected Gaussians have numbers that are not finite: check means, covariances and opacities")
+    if total > LARGEST:
+        raise UserError(f"{total} entries of Gaussians in tiles exceed 2^31: render fewer frames or views in one call")
+
+
+class _Splat(torch.autograd.Function):
+    """means (F, N, 3), covariances (F, N, 3, 3), opacities (1 or F, N), colours (1 or F, 1 or V, N, 3) -> images, alphas."""
+
+    @staticmethod
+    def forward(ctx, means, covariances, opacities, colours, viewmats, Ks, width, height, near, far, eps2d, capacity):
+        frames, count = means.shape[:2]
+        views, device = len(viewmats), means.device
+        images, dtype = frames * views, means.dtype
+        if images * count == 0:
+            ctx.shapes = [t.shape for t in (means, covariances, opacities, colours)]
+            return means.new_zeros(frames, views, height, width, 3), means.new_zeros(frames, views, height, width)
+        side = TILE[device.type]
+        columns, tiles = -(-width // side), -(-width // side) * -(-height // side)
+        if max(images * count * ROWS, images * tiles * side * side) > LARGEST:
+            raise UserError(f"{images} images of {count} Gaussians exceed 2^31 entries: render fewer frames or views in one call")
+        kernels = build(real_of(dtype), side)
+        means, covariances, opacities, colours = (t.detach().contiguous() for t in (means, covariances, opacities, colours))
+        viewmats, Ks = viewmats.contiguous(), Ks.contiguous()
+        new = {"dtype": dtype, "device": device}
+        centre, conic = torch.empty(images * count, 4, **new), torch.empty(images * count, 3, **new)
+        box = torch.empty(images * count, 4, dtype=torch.int32, device=device)
+        depth = torch.empty(images, count, **new)
+        status = torch.zeros(1, dtype=torch.int32, device=device)
+        stride = count if len(opacities) > 1 else 0
+        strides = (colours.shape[1] * count if len(colours) > 1 else 0, count if colours.shape[1] > 1 else 0)
+        image = torch.zeros(frames, views, height, width, 3, **new)
+        clear = torch.ones(frames, views, height, width, **new)
+        last = torch.zeros(frames, views, height, width, dtype=torch.int32, device=device)
+        with torch_stream(device):
+            inputs = [means.view(-1, 3), covariances.view(-1, 3, 3), opacities.view(-1), stride, viewmats, Ks, count, width, height]
+            flat = depth.view(-1)
+            launch(kernels.project, images * count, [*inputs, near, far, eps2d, centre, conic, box, flat, status], device)
+            found = (kernels, (centre, conic, box), depth, status, columns, tiles)
+            lists = _counted(*found) if device.type == "cpu" else _keyed(*found, capacity)
+            tables = [lists.ranges, lists.splats, centre, conic]
+            rest = [colours.view(-1, 3), *strides, count, views, width, height, columns, tiles]
+            result = [image.view(-1, 3), clear.view(-1), last.view(-1)]
+            blend = compose_kernels.build(real_of(dtype), side)
+            if by_tile(device):
+                launch(blend.compose_tile, images * tiles, [*tables, box, *rest, *result], device)
+            else:
+                launch(blend.compose, images * tiles * side * side, [*tables, *rest, *result], device)
+        alphas = 1 - clear
+        if lists.broken is not None:
+            image = torch.where(lists.broken, torch.nan, image)
+        ctx.sizes = (side, strides, width, height, columns, tiles)
+        ctx.save_for_backward(
+            means, covariances, opacities, colours, viewmats, Ks, centre, conic, box, lists.ranges, lists.splats, clear, last
+        )
+        return image, alphas
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, a_image, a_alpha):
+        if hasattr(ctx, "shapes"):
+            return *(a_image.new_zeros(shape) for shape in ctx.shapes), *[None] * 8
+        means, covariances, opacities, colours, viewmats, Ks, centre, conic, box, ranges, splats, clear, last = ctx.saved_tensors
+        side, strides, width, height, columns, tiles = ctx.sizes
+        frames, count = means.shape[:2]
+        views, device = len(viewmats), means.device
+        images = frames * views
+        wanted = ctx.needs_input_grad[2:4]
+        kernels, blend = build(real_of(means.dtype), side), compose_kernels.build(real_of(means.dtype), side, any(wanted))
+        rows = torch.zeros(images * count * ROWS, 4, dtype=means.dtype, device=device)
+        a_means, a_covariances = torch.empty_like(means), torch.empty_like(covariances)
+        a_image = a_image.contiguous()
+        with torch_stream(device):
+            tables = [ranges, splats, centre, conic]
+            rest = [colours.view(-1, 3), *strides, count, views, width, height, columns, tiles]
+            behind = -a_alpha * clear
+            if by_tile(device):
+                given = [clear.clone().view(-1), last.view(-1), a_image.view(-1, 3), behind.view(-1), rows]
+                launch(blend.compose_tile_adjoint, images * tiles, [*tables, box, *rest, *given], device)
+            else:
+                given = [clear.view(-1), last.view(-1), a_image.view(-1, 3), behind.view(-1), rows]
+                launch(blend.compose_adjoint, images * tiles * side * side, [*tables, *rest, *given], device)
+            given = [means.view(-1, 3), covariances.view(-1, 3, 3), viewmats, Ks, count, width, height, centre, conic, rows]
+            launch(kernels.project_adjoint, frames * count, [*given, a_means.view(-1, 3), a_covariances.view(-1, 3, 3)], device)
+        rows = rows.view(frames, views, count, ROWS, 4)
+        a_opacities = rows[..., 1, 1].sum(1).sum_to_size(opacities.shape) if wanted[0] else None
+        a_colours = rows[..., 2, :3].sum_to_size(colours.shape) if wanted[1] else None
+        return a_means, a_covariances, a_opacities, a_colours, *[None] * 8

@@ -1,0 +1,425 @@
+"""Few-shot adaptation: a method's parameters are fitted to the images of one scene, one scene after the other (paper, "Few-Shot")."""
+
+import gc
+import sys
+import time
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import torch
+import warp as wp
+from torch import Tensor, nn
+
+from neuido.data.scenes.filmed_scene import VisualScene
+from neuido.errors import UserError
+from neuido.models.fewshot.fit_progress import Progress, restore
+from neuido.models.fewshot.method import CARD, Method, scalars
+from neuido.models.fewshot.relative_density import RelativeDensity
+from neuido.models.fewshot.scene_fit import DENSITY, EffectSource, SceneFit
+from neuido.models.inference.pipeline import Laws, Prepared, folder_of, prepare, roll_surely
+from neuido.models.inference.transfer import read_conditions, run_condition
+from neuido.models.scoring import motion_scores as scores
+from neuido.models.stages import image_module as filmed
+from neuido.models.stages.image_module import FIGURES, FilmedModule, plainly
+from neuido.types import ParticleState
+
+GIGABYTE = 1e9
+
+
+class AdaptModule(FilmedModule):
+    """Fits a method to each scene by itself, and scores it before and after on views that were held out.
+
+    An epoch is one scene, so that `trainer.max_epochs` is left at -1. The loss is that of Stage II (`filmed.image_losses`). The data module
+    is a `VisualDataModule`. `out/scores.csv` has two rows a scene, of `stage` before and after; `out/<scene>/fit` is of `SceneFit.save`.
+
+    Args:
+        method: What is fitted (`models.methods`).
+        steps: Optimiser steps of each scene; none: the method's own number (ours: 100, the paper's).
+        views_per_step: Training views in a step, drawn anew for each; 0: all.
+        encoder_views: Training views that the encoder sees; 0: all.
+        fit_frames: Frames that fitting sees, the first ones; 0: all. Scores then have the rest apart, as `later_...`.
+        curriculum: Shares of these frames that are rolled out, one after the other, for equal parts of `curriculum_share` of the steps.
+        curriculum_share: Share of the steps.
+        image_weight: Of the images' squared error; 0: silhouettes alone.
+        silhouette_weight: Of the silhouettes' squared error.
+        estimate_velocity: Estimate a rigid motion at t = 0 that is added to the body's known one.
+        velocity_lr: Its rate, in m/s and rad/s a step.
+        velocity_steps: Steps before the others in which it is fitted alone, with a cosine of their own.
+        velocity_frames: Frames that these steps see.
+        estimate_density: Estimate how densely the body is filled, which no first frame shows (`models.relative_density`); paper: no.
+        density_lr: Its rate, of the logarithm a step.
+        density_from: Share of the steps before it joins the law, which then has the large part of the motion to itself.
+        density_weight: Of its mean square logarithm: pulls it to an even filling.
+        stop_on: When to end a scene early: `none`, `loss` (no lower loss on all training views), `view` (no lower loss on the last
+            training view, which is then not trained on). The best parameters are kept.
+        patience: Steps without an improvement by 1 % after which a scene ends.
+        check_every: Steps between two looks at that loss.
+        segment: Keep the state of a rollout every so many frames only (`Simulator.rollout`); 0: of all. Saves memory.
+        effects: Effects that act on top of the law, of a diagnosis say; none: none.
+        adapter: Folder of a fit, for test and predict: `out` of one, or what is in `out/<scene>/fit`.
+        cache: Folder in which optical flow is kept.
+        out: Folder for results.
+        lpips_backbone: Local file of VGG16's or AlexNet's weights; none: LPIPS is absent.
+        lpips_net: `vgg` or `alex`.
+        condition_files: In a prediction, files of `models.conditions` to run with the laws that were fitted.
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        steps: int | None = None,
+        views_per_step: int = 2,
+        encoder_views: int = 0,
+        fit_frames: int = 0,
+        curriculum: list[float] = [0.25, 0.5],  # noqa: B006 (read only)
+        curriculum_share: float = 0.3,
+        image_weight: float = 1.0,
+        silhouette_weight: float = 0.1,
+        estimate_velocity: bool = False,
+        velocity_lr: float = 0.2,
+        velocity_steps: int = 40,
+        velocity_frames: int = 8,
+        estimate_density: bool = False,
+        density_lr: float = 0.03,
+        density_from: float = 0.0,
+        density_weight: float = 1e-3,
+        stop_on: Literal["none", "loss", "view"] = "none",
+        patience: int = 20,
+        check_every: int = 5,
+        segment: int = 0,
+        effects: EffectSource | None = None,
+        adapter: str | None = None,
+        cache: str | None = None,
+        out: str = "runs/adapt",
+        lpips_backbone: str | None = None,
+        lpips_net: str = "vgg",
+        condition_files: list[str] | None = None,
+    ):
+        super().__init__()
+        counts = {"steps": steps or 0, "fit_frames": fit_frames, "velocity_steps": velocity_steps, "segment": segment}
+        counts |= {"views_per_step": views_per_step, "encoder_views": encoder_views}
+        weights = {"image_weight": image_weight, "silhouette_weight": silhouette_weight, "velocity_lr": velocity_lr}
+        weights |= {"density_lr": density_lr, "density_weight": density_weight}
+        filmed.check_options(counts, weights, {"curriculum_share": curriculum_share, "density_from": density_from}, curriculum)
+        if image_weight + silhouette_weight == 0:
+            raise UserError("model.image_weight and silhouette_weight are both 0: nothing would be compared")
+        if fit_frames == 1 or velocity_frames < 2:
+            raise UserError(f"model.fit_frames = {fit_frames}, velocity_frames = {velocity_frames}: a motion needs at least 2 frames")
+        if patience < 1 or check_every < 1:
+            raise UserError(f"model.patience = {patience}, check_every = {check_every}: at least 1 is needed")
+        self.save_hyperparameters(ignore=["method", "effects"])
+        object.__setattr__(self, "plan", method)  # its copies are trained, one a scene
+        self.effects = effects
+        self.steps = method.steps if steps is None else steps
+        self.ahead = velocity_steps if estimate_velocity else 0
+        """Steps of the velocity alone, before those of the method."""
+        self.fits = nn.ModuleList()
+        self._names: list[str] = []
+        self._current: tuple[str, Prepared] | None = None
+        self._progress: dict[str, Progress] = {}
+        self._rows: list[dict[str, Any]] = []
+        self._predicted: list[tuple[Prepared, Laws]] = []
+
+    # What there is of a scene.
+
+    def open_scene(self, scene: VisualScene, device: torch.device, *, watched: bool) -> Prepared:
+        """The scene on the device; `watched`: with the flow that the method's encoder wants."""
+        encoder = self.plan.encoder.to(device) if watched and self.plan.encoder is not None else None
+        return prepare(scene, encoder, device=device, encoder_views=self.hparams.encoder_views, cache=self.hparams.cache)
+
+    def new_fit(self, prepared: Prepared, uneven: bool = False) -> SceneFit:
+        """A fit that has not begun; `uneven`: with a density, whatever the option says."""
+        density = None
+        if self.hparams.estimate_density or uneven:
+            simulator = prepared.simulator
+            density = RelativeDensity(simulator.state.x, simulator.volume, simulator.scenes[0].dx)
+        method = self.plan.for_scene(prepared)
+        return SceneFit(method, self.hparams.estimate_velocity, self.effects, density).to(prepared.images.device)
+
+    def setup(self, stage: str) -> None:
+        if stage != "fit" or len(self.fits):
+            return
+        if self.trainer.world_size > 1:
+            raise UserError(f"trainer.devices: adaptation runs in one process, not in {self.trainer.world_size}; use several runs")
+        data = self.trainer.datamodule
+        data.steps_in_a_row = self.ahead + self.steps
+        self.trainer.fit_loop.max_epochs = len(data.scenes)
+        for scene in data.scenes:
+            prepared = self.open_scene(scene, self.trainer.strategy.root_device, watched=True)
+            self._training_views(prepared)
+            self.fits.append(self.new_fit(prepared))
+            self._names.append(scene.name)
+
+    def fit_of(self, name: str) -> SceneFit:
+        """The fit of a scene of this run."""
+        return cast(SceneFit, self.fits[self._names.index(name)])
+
+    def _training_views(self, prepared: Prepared) -> list[int]:
+        """The views that are trained on."""
+        if self.hparams.stop_on != "view":
+            return prepared.training
+        if len(prepared.training) < 2:
+            raise UserError(f"model.stop_on = view: {prepared.source.name} has one training view, and none would be left; use loss or none")
+        return prepared.training[:-1]
+
+    def _frames(self, prepared: Prepared) -> int:
+        """Frames that fitting sees."""
+        return min(prepared.frames, self.hparams.fit_frames or prepared.frames)
+
+    # Fitting.
+
+    def configure_optimizers(self) -> torch.optim.Optimizer | None:
+        groups = []
+        for i, fit in enumerate(self.fits):
+            own = [{**group, "of": i, "start_lr": group["lr"], "first": self.ahead} for group in fit.method.parameter_groups()]
+            if fit.twist is not None:
+                rate = self.hparams.velocity_lr
+                own.append({"params": [fit.twist], "lr": rate, "of": i, "start_lr": rate, "first": 0})
+            if fit.density is not None:
+                rate, first = self.hparams.density_lr, self.ahead + round(self.hparams.density_from * self.steps)
+                own.append({"params": list(fit.density.parameters()), "lr": rate, "of": i, "start_lr": rate, "first": first})
+            groups += own
+        return self.plan.optimizer(groups) if groups and self.ahead + self.steps else None
+
+    def on_fit_start(self) -> None:
+        for scene in self.trainer.datamodule.scenes:
+            if not self.ahead + self.steps:  # Lightning then runs no epoch
+                self._begin(scene)
+                self.fit_of(scene.name).save(folder_of(self.hparams.out, scene.name) / "fit")
+            elif scene.name in self._progress and self._progress[scene.name].done:  # killed between its last step and its scores
+                self._begin(scene)
+                self._finish()
+
+    def on_train_batch_start(self, batch: VisualScene, batch_idx: int) -> int | None:
+        self._begin(batch)
+        return -1 if self._progress[batch.name].done else None
+
+    def _begin(self, scene: VisualScene) -> Prepared:
+        """Bring the scene to the device, and score it before its first step."""
+        if self._current is None or self._current[0] != scene.name:
+            self._finish()
+            self._current = None
+            gc.collect()  # the last scene's tapes, before the next one's are made
+            self._current = scene.name, self.open_scene(scene, self.device, watched=False)
+            if scene.name not in self._progress:
+                self._progress[scene.name] = Progress()
+                self._score_fit("before")
+            if self.device.type == "cuda":
+                torch.cuda.reset_peak_memory_stats(self.device)
+        return self._current[1]
+
+    def training_step(self, scene: VisualScene, batch_idx: int) -> Tensor:
+        prepared, fit, step = self._begin(scene), self.fit_of(scene.name), self._progress[scene.name].steps
+        frames = self.frames_now(prepared, step)
+        motion = self._roll_or_undo(prepared, fit, frames)
+        if motion is None:
+            return fit.method.retreat()
+        views = filmed.some_views(self._training_views(prepared), self.hparams.views_per_step, step)
+        loss, silhouette = filmed.image_losses(prepared, motion, views)
+        regular = fit.regulariser(self.hparams.density_weight)
+        self._log({"train/loss": loss, "train/silhouette": silhouette, "train/regulariser": regular, "train/frames": float(frames)})
+        return self._weighted(loss, silhouette) + regular
+
+    def _roll_or_undo(self, prepared: Prepared, fit: SceneFit, frames: int) -> ParticleState | None:
+        """The motion; where it fails that of parameters that ran, to which the fit returns with half the rates; or none."""
+        name = prepared.source.name
+        progress = self._progress[name]
+        for _ in range(2):
+            try:
+                motion = fit.roll(prepared, frames, segment=self.hparams.segment)
+                progress.ran(fit)
+                return motion
+            except UserError as error:  # a law that cannot run has no image
+                print(f"{name}: {error}", file=sys.stderr)
+                self._log({"train/failed": 1.0})
+            if not progress.undo(fit):
+                return None
+        return None
+
+    def _weighted(self, loss: Tensor, silhouette: Tensor) -> Tensor:
+        return self.hparams.image_weight * loss + self.hparams.silhouette_weight * silhouette
+
+    def frames_now(self, prepared: Prepared, step: int) -> int:
+        """Frames of a rollout at this step of a scene."""
+        frames = self._frames(prepared)
+        if step < self.ahead:
+            return min(frames, self.hparams.velocity_frames)
+        return filmed.frames_at((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """A step whose gradient is not finite is left out; where that comes again the fit goes back as from a law that does not run."""
+        gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+        if gradients and not bool(torch.stack([g.isfinite().all() for g in gradients]).all()):
+            self._log({"train/not_finite": 1.0})
+            for g in gradients:
+                g.zero_()
+            if self._current is not None:
+                name = self._current[0]
+                self._progress[name].undo(self.fit_of(name), ran=True)
+
+    def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
+        name, prepared = self._current  # type: ignore[misc]
+        progress = self._progress[name]
+        self._set_rates(optimizer, name, progress)
+        begun = time.perf_counter()
+        super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        progress.steps += 1
+        if self.hparams.stop_on != "none" and progress.steps >= self.ahead and progress.steps % self.hparams.check_every == 0:
+            self._look(prepared, progress)
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+            progress.peak_memory_gb = max(progress.peak_memory_gb, torch.cuda.max_memory_allocated(self.device) / GIGABYTE)
+            if wp.is_mempool_enabled(str(self.device)):
+                progress.warp_memory_gb = wp.get_mempool_used_mem_high(str(self.device)) / GIGABYTE
+        progress.seconds += time.perf_counter() - begun
+        progress.done = progress.steps >= self.ahead + self.steps or progress.over
+
+    def _set_rates(self, optimizer: Any, name: str, progress: Progress) -> None:
+        step, ahead = progress.steps, self.ahead
+        share = step / ahead if step < ahead else (step - ahead) / max(1, self.steps)
+        factor = progress.damping * self.fit_of(name).method.rate(share)
+        for group in optimizer.param_groups:
+            group["lr"] = 0.0 if step < group["first"] or group["of"] != self._names.index(name) else factor * group["start_lr"]
+
+    @plainly
+    def _look(self, prepared: Prepared, progress: Progress) -> None:
+        """The loss of all frames on all training views, or on the one that is kept from training."""
+        fit = self.fit_of(prepared.source.name)
+        motion = self._try(prepared, fit)
+        if motion is None:
+            return
+        views = prepared.training[-1:] if self.hparams.stop_on == "view" else prepared.training
+        value = float(self._weighted(*filmed.image_losses(prepared, motion, views)))
+        self._log({"train/looked": value})
+        progress.see(value, fit, self.hparams.patience)
+
+    def on_train_epoch_end(self) -> None:
+        self._finish()
+
+    def on_train_end(self) -> None:
+        self._finish()
+        self._say_absent()
+
+    def _finish(self) -> None:
+        """Score the current scene once its steps are done, and write what was found."""
+        if self._current is None:
+            return
+        name, prepared = self._current
+        progress, fit = self._progress[name], self.fit_of(name)
+        if not progress.done or any(row["scene"] == name and row["stage"] == "after" for row in self._rows):
+            return
+        if not restore(fit, progress.best) and self._try(prepared, fit) is None:  # the last step's law was never run
+            restore(fit, progress.good)
+        progress.best, progress.good, progress.first = {}, {}, {}
+        fit.save(folder_of(self.hparams.out, name) / "fit")
+        self._score_fit("after")
+        self._current = None
+
+    @plainly
+    def _try(self, prepared: Prepared, fit: SceneFit) -> ParticleState | None:
+        """The motion over all frames that fitting sees, none where it fails."""
+        try:
+            return fit.roll(prepared, self._frames(prepared))
+        except UserError:
+            return None
+
+    @plainly
+    def _score_fit(self, stage: str) -> None:
+        name, prepared = self._current  # type: ignore[misc]
+        fit = self.fit_of(name)
+        row = {"scene": name, "method": type(self.plan).__name__, "stage": stage}
+        if stage == "after":
+            keys = ("steps", "seconds", "peak_memory_gb", "warp_memory_gb") if self.device.type == "cuda" else ("steps", "seconds")
+            row |= {key: getattr(self._progress[name], key) for key in keys}
+        self._rows.append(row | self.score(prepared, fit, stage))
+        scores.write_rows(Path(self.hparams.out) / "scores.csv", self._rows)
+        self._show(self._rows[-1])
+
+    def score(self, prepared: Prepared, fit: SceneFit, stage: str) -> dict[str, Any]:
+        """Means of the scores and what was found; the rows by time step go to files in `out/<scene>/<stage>`."""
+        found = {f"found_{key}": value for key, value in scalars(fit.describe()).items()}
+        try:
+            motion, halvings = roll_surely(prepared, lambda scene: fit.roll(scene, prepared.frames))
+        except UserError as error:
+            return {"failed": str(error), **found}
+        figures, particles, pictures = self.figures_of(prepared, motion)
+        filmed.write_by_frame(folder_of(self.hparams.out, prepared.source.name) / stage, particles, pictures)
+        if self._frames(prepared) < prepared.frames:
+            later = scores.later(particles, pictures, self._frames(prepared), FIGURES)
+            figures |= {f"later_{key}": value for key, value in later.items()}
+        return {**figures, "halvings": halvings, **found}
+
+    def _show(self, row: dict[str, Any]) -> None:
+        shown = [f"{key} {row[key]:.4g}" for key in (*FIGURES, "later_iou", "steps", "seconds", "peak_memory_gb") if key in row]
+        self.print(f"{row['scene']:16s} {row['stage']:7s} {', '.join(shown)}{row.get('failed', '')}")
+
+    # Checkpoints.
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        progress = {name: progress.state() for name, progress in self._progress.items()}
+        checkpoint["adaptation"] = {"progress": progress, "rows": self._rows}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        kept = checkpoint.get("adaptation")
+        if kept is None:
+            raise UserError("ckpt_path is no checkpoint of an adaptation")
+        self._progress = {name: Progress(**state) for name, state in kept["progress"].items()}
+        self._rows = kept["rows"]
+
+    # Test and prediction, with what a fit wrote.
+
+    def load_fit(self, scene: VisualScene) -> tuple[Prepared, SceneFit]:
+        """The scene, and its fit: the one of this run, of `adapter`, or one that has not begun."""
+        if scene.name in self._names:
+            return self.open_scene(scene, self.device, watched=False), self.fit_of(scene.name)
+        prepared = self.open_scene(scene, self.device, watched=True)
+        if self.hparams.adapter is None:
+            return prepared, self.new_fit(prepared)
+        folder = self._folder_of_fit(scene.name)
+        fit = self.new_fit(prepared, uneven=(folder / DENSITY).is_file())
+        fit.load(folder)
+        return prepared, fit
+
+    def _folder_of_fit(self, name: str) -> Path:
+        given = Path(self.hparams.adapter)
+        for folder in (given, folder_of(given, name) / "fit"):
+            if (folder / CARD).is_file():
+                return folder
+        raise UserError(f"model.adapter = {given}: neither it nor {folder_of(given, name) / 'fit'} holds {CARD}")
+
+    @plainly
+    def test_step(self, scene: VisualScene, batch_idx: int) -> None:
+        prepared, fit = self.load_fit(scene)
+        row = {"scene": scene.name, "method": type(self.plan).__name__, "stage": "test", **self.score(prepared, fit, "test")}
+        self._rows.append(row)
+        self._show(row)
+
+    def on_test_epoch_end(self) -> None:
+        rows, self._rows = self._rows, []
+        self.log_dict({f"test/{name}": value for name, value in scores.mean_of(rows, FIGURES).items()})
+        scores.write_rows(Path(self.hparams.out) / "test.csv", rows)
+        self._say_absent()
+
+    @plainly
+    def predict_step(self, scene: VisualScene, batch_idx: int) -> dict[str, Any]:
+        """Write what was found, particles, video and picture of a scene; the paths."""
+        prepared, fit = self.load_fit(scene)
+        folder = folder_of(self.hparams.out, scene.name)
+        fit.save(folder / "fit")
+        try:
+            motion, _ = roll_surely(prepared, lambda refined: fit.roll(refined, prepared.frames))
+        except UserError as error:
+            print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
+            return {"scene": scene.name, "folder": str(folder), "failed": str(error)}
+        filmed.write_prediction(folder, prepared, motion)
+        if self.hparams.condition_files:
+            self._predicted.append((prepared, fit.method.laws(prepared)))
+        self.print(f"{scene.name}: {folder}")
+        return {"scene": scene.name, "folder": str(folder)}
+
+    @plainly
+    def on_predict_epoch_end(self) -> None:
+        for path in self.hparams.condition_files or []:
+            condition = read_conditions(path)
+            self.print(f"condition {condition.name}: {run_condition(condition, self._predicted, self.hparams.out)}")
+        self._predicted = []

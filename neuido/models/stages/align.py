@@ -1,0 +1,279 @@
+"""Stage II: the projector learns from images which laws make the recorded motion (paper, "Visual-to-Dynamics Alignment")."""
+
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from lightning.pytorch.utilities import rank_zero_only
+from torch import Tensor
+
+from neuido.data.scenes.filmed_scene import VisualScene
+from neuido.errors import UserError
+from neuido.models.inference import outputs as results
+from neuido.models.inference.pipeline import Laws, Prepared, folder_of, infer, prepare, roll, roll_surely
+from neuido.models.inference.transfer import read_conditions, run_condition
+from neuido.models.operator.branch import implausibility, open_branch, small_strain_modulus
+from neuido.models.scoring import motion_scores as scores
+from neuido.models.stages.image_module import (
+    FIGURES,
+    FilmedModule,
+    check_options,
+    frames_at,
+    image_losses,
+    plainly,
+    some_views,
+    write_by_frame,
+    write_prediction,
+)
+from neuido.models.stages.training import publish, run_length
+
+
+class AlignModule(FilmedModule):
+    """Stage II, its scores, and zero-shot prediction. Trunks, heads and VAE are frozen; scenes take turns, one step each.
+
+    The loss of a scene is the squared error of the images over all training views, divided by what a still image of the first frame would
+    score: one says that nothing of the motion is explained, whatever the size of the body. (AdamW does not see a scene's constant
+    factor, but the clipping of gradients does.) The paper's Stage II is `silhouette_weight: 0`, `curriculum: [1.0]`, `init_from: null`.
+
+    The data module is a `VisualDataModule`.
+
+    Args:
+        operator: File of the operator, or `pretrained`.
+        init_from: Encoder to start from (of the warm-up, say, or `pretrained`); none: a new projector, near Stage I's mean latent.
+        vae: Of a new encoder: a file, `pretrained`, or `cogvideox:` and a source.
+        flow_size, flow_encoding, speed_scale, width, heads, conditions, dropout: Of a new encoder (`DynamicsEncoder`).
+        lr: AdamW with a cosine to zero over the run (paper: AdamW, cosine; it gives no rate).
+        weight_decay: Of the projector.
+        views_per_step: Training views in a step, drawn anew for each; 0: all.
+        encoder_views: Training views that the encoder sees; 0: all.
+        curriculum: Shares of the frames that are rolled out, one after the other, for equal parts of `curriculum_share` of the run; all
+            after it. Short rollouts first: while the law is far off, the gradient of a long one through several contacts points anywhere.
+        curriculum_share: Share of the run.
+        silhouette_weight: Of the squared error of the silhouettes, normalised as the images'; it pulls where colours mislead.
+        prior_weight: Pulls z to where training began, per squared unit: the mean over z's components. 0: not at all.
+        plausibility_weight: Keeps z where elastic laws can run (`branch.implausibility`); paper: 0.
+        segment: Keep the state of a rollout every so many frames only (`Simulator.rollout`); 0: of all. Saves memory.
+        cache: Folder in which optical flow is kept.
+        save_to: File to write the encoder to at the end of a fit.
+        out: Folder for the results of test and predict.
+        lpips_backbone: Local file of VGG16's or AlexNet's weights; none: LPIPS is absent.
+        lpips_net: `vgg` or `alex`.
+        baselines: In a test, random latents to score each unseen scene with, beside the mean latent.
+        condition_files: In a prediction, files of `models.conditions` to run with the laws that were found.
+    """
+
+    def __init__(
+        self,
+        operator: str = "pretrained",
+        init_from: str | None = None,
+        vae: str = "pretrained",
+        flow_size: int = 64,
+        flow_encoding: Literal["velocity", "wheel"] = "velocity",
+        speed_scale: float = 2.0,
+        width: int = 96,
+        heads: int = 4,
+        conditions: bool = True,
+        dropout: float = 0.0,
+        lr: float = 1e-3,
+        weight_decay: float = 0.0,
+        views_per_step: int = 0,
+        encoder_views: int = 0,
+        curriculum: list[float] = [0.25, 0.5],  # noqa: B006 (read only)
+        curriculum_share: float = 0.4,
+        silhouette_weight: float = 0.1,
+        prior_weight: float = 0.0,
+        plausibility_weight: float = 1.0,
+        segment: int = 0,
+        cache: str | None = None,
+        save_to: str | None = None,
+        out: str = "runs/stage2/results",
+        lpips_backbone: str | None = None,
+        lpips_net: str = "vgg",
+        baselines: int = 8,
+        condition_files: list[str] | None = None,
+    ):
+        super().__init__()
+        if not lr > 0:
+            raise UserError(f"model.lr = {lr}: it must be positive")
+        counts = {"views_per_step": views_per_step, "encoder_views": encoder_views, "segment": segment, "baselines": baselines}
+        weights = {"silhouette_weight": silhouette_weight, "prior_weight": prior_weight, "plausibility_weight": plausibility_weight}
+        check_options(counts, weights, {"curriculum_share": curriculum_share}, curriculum)
+        self.save_hyperparameters()
+        flow = {"flow_size": flow_size, "flow_encoding": flow_encoding, "speed_scale": speed_scale}
+        sizes = {"width": width, "heads": heads, "conditions": conditions, "dropout": dropout}
+        self.operator, self.encoder = open_branch(operator, init_from, vae, **flow, **sizes)  # type: ignore[arg-type]
+        self._prepared: dict[str, Prepared] = {}
+        self._start: dict[str, Tensor] = {}
+        self._rows: list[dict[str, Any]] = []
+        self._predicted: list[tuple[Prepared, Laws]] = []
+        self._total = 1
+
+    # What there is of a scene.
+
+    def prepared(self, scene: VisualScene) -> Prepared:
+        """The scene, prepared when it is first seen."""
+        if scene.name not in self._prepared:
+            options = {"encoder_views": self.hparams.encoder_views, "cache": self.hparams.cache}
+            self._prepared[scene.name] = prepare(scene, self.encoder, device=self.device, **options)
+        return self._prepared[scene.name]
+
+    # Fitting.
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        self._total = run_length(self.trainer)
+        parameters = self.encoder.projector.parameters()
+        optimizer = torch.optim.AdamW(parameters, lr=self.hparams.lr, weight_decay=self.hparams.weight_decay)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self._total)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def frames_now(self, prepared: Prepared) -> int:
+        """Frames of a rollout at this point of the run."""
+        done = self.global_step / max(1, self._total)
+        return frames_at(done, prepared.frames, self.hparams.curriculum, self.hparams.curriculum_share)
+
+    def training_step(self, scene: VisualScene, batch_idx: int) -> Tensor:
+        prepared = self.prepared(scene)
+        frames = self.frames_now(prepared)
+        z = self.encoder(prepared.volume, prepared.conditions)
+        start = self._start.setdefault(scene.name, z.detach().clone())
+        try:
+            motion = roll(prepared, self.operator, z, frames, segment=self.hparams.segment)
+        except UserError as error:  # a law that cannot run has no image: back towards laws that can
+            print(f"{scene.name}: {error}", file=sys.stderr)
+            self._log({"train/failed": 1.0})
+            return (z - self._haven(z)).square().mean()
+        views = some_views(prepared.training, self.hparams.views_per_step, self.global_step)
+        loss, silhouette = image_losses(prepared, motion, views)
+        total = loss + self.hparams.silhouette_weight * silhouette + self.hparams.prior_weight * (z - start).square().mean()
+        if self.hparams.plausibility_weight:
+            implausible = implausibility(self.operator, z)
+            total = total + self.hparams.plausibility_weight * implausible
+            self._log({"train/implausible": implausible})
+        self._log({"train/loss": loss, f"train/{scene.name}": loss, "train/silhouette": silhouette, "train/frames": float(frames)})
+        return total
+
+    def _haven(self, z: Tensor) -> Tensor:
+        """The mean latent of Stage I, whose law runs."""
+        return self.operator.latents.mean(0).to(z) if len(self.operator.latents) else torch.zeros_like(z)
+
+    # Scores.
+
+    def score(self, scene: VisualScene, *, images: bool = True) -> tuple[dict[str, Any], list[dict[str, Any]], list[dict[str, Any]]]:
+        """Zero-shot scores of a scene: their means, and the rows by time step, of particles and of images."""
+        prepared = self.prepared(scene)
+        found = infer(self.encoder, self.operator, prepared)
+        summary: dict[str, Any] = {"scene": scene.name, "seconds": found.seconds}
+        summary["modulus"] = float(small_strain_modulus(self.operator, found.z[None])[0])
+        try:
+            with torch.no_grad():
+                motion, halvings = roll_surely(prepared, lambda scene: roll(scene, self.operator, found.z))
+            summary["halvings"] = halvings
+        except UserError as error:
+            return summary | {"failed": str(error)}, [], []
+        figures, particles, pictures = self.figures_of(prepared, motion, images=images)
+        return summary | figures, particles, pictures
+
+    @plainly
+    def validation_step(self, scene: VisualScene, batch_idx: int) -> None:
+        self._rows.append(self.score(scene)[0])
+
+    def on_validation_epoch_end(self) -> None:
+        rows = self._gather()
+        values = {f"val/{name}": value for name, value in scores.mean_of(rows, FIGURES).items()}
+        values["val/failed"] = float(sum("failed" in row for row in rows))
+        for row in rows:
+            values |= {f"val/{row['scene']}/{name}": row[name] for name in ("cd", "rmse", "psnr", "modulus") if name in row}
+        self.log_dict(values)
+
+    def _gather(self) -> list[dict[str, Any]]:
+        """The rows of all processes, one a scene, in order of name; empties them here."""
+        rows, self._rows = self._rows, []
+        if self.trainer.world_size > 1:
+            everyone: list[Any] = [None] * self.trainer.world_size
+            torch.distributed.all_gather_object(everyone, rows)
+            rows = [row for part in everyone for row in part]
+        return sorted({row["scene"]: row for row in rows}.values(), key=lambda row: row["scene"])
+
+    # Test: everything, with baselines for unseen scenes.
+
+    @plainly
+    def test_step(self, scene: VisualScene, batch_idx: int) -> None:
+        summary, particles, pictures = self.score(scene)
+        unseen = scene.name in getattr(self.trainer.datamodule, "unseen_names", [])
+        summary["unseen"] = int(unseen)
+        if unseen and self.hparams.baselines and scene.truth is not None:
+            summary |= self.score_baselines(self.prepared(scene))
+        write_by_frame(folder_of(self.hparams.out, scene.name), particles, pictures)
+        self._rows.append(summary)
+
+    def score_baselines(self, prepared: Prepared) -> dict[str, float]:
+        """CD of Stage I's mean latent, of random ones (`random_latents`), and of its own at random (medians over those that run)."""
+        generator = torch.Generator().manual_seed(0)
+        latents, count = self.operator.latents, self.hparams.baselines
+        drawn = self.operator.random_latents(count, generator)
+        picked = latents[torch.randperm(len(latents), generator=generator)[:count]]
+        out: dict[str, float] = {}
+        for name, candidates in (("mean", latents.mean(0)[None]), ("random", drawn), ("trained", picked)):
+            values = []
+            for z in candidates.to(self.device):
+                try:
+                    with torch.no_grad():
+                        motion, _ = roll_surely(prepared, lambda scene, z=z: roll(scene, self.operator, z))
+                except UserError:
+                    continue
+                values.append(float(scores.chamfer_by_frame(prepared, motion).mean()))
+            out[f"cd_{name}_failed"] = len(candidates) - len(values)
+            if values:
+                out[f"cd_{name}"] = sorted(values)[len(values) // 2]
+        return out
+
+    def on_test_epoch_end(self) -> None:
+        rows = self._gather()
+        parts = {"test": rows, "unseen": [row for row in rows if row.get("unseen")], "seen": [row for row in rows if not row.get("unseen")]}
+        for part, own in parts.items():
+            self.log_dict({f"{part}/{name}": value for name, value in scores.mean_of(own, (*FIGURES, "seconds")).items()})
+        self._write_table(rows)
+
+    @rank_zero_only
+    def _write_table(self, rows: list[dict[str, Any]]) -> None:
+        scores.write_rows(Path(self.hparams.out) / "scores.csv", rows)
+        self._say_absent()
+        for row in rows:
+            shown = [f"{name} {row[name]:.4g}" for name in (*FIGURES, "cd_mean", "cd_random", "cd_trained", "seconds") if name in row]
+            self.print(f"{row['scene']:16s} {'unseen ' if row.get('unseen') else ''}{', '.join(shown)}{row.get('failed', '')}")
+
+    # Prediction.
+
+    @plainly
+    def predict_step(self, scene: VisualScene, batch_idx: int) -> dict[str, Any]:
+        """Write law, particles, video and picture of a scene; the paths, and the time that inference took."""
+        prepared = self.prepared(scene)
+        found = infer(self.encoder, self.operator, prepared)
+        folder = folder_of(self.hparams.out, scene.name)
+        card = {"scene": scene.name, "views": len(prepared.volume), "frames": prepared.frames, "seconds": found.seconds}
+        results.save_law(folder / "law.safetensors", self.operator, found.z, card)
+        with torch.no_grad():
+            try:
+                motion, halvings = roll_surely(prepared, lambda scene: roll(scene, self.operator, found.z))
+            except UserError as error:
+                print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
+                return {"scene": scene.name, "folder": str(folder), "seconds": found.seconds, "failed": str(error)}
+            if halvings:
+                print(f"{scene.name}: the law runs with a step of dt / {2**halvings} only", file=sys.stderr)
+            write_prediction(folder, prepared, motion)
+        self.print(f"{scene.name}: law in {1e3 * found.seconds:.1f} ms; {folder}")
+        self._predicted.append((prepared, self.operator.laws(found.z)))
+        return {"scene": scene.name, "folder": str(folder), "seconds": found.seconds}
+
+    @plainly
+    def on_predict_epoch_end(self) -> None:
+        for path in self.hparams.condition_files or []:
+            condition = read_conditions(path)
+            folder = run_condition(condition, self._predicted, self.hparams.out)
+            self.print(f"condition {condition.name}: {folder}")
+        self._predicted = []
+
+    def on_train_end(self) -> None:
+        names = [scene.name for scene in self.trainer.datamodule.scenes]
+        publish(self, self.encoder.save, {"stage": "II", "steps": self.global_step, "scenes": names})

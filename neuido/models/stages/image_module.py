@@ -1,0 +1,131 @@
+"""What Stage II and few-shot adaptation share: losses of images, the curriculum of a rollout, scores, and what they write."""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from lightning.pytorch import LightningModule
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.models.inference import outputs as results
+from neuido.models.inference.pipeline import Prepared, draw
+from neuido.models.scoring import motion_scores as scores
+from neuido.models.scoring.lpips import LPIPS, Absent, open_lpips
+from neuido.types import ParticleState
+
+FIGURES = ("cd", "floor", "rmse", "psnr", "ssim", "lpips", "iou", "crop_psnr", "crop_ssim", "crop_lpips")
+STILL_IMAGE, STILL_MASK = 1e-6, 1e-5
+"""Floors of the mean squared change from the first frame, of a body at rest."""
+
+
+def plainly(method: Callable) -> Callable:
+    """Without gradients, but outside Lightning's inference mode: rollouts keep buffers, and training could not write to them afterwards."""
+
+    @functools.wraps(method)
+    def run(*arguments, **options):
+        with torch.inference_mode(False), torch.no_grad():
+            return method(*arguments, **options)
+
+    return run
+
+
+def check_options(counts: dict[str, int], weights: dict[str, float], shares: dict[str, float], curriculum: Sequence[float]) -> None:
+    """Refuse options that are negative, or shares that are none.
+
+    Raises:
+        UserError: It names the option.
+    """
+    for name, value in {**counts, **weights}.items():
+        if not value >= 0:
+            raise UserError(f"model.{name} = {value}: it must not be negative")
+    for name, value in shares.items():
+        if not 0 <= value <= 1:
+            raise UserError(f"model.{name} = {value}: it must be a share, from 0 to 1")
+    if not all(0 < share <= 1 for share in curriculum):
+        raise UserError(f"model.curriculum = {curriculum}: each must be a share, above 0 and up to 1")
+
+
+def frames_at(done: float, frames: int, curriculum: Sequence[float], curriculum_share: float) -> int:
+    """Frames of a rollout when the share `done` of a run is done: shares of `frames`, one after the other, and then all."""
+    if not curriculum or done >= curriculum_share:
+        return frames
+    share = curriculum[min(int(done / curriculum_share * len(curriculum)), len(curriculum) - 1)]
+    return min(frames, max(2, math.ceil(share * frames)))
+
+
+def some_views(views: list[int], count: int, step: int) -> list[int]:
+    """So many of the views (0: all), drawn anew in each step, by the step alone: a resumed run draws as the interrupted one would have."""
+    if not 0 < count < len(views):
+        return views
+    order = torch.randperm(len(views), generator=torch.Generator().manual_seed(step))
+    return [views[i] for i in order[:count].tolist()]
+
+
+def image_losses(prepared: Prepared, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:
+    """Squared errors of the images and of the silhouettes, over those of a still first frame."""
+    frames = len(motion.x)
+    images, alphas = draw(prepared, motion, views)
+    recorded, masks = prepared.recorded(views, frames), prepared.silhouettes(views, frames)
+    still = (recorded - recorded[:1]).square().mean(), (masks - masks[:1]).square().mean()
+    floors = (STILL_IMAGE, STILL_MASK)
+    return tuple(  # type: ignore[return-value]
+        (a - b).square().mean() / (s + floor) for a, b, s, floor in zip((images, alphas), (recorded, masks), still, floors)
+    )
+
+
+class FilmedModule(LightningModule):
+    """Scores and results of filmed scenes; its subclasses have the options `out`, `lpips_backbone` and `lpips_net`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._floors: dict[str, Tensor] = {}
+
+    def figures_of(
+        self, prepared: Prepared, motion: ParticleState, *, images: bool = True
+    ) -> tuple[dict[str, float], list[dict[str, Any]], list[dict[str, Any]]]:
+        """Scores of a motion: their means, and the rows by time step, of particles and of images on the views that were held out."""
+        particles = scores.score_motion(prepared, motion, self._floor(prepared))
+        pictures = scores.score_images(prepared, motion, prepared.scoring, self._lpips()) if images else []
+        return scores.mean_of(particles, FIGURES) | scores.mean_of(pictures, FIGURES), particles, pictures
+
+    def _floor(self, prepared: Prepared) -> Tensor | None:
+        """Measured once a scene: it depends on the truth alone."""
+        name = prepared.source.name
+        if prepared.source.truth is not None and name not in self._floors:
+            self._floors[name] = scores.floor_by_frame(prepared)
+        return self._floors.get(name)
+
+    def _lpips(self) -> LPIPS | Absent:
+        if not hasattr(self, "_lpips_module"):
+            opened = open_lpips(self.hparams.lpips_backbone, self.hparams.lpips_net, self.device)
+            object.__setattr__(self, "_lpips_module", opened)  # no part of the checkpoint
+        return cast(LPIPS | Absent, self._lpips_module)
+
+    def _log(self, values: dict[str, Tensor | float]) -> None:
+        if self._trainer is not None:
+            plain = {name: value.detach() if isinstance(value, Tensor) else value for name, value in values.items()}
+            self.log_dict(plain, prog_bar=False, batch_size=1)
+
+    def _say_absent(self) -> None:
+        absent = self._lpips()
+        if isinstance(absent, Absent):
+            self.print(f"LPIPS is absent: {absent.reason}")
+
+
+def write_by_frame(folder: Path, particles: list[dict[str, Any]], pictures: list[dict[str, Any]]) -> None:
+    """Write the rows of `FilmedModule.figures_of`."""
+    scores.write_rows(folder / "particles.csv", particles)
+    scores.write_rows(folder / "images.csv", pictures)
+
+
+def write_prediction(folder: Path, prepared: Prepared, motion: ParticleState) -> None:
+    """Write particles, and recorded frames beside predicted ones from one of the scoring views as a video and a picture."""
+    view = prepared.scoring[0]
+    images, recorded = draw(prepared, motion, [view])[0][:, 0], prepared.recorded([view])[:, 0]
+    results.write_plys(folder / "particles", motion)
+    results.write_video(folder / "prediction.mp4", torch.cat([recorded, images], 2))
+    results.contact_sheet(folder / "prediction.png", [recorded, images])

@@ -1,0 +1,375 @@
+"""Stage I: trunks, heads and one latent for each trajectory, learned from constitutive data (paper, "Dynamics Operator Pretraining")."""
+
+import sys
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch
+from lightning.pytorch import LightningModule
+from lightning.pytorch.utilities import rank_zero_only
+from torch import Tensor, nn
+from torchmetrics import MeanSquaredError, MetricCollection
+
+from neuido.errors import UserError
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.scoring.losses import relative_errors
+from neuido.models.scoring.metrics import MedianRelativeError
+from neuido.models.stages.training import figures_of, run_length
+from neuido.types import TrajectoryBatch
+
+RESIDUAL_FLOOR = 1e-5
+"""Least epsilon of a relative plastic error [-]: an elastic trajectory has no residual at all."""
+
+
+class Answers(NamedTuple):
+    """What an operator says about a batch of M trajectories with n samples each."""
+
+    stress: Tensor
+    """Predicted Kirchhoff stress [Pa], (M, n, 3, 3)."""
+    corrected: Tensor
+    """Predicted corrected deformation gradient [-], (M, n, 3, 3)."""
+    stress_error: Tensor
+    """Relative error of the stress, (M, n)."""
+    plastic_error: Tensor
+    """Relative error of the plastic residual F_hat - F_tr (or of F_hat), (M, n)."""
+
+
+def answer(
+    operator: IntrinsicDynamicsOperator,
+    z: Tensor,
+    batch: TrajectoryBatch,
+    stress_epsilon: Tensor,
+    residual_epsilon: Tensor,
+    plastic_target: str = "residual",
+) -> Answers:
+    """Evaluate the operator and its relative errors.
+
+    Args:
+        operator: The operator.
+        z: Latents (M, d).
+        batch: M n samples sorted by trajectory, n of each.
+        stress_epsilon: Floor of the stress norm for each trajectory [Pa], (M,).
+        residual_epsilon: Floor of the residual norm for each trajectory [-], (M,).
+        plastic_target: `residual` compares F_hat - F_tr; `full` compares F_hat (the paper, to the letter), whose norm is about
+            sqrt(3), so that the error is nearly absolute.
+    """
+    trial, corrected, stress = (t.view(len(z), -1, 3, 3) for t in batch[:3])
+    predicted, returned = operator.elastic(z, corrected), operator.plastic(z, trial)
+    stress_error = relative_errors(predicted, stress, stress_epsilon[:, None])
+    if plastic_target == "residual":
+        plastic_error = relative_errors(returned - trial, corrected - trial, residual_epsilon[:, None])
+    else:
+        plastic_error = relative_errors(returned, corrected)
+    return Answers(predicted, returned, stress_error, plastic_error)
+
+
+def fit_latents(
+    operator: IntrinsicDynamicsOperator,
+    batch: TrajectoryBatch,
+    candidates: Tensor,
+    stress_epsilon: Tensor,
+    residual_epsilon: Tensor,
+    *,
+    steps: int = 300,
+    lr: float = 0.1,
+    samples: int = 128,
+    progress: bool = False,
+) -> Tensor:
+    """Fit only the latents of materials that the operator has not seen; its weights stay as they are.
+
+    Each latent starts at the candidate with the least error and takes AdamW steps with a cosine schedule.
+
+    Args:
+        operator: The operator.
+        batch: Samples to fit, sorted by material, the same number of each of M.
+        candidates: Latents to start from, (K, d), such as those of the training trajectories.
+        stress_epsilon: As for `answer`, (M,).
+        residual_epsilon: As for `answer`, (M,).
+        steps: Number of steps.
+        lr: Learning rate at the start.
+        samples: Samples of each material in a step, taken in turn.
+        progress: Write the error to stderr ten times.
+
+    Returns:
+        Latents (M, d), without gradient.
+    """
+    count = len(stress_epsilon)
+    trial, corrected, stress = (t.view(count, -1, 3, 3) for t in batch[:3])
+    total = trial.shape[1]
+    generator = torch.Generator().manual_seed(0)
+    order = torch.randperm(total, generator=generator).to(trial.device)
+
+    def errors(z: Tensor, step: int) -> Tensor:
+        rows = order[(torch.arange(min(samples, total), device=order.device) + step * samples) % total]
+        part = TrajectoryBatch(*(t[:, rows].contiguous() for t in (trial, corrected, stress)), batch.trajectory)
+        answers = answer(operator, z, part, stress_epsilon, residual_epsilon)
+        return (answers.stress_error + answers.plastic_error).mean(1)
+
+    trainable = [p for p in operator.parameters() if p.requires_grad]
+    for parameter in trainable:
+        parameter.requires_grad_(False)
+    try:
+        with torch.no_grad():
+            scores = torch.stack([errors(z.expand(count, -1), 0) for z in candidates])
+        z = candidates.detach()[scores.argmin(0)].clone().requires_grad_(True)
+        optimizer = torch.optim.AdamW([z], lr=lr, weight_decay=0.0)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+        for step in range(steps):
+            optimizer.zero_grad()
+            error = errors(z, step)
+            error.sum().backward()
+            optimizer.step()
+            schedule.step()
+            if progress and (step + 1) % max(1, steps // 10) == 0:
+                print(f"held-out instances: latent step {step + 1}/{steps}, error {error.mean().item():.4f}", file=sys.stderr)
+    finally:
+        for parameter in trainable:
+            parameter.requires_grad_(True)
+    return z.detach()
+
+
+class ConstitutiveMetrics(nn.Module):
+    """Stress MSE [Pa^2], plastic MSE (both as in the paper's Table 3, mean over components), and median relative errors.
+
+    `stress_error` and `plastic_error` are medians over all samples, `plastic_error_yielding` over those that flow, and
+    `stress_error/<family>` and `plastic_error/<family>` over the samples of a family. Memory does not grow with the samples.
+
+    Args:
+        prefix: Prepended to the names, e.g. `val/`.
+        families: Family of each trajectory.
+    """
+
+    def __init__(self, prefix: str, families: Sequence[str]):
+        super().__init__()
+        self.prefix, self.families = prefix, list(families)
+        self.names = sorted(set(families))
+        response = MetricCollection({"mse": MeanSquaredError(), "error": MedianRelativeError()}, compute_groups=False)
+        self.stress = response.clone(prefix=f"{prefix}stress_")
+        self.plastic = response.clone(prefix=f"{prefix}plastic_")
+        errors = MetricCollection({"yielding": MedianRelativeError()}, compute_groups=False)
+        self.yielding = errors.clone(prefix=f"{prefix}plastic_error_")
+        by_family = MetricCollection({name: MedianRelativeError() for name in self.names}, compute_groups=False)
+        self.stress_by_family = by_family.clone(prefix=f"{prefix}stress_error/")
+        self.plastic_by_family = by_family.clone(prefix=f"{prefix}plastic_error/")
+
+    def update(self, answers: Answers, batch: TrajectoryBatch) -> None:
+        """Add a batch of all trajectories."""
+        trial, corrected, stress = (t.view_as(answers.stress) for t in batch[:3])
+        self.stress.update(preds=answers.stress.flatten(), target=stress.flatten(), errors=answers.stress_error)
+        self.plastic.update(preds=answers.corrected.flatten(), target=corrected.flatten(), errors=answers.plastic_error)
+        flows = (corrected - trial).flatten(-2).norm(dim=-1) > RESIDUAL_FLOOR
+        self.yielding.update(errors=answers.plastic_error[flows])
+        for name in self.names:
+            rows = [i for i, family in enumerate(self.families) if family == name]
+            self.stress_by_family[name].update(answers.stress_error[rows])
+            self.plastic_by_family[name].update(answers.plastic_error[rows])
+
+    def compute(self) -> dict[str, Tensor]:
+        return {k: v for m in self._all() for k, v in m.compute().items()}
+
+    def reset(self) -> None:
+        for collection in self._all():
+            collection.reset()
+
+    def _all(self) -> tuple[MetricCollection, ...]:
+        return self.stress, self.plastic, self.yielding, self.stress_by_family, self.plastic_by_family
+
+
+class PretrainModule(LightningModule):
+    """Stage I.
+
+    The data module gives balanced batches, and says of the trajectories their `names`, `families`, `stress_rms` and
+    `residual_rms`, and of the held-out instances the same with `instance_` before it (`neuido.data.trajectories.trajectory_module`).
+
+    Args:
+        trajectory_count: Number of training trajectories, M (linked to the data by the command line).
+        trunk: `objective` or `raw`.
+        latent_dim: d (paper: 128).
+        basis_dim: Number of basis functions D (the paper does not say).
+        hidden_dim: Width of the trunks (the paper does not say).
+        head_dim: Width of the heads (the paper does not say).
+        latent_std: Standard deviation of the latents at the start (paper: 1). What the laws do not feel of it stays in them for good; with
+            0.1 their families lie apart in the space of the latents itself (`neuido latents`).
+        lr: Learning rate of trunks and heads; AdamW with a cosine to zero over the run (paper).
+        latent_lr_factor: The latents learn with this many times `lr`.
+        latent_decay: Weight decay of the latents. Adam moves them at random wherever the laws do not feel them, and this draws that back.
+        latent_decay_to: What that draws them to: `zero`, or the mean of their `family`.
+        weight_decay: Of trunks and heads.
+        relative_epsilon: Floor of the relative loss, as a fraction of the trajectory's RMS (design: about 1 %).
+        plastic_target: `residual`: relative error of F_hat - F_tr; `full`: of F_hat, the paper to the letter.
+        instance_steps: Steps that fit the latents of the held-out instances at the end; 0 leaves that out.
+        instance_lr: Their learning rate.
+        instance_samples: Samples of each instance in such a step.
+        save_to: File to write the operator to at the end of a fit (safetensors); none: only Lightning's checkpoints.
+        init_from: File of `IntrinsicDynamicsOperator.save`, or `pretrained`, to start from; its sizes must be the same.
+        compile: Compile the trunks with torch.compile.
+    """
+
+    def __init__(
+        self,
+        trajectory_count: int,
+        trunk: Literal["raw", "objective"] = "objective",
+        latent_dim: int = 128,
+        basis_dim: int = 64,
+        hidden_dim: int = 64,
+        head_dim: int = 128,
+        latent_std: float = 1.0,
+        lr: float = 3e-3,
+        latent_lr_factor: float = 10.0,
+        latent_decay: float = 0.0,
+        latent_decay_to: Literal["zero", "family"] = "zero",
+        weight_decay: float = 1e-4,
+        relative_epsilon: float = 0.01,
+        plastic_target: Literal["residual", "full"] = "residual",
+        instance_steps: int = 300,
+        instance_lr: float = 0.1,
+        instance_samples: int = 128,
+        save_to: str | None = None,
+        init_from: str | None = None,
+        compile: bool = False,
+    ):
+        super().__init__()
+        for name, value in (
+            ("trajectory_count", trajectory_count),
+            ("latent_std", latent_std),
+            ("lr", lr),
+            ("relative_epsilon", relative_epsilon),
+        ):
+            if value <= 0:
+                raise UserError(f"model.{name} = {value}: it must be positive")
+        if latent_decay < 0:
+            raise UserError(f"model.latent_decay = {latent_decay}: it must not be negative")
+        if latent_decay_to not in ("zero", "family"):
+            raise UserError(f"model.latent_decay_to = {latent_decay_to!r}: choose zero or family")
+        if plastic_target not in ("residual", "full"):
+            raise UserError(f"model.plastic_target = {plastic_target!r}: choose residual or full")
+        self.save_hyperparameters()
+        sizes = {"trunk": trunk, "latent_dim": latent_dim, "basis_dim": basis_dim, "hidden_dim": hidden_dim, "head_dim": head_dim}
+        self.operator = IntrinsicDynamicsOperator(**sizes)  # type: ignore[arg-type]
+        self.latents = nn.Parameter(latent_std * torch.randn(trajectory_count, latent_dim))
+        if init_from is not None:
+            self._start_from(init_from)
+        if compile:
+            for each in (self.operator.elastic_trunk, self.operator.plastic_trunk):
+                each.hidden = torch.compile(each.hidden)  # type: ignore[method-assign]
+        self.register_buffer("stress_epsilon", torch.ones(trajectory_count))
+        self.register_buffer("residual_epsilon", torch.full((trajectory_count,), RESIDUAL_FLOOR))
+        self.register_buffer("family_mean", torch.eye(trajectory_count), persistent=False)
+        self.metrics: ConstitutiveMetrics | None = None
+        self.families: list[str] = []
+
+    def _start_from(self, init_from: str) -> None:
+        loaded = IntrinsicDynamicsOperator.load(init_from)
+        if loaded.config != self.operator.config:
+            raise UserError(f"model.init_from = {init_from} has {loaded.config}; this model has {self.operator.config}")
+        self.operator.load_state_dict(loaded.state_dict())
+        if len(loaded.latents) == len(self.latents):
+            self.latents.data.copy_(loaded.latents)
+
+    # Fitting.
+
+    def setup(self, stage: str) -> None:
+        data = self.trainer.datamodule
+        count = self.hparams.trajectory_count
+        if data.trajectory_count != count:
+            raise UserError(f"model.trajectory_count = {count}, and the data have {data.trajectory_count} trajectories")
+        self.stress_epsilon.copy_(self.hparams.relative_epsilon * data.stress_rms)
+        self.residual_epsilon.copy_(self._residual_epsilon(data.residual_rms))
+        alike = torch.tensor([[a == b for b in data.families] for a in data.families], dtype=torch.float32, device=self.device)
+        self.family_mean = alike / alike.sum(1, keepdim=True)
+        self.metrics = ConstitutiveMetrics("test/" if stage == "test" else "val/", data.families)
+
+    def _residual_epsilon(self, rms: Tensor) -> Tensor:
+        return self.hparams.relative_epsilon * rms + RESIDUAL_FLOOR
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        decay = self.hparams.latent_decay if self.hparams.latent_decay_to == "zero" else 0.0
+        groups = [
+            {"params": list(self.operator.parameters()), "weight_decay": self.hparams.weight_decay},
+            {"params": [self.latents], "lr": self.hparams.lr * self.hparams.latent_lr_factor, "weight_decay": decay},
+        ]
+        optimizer = torch.optim.AdamW(groups, lr=self.hparams.lr, fused=self.latents.is_cuda)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, run_length(self.trainer))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
+        super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        if self.hparams.latent_decay_to == "family":
+            rate = optimizer.param_groups[-1]["lr"] * self.hparams.latent_decay  # decoupled, as AdamW's
+            with torch.no_grad():
+                self.latents.lerp_(self.family_mean @ self.latents, rate)
+
+    def training_step(self, batch: TrajectoryBatch, batch_idx: int) -> Tensor:
+        answers = self._answer(batch)
+        stress, plastic = answers.stress_error.mean(), answers.plastic_error.mean()
+        if self.global_step % self.trainer.log_every_n_steps == 0:
+            values = {"train/stress_loss": stress.detach(), "train/plastic_loss": plastic.detach()}
+            self.log_dict(values, prog_bar=True)
+        return stress + plastic
+
+    def _answer(self, batch: TrajectoryBatch) -> Answers:
+        target = self.hparams.plastic_target
+        return answer(self.operator, self.latents, batch, self.stress_epsilon, self.residual_epsilon, target)
+
+    def on_train_end(self) -> None:
+        """Score the held-out instances and write the operator; both go to the logger and the file's card."""
+        figures = figures_of(self) | {k: float(v) for k, v in self.score_instances().items()}
+        self._publish(figures)
+
+    @rank_zero_only
+    def _publish(self, figures: dict[str, float]) -> None:
+        instance = {k: v for k, v in figures.items() if k.startswith("instance/")}
+        for logger in self.trainer.loggers:
+            if instance:
+                logger.log_metrics(instance, step=self.global_step)
+                logger.save()
+        for name, value in figures.items():
+            self.print(f"{name:40s} {value:.4g}")
+        data = self.trainer.datamodule
+        self.operator.name_latents(self.latents.detach().cpu(), data.names, data.families)
+        if self.hparams.save_to is not None:
+            setup = getattr(data, "index", {}).get("setup", {})
+            self.operator.save(self.hparams.save_to, {"stage": "I", "steps": self.global_step, "data": setup, "figures": figures})
+
+    # Validation: held-out particles and steps. Test: also held-out instances.
+
+    def validation_step(self, batch: TrajectoryBatch, batch_idx: int) -> None:
+        self.metrics.update(self._answer(batch), batch)
+
+    def on_validation_epoch_end(self) -> None:
+        self.log_dict(self.metrics.compute())
+        self.metrics.reset()
+
+    def test_step(self, batch: TrajectoryBatch, batch_idx: int) -> None:
+        self.metrics.update(self._answer(batch), batch)
+
+    def on_test_epoch_end(self) -> None:
+        self.log_dict(self.metrics.compute())
+        self.metrics.reset()
+        self.log_dict(self.score_instances())
+
+    def score_instances(self) -> dict[str, Tensor]:
+        """Fit a latent to each held-out instance with all weights frozen, and score it on that instance's held-out samples."""
+        data = self.trainer.datamodule
+        if self.hparams.instance_steps == 0 or not data.instance_names:
+            return {}
+        with torch.inference_mode(False), torch.enable_grad():
+            to_fit, to_score = (TrajectoryBatch(*(t.to(self.device) for t in part)) for part in data.instance_batches())
+            epsilons = (
+                (self.hparams.relative_epsilon * data.instance_stress_rms).to(self.device),
+                self._residual_epsilon(data.instance_residual_rms).to(self.device),
+            )
+            z = fit_latents(
+                self.operator,
+                to_fit,
+                self.latents.detach(),
+                *epsilons,
+                steps=self.hparams.instance_steps,
+                lr=self.hparams.instance_lr,
+                samples=self.hparams.instance_samples,
+                progress=self.trainer.is_global_zero,
+            )
+            metrics = ConstitutiveMetrics("instance/", data.instance_families).to(self.device)
+            with torch.no_grad():
+                metrics.update(answer(self.operator, z, to_score, *epsilons), to_score)
+        return metrics.compute()

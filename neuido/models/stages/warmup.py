@@ -1,0 +1,213 @@
+"""The projector's warm-up: from the flow of simulated clips to laws that are known, before any scene's images (not in the paper).
+
+Stage II alone sees few scenes, and what it learns from their images holds for them. Here the projector sees many cheap clips of `neuido
+film`, and its latent is judged by the law that the frozen operator makes of it, on samples of the true law: as in Stage I, but with z
+from a video.
+"""
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import torch
+from lightning.pytorch import LightningModule
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from tqdm import tqdm
+
+from neuido.data.bodies.families import laws
+from neuido.data.scenes.clips import Clip, FilmDataModule
+from neuido.errors import UserError
+from neuido.models.operator.branch import open_branch, small_strain_modulus
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.stages.training import publish, run_length
+from neuido.models.video.flow import Velocities
+
+STRAIN_FLOOR = 3e-4
+"""Floor of a plastic correction's norm [-] in its relative error."""
+
+
+class Judgement(NamedTuple):
+    """How far laws are from true ones, one number each for B materials."""
+
+    stress: Tensor
+    """|tau^ - tau| / (|tau^| + |tau| + 1 %), mean over samples: 0 to 1, the same for a stress twice as large as for half of it."""
+    plastic: Tensor
+    """The same of the correction F_hat - F_tr."""
+    size: Tensor
+    """|log| of the ratio of the stresses' root mean squares, which does not saturate."""
+
+    def total(self, size_weight: float) -> Tensor:
+        """What is minimised, (B,)."""
+        return self.stress + self.plastic + size_weight * self.size
+
+
+def judge(operator: IntrinsicDynamicsOperator, z: Tensor, trial: Tensor, corrected: Tensor, stress: Tensor) -> Judgement:
+    """Compare the laws of z (B, d) with samples of true ones: trial, corrected (B, n, 3, 3) and stress [Pa] (B, n, 3, 3)."""
+    predicted, returned = operator.elastic(z, corrected), operator.plastic(z, trial)
+    norm = stress.flatten(2).norm(dim=2)
+    rms = norm.square().mean(1).sqrt()
+    floor = 0.01 * rms[:, None] + 1e-3
+    other = predicted.flatten(2).norm(dim=2)
+    stress_error = (predicted - stress).flatten(2).norm(dim=2) / (norm + other + floor)
+    a, b = (returned - trial).flatten(2), (corrected - trial).flatten(2)
+    plastic_error = (a - b).norm(dim=2) / (a.norm(dim=2) + b.norm(dim=2) + STRAIN_FLOOR)
+    size = ((other.square().mean(1) + 1e-6).sqrt() / (rms + 1e-3)).log().abs()
+    return Judgement(stress_error.mean(1), plastic_error.mean(1), size)
+
+
+class WarmupModule(LightningModule):
+    """Flow of clips -> z -> law, against the law that made the clip; operator and VAE are frozen.
+
+    The data module is a `FilmDataModule` with `frames: 0`.
+
+    Args:
+        operator: File of the operator, or `pretrained`.
+        init_from: Encoder to go on from; none: a new one, near the mean latent of Stage I.
+        vae: Its VAE: a file, `pretrained`, or `cogvideox:` and a source.
+        flow_size, flow_encoding, speed_scale, width, heads, conditions, dropout: Of a new encoder (`DynamicsEncoder`).
+        lr: AdamW with a cosine to zero over the run.
+        weight_decay: Of the projector.
+        size_weight: Of `Judgement.size` in the loss.
+        mirror: Show mirrored clips too.
+        noise: Standard deviation of noise on the flow latents, in units of theirs, in training.
+        samples: Samples of a clip's law in a step.
+        cache: Folder in which the clips' flow latents are kept; none: nowhere.
+        save_to: File to write the encoder to at the end of a fit.
+    """
+
+    def __init__(
+        self,
+        operator: str = "pretrained",
+        init_from: str | None = None,
+        vae: str = "pretrained",
+        flow_size: int = 64,
+        flow_encoding: Literal["velocity", "wheel"] = "velocity",
+        speed_scale: float = 2.0,
+        width: int = 96,
+        heads: int = 4,
+        conditions: bool = True,
+        dropout: float = 0.1,
+        lr: float = 1e-3,
+        weight_decay: float = 0.01,
+        size_weight: float = 0.3,
+        mirror: bool = True,
+        noise: float = 0.05,
+        samples: int = 64,
+        cache: str | None = None,
+        save_to: str | None = None,
+    ):
+        super().__init__()
+        if lr <= 0 or samples < 1 or size_weight < 0 or noise < 0:
+            raise UserError(f"model.lr = {lr} must be positive, samples = {samples} at least 1, size_weight and noise not negative")
+        self.save_hyperparameters()
+        flow = {"flow_size": flow_size, "flow_encoding": flow_encoding, "speed_scale": speed_scale}
+        sizes = {"width": width, "heads": heads, "conditions": conditions, "dropout": dropout}
+        self.operator, self.encoder = open_branch(operator, init_from, vae, **flow, **sizes)  # type: ignore[arg-type]
+        self._clips: dict[str, Tensor] = {}
+        self._rows: list[tuple[Judgement, Tensor, Tensor, Tensor]] = []
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        parameters = self.encoder.projector.parameters()
+        optimizer = torch.optim.AdamW(parameters, lr=self.hparams.lr, weight_decay=self.hparams.weight_decay)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, run_length(self.trainer))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_fit_start(self) -> None:
+        self._load()
+
+    def on_validation_start(self) -> None:
+        self._load()
+
+    def _load(self) -> None:
+        """Embed all clips once, since the VAE is frozen; `cache` keeps the results under a key of VAE, flow image and clips."""
+        if self._clips:
+            return
+        data: FilmDataModule = self.trainer.datamodule
+        parts: dict[str, list[Tensor]] = {
+            name: [] for name in ("volume", "conditions", "trial", "corrected", "stress", "modulus", "elastic")
+        }
+        cache = None if self.hparams.cache is None else Path(self.hparams.cache) / f"clips-{self._key(data)}"
+        shown = tqdm(range(len(data.clips)), unit="clip", desc="flow latents", disable=not self.trainer.is_global_zero, leave=False)
+        for number in shown:
+            clip = data.read(number)
+            volume, conditions = self._embed(clip, None if cache is None else cache / f"{data.clips[number]['name']}.safetensors")
+            parts["volume"].append(volume)
+            parts["conditions"].append(conditions)
+            for name in ("trial", "corrected", "stress"):
+                parts[name].append(getattr(clip, name))
+            entry = data.clips[number]
+            parts["elastic"].append(torch.tensor(entry["family"] == "elastic"))
+            parts["modulus"].append(laws(entry["family"], [entry["parameters"]])[0].modulus().float()[0])
+        self._clips = {name: torch.stack(rows).to(self.device) for name, rows in parts.items()}
+
+    def _key(self, data: FilmDataModule) -> str:
+        key = hashlib.sha256(json.dumps([self.encoder.flow, data.index, self.hparams.mirror], sort_keys=True).encode())
+        for tensor in self.encoder.vae.state_dict().values():
+            key.update(tensor.cpu().contiguous().numpy().tobytes())
+        return key.hexdigest()[:24]
+
+    def _embed(self, clip: Clip, kept: Path | None) -> tuple[Tensor, Tensor]:
+        """Flow latents (1 or 2 with the mirrored, V, channels, T', h, w) and conditions (V, 2)."""
+        if kept is not None and kept.is_file():
+            found = load_file(kept)
+            return found["volume"], found["conditions"]
+        seen = [clip.flow.float()]
+        if self.hparams.mirror:
+            seen.append(seen[0].flip(3) * seen[0].new_tensor([-1.0, 1.0]))
+        pairs = [self.encoder.embed(Velocities(flow, clip.cell, clip.frame_interval)) for flow in seen]
+        volume, conditions = torch.stack([volume for volume, _ in pairs]).cpu(), pairs[0][1].cpu()
+        if kept is not None:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            hidden = kept.with_name(f".{kept.name}.{os.getpid()}.tmp")
+            save_file({"volume": volume, "conditions": conditions}, hidden)
+            os.replace(hidden, kept)
+        return volume, conditions
+
+    def training_step(self, numbers: Tensor, batch_idx: int) -> Tensor:
+        clips, count = self._clips, len(numbers)
+        _, sides, views = clips["volume"].shape[:3]
+        side, view = (torch.randint(n, (count,), device=self.device) for n in (sides, views))
+        volume = clips["volume"][numbers, side, view]
+        volume = volume + self.hparams.noise * torch.randn_like(volume)
+        z = self.encoder.projector(volume, clips["conditions"][numbers, view])
+        rows = torch.randint(clips["trial"].shape[1], (self.hparams.samples,), device=self.device)
+        judged = judge(self.operator, z, *(clips[name][numbers][:, rows] for name in ("trial", "corrected", "stress")))
+        values = {"train/stress": judged.stress, "train/plastic": judged.plastic, "train/size": judged.size}
+        self.log_dict({name: value.detach().mean() for name, value in values.items()}, prog_bar=True)
+        return judged.total(self.hparams.size_weight).mean()
+
+    def validation_step(self, numbers: Tensor, batch_idx: int) -> None:
+        """All views of a clip give one z, as in Stage II."""
+        clips = self._clips
+        volume, conditions = clips["volume"][numbers, 0], clips["conditions"][numbers]
+        views = volume.shape[1]
+        z = self.encoder.projector(volume.flatten(0, 1), conditions.flatten(0, 1)).unflatten(0, (-1, views)).mean(1)
+        judged = judge(self.operator, z, *(clips[name][numbers] for name in ("trial", "corrected", "stress")))
+        self._rows.append((judged, small_strain_modulus(self.operator, z), clips["modulus"][numbers], clips["elastic"][numbers]))
+
+    def on_validation_epoch_end(self) -> None:
+        columns = list(zip(*self._rows))
+        judged = Judgement(*(torch.cat(column) for column in zip(*columns[0])))
+        found, true, elastic = (torch.cat(column) for column in columns[1:])
+        self._rows.clear()
+        error = (found.clamp(min=1.0) / true).log().abs()
+        values = {"val/stress": judged.stress.mean(), "val/plastic": judged.plastic.mean(), "val/size": judged.size.mean()}
+        values |= {"val/modulus_error": error.median().exp() - 1, "val/modulus_order": _rank_correlation(found, true)}
+        if bool(elastic.any()):  # what flows does not show its stiffness
+            own = _rank_correlation(found[elastic], true[elastic])
+            values |= {"val/modulus_error_elastic": error[elastic].median().exp() - 1, "val/modulus_order_elastic": own}
+        self.log_dict(values, prog_bar=True, sync_dist=True)
+
+    def on_train_end(self) -> None:
+        publish(self, self.encoder.save, {"stage": "warm-up", "steps": self.global_step})
+
+
+def _rank_correlation(a: Tensor, b: Tensor) -> Tensor:
+    """Spearman's, of two vectors; NaN of fewer than three."""
+    if len(a) < 3:
+        return a.new_tensor(float("nan"))
+    ranks = torch.stack([v.argsort().argsort().to(torch.float32) for v in (a, b)])
+    return torch.corrcoef(ranks)[0, 1]

@@ -1,0 +1,237 @@
+"""The dynamics encoder: flow latents of a video -> latent z of a material (paper, "Model Architecture Details", branch network).
+
+The frozen 3D VAE (`video_vae.py`) turns flow videos into a volume; a 3D convolution, an MLP, attention pooling and a last MLP, together
+the projector, turn that into z. The projector alone is trained. Several views are encoded each, and their z averaged.
+"""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from neuido.errors import UserError
+from neuido.models.video.flow import ENCODINGS, Velocities, encode_flow, measure
+from neuido.models.video.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, load_state, read_weights, write_weights
+from neuido.models.video.video_vae import CogVideoXVAE, open_vae
+from neuido.types import MultiViewBatch
+
+PRETRAINED = {
+    "pretrained": Path(__file__).parents[1] / "weights" / "stage2.safetensors",
+    "pretrained-small": Path(__file__).parents[1] / "weights" / "stage2_small.safetensors",
+}
+CLOCK, CELL = 5e-3, 1e-2
+"""The frame interval [s] and the side of a cell [m] at which the projector's two conditions are zero."""
+
+
+class AttentionPool(nn.Module):
+    """Tokens (B, N, width) -> (B, width): learned queries, one for each head's share, attend to all tokens."""
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Parameter(torch.randn(1, 1, width) / width**0.5)
+        self.key, self.value, self.out = nn.Linear(width, width), nn.Linear(width, width), nn.Linear(width, width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (self.query, self.key(tokens), self.value(tokens)))
+        pooled = functional.scaled_dot_product_attention(q.expand(len(tokens), -1, -1, -1), k, v)
+        return self.out(pooled.transpose(1, 2).flatten(1))
+
+
+class Projector(nn.Module):
+    """Flow latents -> z; the trained part of the branch.
+
+    Args:
+        channels: Channels of the flow latents.
+        latent_dim: d of z.
+        width: Of the convolution, the tokens and the MLPs (the paper does not say).
+        heads: Of the attention pooling.
+        conditions: Whether frame interval and size of a cell are told too. A video alone does not hold the units of time and length, so
+            that without them one stiffness looks like another; the paper leaves them out.
+        dropout: Of tokens, in training.
+
+    Raises:
+        UserError: A size below one, or a width that heads or 6 do not divide.
+    """
+
+    def __init__(
+        self,
+        channels: int = CHANNELS,
+        latent_dim: int = 128,
+        width: int = 96,
+        heads: int = 4,
+        conditions: bool = True,
+        dropout: float = 0.0,
+    ):
+        super().__init__()
+        if min(channels, latent_dim, width, heads) < 1 or width % heads or width % 6:
+            raise UserError(f"width = {width} must be a multiple of heads = {heads} and of 6; channels and latent_dim at least 1")
+        if not 0 <= dropout < 1:
+            raise UserError(f"dropout = {dropout} must lie in [0, 1)")
+        self.config = {"channels": channels, "latent_dim": latent_dim, "width": width, "heads": heads, "conditions": conditions}
+        self.conv = nn.Conv3d(channels, width, 3, padding=1)
+        self.tokens = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, width))
+        self.clock = nn.Linear(2, width) if conditions else None
+        self.dropout = nn.Dropout(dropout)
+        self.pool = AttentionPool(width, heads)
+        self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, latent_dim))
+
+    def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
+        """z of each view (V, d), of flow latents (V, channels, T', h, w) and conditions (V, 2) of `conditions_of`."""
+        x = self.conv(volume)
+        x = (x + _positions(x)).flatten(2).transpose(1, 2)
+        x = x + self.tokens(x)
+        if self.clock is not None:
+            x = x + self.clock(conditions)[:, None]
+        return self.head(self.pool(self.dropout(x)))
+
+    @torch.no_grad()
+    def start_at(self, latents: Tensor, spread: float = 0.1) -> None:
+        """Begin near the mean of latents (M, d), with outputs that vary in the directions in which they do.
+
+        Args:
+            latents: Those of Stage I.
+            spread: Standard deviation of z at the start, in units of theirs.
+        """
+        last = self.head[-1]
+        centred = latents - latents.mean(0)
+        mix = torch.randn(len(latents), last.in_features, dtype=latents.dtype) / last.in_features**0.5
+        last.weight.copy_(spread * centred.T @ mix / max(1, len(latents) - 1) ** 0.5)
+        last.bias.copy_(latents.mean(0))
+
+
+def _positions(x: Tensor) -> Tensor:
+    """Sines and cosines of place and time, (1, C, T, H, W): place in parts of the image, time in latent frames."""
+    _, channels, T, H, W = x.shape
+    axes = (torch.arange(T) / 8.0, (torch.arange(H) + 0.5) / H, (torch.arange(W) + 0.5) / W)
+    share = channels // 6
+    frequency = math.pi * 2.0 ** torch.linspace(0, 2, share)
+    parts = []
+    for a, axis in enumerate(axes):
+        angle = frequency[:, None] * axis
+        wave = torch.cat([angle.sin(), angle.cos()])
+        shape = [1, 2 * share, 1, 1, 1]
+        shape[2 + a] = len(axis)
+        parts.append(wave.view(shape).expand(1, 2 * share, T, H, W))
+    return torch.cat(parts, 1).to(x)
+
+
+def conditions_of(frame_interval: Tensor | float, cell: Tensor) -> Tensor:
+    """What the projector is told beside the video, (V, 2): logarithms of the frame interval and of a cell's side over the constants here.
+
+    Args:
+        frame_interval: [s], a number or (V,).
+        cell: Side of a cell of the flow at the body [m], (V,).
+    """
+    interval = torch.as_tensor(frame_interval).to(cell).expand(len(cell))
+    return torch.stack([(interval / CLOCK).log(), (cell / CELL).log()], -1)
+
+
+class DynamicsEncoder(nn.Module):
+    """A video of a body -> the latent z of its material.
+
+    Args:
+        vae: A file of `FlowVAE.save`, `cogvideox:` and a folder or repository (`video_vae.open_vae`), or a VAE itself; it is frozen.
+        latent_dim: d of z.
+        flow_size: Side of the flow videos [px], a multiple of 8.
+        flow_encoding: `velocity` (magnitude kept) or `wheel` (the paper's, normalised frame by frame).
+        speed_scale: The speed that counts as one [m/s].
+        flow_preset: Of DIS: `ultrafast`, `fast`, `medium`.
+        width, heads, conditions, dropout: Of the `Projector`.
+
+    Attributes:
+        card: What the weights file says about their making.
+    """
+
+    def __init__(
+        self,
+        vae: str | os.PathLike | FlowVAE | CogVideoXVAE,
+        latent_dim: int = 128,
+        flow_size: int = 64,
+        flow_encoding: Literal["velocity", "wheel"] = "velocity",
+        speed_scale: float = 2.0,
+        flow_preset: str = "medium",
+        width: int = 96,
+        heads: int = 4,
+        conditions: bool = True,
+        dropout: float = 0.0,
+    ):
+        super().__init__()
+        if flow_size < 16 or flow_size % 8:
+            raise UserError(f"flow_size = {flow_size} must be a multiple of 8 of at least 16")
+        if flow_encoding not in ENCODINGS:
+            raise UserError(f"flow_encoding = {flow_encoding!r}; one of {', '.join(ENCODINGS)}")
+        opened = vae if isinstance(vae, nn.Module) else open_vae(vae)
+        self.source = None if isinstance(opened, FlowVAE) else str(vae)
+        self.vae = opened.eval().requires_grad_(False)
+        self.flow = {"flow_size": flow_size, "flow_encoding": flow_encoding, "speed_scale": speed_scale, "flow_preset": flow_preset}
+        self.projector = Projector(opened.channels, latent_dim, width, heads, conditions, dropout)
+        self.card: dict[str, Any] = {}
+
+    def train(self, mode: bool = True) -> Self:
+        """As ever, but the VAE stays as it is."""
+        super().train(mode)
+        self.vae.eval()
+        return self
+
+    @torch.no_grad()
+    def embed(self, seen: Velocities) -> tuple[Tensor, Tensor]:
+        """What stays constant while the projector learns: flow latents (V, channels, T', S/8, S/8) and conditions (V, 2)."""
+        like = next(self.projector.parameters())
+        flow, cell = seen.flow.to(like.device, torch.float32), seen.cell.to(like.device)
+        options = {"encoding": self.flow["flow_encoding"], "speed_scale": self.flow["speed_scale"]}
+        volume = torch.cat([self.vae.encode(encode_flow(each[None], **options)) for each in flow])
+        return volume.to(like), conditions_of(seen.frame_interval, cell).to(like)
+
+    def watch(self, batch: MultiViewBatch, views: Sequence[int], centre: Tensor, *, cache: str | os.PathLike | None = None) -> Velocities:
+        """The velocities that some views of a scene show.
+
+        Args:
+            batch: The scene.
+            views: Which of its views.
+            centre: The middle of the body [m], (3,).
+            cache: Folder in which flows are kept.
+        """
+        views = list(views)
+        cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats[views], Ks=batch.cameras.Ks[views])
+        options = {"size": self.flow["flow_size"], "preset": self.flow["flow_preset"], "cache": cache}
+        return measure(batch.images[views], batch.masks[views], batch.times, cameras, centre, **options)
+
+    def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
+        """z (d,): the mean over the views of the projector's, of flow latents and conditions."""
+        return self.projector(volume, conditions).mean(0)
+
+    def save(self, path: str | os.PathLike, card: Mapping[str, Any] | None = None) -> None:
+        """Write projector and VAE (of CogVideoX: its name alone) to a safetensors file, all at once."""
+        tensors = {f"projector.{name}": t.detach().contiguous().cpu() for name, t in self.projector.state_dict().items()}
+        if isinstance(self.vae, FlowVAE):
+            tensors |= {f"vae.{name}": t.detach().contiguous().cpu() for name, t in self.vae.state_dict().items()}
+        config = {"flow": self.flow, "projector": self.projector.config, "source": self.source, "vae": getattr(self.vae, "config", None)}
+        if self.source is not None:
+            config["vae"] = None
+        write_weights(path, ENCODER_FORMAT, config, tensors, {"date": date.today().isoformat(), **(card or {})})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike = "pretrained") -> Self:
+        """Read what `save` wrote. `pretrained` comes with neuido; so does `pretrained-small`, for few, coarse frames on a CPU.
+
+        Raises:
+            UserError: No such file, or not one of this kind.
+        """
+        file = PRETRAINED.get(str(path)) or Path(path)
+        config, tensors, card = read_weights(file, (ENCODER_FORMAT,), "encoder")
+        vae = config["source"] or FlowVAE(**config["vae"])
+        sizes = {key: config["projector"][key] for key in ("latent_dim", "width", "heads", "conditions")}
+        encoder = cls(vae, **config["flow"], **sizes)
+        for part in ("projector", "vae"):
+            own = {name.removeprefix(f"{part}."): t for name, t in tensors.items() if name.startswith(f"{part}.")}
+            if own or part == "projector":
+                load_state(getattr(encoder, part), own, file)
+        encoder.card = card
+        return encoder

@@ -1,0 +1,269 @@
+"""From the parameters of the effects to the tables that the kernels and the torch twin read: products with the base law's moduli.
+
+A table has one row for each scene. What each column means is said once, here; `effect_kernels` and `constitutive` follow it.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws import classical_kernels as law_kernels
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, StackedElastic
+from neuido.types import Particles
+
+NO_FLOW, VON_MISES, DRUCKER_PRAGER = law_kernels.IDENTITY, law_kernels.VON_MISES, law_kernels.DRUCKER_PRAGER
+"""Kinds of plastic flow that an effect takes over from the base law."""
+
+BAND = (0.5, 200.0)
+"""Frequencies [Hz] over which `hysteresis` has its loss factor."""
+BRANCHES, MARGIN = 6, 1.8
+"""Its Maxwell branches, and how far (in ln of the time) their times reach beyond the band."""
+
+
+class Layout(NamedTuple):
+    """Columns of the history of a particle, (P, width): 6 for each branch, alpha, 6 of the backstress, e_max.
+
+    Symmetric matrices are stored as xx, yy, zz, xy, xz, yz.
+    """
+
+    branches: int = 0
+    """Maxwell branches."""
+    alpha: bool = False
+    """Whether the accumulated plastic strain is kept."""
+    backstress: bool = False
+    """Whether the backstress is kept."""
+    e_max: bool = False
+    """Whether the largest strain so far is kept."""
+
+    @property
+    def at_alpha(self) -> int:
+        """Column of alpha, -1 where absent."""
+        return 6 * self.branches if self.alpha else -1
+
+    @property
+    def at_backstress(self) -> int:
+        """First column of the backstress, -1 where absent."""
+        return 6 * self.branches + self.alpha if self.backstress else -1
+
+    @property
+    def at_e_max(self) -> int:
+        """Column of the largest strain, -1 where absent."""
+        return 6 * self.branches + self.alpha + 6 * self.backstress if self.e_max else -1
+
+    @property
+    def width(self) -> int:
+        return 6 * self.branches + self.alpha + 6 * self.backstress + self.e_max
+
+
+class Tables(NamedTuple):
+    """What the effects of the material need, S rows each; None where nothing needs it."""
+
+    layout: Layout
+    material: Tensor | None
+    """(S, 9): mu k of `strain_stiffening`, mu c of `second_invariant`, 2 mu r of `tension_compression`, `fibre` [Pa], its unit direction
+    x, y, z, the s of damage [-], and the k of `strain_stiffening`, one over the I1bar - 3 at which the body locks [-]."""
+    spectral: bool
+    """Whether the stress needs principal strains (`tension_compression`)."""
+    branches: Tensor | None
+    """(S, B, 2): 2 g mu [Pa] and time [s] of each Maxwell branch."""
+    flow: Tensor | None
+    """(S, 8): 2 mu [Pa], 1/yield stress [1/Pa] (0: none), H [Pa], s, H_k [Pa], eta [Pa s] of `rate_yield`, and for Drucker and Prager's
+    cone its slope in Hencky strain and the volumetric strain of its tip at full stiffness."""
+    kinds: tuple[int, ...]
+    """Kind of the flow of each scene."""
+    stiffening: Tensor
+    """What branches, fibres and the like add to the P-wave modulus at rest [Pa], (S,)."""
+
+
+def shear_modulus(law: ElasticLaw) -> Tensor:
+    """The law's shear modulus at F = I [Pa], (S,) of the law.
+
+    That of a classical law comes from its parameters. Any other law is asked: the mean of central differences of tau_ij in three pure
+    shears of 1e-4 (1e-2 in float32), differentiable in the law's tensors.
+    """
+    tensors = law.tensors()
+    if isinstance(law, (FixedCorotated, Sigma, NeoHookean, StackedElastic)):
+        return tensors[0][:, 0]
+    rows = law.modulus().shape[0]
+    like = tensors[0] if tensors else law.modulus()
+    h = 1e-4 if like.dtype == torch.float64 else 1e-2
+    F = torch.eye(3, dtype=like.dtype, device=like.device).repeat(rows, 6, 1, 1)
+    planes = ((0, 1), (0, 2), (1, 2))
+    for n, (i, j) in enumerate(planes):
+        for side, sign in enumerate((1.0, -1.0)):
+            F[:, 2 * n + side, i, j] = F[:, 2 * n + side, j, i] = sign * h
+    scene = torch.arange(rows, dtype=torch.int32, device=like.device).repeat_interleave(6)
+    tau = law(F.reshape(-1, 3, 3), Particles(scene, tuple(range(0, 6 * rows + 1, 6)))).reshape(rows, 3, 2, 3, 3)
+    jump = tau[:, :, 0] - tau[:, :, 1]
+    return torch.stack([jump[:, n, i, j] + jump[:, n, j, i] for n, (i, j) in enumerate(planes)]).sum(dim=0) / (24 * h)
+
+
+def hysteresis_spectrum(loss: Tensor) -> tuple[Tensor, Tensor]:
+    """Six Maxwell branches whose loss factor is nearly constant over `BAND`.
+
+    The relaxation spectrum of a material of constant loss factor eta is h(T) = (2 eta / pi) G'(1/T), with G' the storage modulus, which
+    must rise as the power (2/pi) atan(eta) of the frequency (Kramers and Kronig; Findley, Lai and Onaran, Creep and Relaxation of
+    Nonlinear Viscoelastic Materials, 1976). Equal weights, which leave that rise out, fall 16-37 % short at eta = 0.1.
+
+    Args:
+        loss: eta [-], (S,).
+
+    Returns:
+        Weights as shares of the relaxed shear modulus [-], (S, 6), and times [s], (6,).
+    """
+    low, high = (math.log(1 / (2 * math.pi * f)) for f in reversed(BAND))
+    at = torch.linspace(low - MARGIN, high + MARGIN, BRANCHES, dtype=loss.dtype, device=loss.device)
+    step = (high - low + 2 * MARGIN) / (BRANCHES - 1)
+    power = 2 / math.pi * torch.atan(loss)
+    rise = torch.exp(power[:, None] * (at[-1] + step / 2 - at))
+    return 2 / math.pi * step * loss[:, None] * rise, at.exp()
+
+
+def _kinds(plasticity: PlasticLaw | None, scene_count: int) -> tuple[int, ...] | None:
+    """The kind of each scene's base plasticity, or None for a law that is not a classical one."""
+    if plasticity is None or plasticity.identity:
+        return (NO_FLOW,) * scene_count
+    if not hasattr(plasticity, "scene_laws"):
+        return None
+    kinds = tuple(law.kind for law in plasticity.scene_laws())
+    return kinds * scene_count if len(kinds) == 1 else kinds
+
+
+def _flow(
+    effects: Effects,
+    elasticity: ElasticLaw,
+    plasticity: PlasticLaw | None,
+    count: int,
+    like: Tensor,
+    mu: Tensor,
+) -> tuple[Tensor | None, tuple[int, ...]]:
+    """The table of the flow and its kinds, or None where the base law does it all."""
+    base = _kinds(plasticity, count)
+    own = {name: getattr(effects, name) for name in ("hardening", "softening", "kinematic_hardening", "rate_yield")}
+    given = [name for name, value in own.items() if value is not None]
+    of_yield = effects.yield_inverse is not None
+    scaled = effects.stiffness is not None or effects.stiffness_change is not None
+    if base is None:
+        if of_yield or effects.cohesion is not None or given:
+            name = "yield_inverse" if of_yield else "cohesion" if effects.cohesion is not None else given[0]
+            raise UserError(f"{name} needs a classical plastic law or none, not {type(plasticity).__name__}")
+        return None, ()
+    if effects.cohesion is not None and any(kind != DRUCKER_PRAGER for kind in base):
+        raise UserError("cohesion needs a declared drucker_prager plasticity: it moves the tip of its cone")
+    if of_yield and any(kind != NO_FLOW for kind in base):
+        raise UserError("yield_inverse needs an elastic body; the declared plasticity yields already")
+    if given and any(kind == DRUCKER_PRAGER for kind in base):
+        raise UserError(f"{given[0]} needs a declared von_mises plasticity, or an elastic body")
+    flowing = [name for name in given if name != "softening"]
+    if flowing and not of_yield and all(kind == NO_FLOW for kind in base):
+        raise UserError(f"{flowing[0]} needs a yield stress: a declared von_mises plasticity, or yield_inverse")
+    declared = any(kind != NO_FLOW for kind in base)
+    if not (of_yield or effects.cohesion is not None or (declared and (given or (scaled and VON_MISES in base)))):
+        return None, ()
+    column = {name: effects.rows(name, count, like)[:, 0] for name in ("yield_inverse", *own, "cohesion")}
+    kinds = tuple(VON_MISES if of_yield and kind == NO_FLOW else kind for kind in base)
+    radius = like.new_zeros(count)
+    if plasticity is not None and declared:
+        radius = plasticity.tensors()[0].to(like)[:, 0].expand(count)
+    is_mises = torch.tensor([kind == VON_MISES for kind in base], device=like.device)
+    is_cone = torch.tensor([kind == DRUCKER_PRAGER for kind in base], device=like.device)
+    inverse = torch.where(is_mises, 1 / (2 * mu * torch.where(is_mises, radius, 1.0)), column["yield_inverse"])
+    slope = torch.where(is_cone, radius, 0.0)
+    # Mohr and Coulomb's tip, tr tau = 3 c cot phi, on the cone |dev tau| = -alpha (tr tau - 3 c cot phi)
+    bulk3 = 3 * elasticity.modulus().to(like).expand(count) - 4 * mu
+    a = torch.where(is_cone, radius, 0.1 * bulk3 / mu) * 2 * mu / bulk3 / math.sqrt(2 / 3)
+    sine = 3 * a / (2 + a)
+    tip = torch.where(is_cone, 3 * column["cohesion"] * torch.sqrt(1 - sine**2) / sine / bulk3, 0.0)
+    columns = [2 * mu, inverse, column["hardening"], column["softening"], column["kinematic_hardening"], column["rate_yield"], slope, tip]
+    return torch.stack(columns, dim=1), kinds
+
+
+def tables(
+    effects: Effects,
+    elasticity: ElasticLaw,
+    plasticity: PlasticLaw | None,
+    count: int,
+    like: Tensor,
+    *,
+    shear: Tensor | float | None = None,
+) -> Tables:
+    """The tables of the effects of the material, differentiable in the effects and in the parameters of the base laws.
+
+    Args:
+        effects: The effects.
+        elasticity: Base law.
+        plasticity: Base law, or None.
+        count: Scenes S.
+        like: Type and device.
+        shear: The base law's shear modulus [Pa], () or (S,); `shear_modulus(elasticity)` where absent.
+
+    Raises:
+        UserError: An effect that the base law does not admit (hardening without a yield stress, cohesion without Drucker and Prager's
+            cone), a parameter out of its range, or half of a pair.
+    """
+    if (effects.maxwell_ratio is None) != (effects.maxwell_time is None):
+        raise UserError("maxwell_ratio and maxwell_time come together; one of them is missing")
+    if (effects.fibre is None) != (effects.fibre_direction is None):
+        raise UserError("fibre and fibre_direction come together; one of them is missing")
+    if not effects.of_material:
+        return Tables(Layout(), None, False, None, None, (), like.new_zeros(count))
+    mu = torch.as_tensor(shear_modulus(elasticity) if shear is None else shear, dtype=like.dtype, device=like.device)
+    mu = mu.reshape(-1).expand(count)
+    branches = _branches(effects, count, like, mu)
+    flow, kinds = _flow(effects, elasticity, plasticity, count, like, mu)
+    damages = effects.softening is not None and (flow is None or bool((flow[:, 1] <= 0).any()))
+    material, stiff = _material(effects, count, like, mu, flow, damages)
+    if branches is not None:
+        stiff = stiff + 2 / 3 * branches[:, :, 0].sum(dim=1)
+    layout = Layout(
+        0 if branches is None else branches.shape[1],
+        flow is not None and (effects.hardening is not None or effects.softening is not None),
+        flow is not None and effects.kinematic_hardening is not None,
+        damages,
+    )
+    return Tables(layout, material, effects.tension_compression is not None, branches, flow, kinds, stiff.detach())
+
+
+def _branches(effects: Effects, count: int, like: Tensor, mu: Tensor) -> Tensor | None:
+    """`Tables.branches`."""
+    weights, times = [], []
+    if effects.maxwell_ratio is not None:
+        ratio, time = (effects.rows(name, count, like)[:, 0] for name in ("maxwell_ratio", "maxwell_time"))
+        if bool(((time <= 0) & (ratio != 0)).any()):
+            raise UserError(f"maxwell_time is {time.min().item():g} s; it must be positive")
+        time = torch.where(time > 0, time, 1.0)  # of a branch that is not there
+        weights.append(ratio[:, None])
+        times.append(time[:, None])
+    if effects.hysteresis is not None:
+        g, T = hysteresis_spectrum(effects.rows("hysteresis", count, like)[:, 0])
+        weights.append(g)
+        times.append(T.expand_as(g))
+    return torch.stack([2 * mu[:, None] * torch.cat(weights, 1), torch.cat(times, 1)], dim=-1) if weights else None
+
+
+def _material(effects: Effects, count: int, like: Tensor, mu: Tensor, flow: Tensor | None, damages: bool) -> tuple[Tensor | None, Tensor]:
+    """`Tables.material`, and what it adds to the P-wave modulus [Pa], (S,)."""
+    names = ("strain_stiffening", "second_invariant", "tension_compression", "fibre")
+    zero = like.new_zeros(count)
+    if not damages and all(getattr(effects, name) is None for name in names):
+        return None, zero
+    damage = zero
+    if effects.softening is not None:
+        damage = effects.rows("softening", count, like)[:, 0]
+        if flow is not None:
+            damage = torch.where(flow[:, 1] > 0, 0.0, damage)
+    direction = like.new_zeros(count, 3)
+    if effects.fibre_direction is not None:
+        direction = effects.rows("fibre_direction", count, like)
+        size = direction.norm(dim=1, keepdim=True)
+        if bool((size <= 0).any()):
+            raise UserError("fibre_direction is zero; give a vector of any length")
+        direction = direction / size
+    k, c, r, f = (effects.rows(name, count, like)[:, 0] for name in names)
+    material = torch.cat([torch.stack([mu * k, mu * c, 2 * mu * r, f], dim=1), direction, damage[:, None], k[:, None]], dim=1)
+    return material, 4 / 3 * mu * c + 2 * mu * r.clamp(min=0) + 2 * f

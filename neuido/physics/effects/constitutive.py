@@ -1,0 +1,244 @@
+"""A law with effects at material points, in plain torch: the slow twin of `effect_kernels`, differentiable by autograd.
+
+The order is that of a substep (paper, appendix "Material Point Method"): the stress of F and of the history, then, after the motion
+has given C and F_tr = (I + dt C) F, the corrected gradient and the new history.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuido.physics.effects import coefficients as effect_tables
+from neuido.physics.effects.coefficients import DRUCKER_PRAGER, VON_MISES
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.laws.classical_kernels import FLOOR, LOCKED
+from neuido.physics.linalg import decompositions as linalg
+from neuido.types import Particles
+
+
+class History(NamedTuple):
+    """What P particles remember, zero at the start. B branches."""
+
+    branches: Tensor
+    """Deviatoric strain of each Maxwell branch [-], (P, B, 3, 3)."""
+    alpha: Tensor
+    """Accumulated norm of the plastic strain [-], (P,)."""
+    backstress: Tensor
+    """Kirchhoff backstress [Pa], (P, 3, 3)."""
+    e_max: Tensor
+    """Largest norm of the deviatoric Hencky strain so far [-], (P,)."""
+
+
+def spin(C: Tensor, dt: Tensor | float) -> Tensor:
+    """The rotation of a step, Cayley's (I - dt W/2)^-1 (I + dt W/2) with W = skew C, (P, 3, 3) (Hughes and Winget 1980, eq. 14)."""
+    Q = 0.25 * dt * (C - C.mT)
+    size = 0.5 * (Q * Q).sum((-2, -1), keepdim=True)
+    eye = torch.eye(3, dtype=C.dtype, device=C.device)
+    return eye + 2 / (1 + size) * (Q + Q @ Q)
+
+
+def deviator(A: Tensor) -> Tensor:
+    """A - tr(A)/3 I, (..., 3, 3)."""
+    eye = torch.eye(3, dtype=A.dtype, device=A.device)
+    return A - A.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] / 3 * eye
+
+
+def _norm(A: Tensor) -> Tensor:
+    """Frobenius norm (P,), with gradient zero at zero."""
+    square = (A * A).sum((-2, -1))
+    return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
+
+
+def expm(A: Tensor) -> Tensor:
+    """exp(A) of small matrices (|A| up to 5), (P, 3, 3): Taylor to the tenth degree of A/16, squared four times.
+
+    torch.linalg.matrix_exp of a single matrix of double precision is off by up to 1e-10 near |A| = 0.05.
+    """
+    eye = torch.eye(3, dtype=A.dtype, device=A.device)
+    small, out = A / 16, eye
+    for n in range(10, 0, -1):
+        out = eye + small @ out / n
+    for _ in range(4):
+        out = out @ out
+    return out
+
+
+def hencky(F: Tensor) -> Tensor:
+    """The left Hencky strain ln V of F = V R, (P, 3, 3); stretches are bounded below by `law_kernels.FLOOR`."""
+    at = linalg.frame(F)
+    return linalg.isotropic_stress(F, at, at.sigma.clamp(min=FLOOR).log(), linalg.log_difference(at.sigma, FLOOR))
+
+
+def compressive(F: Tensor) -> Tensor:
+    """Its negative part: sum of min(e_i, 0) n_i n_i, (P, 3, 3)."""
+    at = linalg.frame(F)
+    sigma = at.sigma
+    e = sigma.clamp(min=FLOOR, max=1.0).log()
+    below = sigma < 1
+    mixed = below.unsqueeze(-1) ^ below.unsqueeze(-2)
+    gap = torch.where(mixed, sigma.unsqueeze(-2) - sigma.unsqueeze(-1), 1.0)
+    both = below.unsqueeze(-1) & below.unsqueeze(-2)
+    slopes = torch.where(mixed, (e.unsqueeze(-2) - e.unsqueeze(-1)) / gap, torch.where(both, linalg.log_difference(sigma, FLOOR), 0.0))
+    return linalg.isotropic_stress(F, at, e, slopes)
+
+
+class Constitutive:
+    """Elasticity, plasticity and effects of P particles.
+
+    Parameters of the effects, and the laws, have one row for all particles, one for each particle, or (with `particles`) one for each
+    scene. The effects that are forces (gravity, drag, ...) are not in here.
+
+    Args:
+        elasticity: Base law.
+        plasticity: Base law, or None.
+        effects: The effects.
+        count: Particles P.
+        dtype: Of the tables.
+        shear_modulus: The base law's shear modulus [Pa], () or (S,); from the law where absent (`effect_tables.shear_modulus`).
+        particles: Which scene a particle belongs to; where absent each particle is a scene of its own.
+
+    Raises:
+        UserError: As `effect_tables.tables`.
+    """
+
+    def __init__(
+        self,
+        elasticity: ElasticLaw,
+        plasticity: PlasticLaw | None,
+        effects: Effects,
+        *,
+        count: int,
+        dtype: torch.dtype = torch.float64,
+        shear_modulus: Tensor | float | None = None,
+        particles: Particles | None = None,
+    ) -> None:
+        self.elasticity, self.effects, self.count = elasticity, effects, count
+        like = torch.zeros((), dtype=dtype)
+        if particles is None:
+            particles = Particles(torch.arange(count, dtype=torch.int32), tuple(range(count + 1)))
+        else:
+            like = like.to(particles.scene.device)
+        self.particles, self.like, self.scene = particles, like, particles.scene.long()
+        scenes = len(particles.offsets) - 1
+        self.tables = effect_tables.tables(effects, elasticity, plasticity, scenes, like, shear=shear_modulus)
+        self.plasticity = None if self.tables.flow is not None or plasticity is None or plasticity.identity else plasticity
+        self._kinds = torch.tensor(self.tables.kinds, device=like.device)[self.scene] if self.tables.kinds else None
+        viscosity = effects.viscosity(scenes, like)
+        self._viscosity = None if viscosity is None else viscosity[self.scene]
+        self._rate = None if effects.stiffness_change is None else effects.rows("stiffness_change", scenes, like)[self.scene, 0]
+        self._stiffness = effects.particle_stiffness(count, like)
+
+    def start(self) -> History:
+        """A history of zeros."""
+        zero = self.like.new_zeros
+        return History(zero(self.count, self.tables.layout.branches, 3, 3), zero(self.count), zero(self.count, 3, 3), zero(self.count))
+
+    def _scale(self, time: Tensor | float) -> Tensor:
+        """The factor of the elastic stress that does not depend on the history, (P,)."""
+        scale = self.like.new_ones(self.count)
+        if self._stiffness is not None:
+            scale = scale * self._stiffness
+        if self._rate is not None:
+            scale = scale * torch.exp(self._rate * time)
+        return scale
+
+    def stress(self, F: Tensor, C: Tensor, history: History, time: Tensor | float = 0.0) -> Tensor:
+        """Kirchhoff stress tau [Pa], viscosity included.
+
+        Args:
+            F: Elastic deformation gradient, (P, 3, 3).
+            C: Velocity gradient [1/s], (P, 3, 3).
+            history: The history at F.
+            time: Time [s].
+        """
+        tau = self.elasticity(F, self.particles)
+        scale = self._scale(time)
+        if self.tables.material is not None:
+            k, c, r, fibre, x, y, z, damage, lock = self.tables.material[self.scene][..., None, None].unbind(1)
+            J = torch.linalg.det(F)[:, None, None]
+            bbar = J ** (-2 / 3) * (F @ F.mT)
+            I1 = bbar.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
+            square = I1 * bbar - bbar @ bbar
+            I2 = square.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] / 2
+            tau = tau + k * (I1 - 3) / (1 - lock * (I1 - 3)).clamp(min=LOCKED) * deviator(bbar) + 3 * c / I2 * deviator(square)
+            n = F @ torch.cat([x, y, z], dim=1)
+            tau = tau + fibre * ((n * n).sum(1, keepdim=True) - 1) * (n @ n.mT)
+            if self.tables.spectral:
+                tau = tau + r * compressive(F)
+            if self.tables.layout.e_max:
+                scale = scale * torch.exp(-damage[:, 0, 0] * history.e_max)
+        if self.tables.branches is not None:
+            tau = tau + (self.tables.branches[self.scene, :, 0, None, None] * history.branches).sum(1)
+        tau = scale[:, None, None] * tau
+        if self._viscosity is not None:
+            shear, bulk = self._viscosity[..., None, None].unbind(1)
+            D = 0.5 * (C + C.mT)
+            tau = tau + torch.linalg.det(F)[:, None, None] * (2 * shear * deviator(D) + 3 * bulk * (D - deviator(D)))
+        return tau
+
+    def advance(self, trial: Tensor, C: Tensor, history: History, dt: Tensor | float, time: Tensor | float = 0.0) -> tuple[Tensor, History]:
+        """The corrected deformation gradient of a trial one, and the history after the step.
+
+        Args:
+            trial: F_tr = (I + dt C) F, (P, 3, 3).
+            C: Velocity gradient of the step [1/s], (P, 3, 3).
+            history: The history before the step.
+            dt: Step [s], a number or (P,).
+            time: Time at the start of the step [s]; only `stiffness_change` of a body that yields asks for it.
+        """
+        dt = torch.as_tensor(dt, dtype=self.like.dtype, device=self.like.device).expand(self.count)
+        layout = self.tables.layout
+        if self.tables.branches is not None or layout.backstress:
+            R = spin(C, dt[:, None, None])
+        if self.tables.branches is not None:
+            T = self.tables.branches[self.scene, :, 1, None, None]
+            x = dt[:, None, None, None] / T
+            D = deviator(0.5 * (C + C.mT))[:, None]
+            turned = R[:, None] @ history.branches @ R.mT[:, None]
+            history = history._replace(branches=torch.exp(-x) * turned - T * torch.expm1(-x) * D)
+        if self.tables.flow is not None:
+            backstress = R @ history.backstress @ R.mT if layout.backstress else history.backstress
+            F, history = self._flow(trial, history._replace(backstress=backstress), dt, self._scale(time))
+        else:
+            F = trial if self.plasticity is None else self.plasticity(trial, self.particles)
+        if layout.e_max:
+            history = history._replace(e_max=torch.maximum(history.e_max, _norm(deviator(hencky(F)))))
+        return F, history
+
+    def _flow(self, trial: Tensor, history: History, dt: Tensor, scale: Tensor) -> tuple[Tensor, History]:
+        F = trial
+        row = self.tables.flow[self.scene]
+        if VON_MISES in self.tables.kinds:
+            two_mu, inverse, H, s, H_k, eta = row[:, :6].unbind(1)
+            two_mu = two_mu * scale
+            xi = two_mu[:, None, None] * deviator(hencky(trial)) - history.backstress
+            q = _norm(xi)
+            soft = torch.exp(-s * history.alpha)
+            limited = (inverse > 0) & (self._kinds == VON_MISES)
+            limit = (1 / torch.where(limited, inverse, 1.0) + H * history.alpha) * soft
+            flows = limited & (q > limit)
+            increment = torch.where(flows, (q - limit) / (two_mu + H_k + H * soft + eta / dt), 0.0)
+            direction = xi / torch.where(flows, q, 1.0)[:, None, None]
+            step = increment[:, None, None] * direction
+            F = torch.where(flows[:, None, None], expm(torch.where(flows[:, None, None], -step, 0.0)) @ trial, F)
+            history = history._replace(
+                alpha=history.alpha + increment if self.tables.layout.alpha else history.alpha,
+                backstress=history.backstress + H_k[:, None, None] * step,
+            )
+        if DRUCKER_PRAGER in self.tables.kinds:
+            slope, tip = row[:, 6:7], row[:, 7:8] / scale[:, None]
+            at = linalg.frame(trial)
+            e = at.sigma.clamp(min=FLOOR).log()
+            trace = e.sum(-1, keepdim=True)
+            dev = e - trace / 3
+            radius = slope * (tip - trace)
+            beyond = (trace > tip) & (self._kinds == DRUCKER_PRAGER)[:, None]
+            outside = ~beyond & (dev.detach().norm(dim=-1, keepdim=True) > radius) & (self._kinds == DRUCKER_PRAGER)[:, None]
+            ratio = radius / torch.where(outside, dev, 1.0).norm(dim=-1, keepdim=True)
+            h = torch.where(beyond, (tip / 3).expand_as(e), trace / 3 + ratio * dev)
+            slopes = linalg.exp_difference(h) * ratio[..., None] * linalg.log_difference(at.sigma, FLOOR)
+            slopes = torch.where(beyond[..., None], 0.0, slopes)
+            F = torch.where((beyond | outside)[..., None], linalg.isotropic_map(trial, at, h.exp(), slopes), F)
+        return F, history

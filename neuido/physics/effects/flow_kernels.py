@@ -1,0 +1,277 @@
+"""Warp kernels of the plastic flow that effects make, with hand-written adjoints.
+
+Von Mises' flow (Simo and Hughes, Computational Inelasticity, chapters 2 and 3, in Hencky strain): xi = 2 mu dev ln V - beta, the yield
+stress is (Y + H alpha) exp(-s alpha), and a step dgamma = <|xi| - yield stress> / (2 mu + H_k + H exp(-s alpha) + eta/dt) along
+n = xi/|xi| gives F = exp(-dgamma n) F_tr, alpha + dgamma and beta + H_k dgamma n. It is exact but for softening, whose step is explicit.
+Drucker and Prager's cone with a tip: |dev ln V| <= slope (tip - tr ln V), and the tip itself beyond it.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from neuido.physics.effects.history_functions import tools
+from neuido.physics.laws import classical_kernels as law_kernels
+from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.runtime.device import start_warp
+
+
+@functools.cache
+def build(real: type) -> SimpleNamespace:
+    """The kernels for `wp.float32` or `wp.float64`."""
+    start_warp()
+    vec3 = wp.types.vector(length=3, dtype=real)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+    name = f"neuido.flow.{real.__name__}"
+    func = functools.partial(wp.func, module=name)
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    own = warp_linalg.functions(real)
+    frame, compose, eigen, hencky, exp_slope = own.frame, own.compose, own.eigen, own.hencky, own.exp_slope
+    inverse_stretch, log_difference = own.inverse_stretch, own.log_difference
+    shared = tools(real, name)
+    load, store, gather, spread, deviator = shared.load, shared.store, shared.gather, shared.spread, shared.deviator
+    half_turn, rotation, add_spin_adjoint = shared.half_turn, shared.rotation, shared.add_spin_adjoint
+    mean_of, bound, scale_of = shared.mean_of, shared.bound, shared.scale_of
+    zero = wp.constant(real(0.0))
+    half = wp.constant(real(0.5))
+    one = wp.constant(real(1.0))
+    two = wp.constant(real(2.0))
+    three = wp.constant(real(3.0))
+    gap = wp.constant(real(law_kernels.GAP))
+    MISES = wp.constant(law_kernels.VON_MISES)
+    CONE = wp.constant(law_kernels.DRUCKER_PRAGER)
+
+    @func
+    def may_flow(F: mat33, beta: mat33, two_mu: real, limit: real):
+        return two_mu * bound(F) + wp.sqrt(wp.ddot(beta, beta)) > limit
+
+    @func
+    def overstress(e: vec3, U: mat33, beta: mat33, two_mu: real):
+        return compose(U, two_mu * (e - mean_of(e))) - beta
+
+    @func
+    def principal(N: mat33, U: mat33, turned: bool):
+        """Values and frame of the flow's direction; without a backstress the frame is that of the strain."""
+        n = wp.get_diag(wp.transpose(U) * N * U)
+        Z = U
+        if turned:
+            n, Z = eigen(N)
+        return n, Z
+
+    @kernel
+    def flow(
+        scene: wp.array(dtype=wp.int32),
+        dt: wp.array(dtype=real),
+        kinds: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=real),
+        stiffness: wp.array(dtype=real),
+        growth: wp.array(dtype=real),
+        at_alpha: int,
+        at_back: int,
+        F: wp.array(dtype=mat33),
+        C: wp.array(dtype=mat33),
+        history: wp.array2d(dtype=real),
+        F_next: wp.array(dtype=mat33),
+        history_next: wp.array2d(dtype=real),
+    ):
+        """Plastic flow of a trial F: von Mises with hardening, softening, backstress and overstress, or a cone with a tip."""
+        p = wp.tid()
+        s = scene[p]
+        Fp = F[p]
+        kind = kinds[s]
+        out = Fp
+        scale = scale_of(p, s, stiffness, growth)
+        alpha = zero
+        if at_alpha >= 0:
+            alpha = history[p, at_alpha]
+        beta = mat33()
+        if at_back >= 0:
+            R = rotation(half_turn(C[p], dt[s]))
+            beta = R * load(history, p, at_back) * wp.transpose(R)
+        if kind == MISES:
+            two_mu = table[s, 0] * scale
+            soft = wp.exp(-table[s, 3] * alpha)
+            limit = (one / table[s, 1] + table[s, 2] * alpha) * soft
+            if table[s, 1] > zero and may_flow(Fp, beta, two_mu, limit):
+                U, d, _V = frame(Fp)
+                N = overstress(hencky(d), U, beta, two_mu)
+                q = wp.sqrt(wp.ddot(N, N))
+                if q > limit:
+                    step = (q - limit) / (two_mu + table[s, 4] + table[s, 2] * soft + table[s, 5] / dt[s])
+                    N = N / q
+                    n, Z = principal(N, U, at_back >= 0)
+                    x = -step * n
+                    change = compose(Z, vec3(x[0] * exp_slope(x[0]), x[1] * exp_slope(x[1]), x[2] * exp_slope(x[2])))
+                    out = Fp + change * Fp
+                    alpha += step
+                    beta = beta + (table[s, 4] * step) * N
+        elif kind == CONE:
+            U, d, V = frame(Fp)
+            e = hencky(d)
+            trace = e[0] + e[1] + e[2]
+            mean = mean_of(e)
+            q = wp.length(e - mean)
+            tip = table[s, 7] / scale
+            radius = table[s, 6] * (tip - trace)
+            if trace > tip:
+                z = (tip / three) * exp_slope(tip / three)
+                out = Fp + U * wp.diag(vec3(z - d[0], z - d[1], z - d[2])) * wp.transpose(V)
+            elif q > radius:
+                x = (radius / q - one) * (e - mean)
+                c = vec3(x[0] * exp_slope(x[0]), x[1] * exp_slope(x[1]), x[2] * exp_slope(x[2]))
+                out = Fp + U * wp.diag(wp.cw_mul(vec3(wp.exp(e[0]), wp.exp(e[1]), wp.exp(e[2])), c)) * wp.transpose(V)
+        F_next[p] = out
+        if at_alpha >= 0:
+            history_next[p, at_alpha] = alpha
+        if at_back >= 0:
+            store(history_next, p, at_back, beta)
+
+    @kernel
+    def flow_adjoint(
+        scene: wp.array(dtype=wp.int32),
+        dt: wp.array(dtype=real),
+        kinds: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=real),
+        stiffness: wp.array(dtype=real),
+        growth: wp.array(dtype=real),
+        at_alpha: int,
+        at_back: int,
+        F: wp.array(dtype=mat33),
+        C: wp.array(dtype=mat33),
+        history: wp.array2d(dtype=real),
+        a_F_next: wp.array(dtype=mat33),
+        a_history_next: wp.array2d(dtype=real),
+        a_F: wp.array(dtype=mat33),
+        a_C: wp.array(dtype=mat33),
+        a_history: wp.array2d(dtype=real),
+        a_table: wp.array2d(dtype=real),
+        a_stiffness: wp.array(dtype=real),
+        a_growth: wp.array(dtype=real),
+    ):
+        """Adds to all; a_F is that of the trial gradient."""
+        p = wp.tid()
+        s = scene[p]
+        Fp = F[p]
+        kind = kinds[s]
+        A = a_F_next[p]
+        scale = scale_of(p, s, stiffness, growth)
+        a_log = zero
+        alpha = zero
+        a_alpha = zero
+        if at_alpha >= 0:
+            alpha = history[p, at_alpha]
+            a_alpha = a_history_next[p, at_alpha]
+        beta = mat33()
+        a_beta = mat33()
+        R = wp.identity(n=3, dtype=real)
+        if at_back >= 0:
+            R = rotation(half_turn(C[p], dt[s]))
+            beta = R * load(history, p, at_back) * wp.transpose(R)
+            a_beta = gather(a_history_next, p, at_back)
+        grad = A
+        if kind == MISES:
+            two_mu = table[s, 0] * scale
+            soft = wp.exp(-table[s, 3] * alpha)
+            hard = one / table[s, 1] + table[s, 2] * alpha
+            if table[s, 1] > zero and may_flow(Fp, beta, two_mu, hard * soft):
+                U, d, V = frame(Fp)
+                e = hencky(d)
+                X = overstress(e, U, beta, two_mu)
+                q = wp.sqrt(wp.ddot(X, X))
+                if q > hard * soft:
+                    H_k = table[s, 4]
+                    total = two_mu + H_k + table[s, 2] * soft + table[s, 5] / dt[s]
+                    step = (q - hard * soft) / total
+                    N = X / q
+                    n, Z = principal(N, U, at_back >= 0)
+                    x = -step * n
+                    P = compose(Z, vec3(wp.exp(x[0]), wp.exp(x[1]), wp.exp(x[2])))
+                    grad = P * A
+                    S = A * wp.transpose(Fp)
+                    S = wp.transpose(Z) * (half * (S + wp.transpose(S))) * Z
+                    for i in range(3):
+                        for l in range(3):
+                            S[i, l] = S[i, l] * wp.exp(x[i]) * exp_slope(x[l] - x[i])
+                    S = Z * S * wp.transpose(Z)
+                    bN = wp.ddot(a_beta, N)
+                    a_step = a_alpha + H_k * bN - wp.ddot(S, N)
+                    a_N = step * (H_k * a_beta - S)
+                    a_q = a_step / total
+                    a_total = -a_q * step
+                    a_X = (one / q) * (a_N - wp.ddot(a_N, N) * N) + a_q * N
+                    a_soft = a_total * table[s, 2] - a_q * hard
+                    dev = e - mean_of(e)
+                    L = wp.transpose(U) * a_X * U
+                    a_two_mu = a_total + L[0, 0] * dev[0] + L[1, 1] * dev[1] + L[2, 2] * dev[2]
+                    wp.atomic_add(a_table, s, 0, a_two_mu * scale)
+                    wp.atomic_add(a_table, s, 1, a_q * soft / (table[s, 1] * table[s, 1]))
+                    wp.atomic_add(a_table, s, 2, a_total * soft - a_q * alpha * soft)
+                    wp.atomic_add(a_table, s, 3, -a_soft * alpha * soft)
+                    wp.atomic_add(a_table, s, 4, a_total + step * bN)
+                    wp.atomic_add(a_table, s, 5, a_total / dt[s])
+                    a_log = a_two_mu * two_mu
+                    a_alpha = a_alpha - a_q * table[s, 2] * soft - a_soft * table[s, 3] * soft
+                    a_beta = a_beta - a_X
+                    L = two_mu * deviator(L)
+                    B = mat33()
+                    inv = inverse_stretch(d)
+                    for i in range(3):
+                        B[i, i] = L[i, i] * inv[i]
+                        for l in range(3):
+                            if i != l:
+                                pair = wp.max(two + d[i] + d[l], gap)
+                                B[i, l] = (L[i, l] + L[l, i]) * (one + d[l]) * log_difference(d[i], d[l]) / pair
+                    grad = grad + U * B * wp.transpose(V)
+        elif kind == CONE:
+            U, d, V = frame(Fp)
+            e = hencky(d)
+            trace = e[0] + e[1] + e[2]
+            mean = mean_of(e)
+            q = wp.length(e - mean)
+            tip = table[s, 7] / scale
+            radius = table[s, 6] * (tip - trace)
+            M = wp.transpose(U) * A * V
+            B = mat33()
+            if trace > tip:
+                size = wp.exp(tip / three)
+                for i in range(3):
+                    for l in range(3):
+                        if i != l:
+                            B[i, l] = size * (M[i, l] - M[l, i]) / wp.max(two + d[i] + d[l], gap)
+                grad = U * B * wp.transpose(V)
+                a_tip = wp.trace(M) * size / three
+                wp.atomic_add(a_table, s, 7, a_tip / scale)
+                a_log = -a_tip * tip
+            elif q > radius:
+                ratio = radius / q
+                n = (e - mean) / q
+                inv = inverse_stretch(d)
+                z = vec3(wp.exp(mean[0] + radius * n[0]), wp.exp(mean[0] + radius * n[1]), wp.exp(mean[0] + radius * n[2]))
+                g = wp.cw_mul(wp.get_diag(M), z)
+                along = wp.dot(g, n)
+                g_mean = mean_of(g)
+                for i in range(3):
+                    B[i, i] = inv[i] * (g_mean[i] - table[s, 6] * along + ratio * (g[i] - g_mean[i] - along * n[i]))
+                    for l in range(3):
+                        if i != l:
+                            sym = z[i] * exp_slope(ratio * (e[l] - e[i])) * ratio * log_difference(d[i], d[l])
+                            skew = (z[i] + z[l]) / wp.max(two + d[i] + d[l], gap)
+                            B[i, l] = half * (sym * (M[i, l] + M[l, i]) + skew * (M[i, l] - M[l, i]))
+                grad = U * B * wp.transpose(V)
+                wp.atomic_add(a_table, s, 6, (tip - trace) * along)
+                wp.atomic_add(a_table, s, 7, table[s, 6] * along / scale)
+                a_log = -table[s, 6] * along * tip
+        a_F[p] = a_F[p] + grad
+        if stiffness:
+            a_stiffness[p] = a_stiffness[p] + a_log / stiffness[p]
+        if growth:
+            wp.atomic_add(a_growth, s, a_log / growth[s])
+        if at_alpha >= 0:
+            a_history[p, at_alpha] = a_history[p, at_alpha] + a_alpha
+        if at_back >= 0:
+            aR = a_beta * R
+            spread(a_history, p, at_back, wp.transpose(R) * aR)
+            add_spin_adjoint(a_C, p, C[p], dt[s], two * (aR * load(history, p, at_back)))
+
+    return SimpleNamespace(flow=flow, flow_adjoint=flow_adjoint)

@@ -1,0 +1,136 @@
+"""Warp functions that the kernels of the history share: symmetric matrices in six columns, the rotation of a step, sizes."""
+
+import functools
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from neuido.physics.linalg import warp_functions as warp_linalg
+
+
+class Tools(NamedTuple):
+    """Warp functions for one scalar type, in one module."""
+
+    load: Any
+    """(history, p, column) -> symmetric matrix from six columns"""
+    store: Any
+    """(history, p, column, A): write its symmetric part"""
+    gather: Any
+    """(a_history, p, column) -> the adjoint of a symmetric matrix from those of its columns"""
+    spread: Any
+    """(a_history, p, column, A): add the adjoint of a symmetric matrix to those of its columns"""
+    deviator: Any
+    half_turn: Any
+    """(C, dt) -> dt/2 times the angular velocity"""
+    rotation: Any
+    """half turn -> Cayley's rotation"""
+    add_spin_adjoint: Any
+    """(a_C, p, C, dt, M): from the adjoint M of the rotation to that of C"""
+    mean_of: Any
+    """e -> its mean, three times"""
+    bound: Any
+    """F -> at least the norm of dev ln V"""
+    scale_of: Any
+    """(p, s, stiffness, growth) -> the factor of `stiffness` and `stiffness_change` on the elastic stress"""
+
+
+@functools.cache
+def tools(real: type, module: str) -> Tools:
+    """Build them for `wp.float32` or `wp.float64`."""
+    vec3 = wp.types.vector(length=3, dtype=real)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+    func = functools.partial(wp.func, module=module)
+    strain = warp_linalg.functions(real).strain
+    half = wp.constant(real(0.5))
+    one = wp.constant(real(1.0))
+    two = wp.constant(real(2.0))
+    three = wp.constant(real(3.0))
+
+    @func
+    def load(history: wp.array2d(dtype=real), p: int, at: int):
+        xx = history[p, at]
+        yy = history[p, at + 1]
+        zz = history[p, at + 2]
+        xy = history[p, at + 3]
+        xz = history[p, at + 4]
+        yz = history[p, at + 5]
+        return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+
+    @func
+    def spread(a_history: wp.array2d(dtype=real), p: int, at: int, A: mat33):
+        """A must be symmetric."""
+        a_history[p, at] = a_history[p, at] + A[0, 0]
+        a_history[p, at + 1] = a_history[p, at + 1] + A[1, 1]
+        a_history[p, at + 2] = a_history[p, at + 2] + A[2, 2]
+        a_history[p, at + 3] = a_history[p, at + 3] + two * A[0, 1]
+        a_history[p, at + 4] = a_history[p, at + 4] + two * A[0, 2]
+        a_history[p, at + 5] = a_history[p, at + 5] + two * A[1, 2]
+
+    @func
+    def store(history: wp.array2d(dtype=real), p: int, at: int, A: mat33):
+        history[p, at] = A[0, 0]
+        history[p, at + 1] = A[1, 1]
+        history[p, at + 2] = A[2, 2]
+        history[p, at + 3] = half * (A[0, 1] + A[1, 0])
+        history[p, at + 4] = half * (A[0, 2] + A[2, 0])
+        history[p, at + 5] = half * (A[1, 2] + A[2, 1])
+
+    @func
+    def gather(a_history: wp.array2d(dtype=real), p: int, at: int):
+        """The adjoint of a symmetric matrix, from those of its columns."""
+        A = load(a_history, p, at)
+        return half * (A + wp.diag(wp.get_diag(A)))
+
+    @func
+    def deviator(A: mat33):
+        return A - (wp.trace(A) / three) * wp.identity(n=3, dtype=real)
+
+    @func
+    def axial(A: mat33):
+        return vec3(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
+
+    @func
+    def half_turn(C: mat33, dt: real):
+        """dt/2 times the angular velocity."""
+        return (real(0.25) * dt) * axial(C)
+
+    @func
+    def rotation(q: vec3):
+        Q = wp.skew(q)
+        return wp.identity(n=3, dtype=real) + (two / (one + wp.dot(q, q))) * (Q + Q * Q)
+
+    @func
+    def add_spin_adjoint(a_C: wp.array(dtype=mat33), p: int, C: mat33, dt: real, M: mat33):
+        """From the adjoint M of the rotation of a step to that of C."""
+        q = half_turn(C, dt)
+        Q = wp.skew(q)
+        s = two / (one + wp.dot(q, q))
+        a_q = s * axial(M - M * Q - Q * M) - (s * s * wp.ddot(M, Q + Q * Q)) * q
+        a_C[p] = a_C[p] + (real(0.25) * dt) * wp.skew(a_q)
+
+    @func
+    def mean_of(e: vec3):
+        m = (e[0] + e[1] + e[2]) / three
+        return vec3(m, m, m)
+
+    @func
+    def bound(F: mat33):
+        """At least the norm of dev ln V, without a principal frame: the slope of ln(1 + x)/2 is largest at the smallest x."""
+        E = strain(F)
+        r = wp.sqrt(wp.ddot(E, E))
+        D = deviator(E)
+        out = real(1.0e30)
+        if r < real(0.9):
+            out = half * wp.sqrt(wp.ddot(D, D)) / (one - r)
+        return out
+
+    @func
+    def scale_of(p: int, s: int, stiffness: wp.array(dtype=real), growth: wp.array(dtype=real)):
+        out = one
+        if stiffness:
+            out = out * stiffness[p]
+        if growth:
+            out = out * growth[s]
+        return out
+
+    return Tools(load, store, gather, spread, deviator, half_turn, rotation, add_spin_adjoint, mean_of, bound, scale_of)

@@ -1,0 +1,134 @@
+"""Warp kernels of what a particle remembers, Maxwell branches and the largest strain, with hand-written adjoints.
+
+Plastic flow is in `flow_kernels`. Columns of the history are those of `effect_tables.Layout`, of the tables those of
+`effect_tables.Tables`.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from neuido.physics.effects import flow_kernels
+from neuido.physics.effects.history_functions import tools
+from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.runtime.device import start_warp
+
+
+@functools.cache
+def build(real: type) -> SimpleNamespace:
+    """The kernels for `wp.float32` or `wp.float64`."""
+    start_warp()
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+    name = f"neuido.history.{real.__name__}"
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    own = warp_linalg.functions(real)
+    frame, hencky, exp_slope, inverse_stretch = own.frame, own.hencky, own.exp_slope, own.inverse_stretch
+    shared = tools(real, name)
+    load, store, gather, spread, deviator = shared.load, shared.store, shared.gather, shared.spread, shared.deviator
+    half_turn, rotation, add_spin_adjoint = shared.half_turn, shared.rotation, shared.add_spin_adjoint
+    mean_of, bound = shared.mean_of, shared.bound
+    zero = wp.constant(real(0.0))
+    half = wp.constant(real(0.5))
+    two = wp.constant(real(2.0))
+
+    @kernel
+    def relax(
+        scene: wp.array(dtype=wp.int32),
+        dt: wp.array(dtype=real),
+        branches: wp.array3d(dtype=real),
+        idle: bool,
+        C: wp.array(dtype=mat33),
+        history: wp.array2d(dtype=real),
+        history_next: wp.array2d(dtype=real),
+    ):
+        """e = exp(-dt/T) R e R^T + T (1 - exp(-dt/T)) dev D of each branch: exact for a steady D in the turning frame.
+
+        `idle`: of those of weight zero too, whose slope with the weight a backward pass asks for. Else nobody reads them.
+        """
+        p = wp.tid()
+        s = scene[p]
+        h = dt[s]
+        R = rotation(half_turn(C[p], h))
+        D = deviator(half * (C[p] + wp.transpose(C[p])))
+        for b in range(branches.shape[1]):
+            if idle or branches[s, b, 0] != zero:
+                x = h / branches[s, b, 1]
+                e = R * load(history, p, 6 * b) * wp.transpose(R)
+                store(history_next, p, 6 * b, wp.exp(-x) * e + (h * exp_slope(-x)) * D)
+
+    @kernel
+    def relax_adjoint(
+        scene: wp.array(dtype=wp.int32),
+        dt: wp.array(dtype=real),
+        branches: wp.array3d(dtype=real),
+        C: wp.array(dtype=mat33),
+        history: wp.array2d(dtype=real),
+        a_history_next: wp.array2d(dtype=real),
+        a_C: wp.array(dtype=mat33),
+        a_history: wp.array2d(dtype=real),
+        a_branches: wp.array3d(dtype=real),
+    ):
+        p = wp.tid()
+        s = scene[p]
+        h = dt[s]
+        R = rotation(half_turn(C[p], h))
+        D = deviator(half * (C[p] + wp.transpose(C[p])))
+        a_R = mat33()
+        a_D = mat33()
+        for b in range(branches.shape[1]):
+            T = branches[s, b, 1]
+            x = h / T
+            decay = wp.exp(-x)
+            reach = h * exp_slope(-x)
+            e = load(history, p, 6 * b)
+            Y = gather(a_history_next, p, 6 * b)
+            YR = Y * R
+            back = wp.transpose(R) * YR
+            spread(a_history, p, 6 * b, decay * back)
+            a_D = a_D + reach * Y
+            a_R = a_R + (two * decay) * (YR * e)
+            wp.atomic_add(a_branches, s, b, 1, wp.ddot(back, e) * decay * x / T + wp.ddot(Y, D) * (reach - h * decay) / T)
+        a_C[p] = a_C[p] + deviator(a_D)
+        add_spin_adjoint(a_C, p, C[p], h, a_R)
+
+    @kernel
+    def remember(
+        F: wp.array(dtype=mat33),
+        at: int,
+        history: wp.array2d(dtype=real),
+        history_next: wp.array2d(dtype=real),
+    ):
+        """The largest norm of the deviatoric Hencky strain so far."""
+        p = wp.tid()
+        most = history[p, at]
+        if bound(F[p]) > most:
+            _U, d, _V = frame(F[p])
+            e = hencky(d)
+            most = wp.max(most, wp.length(e - mean_of(e)))
+        history_next[p, at] = most
+
+    @kernel
+    def remember_adjoint(
+        F: wp.array(dtype=mat33),
+        at: int,
+        history: wp.array2d(dtype=real),
+        a_history_next: wp.array2d(dtype=real),
+        a_F: wp.array(dtype=mat33),
+        a_history: wp.array2d(dtype=real),
+    ):
+        p = wp.tid()
+        a = a_history_next[p, at]
+        if bound(F[p]) > history[p, at]:
+            U, d, V = frame(F[p])
+            e = hencky(d)
+            e = e - mean_of(e)
+            size = wp.length(e)
+            if size > history[p, at]:
+                a_F[p] = a_F[p] + U * wp.diag((a / size) * wp.cw_mul(e, inverse_stretch(d))) * wp.transpose(V)
+                a = zero
+        a_history[p, at] = a_history[p, at] + a
+
+    return SimpleNamespace(
+        relax=relax, relax_adjoint=relax_adjoint, remember=remember, remember_adjoint=remember_adjoint, **vars(flow_kernels.build(real))
+    )

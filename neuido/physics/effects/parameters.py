@@ -1,0 +1,381 @@
+"""Physical effects beyond the declared law: each is a parameter that is zero (here: None or 0) when the effect is absent.
+
+Nested models are one model with parameters held at zero, so the gradient at zero is a score test for a candidate effect. The rollout
+takes the parameters as differentiable inputs and skips what is absent. Forces, contact and inertia act on the grid; effects of the
+material act on the stress and on a history (`effect_tables`, `effect_kernels`, and their torch twin `constitutive`).
+`LIBRARY` says of each effect its equation, parameters, prior range, where it shows and what it is confused with.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.effects.library import LIBRARY, Entry, Parameter
+
+__all__ = ["LIBRARY", "Effects", "Entry", "Parameter", "ball_inclusion", "linear_gradient"]
+
+Number = Tensor | float | None
+Triple = Tensor | tuple[float, float, float] | None
+
+_MATERIAL = (
+    "stiffness",
+    "relative_density",
+    "stiffness_change",
+    "maxwell_ratio",
+    "hysteresis",
+    "strain_stiffening",
+    "second_invariant",
+    "tension_compression",
+    "fibre",
+    "yield_inverse",
+    "hardening",
+    "softening",
+    "kinematic_hardening",
+    "rate_yield",
+    "cohesion",
+)
+_AT_LEAST = {
+    "added_mass": (-1.0, ""),
+    "drag_linear": (0.0, " 1/s"),
+    "drag_quadratic": (0.0, " 1/m"),
+    "viscosity_shear": (0.0, " Pa s"),
+    "viscosity_bulk": (0.0, " Pa s"),
+    "stick": (0.0, " 1/s"),
+    "restitution": (0.0, " 1/s"),
+    "maxwell_ratio": (0.0, ""),
+    "hysteresis": (0.0, ""),
+    "second_invariant": (-1.0, ""),
+    "tension_compression": (-1.0, ""),
+    "fibre": (0.0, " Pa"),
+    "yield_inverse": (0.0, " 1/Pa"),
+    "hardening": (0.0, " Pa"),
+    "softening": (0.0, ""),
+    "kinematic_hardening": (0.0, " Pa"),
+    "rate_yield": (0.0, " Pa s"),
+    "cohesion": (0.0, " Pa"),
+}
+
+
+class Effects(NamedTuple):
+    """Parameters of the effects; each a float or a tensor of shape () or (S,), vectors (3,) or (S, 3). None: absent."""
+
+    uniform_acceleration: Triple = None
+    """An acceleration beside gravity, a tilt or a steady wind [m/s^2], (3,) or (S, 3)."""
+    drag_linear: Number = None
+    """c of the acceleration -c v [1/s]."""
+    drag_quadratic: Number = None
+    """k of the acceleration -k |v| v [1/m]."""
+    position_force: Number = None
+    """k of the acceleration -k (x - centre) [1/s^2], a pull to a place."""
+    position_centre: Triple = None
+    """That place [m], (3,) or (S, 3)."""
+    viscosity_shear: Number = None
+    """eta of Kelvin-Voigt's Cauchy stress 2 eta D [Pa s]: in full, not its deviator alone."""
+    viscosity_bulk: Number = None
+    """zeta of Kelvin-Voigt's Cauchy stress zeta tr(D) I [Pa s]."""
+    gravity: Number = None
+    """Added to the size of gravity, along its own direction [m/s^2]."""
+    magnus: Triple = None
+    """w of the acceleration w x v [1/s], (3,) or (S, 3): the spin times a coefficient; in a turning frame minus twice its rate."""
+    time_force: Tensor | None = None
+    """Accelerations [m/s^2] at J evenly spaced times from t = 0, (J, 3) or (S, J, 3); linear in between, constant after the last."""
+    time_force_interval: float | None = None
+    """Time between two of them [s]."""
+    stiffness: Tensor | None = None
+    """Factor of each particle's elastic stress [-], (P,) in the order of the bodies; see `linear_gradient` and `ball_inclusion`."""
+    stiffness_change: Number = None
+    """r of the elastic stress times exp(r t) [1/s]."""
+    maxwell_ratio: Number = None
+    """Shear modulus of a parallel Maxwell branch over the base law's [-]."""
+    maxwell_time: Number = None
+    """Its relaxation time [s], > 0."""
+    hysteresis: Number = None
+    """Loss factor [-] of a rate-independent loss (`effect_tables.hysteresis_spectrum`); twice a damping ratio."""
+    strain_stiffening: Number = None
+    """k of tau += mu k x / (1 - k x) dev bbar with x = I1bar - 3 [-], Gent's law: for small x Yeoh's second term mu k x dev bbar;
+    no stretch goes beyond x = 1/k. Negative k: a body that softens. The factor is bounded at `law_kernels.LOCKED`."""
+    second_invariant: Number = None
+    """c of W = 3/2 mu c ln(I2bar / 3) [-], Gent and Thomas' second term: for small strains Mooney and Rivlin's mu c / 2 (I2bar - 3)."""
+    tension_compression: Number = None
+    """r of tau += 2 mu r sum min(e_i, 0) n_i n_i [-]: principal Hencky strains that are negative resist 1 + r times as much."""
+    fibre: Number = None
+    """c of W = c / 4 (I4 - 1)^2 [Pa]."""
+    fibre_direction: Triple = None
+    """Direction of the fibres in the reference body, (3,) or (S, 3); brought to length one."""
+    yield_inverse: Number = None
+    """One over the yield stress of an elastic body, the norm of its deviatoric Kirchhoff stress 2 mu dev ln V at yield [1/Pa]."""
+    hardening: Number = None
+    """H of the yield stress plus H alpha [Pa], alpha the accumulated norm of the plastic strain."""
+    softening: Number = None
+    """s of the yield stress times exp(-s alpha) [-]; of a body that does not yield the elastic stress times exp(-s e_max)."""
+    kinematic_hardening: Number = None
+    """H_k [Pa] of Prager's backstress, which grows by H_k times the plastic strain and turns with the spin."""
+    rate_yield: Number = None
+    """eta of Perzyna's overstress [Pa s]; 0 is the flow that does not know the rate."""
+    cohesion: Number = None
+    """Mohr and Coulomb's c of a body declared as Drucker and Prager's [Pa]."""
+    friction: Number = None
+    """Added to the friction coefficient of every collider and wall [-]."""
+    stick: Number = None
+    """Velocity of a node inside a collider times exp(-stick dt), after contact [1/s]; infinity is a sticky floor."""
+    restitution: Number = None
+    """Its outward normal velocity alone times exp(-restitution dt) [1/s]: a lossy floor."""
+    added_mass: Number = None
+    """c of the inertia 1 + c times as large at the same weight [-]."""
+    relative_density: Tensor | None = None
+    """Factor of each particle's mass and elastic stress [-], (P,) in the order of the bodies: a foam or a hollow body, whose modulus
+    goes with its relative density (Gibson and Ashby, exponent 1), or one whose particles lie closer in places than its volumes say. It
+    flows at the strain at which the solid does."""
+
+    @classmethod
+    def of(cls, values: Mapping[str, Tensor | float], *, x: Tensor | None = None, scene: Tensor | None = None) -> "Effects":
+        """Effects from flat names as `LIBRARY` lists them: "viscosity_shear.eta", "uniform_acceleration.x", "time_force.y2", ...
+
+        Args:
+            values: Numbers or tensors (S,).
+            x: Reference positions [m], (P, 3), which `stiffness_gradient` needs.
+            scene: Scene of each particle, (P,), where its values have S > 1 rows.
+
+        Raises:
+            UserError: A name that is not in the library, or one that needs another beside it.
+        """
+        return cls(**_fields(values, x, scene))
+
+    @property
+    def of_material(self) -> bool:
+        """Whether an effect acts on the law, viscosity apart."""
+        return any(getattr(self, name) is not None for name in _MATERIAL)
+
+    def rows(self, name: str, scene_count: int, like: Tensor) -> Tensor:
+        """The parameter `name` as (S, 1) or (S, 3), differentiable, in the type and on the device of `like`; zero where absent.
+
+        Raises:
+            UserError: Below its range, not a number, or a shape that fits neither one scene nor all.
+        """
+        width = 3 if name in ("uniform_acceleration", "position_centre", "magnus", "fibre_direction") else 1
+        value = getattr(self, name)
+        if value is None:
+            return like.new_zeros(scene_count, width)
+        rows = _tensor(value).to(like.device, like.dtype)
+        rows = rows.reshape((1, width) if rows.numel() == width else (-1, width))
+        if rows.shape[0] not in (1, scene_count):
+            raise UserError(f"{name} has {rows.shape[0]} rows for {scene_count} scenes; give one value or one for each scene")
+        least, unit = _AT_LEAST.get(name, (-math.inf, ""))
+        if bool((~(rows >= least)).any()):
+            worst = rows[~(rows >= least)][0].item()
+            bound = "zero" if least == 0.0 else f"{least:g}"
+            raise UserError(f"{name} is {worst:g}{unit}; it must be {bound} or more")
+        return rows.expand(scene_count, width)
+
+    def particle_stiffness(self, count: int, like: Tensor) -> Tensor | None:
+        """The factor on each particle's elastic stress, (P,), of `stiffness` and `relative_density`; None: neither is given.
+
+        Raises:
+            UserError: As `particle_factor`.
+        """
+        factors = [self.particle_factor(name, count, like) for name in ("stiffness", "relative_density") if getattr(self, name) is not None]
+        return math.prod(factors[1:], start=factors[0]) if factors else None
+
+    def particle_factor(self, name: str, count: int, like: Tensor) -> Tensor:
+        """`stiffness` or `relative_density` as (P,), checked.
+
+        Raises:
+            UserError: Another number of particles, or a factor that is not positive.
+        """
+        factor = _tensor(getattr(self, name)).to(like.device, like.dtype)
+        if factor.ndim == 0:
+            factor = factor.expand(count)
+        if factor.shape != (count,):
+            raise UserError(f"{name} has shape {tuple(factor.shape)} for {count} particles; give one factor for each")
+        if bool((~(factor > 0)).any()):
+            raise UserError(f"{name} is {factor.min().item():g} somewhere; it must be positive")
+        return factor
+
+    def accelerations(self, gravity: Tensor, dt: Tensor, steps: int) -> Tensor:
+        """Gravity and all accelerations that are uniform in space, (1, S, 3), or (T, S, 3) where they change with time.
+
+        Args:
+            gravity: [m/s^2], (S, 3).
+            dt: Step of each scene [s], (S,).
+            steps: Substeps T; each gets the time force at its middle.
+        """
+        count = len(gravity)
+        if self.gravity is not None:
+            size = gravity.norm(dim=1, keepdim=True)
+            direction = gravity / torch.where(size > 0, size, 1.0)
+            gravity = gravity + self.rows("gravity", count, gravity) * direction
+        if self.added_mass is not None:
+            gravity = gravity / (1 + self.rows("added_mass", count, gravity))
+        total = (gravity + self.rows("uniform_acceleration", count, gravity))[None]
+        if self.time_force is None:
+            return total
+        if self.time_force_interval is None or not self.time_force_interval > 0:
+            raise UserError(f"time_force_interval is {self.time_force_interval}; time_force needs a positive time between its knots")
+        knots = _tensor(self.time_force).to(gravity)
+        if knots.ndim not in (2, 3) or knots.shape[-1] != 3 or (knots.ndim == 3 and len(knots) not in (1, count)):
+            raise UserError(f"time_force has shape {tuple(knots.shape)}; give (J, 3), or (S, J, 3) for {count} scenes")
+        knots = knots.expand(count, *knots.shape[-2:])
+        at = (torch.arange(steps, dtype=torch.float64, device=dt.device)[:, None] + 0.5) * dt.double() / self.time_force_interval
+        at = at.clamp(max=knots.shape[1] - 1)
+        left = at.floor().long().clamp(max=max(knots.shape[1] - 2, 0))
+        share = (at - left).to(gravity)[..., None]
+        scene = torch.arange(count, device=dt.device)
+        right = (left + 1).clamp(max=knots.shape[1] - 1)
+        return total + (1 - share) * knots[scene, left] + share * knots[scene, right]
+
+    def force_table(self, scene_count: int, like: Tensor) -> Tensor:
+        """What `grid_kernels.update_grid` reads.
+
+        Columns linear drag, quadratic drag, pull, centre x, y, z, (S, 6); where one of them is given also magnus x, y, z, stick and
+        restitution, (S, 11).
+        """
+        names = ["drag_linear", "drag_quadratic", "position_force", "position_centre"]
+        more = ["magnus", "stick", "restitution"]
+        if any(getattr(self, name) is not None for name in more):
+            names += more
+        return torch.cat([self.rows(name, scene_count, like) for name in names], dim=1)
+
+    def viscosity(self, scene_count: int, like: Tensor) -> Tensor | None:
+        """Columns of 2 eta dev D + zeta tr(D) I, (S, 2), or None where neither is given (the rollout then skips them).
+
+        The trace of `viscosity_shear`'s own 2 eta D is in the second.
+        """
+        if self.viscosity_shear is None and self.viscosity_bulk is None:
+            return None
+        eta, zeta = (self.rows(name, scene_count, like) for name in ("viscosity_shear", "viscosity_bulk"))
+        return torch.cat([eta, zeta + 2.0 / 3.0 * eta], dim=1)
+
+    def growth(self, dt: Tensor, steps: int) -> Tensor | None:
+        """exp(r t) of `stiffness_change` at the start of each substep, (T, S), or None."""
+        if self.stiffness_change is None:
+            return None
+        times = torch.arange(steps, dtype=torch.float64, device=dt.device)[:, None] * dt.double()
+        return torch.exp(self.rows("stiffness_change", len(dt), dt)[:, 0] * times.to(dt))
+
+
+def _tensor(value) -> Tensor:
+    """Numbers become float64, so that they keep their digits."""
+    return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+
+
+def linear_gradient(x: Tensor, slope: Tensor, *, mean: Tensor | None = None, length: Tensor | float | None = None) -> Tensor:
+    """The factor exp(slope . (X - mean) / length), (P,): a stiffness gradient over the body.
+
+    Args:
+        x: Reference positions [m], (P, 3).
+        slope: Change of the factor's logarithm over `length` along each axis [-], (3,) or (P, 3).
+        mean: Where the factor is one [m]; the mean of `x` where absent.
+        length: [m]; the largest extent of `x` where absent.
+    """
+    mean = x.mean(dim=0) if mean is None else mean
+    length = (x.amax(dim=0) - x.amin(dim=0)).max() if length is None else length
+    return torch.exp(((x - mean) / length * slope).sum(-1))
+
+
+def ball_inclusion(
+    x: Tensor, log_ratio: Tensor | float, centre: Tensor, radius: Tensor | float, *, width: Tensor | float = 0.0, mean: Tensor | None = None
+) -> Tensor:
+    """The factor exp(log_ratio) inside a ball and one outside, (P,): a stiffer or a softer inclusion.
+
+    Args:
+        x: Reference positions [m], (P, 3).
+        log_ratio: Logarithm of the factor inside [-], () or (P,).
+        centre: Of the ball, from the mean of `x` [m], (3,) or (P, 3).
+        radius: [m], () or (P,).
+        width: Of a smooth border, tanh((radius - r) / width) [m]; 0 is a sharp one, whose factor has no slope in centre and radius.
+        mean: In place of the mean of `x`.
+    """
+    r = torch.linalg.vector_norm(x - (x.mean(dim=0) if mean is None else mean) - centre, dim=-1)
+    width = torch.as_tensor(width, dtype=x.dtype, device=x.device)
+    soft = 0.5 + 0.5 * torch.tanh((radius - r) / torch.where(width > 0, width, 1.0))
+    inside = torch.where(width > 0, soft, (r <= radius).to(x.dtype))
+    return torch.exp(log_ratio * inside)
+
+
+_FIELDS = {
+    f"{entry.name}.{parameter.name}": parameter.field
+    for entry in LIBRARY
+    for parameter in entry.parameters
+    if parameter.field in Effects._fields
+}
+"""Names that are one field of `Effects`, or (x, y, z) one part of it."""
+
+
+def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tensor | None) -> dict[str, Tensor | float]:
+    given = {name: value for name, value in values.items() if value is not None}
+    out: dict[str, Tensor | float] = {}
+    vectors: dict[str, dict[str, Tensor | float]] = {}
+    gradient: dict[str, Tensor | float] = {}
+    for name, value in given.items():
+        effect, _, part = name.partition(".")
+        if effect == "time_force" and part[:1] in ("x", "y", "z") and part[1:].isdigit():
+            vectors.setdefault("time_force", {})[part] = value
+        elif effect == "fibre" and part in ("azimuth", "elevation"):
+            vectors.setdefault("fibre", {})[part] = value
+        elif effect == "stiffness_gradient" and name in _NAMES:
+            gradient[part] = value
+        elif name not in _FIELDS:
+            raise UserError(f"{name} is not a parameter of an effect; see LIBRARY, for example {', '.join(_of(effect)) or 'drag_linear.k'}")
+        elif name == "time_force.interval":
+            intervals = _tensor(value).detach().reshape(-1)
+            if bool((intervals != intervals[0]).any()):
+                raise UserError(f"time_force.interval is {intervals.tolist()}; all scenes of a launch share one")
+            out["time_force_interval"] = intervals[0].item()
+        elif part in ("x", "y", "z"):
+            vectors.setdefault(_FIELDS[name], {})[part] = value
+        else:
+            out[_FIELDS[name]] = value
+    for field, parts in vectors.items():
+        tensors = {key: _tensor(v).reshape(-1) for key, v in parts.items()}
+        like = next((t for t in tensors.values() if t.requires_grad), next(iter(tensors.values())))
+        size = max(len(t) for t in tensors.values())
+        part = {key: t.to(like).expand(size) for key, t in tensors.items()}
+        zero = like.new_zeros(size)
+        if field == "time_force":
+            knots = 1 + max(int(key[1:]) for key in part)
+            out[field] = torch.stack([torch.stack([part.get(f"{a}{j}", zero) for a in "xyz"], -1) for j in range(knots)], 1)
+        elif field == "fibre":
+            az, el = part.get("azimuth", zero), part.get("elevation", zero)
+            out["fibre_direction"] = torch.stack([el.cos() * az.cos(), el.sin(), el.cos() * az.sin()], -1)
+        else:
+            out[field] = torch.stack([part.get(a, zero) for a in "xyz"], -1)
+    if "fibre" in out and "fibre_direction" not in out:
+        out["fibre_direction"] = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    if gradient:
+        out["stiffness"] = _stiffness(gradient, x, scene)
+    return out
+
+
+def _stiffness(part: Mapping[str, Tensor | float], x: Tensor | None, scene: Tensor | None) -> Tensor:
+    """The factor of each particle from the parameters of `stiffness_gradient`; each scene has its own mean and length."""
+    if x is None:
+        raise UserError("stiffness_gradient needs the particles' reference positions: Effects.of(values, x=...)")
+    index = torch.zeros(len(x), dtype=torch.long, device=x.device) if scene is None else scene.long()
+    scenes = int(index.max()) + 1
+
+    def row(name: str, s: int) -> Tensor:
+        t = _tensor(part.get(name, 0.0)).to(x).reshape(-1)
+        if len(t) not in (1, scenes):
+            raise UserError(f"stiffness_gradient.{name} has {len(t)} values for {scenes} scenes; give one, or `scene` of each particle")
+        return t[s if len(t) > 1 else 0]
+
+    factor = x.new_ones(len(x))
+    for s in range(scenes):
+        (own,) = torch.nonzero(index == s, as_tuple=True)
+        slope, centre = (torch.stack([row(f"{name}{a}", s) for a in "xyz"]) for name in ("", "c"))
+        f = linear_gradient(x[own], slope)
+        if "log_ratio" in part:
+            f = f * ball_inclusion(x[own], row("log_ratio", s), centre, row("radius", s), width=row("width", s))
+        factor = factor.index_copy(0, own, f)
+    return factor
+
+
+_NAMES = {f"{entry.name}.{parameter.name}" for entry in LIBRARY for parameter in entry.parameters}
+
+
+def _of(effect: str) -> list[str]:
+    return [name for name in sorted(_NAMES) if name.startswith(effect + ".")]

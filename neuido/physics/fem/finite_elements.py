@@ -1,0 +1,303 @@
+"""Explicit finite elements beside the material point method: the same scenes, laws, effects and call, another discretisation.
+
+Linear tetrahedra with lumped masses, symplectic Euler in time, contact of the nodes at the exact planes. Forward only. The body
+of particles is meshed (`meshing`), and the motion is given back at the particles. A step is cut into as many equal inner steps as
+the smallest element and the fastest wave ask for.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NoReturn
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.fem import element_kernels
+from neuido.physics.fem.assembly import Assembly, Inputs, Piece, piece_of
+from neuido.physics.fem.meshing import Mesh, mesh_body
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.mpm import inputs
+from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.mpm.threads import one_thread_each, pool
+from neuido.physics.runtime.device import real_of
+from neuido.physics.runtime.invalidation import spoil
+from neuido.types import Body, ParticleState, Scene
+
+SAFETY = 0.5
+"""Inner step over the stable step of the undeformed mesh: elements get thinner while a body is pressed."""
+MOST_INNER = 2000
+"""Inner steps a step, at the most, where nothing else is said."""
+
+
+class FiniteElements:
+    """Explicit finite elements of one or several scenes, each with one body; used as `mpm.Simulator` is.
+
+    Args:
+        scenes: One scene or a list of them; the grid (`cells`) plays no part.
+        bodies: As many bodies.
+        density: [kg/m^3], one number or one for each scene.
+        device: Where it runs.
+        dtype: `torch.float32` for work, `torch.float64` for checks.
+        threads: On the CPU, run several scenes in as many threads as there are cores.
+        graphs: On CUDA, capture the launches between two frames once for each shape and replay them after.
+        elements: About how many elements a body gets; see `meshing.mesh_body`.
+        tetrahedra: A lattice cell is cut into 5 or 6.
+        smoothing: `none`, or `nodal`: the volume change of an element is the mean of its nodes' means, against the locking of
+            nearly incompressible bodies (average nodal pressure, Bonet and Burton 1998).
+        meshes: Meshes in place of the ones made here, one a body or one for all.
+        most_inner: Inner steps a step, at the most; what needs more is an error.
+
+    Raises:
+        UserError: As `mpm.Simulator`, and a body that cannot be meshed.
+
+    Attributes:
+        state: `ParticleState` at t = 0.
+        mass: Particle masses [kg], (P,), attached masses included.
+        volume: Initial volumes [m^3], (P,).
+        particles: `Particles`, which scene each particle belongs to.
+        meshes: The `Mesh` of each scene.
+    """
+
+    def __init__(
+        self,
+        scenes: Scene | Sequence[Scene],
+        bodies: Body | Sequence[Body],
+        *,
+        density: float | Sequence[float] = 1000.0,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float32,
+        threads: bool = True,
+        graphs: bool = True,
+        elements: int | None = None,
+        tetrahedra: int = 5,
+        smoothing: Literal["none", "nodal"] = "none",
+        meshes: Mesh | Sequence[Mesh] | None = None,
+        most_inner: int = MOST_INNER,
+    ) -> None:
+        if smoothing not in ("none", "nodal"):
+            raise UserError(f"smoothing is {smoothing!r}; choose none or nodal")
+        loaded = Simulator(scenes, bodies, density=density, device=device, dtype=dtype, threads=False, graphs=False)
+        self.scenes, self.device, self.dtype, self.smoothing = loaded.scenes, loaded.device, loaded.dtype, smoothing
+        self.particles, self.state, self.mass, self.volume = loaded.particles, loaded.state, loaded.mass, loaded.volume
+        self.dt, self.gravity, self.colliders = loaded.dt, loaded.gravity, loaded.colliders
+        self.graphs, self.most_inner = graphs and self.device.type == "cuda", most_inner
+        self.held = loaded.held.bool()
+        self.kernels = element_kernels.build(real_of(dtype))
+        bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
+        if meshes is not None:
+            meshes = (meshes,) * len(bodies) if isinstance(meshes, Mesh) else tuple(meshes)
+            if len(meshes) != len(bodies):
+                raise UserError(f"{len(meshes)} meshes for {len(bodies)} bodies; give one mesh a body, or one for all")
+        made: dict[tuple[int, ...], tuple[Mesh, Piece]] = {}
+        pieces = []
+        self.meshes: tuple[Mesh, ...] = ()
+        self.sizes: list[float] = []
+        for s, body in enumerate(bodies):
+            given = None if meshes is None else meshes[s]
+            key = (id(body.x), id(body.volume), id(given))  # copies of one body share their mesh
+            if key not in made:
+                x, volume = torch.as_tensor(body.x).double().cpu(), torch.as_tensor(body.volume).double().cpu()
+                mesh = mesh_body(x, volume, elements=elements, kind=tetrahedra) if given is None else given
+                made[key] = (mesh, piece_of(mesh, x, volume, self.device, self.dtype))
+            mesh, piece = made[key]
+            self.meshes += (mesh,)
+            self.sizes.append(self.sizes[-1] if s and mesh is self.meshes[-2] else _size(mesh))
+            pieces.append(piece)
+        # on the CPU a scene is an assembly of its own, which a thread runs; on a GPU all scenes share their launches
+        count = len(self.scenes)
+        ranges = [(s, s + 1) for s in range(count)] if self.device.type == "cpu" else [(0, count)]
+        self.assemblies = [Assembly(self, pieces[a:b], a, b) for a, b in ranges]
+        self.pool = pool() if threads and len(self.assemblies) > 1 else None
+
+    @property
+    def scene_count(self) -> int:
+        return len(self.scenes)
+
+    def inner_steps(
+        self,
+        elasticity: ElasticLaw,
+        viscosity: Tensor | None = None,
+        mass: Tensor | None = None,
+        stiffening: tuple[Tensor, Tensor] | None = None,
+        refused: list[int] | None = None,
+    ) -> list[int]:
+        """Inner steps a step that each scene needs, by 2/omega of the worst element (a bound: Belytschko et al., sec. 6.2).
+
+        Args:
+            elasticity: The law, for its P-wave modulus.
+            viscosity: `Effects.viscosity` [Pa s], (S, 2), or None; it acts with the velocity of half a step before.
+            mass: Particle masses [kg], (P,).
+            stiffening: What effects add to each scene's modulus [Pa], and the largest factor on the sum, (S,) each.
+            refused: Gets the scenes that need more than `most_inner`, in place of an error; they get no more than the others.
+
+        Raises:
+            UserError: A modulus that is negative, or more than `most_inner`.
+        """
+        needs = [math.ceil(need - 1e-9) for need in self._needs(elasticity, viscosity, mass, stiffening)]
+        out = []
+        for assembly in self.assemblies:
+            most = 1
+            for s in range(assembly.a, assembly.b):
+                if needs[s] <= self.most_inner:
+                    most = max(most, needs[s])
+                elif refused is not None:
+                    refused.append(s)
+                else:
+                    raise UserError(f"dt of scene {s} needs {needs[s]} inner steps of its smallest element, more than {self.most_inner}; "
+                                    "lower the stiffness, the viscosity or `elements`")  # fmt: skip
+            out += [most] * (assembly.b - assembly.a)
+        return out
+
+    def _needs(
+        self, elasticity: ElasticLaw, viscosity: Tensor | None, mass: Tensor | None, stiffening: tuple[Tensor, Tensor] | None
+    ) -> list[float]:
+        """Step over the stable one of each scene; arguments are those of `inner_steps`."""
+        bounds = inputs.waves(self, elasticity, mass, stiffening)
+        out = []
+        for assembly in self.assemblies:
+            for s in range(assembly.a, assembly.b):
+                modulus, density = bounds[s]
+                steep = float(assembly.pieces[s - assembly.a].steepest.max())
+                omega = 2.0 * math.sqrt(modulus / density * steep)
+                damping = 0.0
+                if viscosity is not None:
+                    eta, zeta = viscosity.detach()[s].double().tolist()
+                    damping = 4.0 * steep * (4.0 / 3.0 * eta + zeta) / density
+                # the root of (omega dt)^2 + 2 damping dt = 4
+                step = 4.0 / (damping + math.sqrt(damping**2 + 4.0 * omega**2)) if omega + damping > 0 else math.inf
+                out.append(self.scenes[s].dt / (SAFETY * step))
+        return out
+
+    def step_margin(
+        self, steps: int, elasticity: ElasticLaw, plasticity: PlasticLaw | None = None, *, effects: Effects | None = None
+    ) -> float:
+        """`most_inner` over the inner steps in need, of the scene that has least to spare; below 1 a `rollout` of these refuses.
+
+        Raises:
+            UserError: As `rollout`, but for the inner steps.
+        """
+        given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
+        return self.most_inner / max(self._needs(elasticity, given.viscosity, given.mass, given.stiffening(self)))
+
+    def rollout(
+        self,
+        steps: int,
+        elasticity: ElasticLaw,
+        plasticity: PlasticLaw | None = None,
+        *,
+        state: ParticleState | None = None,
+        effects: Effects | None = None,
+        gravity: Tensor | None = None,
+        friction: Tensor | None = None,
+        mass: Tensor | None = None,
+        every: int = 1,
+        segment: int | None = None,
+        check: bool = True,
+        inner: int | None = None,
+        finer: int = 1,
+        lenient: bool = False,
+    ) -> ParticleState:
+        """Run `steps` steps of the scenes; arguments and result are those of `mpm.Simulator.rollout`, without gradients.
+
+        Args:
+            steps: Number of steps.
+            elasticity: F -> Kirchhoff stress.
+            plasticity: Trial F -> corrected F; none: purely elastic.
+            state: Start, (P, ...): its difference from the bodies as loaded, or from the end of the last rollout where that is where the
+                particles are, is interpolated to nodes and elements; F is the elastic strain of the start, whatever its positions.
+            effects: Further effects.
+            gravity: [m/s^2], (S, 3); the scenes' own where absent.
+            friction: Coefficients of the colliders, (S, K) in the order colliders, walls.
+            mass: [kg], (P,); density times volume where absent.
+            every: Keep a frame every so many steps.
+            segment: Not read; there is no tape.
+            check: Not read; the inner steps are always stable for the undeformed mesh.
+            inner: Inner steps a step, in place of `inner_steps`.
+            finer: Times that many: those of `inner_steps` are stable for the body at rest, and a law may stiffen with strain.
+            lenient: Frames of a scene that needs too many, or whose motion fails, are NaN, in place of an error.
+
+        Returns:
+            Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1: x and v interpolated in the element of
+            each particle, C and F of that element. Frame 0 is the start.
+
+        Raises:
+            UserError: Before the start, as `inner_steps`; afterwards a motion that is not finite.
+        """
+        inputs.check_frames(steps, every)
+        with torch.no_grad():
+            given = inputs.prepare(
+                self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
+            )
+            return self._rollout(steps, elasticity, plasticity, given, every, inner, finer, lenient)
+
+    def _rollout(
+        self,
+        steps: int,
+        elasticity: ElasticLaw,
+        plasticity: PlasticLaw | None,
+        given: inputs.RolloutInputs,
+        every: int,
+        inner: int | None,
+        finer: int,
+        lenient: bool,
+    ) -> ParticleState:
+        state, effects, tables, viscosity, stiffness = given.state, given.effects, given.tables, given.viscosity, given.stiffness
+        refused: list[int] = []
+        if inner is None:
+            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self), refused if lenient else None)
+        else:
+            inner_of = [inner] * self.scene_count
+        inner_of = [n * finer for n in inner_of]
+        frames = ParticleState(*(t.new_empty(steps // every + 1, *t.shape) for t in state))
+
+        def one(assembly: Assembly) -> None:
+            a, b = assembly.a, assembly.b
+            n = inner_of[a]
+            scenes, own = slice(a, b), slice(self.particles.offsets[a], self.particles.offsets[b])
+            dt = self.dt[scenes] / n
+            growth = effects.growth(self.dt / n, steps * n)
+            part = Inputs(
+                ParticleState(*(t[own] for t in state)),
+                given.mass[own],
+                effects.accelerations(given.gravity, self.dt / n, steps * n)[:, scenes].contiguous(),
+                given.force[scenes].contiguous(),
+                given.friction[scenes].contiguous(),
+                None if viscosity is None else viscosity[scenes].contiguous(),
+                None if tables is None else assembly.rows(tables),
+                None if stiffness is None else stiffness[own],
+                None if growth is None else growth[:, scenes].contiguous(),
+                dt.contiguous(),
+            )
+            assembly.run(steps, every, n, elasticity, plasticity, part, ParticleState(*(t[:, own] for t in frames)))
+
+        if self.pool is None:
+            for assembly in self.assemblies:
+                one(assembly)
+        else:
+            with one_thread_each():
+                list(self.pool.map(one, self.assemblies))
+        scene = self.particles.scene.long()
+        dt = self.dt / torch.tensor(inner_of).to(self.dt)
+        limit = (torch.tensor(self.sizes).to(self.dt) / dt)[scene]  # faster, and a point crosses an element in a step
+        fine = torch.isfinite(frames.x).all(dim=2) & (frames.v.norm(dim=2) <= limit)
+        if lenient:
+            refusing = torch.tensor([s in refused for s in range(self.scene_count)], device=self.device)
+            spoil(frames, refusing[scene] | ~fine.all(dim=0), scene)
+        elif not bool(fine.all()):
+            self._raise(fine, steps, every, inner_of)
+        return frames
+
+    def _raise(self, fine: Tensor, steps: int, every: int, inner: list[int]) -> NoReturn:
+        """Say where a motion is not finite, or too fast; `fine` (K, P)."""
+        frame, p = ((~fine).nonzero()[0]).tolist()
+        s = int(self.particles.scene[p])
+        raise UserError(f"the motion of scene {s} is not finite from step {max(frame - 1, 0) * every} of {steps} on; lower `dt` "
+                        f"(now {self.scenes[s].dt:g} s in {inner[s]} inner steps) or the stiffness")  # fmt: skip
+
+
+def _size(mesh: Mesh) -> float:
+    """The longest edge from an element's first corner [m]."""
+    corners = mesh.nodes[mesh.elements]
+    return float((corners[:, 1:] - corners[:, :1]).norm(dim=2).max())

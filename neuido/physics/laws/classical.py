@@ -1,0 +1,425 @@
+"""The classical elastic and plastic laws, and mixtures of them over scenes. Engine form in Warp, slow twin in torch; see `law.Law`."""
+
+import math
+import numbers
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.laws import classical_kernels as law_kernels
+from neuido.physics.laws.base import AutogradElastic, AutogradLaw, AutogradPlastic, ElasticLaw, Law, Parameter, PlasticLaw
+from neuido.physics.laws.classical_kernels import FLOOR
+from neuido.physics.linalg import decompositions as linalg
+from neuido.physics.runtime.device import launch, real_of, torch_stream
+from neuido.types import Particles
+
+__all__ = [
+    "AutogradElastic",
+    "AutogradLaw",
+    "AutogradPlastic",
+    "DruckerPrager",
+    "ElasticLaw",
+    "FixedCorotated",
+    "Identity",
+    "Law",
+    "NeoHookean",
+    "PlasticLaw",
+    "Sigma",
+    "StackedElastic",
+    "StackedPlastic",
+    "VonMises",
+    "lame",
+    "material",
+    "stack",
+]
+
+
+def lame(young: Tensor, poisson: Tensor) -> tuple[Tensor, Tensor]:
+    """Lamé's parameters (mu, lambda) [Pa] of Young's modulus [Pa] and Poisson's ratio."""
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+# Allowed open interval of each parameter, and its unit.
+_RANGES = {
+    "young": (0.0, math.inf, " Pa"),
+    "poisson": (-1.0, 0.5, ""),
+    "yield_stress": (0.0, math.inf, " Pa"),
+    "friction_angle": (0.0, 90.0, " degrees"),
+}
+
+
+def _parameters(law: type, **values: Parameter) -> tuple[Tensor, ...]:
+    """Check the parameters and bring them to one shape (S,). Numbers become float64, on the device of the tensors."""
+    tensors = []
+    device = next((value.device for value in values.values() if isinstance(value, Tensor)), None)
+    for name, value in values.items():
+        low, high, unit = _RANGES[name]
+        if not isinstance(value, Tensor):
+            if isinstance(value, bool) or not isinstance(value, numbers.Real):
+                hint = " (YAML reads 1e5 as text: write 1.0e+5)" if isinstance(value, str) else ""
+                raise UserError(f"{law.__name__}: {name} = {value!r} is not a number{hint}")
+            value = torch.tensor(float(value), dtype=torch.float64, device=device)
+        if value.dtype not in (torch.float32, torch.float64) or value.ndim > 1 or value.numel() == 0:
+            raise UserError(
+                f"{law.__name__}: {name} is a {value.dtype} tensor of shape {tuple(value.shape)}; give float32 or float64, (S,)"
+            )
+        value = value.reshape(-1)
+        bad = ~((value > low) & (value < high)).detach()
+        if bad.any():
+            allowed = f"{name} > {low:g}" if high == math.inf else f"{low:g} < {name} < {high:g}"
+            finite = " and finite" if high == math.inf else ""
+            raise UserError(f"{law.__name__}: {name} = {value.detach()[bad][0].item():g}{unit} is out of range: need {allowed}{finite}")
+        tensors.append(value)
+    sizes = {name: t.shape[0] for name, t in zip(values, tensors)}
+    scenes = max(sizes.values())
+    if any(size not in (1, scenes) for size in sizes.values()):
+        raise UserError(f"{law.__name__}: parameters of different length {sizes}; give one value, or one for each scene")
+    return tuple(t.expand(scenes) for t in tensors)
+
+
+class _Classical(Law):
+    """The engine form shared by the classical laws: one (S, n) tensor of parameters and a kind for each scene."""
+
+    kind: int
+    """Index of the law in `law_kernels`."""
+    _correct: bool
+    """True for plastic laws."""
+
+    def scene_laws(self) -> tuple[type["_Classical"], ...]:
+        """The class of each scene's law, S of them."""
+        return (type(self),) * self.tensors()[0].shape[0]
+
+    @staticmethod
+    def twin(F: Tensor, parameters: Tensor) -> Tensor:
+        """The law in plain torch; F (..., 3, 3), parameters (..., n) that broadcast against its leading axes."""
+        raise NotImplementedError
+
+    def _kinds(self, device: torch.device) -> Tensor:
+        cache = self.__dict__.setdefault("_kind_cache", {})
+        if device not in cache:
+            cache[device] = torch.tensor([law.kind for law in self.scene_laws()], dtype=torch.int32, device=device)
+        return cache[device]
+
+    def _launch(
+        self, name: str, tensors: Sequence[Tensor], arrays: Sequence[Tensor], parameters: Tensor | None, particles: Particles
+    ) -> None:
+        F = arrays[0]
+        kernel = getattr(law_kernels.kernels(real_of(F.dtype)), name)
+        row = tensors[0].detach().to(F).contiguous()
+        inputs: list[Any] = [F, self._kinds(F.device), row, particles.scene, *arrays[1:]]
+        if name.endswith("adjoint"):
+            inputs.append(parameters)
+        with torch_stream(F.device):
+            launch(kernel, len(F), inputs, F.device)
+
+    def alone(self, s: int) -> Law:
+        laws = self.scene_laws()
+        return _OfScene(laws[min(s, len(laws) - 1)], self._correct)
+
+    def key(self, tensors: Sequence[Tensor]) -> Hashable:
+        return tuple(law.__name__ for law in self.scene_laws())
+
+    def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
+        self._launch("correct" if self._correct else "stress", tensors, [F, out], None, particles)
+
+    def adjoint(
+        self,
+        tensors: Sequence[Tensor],
+        F: Tensor,
+        grad_out: Tensor,
+        grad_F: Tensor,
+        grad_tensors: Sequence[Tensor | None],
+        particles: Particles,
+    ) -> None:
+        name = "correct_adjoint" if self._correct else "stress_adjoint"
+        wanted = grad_tensors[0]
+        direct = wanted is None or (wanted.dtype == F.dtype and wanted.device == F.device and wanted.is_contiguous())
+        sink = wanted if direct else torch.zeros(wanted.shape, dtype=F.dtype, device=F.device)
+        self._launch(name, tensors, [F, grad_out, grad_F], sink, particles)
+        if not direct:
+            wanted += sink.to(wanted)
+
+    def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
+        (parameters,), laws = self.tensors(), self.scene_laws()
+        parameters = parameters.to(F)
+        if len(laws) == 1:
+            return laws[0].twin(F, parameters[0])
+        if particles is None:
+            raise UserError(f"{type(self).__name__} holds {len(laws)} scenes: give `particles` to say which scene each F belongs to")
+        out = torch.zeros_like(F)
+        scene = particles.scene.long()
+        kinds = self._kinds(F.device)[scene]
+        for law in dict.fromkeys(laws):
+            (index,) = torch.nonzero(kinds == law.kind, as_tuple=True)
+            out = out.index_copy(0, index, law.twin(F[index], parameters[scene[index]]))
+        return out
+
+
+class _OfScene(_Classical):
+    """The kernels' side of one scene of a law: its kind, with tensors from elsewhere."""
+
+    identity = False
+
+    def __init__(self, law: type[_Classical], correct: bool):
+        self._law, self._correct = law, correct
+
+    def scene_laws(self) -> tuple[type[_Classical], ...]:
+        return (self._law,)
+
+
+class _ClassicalElastic(_Classical, ElasticLaw):
+    _correct = False
+
+    def __init__(self, young: Parameter, poisson: Parameter):
+        """
+        Args:
+            young: Young's modulus [Pa], > 0.
+            poisson: Poisson's ratio [-], in (-1, 0.5).
+
+        Raises:
+            UserError: where a parameter is out of its range.
+        """
+        self.young, self.poisson = _parameters(type(self), young=young, poisson=poisson)
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """((S, 2) [mu, lambda] in Pa,)."""
+        return (torch.stack(lame(self.young, self.poisson), -1),)
+
+    def modulus(self) -> Tensor:
+        parameters = self.tensors()[0]
+        return 2 * parameters[:, 0] + parameters[:, 1]
+
+
+class FixedCorotated(_ClassicalElastic):
+    """tau = 2 mu (F - R) F^T + lambda J (J - 1) I (paper, appendix "Classical Material Models", Fixed Corotated Elasticity)."""
+
+    kind = law_kernels.FIXED_COROTATED
+
+    @staticmethod
+    def twin(F: Tensor, parameters: Tensor) -> Tensor:
+        mu, lam = parameters.unsqueeze(-2).unbind(-1)
+        at = linalg.frame(F)
+        sigma = at.sigma
+        J = sigma.prod(-1, keepdim=True)
+        t = 2 * mu * sigma * (sigma - 1) + lam * J * (J - 1)
+        slopes = 2 * mu.unsqueeze(-1) * (sigma.unsqueeze(-1) + sigma.unsqueeze(-2) - 1)
+        return linalg.isotropic_stress(F, at, t, slopes)
+
+
+class Sigma(_ClassicalElastic):
+    """tau = U diag(2 mu log sigma + lambda tr(log sigma)) U^T, Hencky's law (paper, appendix, Sigma Elasticity).
+
+    Principal stretches are bounded below by `law_kernels.FLOOR` inside the logarithm.
+    """
+
+    kind = law_kernels.SIGMA
+
+    @staticmethod
+    def twin(F: Tensor, parameters: Tensor) -> Tensor:
+        mu, lam = parameters.unsqueeze(-2).unbind(-1)
+        at = linalg.frame(F)
+        strain = at.sigma.clamp(min=FLOOR).log()
+        t = 2 * mu * strain + lam * strain.sum(-1, keepdim=True)
+        return linalg.isotropic_stress(F, at, t, 2 * mu.unsqueeze(-1) * linalg.log_difference(at.sigma, FLOOR))
+
+
+class NeoHookean(_ClassicalElastic):
+    """tau = mu F F^T + (lambda ln J - mu) I (PAC-NeRF, neo-Hookean elasticity). J is bounded below by `law_kernels.FLOOR` in ln J."""
+
+    kind = law_kernels.NEO_HOOKEAN
+
+    @staticmethod
+    def twin(F: Tensor, parameters: Tensor) -> Tensor:
+        mu, lam = parameters[..., None, None].unbind(-3)
+        eye = torch.eye(3, dtype=F.dtype, device=F.device)
+        J = torch.linalg.det(F)[..., None, None].clamp(min=FLOOR)
+        return mu * (F @ F.mT - eye) + lam * J.log() * eye
+
+
+class _ClassicalPlastic(_Classical, PlasticLaw):
+    _correct = True
+
+
+class Identity(_ClassicalPlastic):
+    """The corrected gradient is F itself (paper, appendix, Identity Plasticity)."""
+
+    kind = law_kernels.IDENTITY
+    identity = True
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """((1, 1) zero,)."""
+        return (torch.zeros(1, 1, dtype=torch.float64),)
+
+    @staticmethod
+    def twin(F: Tensor, parameters: Tensor) -> Tensor:
+        return F.clone()
+
+
+def _return(F: Tensor, at: linalg.Frame, radius: Tensor, strain: Tensor, elastic: Tensor) -> Tensor:
+    """Scale the deviator of the Hencky strain to `radius` (..., 1), except where `elastic` (...)."""
+    mean = strain.mean(-1, keepdim=True)
+    deviator = strain - mean
+    # Away from the surface the ratio is not used; 1 keeps its derivative finite at zero strain.
+    norm = torch.where(elastic.unsqueeze(-1), torch.ones_like(deviator), deviator).norm(dim=-1, keepdim=True)
+    ratio = radius / norm
+    h = mean + ratio * deviator
+    slopes = linalg.exp_difference(h) * ratio.unsqueeze(-1) * linalg.log_difference(at.sigma, FLOOR)
+    return torch.where(elastic[..., None, None], F, linalg.isotropic_map(F, at, h.exp(), slopes))
+
+
+class VonMises(_ClassicalPlastic):
+    """Return of the deviatoric Hencky strain to the radius tau_Y / (2 mu) (paper, appendix, Von Mises Plasticity).
+
+    F is returned unchanged inside the yield surface; det F never changes (stretches above `law_kernels.FLOOR`).
+    """
+
+    kind = law_kernels.VON_MISES
+
+    def __init__(self, yield_stress: Parameter, young: Parameter, poisson: Parameter):
+        """
+        Args:
+            yield_stress: tau_Y [Pa], > 0: the norm of the deviatoric Kirchhoff stress at yield.
+            young: Young's modulus [Pa], > 0.
+            poisson: Poisson's ratio [-], in (-1, 0.5).
+
+        Raises:
+            UserError: where a parameter is out of its range.
+        """
+        self.yield_stress, self.young, self.poisson = _parameters(type(self), yield_stress=yield_stress, young=young, poisson=poisson)
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """((S, 1) tau_Y / (2 mu), the strain at yield,)."""
+        mu, _ = lame(self.young, self.poisson)
+        return ((self.yield_stress / (2 * mu)).unsqueeze(-1),)
+
+    @staticmethod
+    def twin(F: Tensor, parameters: Tensor) -> Tensor:
+        at = linalg.frame(F)
+        strain = at.sigma.clamp(min=FLOOR).log()
+        deviator = (strain - strain.mean(-1, keepdim=True)).detach().norm(dim=-1)
+        return _return(F, at, parameters, strain, deviator <= parameters[..., 0].detach())
+
+
+class DruckerPrager(_ClassicalPlastic):
+    """Sand without cohesion: the identity stretch in expansion, else a return to Drucker and Prager's cone (paper, appendix).
+
+    F is returned unchanged inside the cone.
+    """
+
+    kind = law_kernels.DRUCKER_PRAGER
+
+    def __init__(self, friction_angle: Parameter, young: Parameter, poisson: Parameter):
+        """
+        Args:
+            friction_angle: phi_f [degrees], in (0, 90).
+            young: Young's modulus [Pa], > 0.
+            poisson: Poisson's ratio [-], in (-1, 0.5).
+
+        Raises:
+            UserError: where a parameter is out of its range.
+        """
+        self.friction_angle, self.young, self.poisson = _parameters(type(self), friction_angle=friction_angle, young=young, poisson=poisson)
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """((S, 1) alpha (3 lambda + 2 mu) / (2 mu), the slope of the cone in Hencky strain,)."""
+        mu, lam = lame(self.young, self.poisson)
+        sine = torch.sin(torch.deg2rad(self.friction_angle))
+        alpha = math.sqrt(2 / 3) * 2 * sine / (3 - sine)
+        return ((alpha * (3 * lam + 2 * mu) / (2 * mu)).unsqueeze(-1),)
+
+    @staticmethod
+    def twin(F: Tensor, parameters: Tensor) -> Tensor:
+        at = linalg.frame(F)
+        strain = at.sigma.clamp(min=FLOOR).log()
+        trace = strain.sum(-1, keepdim=True)
+        deviator = (strain - trace / 3).detach().norm(dim=-1)
+        radius = -parameters * trace
+        expanding = trace.squeeze(-1) > 0
+        elastic = expanding | (deviator <= radius.squeeze(-1))
+        rotation = linalg.isotropic_map(F, at, torch.ones_like(strain), torch.zeros_like(F))
+        return torch.where(expanding[..., None, None], rotation, _return(F, at, radius, strain, elastic))
+
+
+class _Stacked(_Classical):
+    def __init__(self, laws: Sequence[_Classical]):
+        self.laws = tuple(laws)
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        return (torch.cat([law.tensors()[0] for law in self.laws]),)
+
+    def scene_laws(self) -> tuple[type[_Classical], ...]:
+        return sum((law.scene_laws() for law in self.laws), ())
+
+
+class StackedElastic(_Stacked, ElasticLaw):
+    """Elastic laws of several kinds, one after the other over the scenes; see `stack`."""
+
+    _correct = False
+
+    def modulus(self) -> Tensor:
+        return torch.cat([law.modulus() for law in self.laws])
+
+
+class StackedPlastic(_Stacked, PlasticLaw):
+    """Plastic laws of several kinds, one after the other over the scenes; see `stack`."""
+
+    _correct = True
+
+    def __init__(self, laws: Sequence[_Classical]):
+        super().__init__(laws)
+        self.identity = all(law.identity for law in self.laws)
+
+
+def stack(laws: Sequence[Law]) -> StackedElastic | StackedPlastic:
+    """One law for the scenes of all `laws`, in their order: S = sum of theirs. They run in one launch.
+
+    Raises:
+        UserError: where `laws` is empty, mixes elastic and plastic laws, or holds a law that is not a classical one.
+    """
+    names = [type(law).__name__ for law in laws]
+    if not laws or not all(isinstance(law, _Classical) for law in laws):
+        raise UserError(f"stack() takes one or more classical laws, got {names}")
+    if all(isinstance(law, ElasticLaw) for law in laws):
+        return StackedElastic(laws)
+    if all(isinstance(law, PlasticLaw) for law in laws):
+        return StackedPlastic(laws)
+    raise UserError(f"stack() takes elastic laws or plastic laws, not both: {names}")
+
+
+_ELASTIC = {"fixed_corotated": (FixedCorotated, ()), "sigma": (Sigma, ()), "neo_hookean": (NeoHookean, ())}
+_PLASTIC = {"identity": (Identity, ()), "von_mises": (VonMises, ("yield_stress",)), "drucker_prager": (DruckerPrager, ("friction_angle",))}
+
+
+def _named(section: str, given: Mapping[str, Any], laws: dict, common: tuple[str, ...]) -> tuple[type, dict[str, Any]]:
+    name = given.get("law")
+    if name not in laws:
+        raise UserError(f"{section}.law = {name!r} is not known; one of {', '.join(laws)}")
+    law, own = laws[name]
+    accepted = (*common, *own)
+    for key in given:
+        if key not in ("law", *accepted):
+            raise UserError(f"{section}.{key} is not a key of {name}; it takes {', '.join(('law', *accepted))}")
+    for key in accepted:
+        if key not in given:
+            raise UserError(f"{section}.{key} is missing; {name} takes {', '.join(('law', *accepted))}")
+    return law, {key: given[key] for key in accepted}
+
+
+def material(elasticity: Mapping[str, Any], plasticity: Mapping[str, Any] | None = None) -> tuple[ElasticLaw, PlasticLaw]:
+    """The laws that an experiment file names.
+
+    Args:
+        elasticity: `law` (fixed_corotated, sigma, neo_hookean), `young` [Pa], `poisson`; numbers or tensors (S,).
+        plasticity: `law` (identity, von_mises, drucker_prager) with `yield_stress` [Pa] or `friction_angle` [degrees]. It shares
+            `young` and `poisson` with the elasticity. Default: identity.
+
+    Raises:
+        UserError: for an unknown law, an unknown or missing key, or a parameter out of its range.
+    """
+    law, elastic = _named("elasticity", elasticity, _ELASTIC, ("young", "poisson"))
+    pair = law(**elastic)
+    law, own = _named("plasticity", plasticity or {"law": "identity"}, _PLASTIC, ())
+    return pair, law(**own, **elastic) if own else law()

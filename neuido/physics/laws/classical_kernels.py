@@ -1,0 +1,341 @@
+"""Warp kernels of the classical laws, with hand-written adjoints.
+
+Every law here is isotropic: with F = U diag(sigma) V^T the stress is U diag(t) U^T and the corrected gradient U diag(z) V^T. Derivatives in
+the frame of U and V are divided differences of t and z, finite at repeated singular values, which is where every rollout begins (F = I).
+
+The decomposition is `warp_linalg`'s; Warp's own `svd3` and its adjoint are not used.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg.warp_functions import FLOOR
+from neuido.physics.runtime.device import start_warp
+
+FIXED_COROTATED, SIGMA, NEO_HOOKEAN = 0, 1, 2
+IDENTITY, VON_MISES, DRUCKER_PRAGER = 0, 1, 2
+
+LOCKED = 0.05
+"""Least share of its extensibility that `strain_stiffening` leaves a body: 1 - k (I1bar - 3) is bounded below by it."""
+GAP = 1e-6
+"""Lower bound of sigma_i + sigma_j in a denominator; only an inverted F can come near it."""
+
+FLAT = 0.1
+"""det F below which a stretch is taken from the principal frame."""
+
+
+class LawKernels(NamedTuple):
+    """The kernels for one scalar type. `kinds` (S,) int32, `params` (S, n); a particle of scene s reads row min(s, S - 1)."""
+
+    stress: Any
+    """(F, kinds, params (S, 2) [mu, lambda], scene, tau)"""
+    stress_adjoint: Any
+    """(F, kinds, params, scene, grad_tau, grad_F, grad_params or None): both gradients are added to."""
+    correct: Any
+    """(F, kinds, params (S, 1), scene, corrected)"""
+    correct_adjoint: Any
+    """(F, kinds, params, scene, grad_corrected, grad_F, grad_params or None): both gradients are added to."""
+    decompose: Any
+    """(F, U, sigma, V): the principal frame, sigma with the sign of det F on the last."""
+
+
+@functools.cache
+def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = False) -> LawKernels:
+    """Build the kernels for `wp.float32` or `wp.float64`.
+
+    The two options exist for the tests: `enable_backward` lets Warp generate adjoints of the forward kernels as well, and `builtin_svd`
+    puts Warp's own `svd3` in place of the Jacobi iteration (whose data-dependent loop Warp cannot differentiate).
+    """
+    start_warp()
+    mat = wp.types.matrix((3, 3), real)
+    vec = wp.types.vector(3, real)
+    floor = wp.constant(real(FLOOR))
+    gap = wp.constant(real(GAP))
+    flat = wp.constant(real(FLAT))
+    zero = wp.constant(real(0.0))
+    half = wp.constant(real(0.5))
+    one = wp.constant(real(1.0))
+    two = wp.constant(real(2.0))
+    own = warp_linalg.functions(real, builtin_svd=builtin_svd)
+    log1p, exp_slope, strain, volume_change, cofactor = own.log1p, own.exp_slope, own.strain, own.volume_change, own.cofactor
+    frame, compose, bounded, hencky = own.frame, own.compose, own.bounded, own.hencky
+    inverse_stretch, log_difference, stretch = own.inverse_stretch, own.log_difference, own.stretch
+    slight, log_stretch, exp_excess = own.slight, own.log_stretch, own.exp_excess
+
+    @wp.func
+    def corotated_in_frame(Fp: mat, mu: real, lam: real):
+        U, d, _V = frame(Fp)
+        dJ = d[0] + d[1] + d[2] + d[0] * d[1] + d[0] * d[2] + d[1] * d[2] + d[0] * d[1] * d[2]
+        bulk = lam * (one + dJ) * dJ
+        k = two * mu
+        return compose(U, vec(k * (one + d[0]) * d[0] + bulk, k * (one + d[1]) * d[1] + bulk, k * (one + d[2]) * d[2] + bulk))
+
+    @wp.func
+    def corotated_by_stretch(Fp: mat, mu: real, lam: real):
+        """tau = 2 mu (V^2 - V) + lambda J (J - 1) I, without a frame: a fifth of the time."""
+        dJ = volume_change(Fp)
+        out = mat()
+        if one + dJ > flat:
+            E = strain(Fp)
+            out = (two * mu) * (E - stretch(E, dJ)) + (lam * (one + dJ) * dJ) * wp.identity(n=3, dtype=real)
+        else:
+            out = corotated_in_frame(Fp, mu, lam)
+        return out
+
+    @wp.func
+    def hencky_in_frame(Fp: mat, mu: real, lam: real):
+        U, d, _V = frame(Fp)
+        e = hencky(d)
+        bulk = lam * (e[0] + e[1] + e[2])
+        k = two * mu
+        return compose(U, vec(k * e[0] + bulk, k * e[1] + bulk, k * e[2] + bulk))
+
+    @wp.func
+    def hencky_by_series(Fp: mat, mu: real, lam: real):
+        """tau = 2 mu ln V + lambda ln(J) I, without a frame where the strain is slight."""
+        E = strain(Fp)
+        out = mat()
+        if wp.ddot(E, E) <= slight * slight:
+            out = (two * mu) * log_stretch(E) + (lam * log1p(volume_change(Fp))) * wp.identity(n=3, dtype=real)
+        else:
+            out = hencky_in_frame(Fp, mu, lam)
+        return out
+
+    corotated = corotated_in_frame if builtin_svd else corotated_by_stretch
+    logarithmic = hencky_in_frame if builtin_svd else hencky_by_series
+
+    @wp.kernel(enable_backward=enable_backward, module="unique")
+    def stress(
+        F: wp.array(dtype=mat),
+        kinds: wp.array(dtype=wp.int32),
+        params: wp.array2d(dtype=real),
+        scene: wp.array(dtype=wp.int32),
+        tau: wp.array(dtype=mat),
+    ):
+        p = wp.tid()
+        s = wp.min(scene[p], params.shape[0] - 1)
+        mu = params[s, 0]
+        lam = params[s, 1]
+        kind = kinds[s]
+        Fp = F[p]
+        if kind == NEO_HOOKEAN:
+            dJ = bounded(volume_change(Fp))
+            tau[p] = mu * strain(Fp) + (lam * log1p(dJ)) * wp.identity(n=3, dtype=real)
+        elif kind == FIXED_COROTATED:
+            tau[p] = corotated(Fp, mu, lam)
+        else:
+            tau[p] = logarithmic(Fp, mu, lam)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def stress_adjoint(
+        F: wp.array(dtype=mat),
+        kinds: wp.array(dtype=wp.int32),
+        params: wp.array2d(dtype=real),
+        scene: wp.array(dtype=wp.int32),
+        grad_tau: wp.array(dtype=mat),
+        grad_F: wp.array(dtype=mat),
+        grad_params: wp.array2d(dtype=real),
+    ):
+        p = wp.tid()
+        s = wp.min(scene[p], params.shape[0] - 1)
+        mu = params[s, 0]
+        lam = params[s, 1]
+        kind = kinds[s]
+        Fp = F[p]
+        A = grad_tau[p]
+        trace = A[0, 0] + A[1, 1] + A[2, 2]
+        if kind == NEO_HOOKEAN:
+            dJ = volume_change(Fp)
+            grad = mu * ((A + wp.transpose(A)) * Fp)
+            if one + dJ > floor:
+                grad = grad + (trace * lam / (one + dJ)) * cofactor(Fp)
+            grad_F[p] = grad_F[p] + grad
+            if grad_params:
+                wp.atomic_add(grad_params, s, 0, wp.ddot(A, strain(Fp)))
+                wp.atomic_add(grad_params, s, 1, trace * log1p(bounded(dJ)))
+        else:
+            U, d, V = frame(Fp)
+            A = wp.transpose(U) * A * U
+            sigma = vec(one + d[0], one + d[1], one + d[2])
+            B = mat()
+            shear = real(0.0)
+            bulk = real(0.0)
+            if kind == FIXED_COROTATED:
+                dJ = d[0] + d[1] + d[2] + d[0] * d[1] + d[0] * d[2] + d[1] * d[2] + d[0] * d[1] * d[2]
+                cof = vec(sigma[1] * sigma[2], sigma[0] * sigma[2], sigma[0] * sigma[1])
+                bulk = trace * (one + dJ) * dJ
+                for i in range(3):
+                    shear += two * A[i, i] * sigma[i] * d[i]
+                    B[i, i] = A[i, i] * two * mu * (sigma[i] + d[i]) + trace * lam * (one + two * dJ) * cof[i]
+                    for j in range(3):
+                        if i != j:
+                            total = wp.max(sigma[i] + sigma[j], gap)
+                            B[i, j] = (A[i, j] + A[j, i]) * sigma[j] * two * mu * (one - one / total)
+            else:
+                e = hencky(d)
+                inv = inverse_stretch(d)
+                bulk = trace * (e[0] + e[1] + e[2])
+                for i in range(3):
+                    shear += two * A[i, i] * e[i]
+                    B[i, i] = (A[i, i] * two * mu + trace * lam) * inv[i]
+                    for j in range(3):
+                        if i != j:
+                            total = wp.max(sigma[i] + sigma[j], gap)
+                            B[i, j] = (A[i, j] + A[j, i]) * sigma[j] * two * mu * log_difference(d[i], d[j]) / total
+            grad_F[p] = grad_F[p] + U * B * wp.transpose(V)
+            if grad_params:
+                wp.atomic_add(grad_params, s, 0, shear)
+                wp.atomic_add(grad_params, s, 1, bulk)
+
+    @wp.func
+    def limit(q: real, trace: real, kind: wp.int32, param: real):
+        """(state, radius) of |dev e| = q: state 0 is elastic, 1 a return to |dev e| = radius, 2 a return to the identity."""
+        radius = param
+        if kind == DRUCKER_PRAGER:
+            radius = -param * trace
+        state = wp.int32(0)
+        if q > radius:
+            state = wp.int32(1)
+        if kind == DRUCKER_PRAGER and trace > zero:
+            state = wp.int32(2)
+        return state, radius
+
+    @wp.func
+    def flow(e: vec, kind: wp.int32, param: real):
+        """(state, trace, |dev e|, radius), as `limit`."""
+        trace = e[0] + e[1] + e[2]
+        m = trace / real(3.0)
+        q = wp.sqrt((e[0] - m) * (e[0] - m) + (e[1] - m) * (e[1] - m) + (e[2] - m) * (e[2] - m))
+        state, radius = limit(q, trace, kind, param)
+        return state, trace, q, radius
+
+    @wp.func
+    def return_in_frame(Fp: mat, kind: wp.int32, param: real):
+        U, d, V = frame(Fp)
+        e = hencky(d)
+        state, trace, q, radius = flow(e, kind, param)
+        out = Fp
+        if state > 0:
+            # z - sigma, so that F moves by the plastic increment alone and does not pick up the rounding of U and V.
+            c0 = -d[0]
+            c1 = -d[1]
+            c2 = -d[2]
+            if state == 1:
+                m = trace / real(3.0)
+                shrink = radius / q - one
+                x = shrink * (e[0] - m)
+                c0 = wp.exp(e[0]) * x * exp_slope(x) + wp.max(floor - one - d[0], zero)
+                x = shrink * (e[1] - m)
+                c1 = wp.exp(e[1]) * x * exp_slope(x) + wp.max(floor - one - d[1], zero)
+                x = shrink * (e[2] - m)
+                c2 = wp.exp(e[2]) * x * exp_slope(x) + wp.max(floor - one - d[2], zero)
+            out = Fp + U * wp.diag(vec(c0, c1, c2)) * wp.transpose(V)
+        return out
+
+    @wp.func
+    def return_by_series(Fp: mat, kind: wp.int32, param: real):
+        """The same without a frame where the strain is slight: F + (exp(X) - 1) F with X the plastic increment of -ln V."""
+        E = strain(Fp)
+        out = Fp
+        if wp.ddot(E, E) <= slight * slight:
+            L = log_stretch(E)
+            dJ = volume_change(Fp)
+            trace = log1p(dJ)
+            D = L - (trace / real(3.0)) * wp.identity(n=3, dtype=real)
+            q = wp.sqrt(wp.ddot(D, D))
+            state, radius = limit(q, trace, kind, param)
+            if state == 1:
+                out = Fp + exp_excess((radius / q - one) * D) * Fp
+            if state == 2:
+                out = Fp + exp_excess(-L) * Fp
+        else:
+            out = return_in_frame(Fp, kind, param)
+        return out
+
+    returned = return_in_frame if builtin_svd else return_by_series
+
+    @wp.kernel(enable_backward=enable_backward, module="unique")
+    def correct(
+        F: wp.array(dtype=mat),
+        kinds: wp.array(dtype=wp.int32),
+        params: wp.array2d(dtype=real),
+        scene: wp.array(dtype=wp.int32),
+        corrected: wp.array(dtype=mat),
+    ):
+        p = wp.tid()
+        s = wp.min(scene[p], params.shape[0] - 1)
+        kind = kinds[s]
+        if kind == IDENTITY:
+            corrected[p] = F[p]
+        else:
+            corrected[p] = returned(F[p], kind, params[s, 0])
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def correct_adjoint(
+        F: wp.array(dtype=mat),
+        kinds: wp.array(dtype=wp.int32),
+        params: wp.array2d(dtype=real),
+        scene: wp.array(dtype=wp.int32),
+        grad_corrected: wp.array(dtype=mat),
+        grad_F: wp.array(dtype=mat),
+        grad_params: wp.array2d(dtype=real),
+    ):
+        p = wp.tid()
+        s = wp.min(scene[p], params.shape[0] - 1)
+        kind = kinds[s]
+        A = grad_corrected[p]
+        if kind == IDENTITY:
+            grad_F[p] = grad_F[p] + A
+        else:
+            U, d, V = frame(F[p])
+            e = hencky(d)
+            state, trace, q, radius = flow(e, kind, params[s, 0])
+            if state == 0:
+                grad_F[p] = grad_F[p] + A
+            else:
+                A = wp.transpose(U) * A * V
+                B = mat()
+                if state == 2:
+                    for i in range(3):
+                        for j in range(3):
+                            if i != j:
+                                B[i, j] = (A[i, j] - A[j, i]) / wp.max(two + d[i] + d[j], gap)
+                else:
+                    m = trace / real(3.0)
+                    ratio = radius / q
+                    inv = inverse_stretch(d)
+                    n = vec((e[0] - m) / q, (e[1] - m) / q, (e[2] - m) / q)
+                    z = vec(wp.exp(m + radius * n[0]), wp.exp(m + radius * n[1]), wp.exp(m + radius * n[2]))
+                    g = vec(A[0, 0] * z[0], A[1, 1] * z[1], A[2, 2] * z[2])
+                    along = wp.dot(g, n)
+                    mean = (g[0] + g[1] + g[2]) / real(3.0)
+                    # Derivative of the radius with the trace of the strain, and with the law's parameter.
+                    slope = zero
+                    weight = one
+                    if kind == DRUCKER_PRAGER:
+                        slope = -params[s, 0]
+                        weight = -trace
+                    for i in range(3):
+                        B[i, i] = inv[i] * (mean + slope * along + ratio * (g[i] - mean - along * n[i]))
+                        for j in range(3):
+                            if i != j:
+                                x = ratio * (e[j] - e[i])
+                                sym = z[i] * exp_slope(x) * ratio * log_difference(d[i], d[j])
+                                skew = (z[i] + z[j]) / wp.max(two + d[i] + d[j], gap)
+                                B[i, j] = half * (sym * (A[i, j] + A[j, i]) + skew * (A[i, j] - A[j, i]))
+                    if grad_params:
+                        wp.atomic_add(grad_params, s, 0, weight * along)
+                grad_F[p] = grad_F[p] + U * B * wp.transpose(V)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def decompose(F: wp.array(dtype=mat), U: wp.array(dtype=mat), sigma: wp.array(dtype=vec), V: wp.array(dtype=mat)):
+        p = wp.tid()
+        u, excess, v = frame(F[p])
+        U[p] = u
+        sigma[p] = vec(one + excess[0], one + excess[1], one + excess[2])
+        V[p] = v
+
+    return LawKernels(stress, stress_adjoint, correct, correct_adjoint, decompose)

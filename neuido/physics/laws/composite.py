@@ -1,0 +1,105 @@
+"""Several laws in one scene, each for particles of its own: bodies of different materials in contact.
+
+The parts run one after the other on their own particles, gathered and scattered; a rollout with them is not captured in a graph.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.laws.base import ElasticLaw, Law, PlasticLaw
+from neuido.types import Particles
+
+
+class _Composite(Law):
+    """Laws of one scene, by particle.
+
+    Args:
+        laws: B laws of one scene each.
+        body: Which law a particle has, (P,) int64, in the order in which the engine sees the particles (`by_body` sorts it so).
+    """
+
+    def __init__(self, laws: Sequence[Law], body: Tensor):
+        if not laws or int(body.min()) < 0 or int(body.max()) >= len(laws):
+            raise UserError(f"{len(laws)} laws for particles of bodies {int(body.min())} to {int(body.max())}")
+        self.laws = tuple(laws)
+        self.rows = [(body == b).nonzero()[:, 0] for b in range(len(laws))]
+        self.counts = [len(law.tensors()) for law in laws]
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        return tuple(t for law in self.laws for t in law.tensors())
+
+    def _parts(self, tensors: Sequence):
+        start = 0
+        for law, rows, count in zip(self.laws, self.rows, self.counts):
+            own = Particles(torch.zeros(len(rows), dtype=torch.int32, device=rows.device), (0, len(rows)))
+            yield law, rows, own, tensors[start : start + count]
+            start += count
+
+    def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
+        for law, rows, own, part in self._parts(tensors):
+            result = torch.empty_like(F[rows])
+            if getattr(law, "identity", False):
+                result = F[rows]
+            else:
+                law.forward(part, F[rows].contiguous(), result, own)
+            out[rows] = result
+
+    def adjoint(
+        self,
+        tensors: Sequence[Tensor],
+        F: Tensor,
+        grad_out: Tensor,
+        grad_F: Tensor,
+        grad_tensors: Sequence[Tensor | None],
+        particles: Particles,
+    ) -> None:
+        for (law, rows, own, part), (*_, grads) in zip(self._parts(tensors), self._parts(grad_tensors)):
+            if getattr(law, "identity", False):
+                grad_F[rows] += grad_out[rows]
+                continue
+            own_grad = torch.zeros_like(F[rows])
+            law.adjoint(part, F[rows].contiguous(), grad_out[rows].contiguous(), own_grad, grads, own)
+            grad_F[rows] += own_grad
+
+
+class CompositeElastic(_Composite, ElasticLaw):
+    """Elastic laws by particle."""
+
+    def modulus(self) -> Tensor:
+        """The largest of the parts' [Pa], (1,)."""
+        return torch.stack([law.modulus().max().double() for law in self.laws]).max()[None]  # type: ignore[attr-defined]
+
+    def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
+        out = torch.zeros_like(F)
+        for law, rows in zip(self.laws, self.rows):
+            out = out.index_copy(0, rows, law(F[rows]))
+        return out
+
+
+class CompositePlastic(CompositeElastic, PlasticLaw):
+    """Plastic laws by particle."""
+
+    identity = False
+
+
+def by_body(
+    elasticity: Sequence[ElasticLaw], plasticity: Sequence[PlasticLaw], counts: Sequence[int], order: Tensor
+) -> tuple[CompositeElastic, CompositePlastic]:
+    """The laws of bodies that were concatenated to one.
+
+    Args:
+        elasticity: An elastic law of one scene for each body.
+        plasticity: A plastic law for each body.
+        counts: Particles of each body, in the order of concatenation.
+        order: `Simulator.order` of the simulator that will run them.
+
+    Raises:
+        UserError: Numbers of laws, bodies and particles that do not fit.
+    """
+    if not len(elasticity) == len(plasticity) == len(counts) or sum(counts) != len(order):
+        raise UserError(f"{len(elasticity)} and {len(plasticity)} laws for bodies of {list(counts)} particles, {len(order)} in all")
+    body = torch.arange(len(counts), device=order.device).repeat_interleave(torch.tensor(list(counts), device=order.device))[order]
+    return CompositeElastic(elasticity, body), CompositePlastic(plasticity, body)

@@ -1,0 +1,265 @@
+"""Objective networks as one kernel a law: features, network and read-out without a round trip to memory (CUDA, float32).
+
+A warp carries 32 particles of one scene, a lane one of them. Strain, features and read-out are a lane's own; the network's
+layers are matrix products of the warp on the tensor cores, in tf32 with the residues (three products for one, relative error
+1e-7: plain float32 would be bound by reading weights, tf32 alone is right to 1e-3). The columns that a lane holds of one
+layer's result are those that it must hold of the next layer's operand once the weights' rows are permuted, so activations
+never leave their registers. `networks.py` is the slow twin.
+
+    m16n8k8: a lane (g, t) = (lane / 4, lane % 4) holds rows g, g + 8 and columns 2t, 2t + 1 of a 16 x 8 result.
+"""
+
+import functools
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuido.physics.laws.base import Engine
+from neuido.physics.laws.neural import network_kernels
+from neuido.physics.laws.neural.fused_source import BACKWARD, FORWARD
+from neuido.physics.runtime.device import launch, start_warp
+from neuido.types import Particles
+
+WIDTHS = (32, 64)
+"""Hidden widths that are compiled."""
+
+BLOCK = 32
+"""Threads a block: the warps of a small body then spread most evenly over the multiprocessors."""
+
+INPUTS = 16
+"""Columns of the first operand: nine features, a one for the bias, padding."""
+
+
+@functools.cache
+def build(width: int) -> SimpleNamespace:
+    """The fused kernels for one hidden width."""
+    start_warp()
+    tiles = width // 8
+    kept = 8 * tiles + 4
+    sizes = {
+        "H": width, "NT": tiles, "KEPT": kept, "SIZE1": 2 * tiles * 128, "SIZE2": tiles * tiles * 128, "SIZE3": tiles * 128,
+        "SIZE3T": tiles * 128,
+    }  # fmt: skip
+    name = f"neuido.fused.{width}"
+    # approximate logarithms, roots and divisions in the strain and its features, right to 1e-6: a third of the instructions
+    wp.set_module_options({"fast_math": True}, module=wp.get_module(name))
+    own = network_kernels.functions(wp.float32, name)
+    vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
+    vecK = wp.types.vector(length=kept, dtype=wp.float32)
+    measure, features_of, stress_of, stress_coefficients = own.measure, own.features_of, own.stress_of, own.stress_coefficients
+    stress_gradient, correction_of = own.stress_gradient, own.correction_of
+    correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    func = functools.partial(wp.func, module=name)
+    floats = wp.array(dtype=wp.float32)
+    ints = wp.array(dtype=wp.int32)
+
+    @wp.func_native(FORWARD.format(**sizes))
+    def network(x: vec9, shared: int, scene: int, W1: floats, W2: floats, B2: floats, W3: floats, B3: floats) -> vecK: ...
+
+    @wp.func_native(BACKWARD.format(**sizes))
+    def network_adjoint(
+        x: vec9, kept: vecK, gy: vec4, shared: int, scene: int, W1: floats, W2T: floats, W3T: floats, W1T: floats,
+        warp: int, first: int, last: int, P3: floats, PB: floats, H1: floats, G1: floats, G2: floats,
+    ) -> vec9: ...  # fmt: skip
+
+    @func
+    def outputs(k: vecK):
+        return vec4(k[wp.static(kept - 4)], k[wp.static(kept - 3)], k[wp.static(kept - 2)], k[wp.static(kept - 1)])
+
+    @kernel
+    def stress(
+        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
+        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, tau: wp.array(dtype=mat33),
+    ):  # fmt: skip
+        tid = wp.tid()
+        warp = tid / 32
+        p = firsts[warp] + tid % 32
+        s = scenes[warp]
+        Fp = F[wp.min(p, lasts[warp] - 1)]
+        N, h, l, A, q = measure(Fp)
+        k = network(features_of(l, A, q), wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2, B2, W3, B3)
+        if p < lasts[warp]:
+            tau[p] = stress_of(l, A, q, outputs(k), scale)
+
+    @kernel
+    def correct(
+        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
+        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, out: wp.array(dtype=mat33),
+    ):  # fmt: skip
+        tid = wp.tid()
+        warp = tid / 32
+        p = firsts[warp] + tid % 32
+        s = scenes[warp]
+        Fp = F[wp.min(p, lasts[warp] - 1)]
+        N, h, l, A, q = measure(Fp)
+        k = network(features_of(l, A, q), wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2, B2, W3, B3)
+        if p < lasts[warp]:
+            out[p] = correction_of(Fp, l, A, q, outputs(k), scale)
+
+    @kernel
+    def stress_adjoint(
+        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
+        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, W2T: floats, W3T: floats, W1T: floats,
+        g_out: wp.array(dtype=mat33), g_F: wp.array(dtype=mat33),
+        P3: floats, PB: floats, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
+    ):  # fmt: skip
+        """Adds to g_F, and to the warp's share of the last layer's gradient where P3 is given; writes units where X is."""
+        tid = wp.tid()
+        warp = tid / 32
+        last = lasts[warp]
+        p = firsts[warp] + tid % 32
+        s = wp.min(scenes[warp], shared - 1)
+        r = wp.min(scenes[warp], rows - 1)
+        pp = wp.min(p, last - 1)
+        g = g_out[pp]
+        N, h, l, A, q = measure(F[pp])
+        x = features_of(l, A, q)
+        k = network(x, s, r, W1, W2, B2, W3, B3)
+        gy = stress_coefficients(l, A, q, scale, g)
+        if p >= last:
+            gy = vec4(0.0, 0.0, 0.0, 0.0)
+        gx = network_adjoint(x, k, gy, s, r, W1, W2T, W3T, W1T, warp, firsts[warp], last, P3, PB, H1, G1, G2)
+        if p < last:
+            if X:
+                X[p] = x
+            # measured again: cheaper than the registers to remember it
+            N2, h2, l2, A2, q2 = measure(F[p])
+            g_F[p] = g_F[p] + stress_gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, g_out[p], gx)
+
+    @kernel
+    def correct_adjoint(
+        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
+        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, W2T: floats, W3T: floats, W1T: floats,
+        g_out: wp.array(dtype=mat33), g_F: wp.array(dtype=mat33),
+        P3: floats, PB: floats, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
+    ):  # fmt: skip
+        """As `stress_adjoint`."""
+        tid = wp.tid()
+        warp = tid / 32
+        last = lasts[warp]
+        p = firsts[warp] + tid % 32
+        s = wp.min(scenes[warp], shared - 1)
+        r = wp.min(scenes[warp], rows - 1)
+        pp = wp.min(p, last - 1)
+        g = g_out[pp]
+        N, h, l, A, q = measure(F[pp])
+        x = features_of(l, A, q)
+        k = network(x, s, r, W1, W2, B2, W3, B3)
+        gy = correction_coefficients(F[pp], l, A, q, outputs(k), scale, 0, g)
+        if p >= last:
+            gy = vec4(0.0, 0.0, 0.0, 0.0)
+        gx = network_adjoint(x, k, gy, s, r, W1, W2T, W3T, W1T, warp, firsts[warp], last, P3, PB, H1, G1, G2)
+        if p < last:
+            if X:
+                X[p] = x
+            N2, h2, l2, A2, q2 = measure(F[p])  # as above
+            g_F[p] = g_F[p] + correction_gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, g_out[p], gx)
+
+    return SimpleNamespace(stress=stress, correct=correct, stress_adjoint=stress_adjoint, correct_adjoint=correct_adjoint)
+
+
+@functools.lru_cache(maxsize=16)
+def _warps(offsets: tuple[int, ...], device: torch.device) -> list[Tensor]:
+    """Scene, first and last particle of every warp; kept, since a graph may not copy from the host while it is captured."""
+    table = [(s, p, min(p + 32, j)) for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])) for p in range(i, j, 32)]
+    return [torch.tensor(column, dtype=torch.int32, device=device) for column in zip(*table)]
+
+
+@functools.lru_cache(maxsize=16)
+def _order(rows: int, columns: int, device: torch.device) -> Tensor:
+    """Where the two entries of each lane's fragment stand in a (rows, columns) matrix, (tiles, 32 lanes, 2)."""
+    lane = torch.arange(32)
+    g, t = lane // 4, lane % 4
+    tiles = [
+        torch.stack([(8 * k + 2 * t + half) * columns + 8 * n + g for half in (0, 1)], dim=1)
+        for k in range(rows // 8)
+        for n in range(columns // 8)
+    ]
+    return torch.stack(tiles).to(device)
+
+
+def _fragments(W: Tensor) -> Tensor:
+    """(S, rows, columns) -> (S, tiles * 32 * 4): of each lane two entries rounded to tf32, then their residues."""
+    entries = W.flatten(1)[:, _order(W.shape[1], W.shape[2], W.device)]
+    high = ((entries.contiguous().view(torch.int32) + 0x1000) & ~0x1FFF).view(torch.float32)
+    return torch.cat([high, entries - high], dim=-1).flatten(1).contiguous()
+
+
+class FusedEngine(Engine):
+    """An objective network for one rollout; the same interface and results as its law's own engine."""
+
+    def __init__(self, law, tensors: Sequence[Tensor], particles: Particles):
+        super().__init__(law, tensors, particles)
+        W1, b1, W2, b2, W3, b3 = self.tensors
+        self.width, self.outputs = W1.shape[1], W3.shape[1]
+        self.kernels = build(self.width)
+        elastic = self.outputs == network_kernels.STRESS_COEFFICIENTS
+        self._forward = self.kernels.stress if elastic else self.kernels.correct
+        self._adjoint = self.kernels.stress_adjoint if elastic else self.kernels.correct_adjoint
+        shared, own = max(t.shape[0] for t in (W1, b1, W2, b2)), max(W3.shape[0], b3.shape[0])
+        first = W1.new_zeros(shared, INPUTS, self.width)
+        first[:, :9], first[:, 9] = W1.mT, b1
+        last, offset = W1.new_zeros(own, self.width, 8), W1.new_zeros(own, 4)
+        last[..., : self.outputs], offset[:, : self.outputs] = W3.mT, b3
+        second, bias = W2.mT.expand(shared, -1, -1), b2.expand(shared, -1).contiguous()
+        self.first, self.second, self.last = first, second, last
+        self.rows = (shared, own)
+        self.packed = [t.view(-1) for t in (_fragments(first), _fragments(second), bias, _fragments(last), offset)]
+        self.warps = _warps(particles.offsets, W1.device)
+
+    @property
+    def threads(self) -> int:
+        return 32 * len(self.warps[0])
+
+    def forward(self, F: Tensor, out: Tensor) -> None:
+        arguments = [F, *self.warps, *self.rows, *self.packed, self.law.scale, out]
+        launch(self._forward, self.threads, arguments, F.device, block=BLOCK)
+
+    def start_adjoint(self, wanted: Sequence[bool]) -> None:
+        super().start_adjoint(wanted)
+        like, count = self.first, self.particles.offsets[-1]
+        self.transposed = [_fragments(t.mT.contiguous()).view(-1) for t in (self.second, self.last, self.first)]
+        self.full, self.ends = any(wanted[:4]), any(wanted[4:])
+        self.P3 = self.PB = self.X = self.H1 = self.G1 = self.G2 = None
+        if self.ends:
+            self.P3, self.PB = like.new_zeros(self.threads * self.width // 8), like.new_zeros(len(self.warps[0]) * 4)
+        if self.full:
+            self.X = like.new_empty(count, 9)
+            self.H1, self.G1, self.G2 = (like.new_empty(count * self.width) for _ in range(3))
+
+    def adjoint(self, F: Tensor, grad_out: Tensor, grad_F: Tensor) -> None:
+        arguments = [F, *self.warps, *self.rows, *self.packed, self.law.scale, *self.transposed, grad_out, grad_F,
+                     self.P3, self.PB, self.X, self.H1, self.G1, self.G2]  # fmt: skip
+        launch(self._adjoint, self.threads, arguments, F.device, block=BLOCK)
+        if self.full:
+            self._reduce_first(len(F))
+
+    def _reduce_first(self, count: int) -> None:
+        """The gradients of the first two layers, shared by all scenes or one for each."""
+        g1, b1, g2, b2 = self.grads[:4]
+        h1, d1, d2 = (t.view(count, self.width) for t in (self.H1, self.G1, self.G2))
+        ranges = [(0, 0, count)] if self.rows[0] == 1 else [
+            (s, i, j) for s, (i, j) in enumerate(zip(self.particles.offsets[:-1], self.particles.offsets[1:]))
+        ]  # fmt: skip
+        for s, i, j in ranges:
+            for target, d, value in ((g1, d1, self.X), (g2, d2, h1)):
+                if target is not None:
+                    target[min(s, len(target) - 1)].addmm_(d[i:j].T, value[i:j])
+            for target, d in ((b1, d1), (b2, d2)):
+                if target is not None:
+                    target[min(s, len(target) - 1)].add_(d[i:j].sum(0))
+
+    def gradients(self) -> list[Tensor | None]:
+        if self.ends:
+            # a warp's share: tile j, lane (g, t) holds output g % 4 of column 8 j + 2 t + g / 4
+            tiles = self.width // 8
+            share = self.P3.view(-1, tiles, 2, 4, 4).permute(0, 3, 1, 4, 2).reshape(-1, 4, self.width)
+            for target, value in ((self.grads[4], share), (self.grads[5], self.PB.view(-1, 4))):
+                if target is not None:
+                    rows = self.warps[0].long().clamp(max=len(target) - 1)
+                    target.index_add_(0, rows, value[:, : self.outputs].contiguous())
+        return self.grads

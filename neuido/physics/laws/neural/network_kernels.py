@@ -1,0 +1,398 @@
+"""Warp kernels around the effective networks: strain features, read-outs, and their hand-written adjoints.
+
+The strain of the objective trunk needs no SVD. With G = F - I,
+
+    e = (G + G^T + G G^T) / 2 = (b - I) / 2,   N = (I + e)^-1,   h = e N        (eigenvalues of h: tanh ln sigma)
+    H = h + h^3/3 + h^5/5 + h^7/7 ~ ln V,      l = tr H,   A = H - l/3 I,   q = sqrt(A:A + DELTA^2)
+
+Nine features of the invariants feed the network; its outputs c are coefficients:
+
+    elastic (4)   tau = scale (c0 l I + c1 A + c2 dev(A A)/q + c3 (A:A)/q I)
+    plastic (3)   r_d = scale c0 + c1 max(-l, 0),   r_v = scale c2              (radii of the elastic domain)
+                  f = clamp(1 - r_d/q, 0, 1),   u = clamp(l - r_v, 0, l) where l > 0, else 0
+                  F_hat = exp(-u/3) exp(-f A) F
+
+Constant coefficients are Hencky elasticity, von Mises (c0) and Drucker-Prager plasticity (c1; c2 = 0).
+exp of a symmetric matrix: Taylor polynomial of degree 4 at a quarter of it, squared twice.
+"""
+
+import functools
+import math
+from types import SimpleNamespace
+
+import warp as wp
+
+from neuido.physics.runtime.device import start_warp
+
+DELTA = 1e-5
+"""Floor of the deviatoric strain q [-]: keeps its derivative finite at F = I."""
+
+FINE, COARSE, LINEAR = 1e-3, 3e-2, 10.0
+"""Gains of the features: two asinh scales [-] and a linear one."""
+
+LODE = 3.0 * math.sqrt(6.0)
+
+FEATURES, STRESS_COEFFICIENTS, YIELD_COEFFICIENTS = 9, 4, 3
+
+
+def functions(real: type, name: str) -> SimpleNamespace:
+    """Warp functions of one particle, for the kernels of a module `name` (those here, and the fused ones)."""
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+    vec3 = wp.types.vector(length=3, dtype=real)
+    vec4 = wp.types.vector(length=4, dtype=real)
+    vec9 = wp.types.vector(length=9, dtype=real)
+    func = functools.partial(wp.func, module=name)
+
+    @func
+    def unit():
+        return wp.identity(n=3, dtype=real)
+
+    @func
+    def asinh(x: real):
+        y = wp.abs(x)
+        y = wp.log(y + wp.sqrt(y * y + real(1.0)))
+        if x < real(0.0):
+            y = -y
+        return y
+
+    @func
+    def asinh_slope(x: real):
+        return real(1.0) / wp.sqrt(x * x + real(1.0))
+
+    @func
+    def symmetric(m: mat33):
+        return real(0.5) * (m + wp.transpose(m))
+
+    @func
+    def shrinkage(F: mat33):
+        """N = (I + e)^-1 and h = e N."""
+        G = F - unit()
+        e = real(0.5) * (G + wp.transpose(G) + G * wp.transpose(G))
+        N = wp.inverse(unit() + e)
+        return N, symmetric(e * N)
+
+    @func
+    def hencky(h: mat33):
+        """H = artanh(h) to the seventh order."""
+        h2 = h * h
+        T = real(wp.static(1.0 / 5.0)) * unit() + real(wp.static(1.0 / 7.0)) * h2
+        return h + h * h2 * (real(wp.static(1.0 / 3.0)) * unit() + h2 * T)
+
+    @func
+    def norm(A: mat33):
+        return wp.sqrt(wp.ddot(A, A) + real(wp.static(DELTA * DELTA)))
+
+    @func
+    def strain_adjoint(F: mat33, N: mat33, h: mat33, gH: mat33):
+        """Adjoint of F from the adjoint of H."""
+        h2 = h * h
+        T = real(wp.static(1.0 / 5.0)) * unit() + real(wp.static(1.0 / 7.0)) * h2
+        U = real(wp.static(1.0 / 3.0)) * unit() + h2 * T
+        V = unit() + h2 * U
+        gV = h * gH
+        gU = h2 * gV
+        gh2 = gV * U + (h2 * gU) * real(wp.static(1.0 / 7.0)) + gU * T
+        gh = symmetric(gH * V) + real(2.0) * symmetric(h * symmetric(gh2))
+        return N * gh * N * F
+
+    @func
+    def cofactor(A: mat33):
+        """d det(A) / dA of a symmetric A."""
+        a = vec3(A[0, 0], A[0, 1], A[0, 2])
+        b = vec3(A[1, 0], A[1, 1], A[1, 2])
+        c = vec3(A[2, 0], A[2, 1], A[2, 2])
+        return wp.matrix_from_rows(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
+
+    @func
+    def exponential(M: mat33):
+        Y = real(0.25) * M
+        E = unit() + Y * (unit() + real(0.5) * Y * (unit() + real(wp.static(1.0 / 3.0)) * Y * (unit() + real(0.25) * Y)))
+        E = E * E
+        return E * E
+
+    @func
+    def exponential_adjoint(M: mat33, g: mat33):
+        """Adjoint of the symmetric M from the (symmetrised) adjoint of its exponential."""
+        Y = real(0.25) * M
+        C = unit() + real(0.25) * Y
+        B = unit() + real(wp.static(1.0 / 3.0)) * Y * C
+        A = unit() + real(0.5) * Y * B
+        E1 = unit() + Y * A
+        E2 = E1 * E1
+        g = real(2.0) * symmetric(E2 * symmetric(g))
+        g = real(2.0) * symmetric(E1 * g)
+        gA = Y * g
+        gB = real(0.5) * Y * gA
+        gC = real(wp.static(1.0 / 3.0)) * Y * gB
+        gY = g * A + real(0.5) * gA * B + real(wp.static(1.0 / 3.0)) * gB * C + real(0.25) * gC
+        return real(0.25) * symmetric(gY)
+
+    @func
+    def measure(F: mat33):
+        """N, h, and the invariants l, A, q of the Hencky strain."""
+        N, h = shrinkage(F)
+        H = hencky(h)
+        l = wp.trace(H)
+        A = H - (l / real(3.0)) * unit()
+        return N, h, l, A, norm(A)
+
+    @func
+    def features_of(l: real, A: mat33, q: real):
+        d = wp.determinant(A)
+        x = vec9()
+        x[0] = real(0.25) * asinh(l * real(wp.static(1.0 / FINE)))
+        x[1] = asinh(l * real(wp.static(1.0 / COARSE)))
+        x[2] = real(0.25) * asinh(q * real(wp.static(1.0 / FINE)))
+        x[3] = asinh(q * real(wp.static(1.0 / COARSE)))
+        x[4] = l / wp.sqrt(l * l + q * q)
+        x[5] = real(LODE) * d / (q * q * q)
+        x[6] = real(LINEAR) * l
+        x[7] = real(LINEAR) * q
+        x[8] = real(LINEAR) * d / (q * q)
+        return x
+
+    @func
+    def features_adjoint(l: real, A: mat33, q: real, X: vec9):
+        """Adjoints of l, q and A (through its determinant) from that of the features."""
+        d = wp.determinant(A)
+        r2 = l * l + q * q
+        r3 = r2 * wp.sqrt(r2)
+        q2 = q * q
+        gl = (
+            X[0] * real(wp.static(0.25 / FINE)) * asinh_slope(l * real(wp.static(1.0 / FINE)))
+            + X[1] * real(wp.static(1.0 / COARSE)) * asinh_slope(l * real(wp.static(1.0 / COARSE)))
+            + X[4] * q2 / r3
+            + X[6] * real(LINEAR)
+        )
+        gq = (
+            X[2] * real(wp.static(0.25 / FINE)) * asinh_slope(q * real(wp.static(1.0 / FINE)))
+            + X[3] * real(wp.static(1.0 / COARSE)) * asinh_slope(q * real(wp.static(1.0 / COARSE)))
+            - X[4] * l * q / r3
+            - X[5] * real(wp.static(3.0 * LODE)) * d / (q2 * q2)
+            + X[7] * real(LINEAR)
+            - X[8] * real(wp.static(2.0 * LINEAR)) * d / (q2 * q)
+        )
+        gd = X[5] * real(LODE) / (q2 * q) + X[8] * real(LINEAR) / q2
+        return gl, gq, gd * cofactor(A)
+
+    @func
+    def hencky_adjoint(gl: real, gq: real, gA: mat33, A: mat33, q: real):
+        """Adjoint of H from those of l, q and A."""
+        g = gA + (gq / q) * A
+        return symmetric(g) + ((gl - wp.trace(g) / real(3.0)) * unit())
+
+    @func
+    def stress_of(l: real, A: mat33, q: real, c: vec4, scale: real):
+        a = wp.ddot(A, A)
+        D = A * A - (a / real(3.0)) * unit()
+        return scale * ((c[0] * l + c[3] * a / q) * unit() + c[1] * A + (c[2] / q) * D)
+
+    @func
+    def stress_coefficients(l: real, A: mat33, q: real, scale: real, g_tau: mat33):
+        """Adjoint of c."""
+        a = wp.ddot(A, A)
+        D = A * A - (a / real(3.0)) * unit()
+        g = scale * g_tau
+        t = wp.trace(g)
+        return vec4(l * t, wp.ddot(g, A), wp.ddot(g, D) / q, a / q * t)
+
+    @func
+    def stress_gradient(F: mat33, N: mat33, h: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, g_tau: mat33, X: vec9):
+        """Adjoint of F: what comes through the generators, and through the features, whose adjoint is X."""
+        a = wp.ddot(A, A)
+        gl, gq, gA = features_adjoint(l, A, q, X)
+        g = symmetric(scale * g_tau)
+        t = wp.trace(g)
+        gl += c[0] * t
+        gD = (c[2] / q) * (g - (t / real(3.0)) * unit())
+        gA += c[1] * g + real(2.0) * symmetric(gD * A) + (real(2.0) * c[3] * t / q) * A
+        gq -= (c[2] * (wp.ddot(g, A * A) - a * t / real(3.0)) + c[3] * a * t) / (q * q)
+        return strain_adjoint(F, N, h, hencky_adjoint(gl, gq, gA, A, q))
+
+    @func
+    def flow(l: real, q: real, c: vec4, scale: real):
+        """Unclamped deviatoric fraction f, clamped f, and volumetric correction u."""
+        x = real(1.0) - (scale * c[0] + c[1] * wp.max(-l, real(0.0))) / q
+        f = wp.clamp(x, real(0.0), real(1.0))
+        u = real(0.0)
+        if l > real(0.0):
+            u = wp.clamp(l - scale * c[2], real(0.0), l)
+        return x, f, u
+
+    @func
+    def correction_of(F: mat33, l: real, A: mat33, q: real, c: vec4, scale: real):
+        x, f, u = flow(l, q, c, scale)
+        return wp.exp(-u / real(3.0)) * (exponential(-f * A) * F)
+
+    @func
+    def flow_adjoint(F: mat33, A: mat33, f: real, u: real, g: mat33):
+        """Adjoints of f and u, of M = -f A, and of F as the right factor."""
+        M = -f * A
+        E = exponential(M)
+        s = wp.exp(-u / real(3.0))
+        gM = exponential_adjoint(M, s * g * wp.transpose(F))
+        return -wp.ddot(gM, A), -s * wp.ddot(g, E * F) / real(3.0), gM, s * E * g
+
+    @func
+    def correction_coefficients(F: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, straight_through: int, g_out: mat33):
+        """Adjoint of c; `straight_through` lets it pass a clamp where descent leads back into the range."""
+        x, f, u = flow(l, q, c, scale)
+        gf, gu, gM, gF = flow_adjoint(F, A, f, u, g_out)
+        if x < real(0.0) and not (straight_through == 1 and gf < real(0.0)):
+            gf = real(0.0)
+        if x > real(1.0) and not (straight_through == 1 and gf > real(0.0)):
+            gf = real(0.0)
+        r = scale * c[2]
+        if l <= real(0.0):
+            gu = real(0.0)
+        elif r > l and not (straight_through == 1 and gu < real(0.0)):
+            gu = real(0.0)
+        elif r < real(0.0) and not (straight_through == 1 and gu > real(0.0)):
+            gu = real(0.0)
+        return vec4(-gf * scale / q, -gf * wp.max(-l, real(0.0)) / q, -gu * scale, real(0.0))
+
+    @func
+    def correction_gradient(F: mat33, N: mat33, h: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, g_out: mat33, X: vec9):
+        """Adjoint of F: what comes through the return map, and through the features, whose adjoint is X."""
+        x, f, u = flow(l, q, c, scale)
+        gf, gu, gM, gF = flow_adjoint(F, A, f, u, g_out)
+        gl, gq, gA = features_adjoint(l, A, q, X)
+        gA -= f * gM
+        if x > real(0.0) and x < real(1.0):
+            gq += gf * (real(1.0) - x) / q
+            if l < real(0.0):
+                gl += gf * c[1] / q
+        if l > real(0.0) and scale * c[2] < l:
+            gl += gu
+        return gF + strain_adjoint(F, N, h, hencky_adjoint(gl, gq, gA, A, q))
+
+    return SimpleNamespace(
+        vec4=vec4,
+        vec9=vec9,
+        mat33=mat33,
+        measure=measure,
+        features_of=features_of,
+        stress_of=stress_of,
+        stress_coefficients=stress_coefficients,
+        stress_gradient=stress_gradient,
+        correction_of=correction_of,
+        correction_coefficients=correction_coefficients,
+        correction_gradient=correction_gradient,
+    )
+
+
+@functools.cache
+def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
+    """The kernels for one scalar type, compiled on first launch; features (P, 9), coefficients (P, 4) or (P, 3).
+
+    Args:
+        real: `wp.float32` or `wp.float64`.
+        enable_backward: Also generate Warp's own adjoints (the oracle of the tests).
+    """
+    start_warp()
+    name = f"neuido.networks.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
+    own = functions(real, name)
+    vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
+    measure, features_of, stress_of, stress_coefficients = own.measure, own.features_of, own.stress_of, own.stress_coefficients
+    stress_gradient, correction_of = own.stress_gradient, own.correction_of
+    correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
+    func = functools.partial(wp.func, module=name)
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
+
+    @func
+    def row4(c: wp.array2d(dtype=real), p: int):
+        last = real(0.0)
+        if c.shape[1] > 3:
+            last = c[p, 3]
+        return vec4(c[p, 0], c[p, 1], c[p, 2], last)
+
+    @func
+    def row9(X: wp.array2d(dtype=real), p: int):
+        x = vec9()
+        for i in range(9):
+            x[i] = X[p, i]
+        return x
+
+    @kernel
+    def features(F: wp.array(dtype=mat33), X: wp.array2d(dtype=real)):
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        x = features_of(l, A, q)
+        for i in range(9):
+            X[p, i] = x[i]
+
+    @kernel
+    def stress(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, tau: wp.array(dtype=mat33)):
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        tau[p] = stress_of(l, A, q, row4(c, p), scale)
+
+    @kernel
+    def stress_coefficients_adjoint(F: wp.array(dtype=mat33), scale: real, g_tau: wp.array(dtype=mat33), g_c: wp.array2d(dtype=real)):
+        """Writes the adjoint of c."""
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        g = stress_coefficients(l, A, q, scale, g_tau[p])
+        for i in range(4):
+            g_c[p, i] = g[i]
+
+    @kernel
+    def stress_adjoint(
+        F: wp.array(dtype=mat33),
+        c: wp.array2d(dtype=real),
+        scale: real,
+        g_tau: wp.array(dtype=mat33),
+        g_X: wp.array2d(dtype=real),
+        g_F: wp.array(dtype=mat33),
+    ):
+        """Adds to the adjoint of F."""
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        g_F[p] = g_F[p] + stress_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_tau[p], row9(g_X, p))
+
+    @kernel
+    def correction(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, out: wp.array(dtype=mat33)):
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        out[p] = correction_of(F[p], l, A, q, row4(c, p), scale)
+
+    @kernel
+    def correction_coefficients_adjoint(
+        F: wp.array(dtype=mat33),
+        c: wp.array2d(dtype=real),
+        scale: real,
+        straight_through: int,
+        g_out: wp.array(dtype=mat33),
+        g_c: wp.array2d(dtype=real),
+    ):
+        """Writes the adjoint of c."""
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        g = correction_coefficients(F[p], l, A, q, row4(c, p), scale, straight_through, g_out[p])
+        for i in range(3):
+            g_c[p, i] = g[i]
+
+    @kernel
+    def correction_adjoint(
+        F: wp.array(dtype=mat33),
+        c: wp.array2d(dtype=real),
+        scale: real,
+        g_out: wp.array(dtype=mat33),
+        g_X: wp.array2d(dtype=real),
+        g_F: wp.array(dtype=mat33),
+    ):
+        """Adds to the adjoint of F."""
+        p = wp.tid()
+        N, h, l, A, q = measure(F[p])
+        g_F[p] = g_F[p] + correction_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_out[p], row9(g_X, p))
+
+    return SimpleNamespace(
+        mat33=mat33,
+        features=features,
+        stress=stress,
+        stress_coefficients_adjoint=stress_coefficients_adjoint,
+        stress_adjoint=stress_adjoint,
+        correction=correction,
+        correction_coefficients_adjoint=correction_coefficients_adjoint,
+        correction_adjoint=correction_adjoint,
+    )

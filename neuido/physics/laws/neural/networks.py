@@ -1,0 +1,397 @@
+"""Effective neural laws: three-layer networks with lambda contracted into the last layer, and hand-written adjoints.
+
+lambda is constant over a rollout, so sum_k lambda_k W3_k is one matrix per scene (exact, since the last layer is linear), and
+a law is a small network F -> 9 -> hidden -> hidden -> outputs with SiLU (paper, "Model Architecture Details"). Two kinds:
+
+    raw        the paper's: input 10 (F - I), outputs nine components of tau, or of F_hat - F
+    objective  input invariants of the Hencky strain, outputs coefficients of an isotropic stress, or radii of a yield surface
+               (`network_kernels`): frame-indifferent, isotropic, symmetric, free of stress at rest
+
+`forward` and `adjoint` keep their intermediate results in buffers that laws of the same size share; hidden activations are
+recomputed in the adjoint. Calling a law runs its twin in plain torch, which autograd differentiates.
+"""
+
+import functools
+import threading
+from collections.abc import Hashable, Sequence
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.laws.base import ElasticLaw, Engine, PlasticLaw
+from neuido.physics.laws.neural import fused, network_kernels
+from neuido.physics.laws.neural.layers import linear, linear_adjoint
+from neuido.physics.laws.neural.network_kernels import COARSE, DELTA, FINE, LINEAR, LODE
+from neuido.physics.runtime import device
+from neuido.physics.runtime.device import real_of, torch_stream
+from neuido.types import Particles
+
+RAW_GAIN = 10.0
+"""Gain of F - I at the input of a raw network; a larger input is learned faster."""
+
+STRESS_SCALE = 1e5
+"""Unit of the objective elastic coefficients [Pa]."""
+
+RAW_STRESS_SCALE = 1e4
+"""Unit of the raw elastic outputs [Pa]."""
+
+STRAIN_SCALE = 1e-2
+"""Unit of the yield radii and of the raw plastic correction [-]."""
+
+
+def launch(kernel, like: Tensor, *arguments) -> None:
+    """Launches a kernel of `network_kernels` over the rows of `like`, on torch's device and current stream."""
+    with torch_stream(like.device):
+        device.launch(kernel, like.shape[0], arguments, like.device)
+
+
+def kernels(like: Tensor):
+    """The kernels for the scalar type of a tensor."""
+    return network_kernels.build(real_of(like.dtype))
+
+
+# The twins in plain torch: any leading shape, differentiable by autograd.
+
+
+def hencky_strain(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Volumetric and deviatoric left Hencky strain without SVD.
+
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
+
+    Returns:
+        l (...), the trace; A (..., 3, 3), the deviator; q (...), its norm with the floor `DELTA`. The series of ln V ends at
+        the seventh order: relative error below 1e-6 at strains of 0.2, and 3e-4 at 0.5.
+    """
+    eye = torch.eye(3, dtype=F.dtype, device=F.device)
+    G = F - eye
+    e = 0.5 * (G + G.mT + G @ G.mT)
+    h = e @ torch.linalg.inv(eye + e)
+    h = 0.5 * (h + h.mT)
+    h2 = h @ h
+    H = h + h @ h2 @ (eye / 3 + h2 @ (eye / 5 + h2 / 7))
+    l = H.diagonal(dim1=-2, dim2=-1).sum(-1)
+    A = H - l[..., None, None] / 3 * eye
+    return l, A, (A.square().sum((-2, -1)) + DELTA**2).sqrt()
+
+
+def strain_features(l: Tensor, A: Tensor, q: Tensor) -> Tensor:
+    """Nine features (..., 9) of the invariants, each O(1) for strains of 1e-5 to 0.5 (see `network_kernels`)."""
+    a, b, c = A.unbind(-2)
+    d = (torch.linalg.cross(a, b) * c).sum(-1)
+    return torch.stack(
+        [
+            torch.asinh(l / FINE) / 4,
+            torch.asinh(l / COARSE),
+            torch.asinh(q / FINE) / 4,
+            torch.asinh(q / COARSE),
+            l / (l * l + q * q).sqrt(),
+            LODE * d / q**3,
+            LINEAR * l,
+            LINEAR * q,
+            LINEAR * d / q**2,
+        ],
+        dim=-1,
+    )
+
+
+def isotropic_stress(F: Tensor, c: Tensor, scale: float = STRESS_SCALE) -> Tensor:
+    """Kirchhoff stress [Pa] (..., 3, 3) from its four coefficients c (..., 4)."""
+    l, A, q = hencky_strain(F)
+    eye = torch.eye(3, dtype=F.dtype, device=F.device)
+    a = A.square().sum((-2, -1))
+    D = A @ A - a[..., None, None] / 3 * eye
+    c0, c1, c2, c3 = c.unbind(-1)
+    return scale * ((c0 * l + c3 * a / q)[..., None, None] * eye + c1[..., None, None] * A + (c2 / q)[..., None, None] * D)
+
+
+def return_map(F: Tensor, c: Tensor, scale: float = STRAIN_SCALE) -> Tensor:
+    """Corrected deformation gradient (..., 3, 3) from the coefficients c (..., 3) of the yield radii."""
+    l, A, q = hencky_strain(F)
+    f = (1 - (scale * c[..., 0] + c[..., 1] * (-l).clamp(min=0)) / q).clamp(0, 1)
+    u = torch.minimum((l - scale * c[..., 2]).clamp(min=0), l) * (l > 0)
+    eye = torch.eye(3, dtype=F.dtype, device=F.device)
+    Y = -0.25 * f[..., None, None] * A
+    E = eye + Y @ (eye + Y / 2 @ (eye + Y / 3 @ (eye + Y / 4)))
+    E = E @ E
+    return (-u / 3).exp()[..., None, None] * (E @ E @ F)
+
+
+# The network: features (P, 9) -> outputs (P, n), with buffers that laws of the same size share.
+
+
+class _Workspace:
+    """Intermediate results of one network for P particles, and their adjoints; of one thread alone."""
+
+    def __init__(self, rows: int, hidden: int, outputs: int, dtype: torch.dtype, device: torch.device, thread: int):
+        def empty(columns: int) -> Tensor:
+            return torch.empty(rows, columns, dtype=dtype, device=device)
+
+        self.x, self.gx = empty(network_kernels.FEATURES), empty(network_kernels.FEATURES)
+        self.z1, self.h1, self.g1 = empty(hidden), empty(hidden), empty(hidden)
+        self.z2, self.h2, self.g2 = empty(hidden), empty(hidden), empty(hidden)
+        self.y, self.gy = empty(outputs), empty(outputs)
+        self.ones = torch.ones(rows, dtype=dtype, device=device)
+
+
+_workspace = functools.lru_cache(maxsize=8)(_Workspace)
+
+
+class _Network:
+    """What the four laws share; not a law by itself.
+
+    Args:
+        W1: First layer, (1 or S, hidden, 9); b1 (1 or S, hidden). A leading 1 is shared by all scenes.
+        W2: Second layer, (1 or S, hidden, hidden); b2 (1 or S, hidden).
+        W3: Last layer with the coefficients contracted into it, (S, outputs, hidden); b3 (S, outputs).
+        scale: Unit of the outputs [Pa] (elastic) or [-] (plastic); the class's `unit` by default.
+
+    Raises:
+        UserError: shapes that do not fit.
+    """
+
+    outputs = 9
+    unit: float
+
+    def __init__(self, W1: Tensor, b1: Tensor, W2: Tensor, b2: Tensor, W3: Tensor, b3: Tensor, *, scale: float | None = None):
+        hidden = W1.shape[-2]
+        wanted = ((hidden, 9), (hidden,), (hidden, hidden), (hidden,), (self.outputs, hidden), (self.outputs,))
+        scenes = W3.shape[0]
+        for name, tensor, shape in zip(("W1", "b1", "W2", "b2", "W3", "b3"), (W1, b1, W2, b2, W3, b3), wanted):
+            if tuple(tensor.shape[1:]) != shape or tensor.shape[0] not in (1, scenes):
+                needed = f"(1 or {scenes}, {', '.join(map(str, shape))})"
+                raise UserError(f"{type(self).__name__}: {name} has shape {tuple(tensor.shape)}; needed {needed}")
+        self.weights = (W1, b1, W2, b2, W3, b3)
+        self.scale = self.unit if scale is None else scale
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """(W1, b1, W2, b2, W3, b3); see the class."""
+        return self.weights
+
+    def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
+        """The fused kernels on CUDA where they exist for this network, else the engine of every law."""
+        if self._fusable(tensors[0]):
+            return fused.FusedEngine(self, tensors, particles)
+        return Engine(self, tensors, particles)
+
+    def key(self, tensors: Sequence[Tensor]) -> Hashable | None:
+        """Only the fused kernels may be captured: the others keep their results in buffers that laws share."""
+        return (type(self).__name__, self.scale) if self._fusable(tensors[0]) else None
+
+    def _fusable(self, W1: Tensor) -> bool:
+        return W1.is_cuda and W1.dtype == torch.float32 and W1.shape[-2] in fused.WIDTHS and self.outputs < 9
+
+    def _buffers(self, F: Tensor, hidden: int) -> _Workspace:
+        return _workspace(F.shape[0], hidden, self.outputs, F.dtype, F.device, threading.get_ident())
+
+    def _evaluate(self, tensors: Sequence[Tensor], F: Tensor, particles: Particles | None) -> _Workspace:
+        """Runs the network; every intermediate result is in the workspace."""
+        W1, b1, W2, b2, W3, b3 = (t.detach() for t in tensors)
+        offsets = self._offsets(F, particles)
+        w = self._buffers(F, W1.shape[-2])
+        self._features(F, w.x)
+        linear(w.x, W1, b1, offsets, w.z1)
+        torch._C._nn.silu(w.z1, out=w.h1)
+        linear(w.h1, W2, b2, offsets, w.z2)
+        torch._C._nn.silu(w.z2, out=w.h2)
+        linear(w.h2, W3, b3, offsets, w.y)
+        return w
+
+    def _backpropagate(
+        self, w: _Workspace, tensors: Sequence[Tensor], grads: Sequence[Tensor | None], F: Tensor, particles: Particles | None
+    ) -> None:
+        """From w.gy to w.gx and the adjoints of the weights; `w` must be fresh from `_evaluate`."""
+        W1, _, W2, _, W3, _ = (t.detach() for t in tensors)
+        gW1, gb1, gW2, gb2, gW3, gb3 = grads
+        offsets = self._offsets(F, particles)
+        linear_adjoint(w.h2, W3, w.gy, offsets, w.ones, w.g2, gW3, gb3)
+        torch.ops.aten.silu_backward.grad_input(w.g2, w.z2, grad_input=w.g2)
+        linear_adjoint(w.h1, W2, w.g2, offsets, w.ones, w.g1, gW2, gb2)
+        torch.ops.aten.silu_backward.grad_input(w.g1, w.z1, grad_input=w.g1)
+        linear_adjoint(w.x, W1, w.g1, offsets, w.ones, w.gx, gW1, gb1)
+
+    @staticmethod
+    def _offsets(F: Tensor, particles: Particles | None) -> Sequence[int]:
+        return (0, F.shape[0]) if particles is None else particles.offsets
+
+    def _twin(self, features: Tensor, particles: Particles | None) -> Tensor:
+        """The network in plain torch, (..., 9) -> (..., outputs); (P, 9) where there are several scenes."""
+        rows = []
+        offsets = (0, len(features)) if len(self.weights[4]) == 1 else self._offsets(features, particles)
+        for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])):
+            W1, b1, W2, b2, W3, b3 = (t[min(s, len(t) - 1)].to(features.dtype) for t in self.weights)
+            hidden = torch.nn.functional.silu(features[i:j] @ W1.T + b1)
+            rows.append(torch.nn.functional.silu(hidden @ W2.T + b2) @ W3.T + b3)
+        return torch.cat(rows)
+
+    def _modulus(self) -> Tensor:
+        """d tau_11 / dF_11 at F = I for each scene [Pa], (S,): the twin's secant over F_11 = 1 +- 1e-3, in float64."""
+        weights, step = self.weights, 1e-3
+        F = torch.eye(3, dtype=torch.float64, device=weights[4].device).repeat(2, 1, 1)
+        F[0, 0, 0] += step
+        F[1, 0, 0] -= step
+        values = []
+        with torch.no_grad():
+            for s in range(weights[4].shape[0]):
+                self.weights = tuple(t[min(s, len(t) - 1)][None] for t in weights)
+                tau = self(F)[:, 0, 0]
+                values.append((tau[0] - tau[1]) / (2 * step))
+        self.weights = weights
+        return torch.stack(values)
+
+
+class _Raw(_Network):
+    def _features(self, F: Tensor, out: Tensor) -> None:
+        out.copy_(F.view(-1, 9))
+        out[:, ::4] -= 1  # exact near F = I
+        out *= RAW_GAIN
+
+
+class _Objective(_Network):
+    def _features(self, F: Tensor, out: Tensor) -> None:
+        launch(kernels(F).features, F, F, out)
+
+
+class RawElastic(_Raw, ElasticLaw):
+    """tau = scale * network(10 (F - I)) [Pa], the paper's elastic law."""
+
+    unit = RAW_STRESS_SCALE
+
+    def forward(self, tensors, F, out, particles=None) -> None:
+        torch.mul(self._evaluate(tensors, F, particles).y, self.scale, out=out.view(-1, 9))
+
+    def adjoint(self, tensors, F, grad_out, grad_F, grad_tensors, particles=None) -> None:
+        w = self._evaluate(tensors, F, particles)
+        torch.mul(grad_out.view(-1, 9), self.scale, out=w.gy)
+        self._backpropagate(w, tensors, grad_tensors, F, particles)
+        grad_F.view(-1, 9).add_(w.gx, alpha=RAW_GAIN)
+
+    def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
+        return self.scale * self._twin(raw_features(F), particles).unflatten(-1, (3, 3))
+
+    def modulus(self) -> Tensor:
+        """Secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,)."""
+        return self._modulus()
+
+
+class RawPlastic(_Raw, PlasticLaw):
+    """F_hat = F + scale * network(10 (F - I)), the paper's plastic law."""
+
+    identity = False
+    unit = STRAIN_SCALE
+
+    def forward(self, tensors, F, out, particles=None) -> None:
+        torch.add(F.view(-1, 9), self._evaluate(tensors, F, particles).y, alpha=self.scale, out=out.view(-1, 9))
+
+    def adjoint(self, tensors, F, grad_out, grad_F, grad_tensors, particles=None) -> None:
+        w = self._evaluate(tensors, F, particles)
+        torch.mul(grad_out.view(-1, 9), self.scale, out=w.gy)
+        self._backpropagate(w, tensors, grad_tensors, F, particles)
+        grad_F.add_(grad_out)
+        grad_F.view(-1, 9).add_(w.gx, alpha=RAW_GAIN)
+
+    def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
+        return F + self.scale * self._twin(raw_features(F), particles).unflatten(-1, (3, 3))
+
+
+class ObjectiveElastic(_Objective, ElasticLaw):
+    """tau [Pa] from four coefficients that a network makes of the strain's invariants; zero at F = I for any weights."""
+
+    outputs = network_kernels.STRESS_COEFFICIENTS
+    unit = STRESS_SCALE
+
+    def forward(self, tensors, F, out, particles=None) -> None:
+        w = self._evaluate(tensors, F, particles)
+        launch(kernels(F).stress, F, F, w.y, self.scale, out)
+
+    def adjoint(self, tensors, F, grad_out, grad_F, grad_tensors, particles=None) -> None:
+        w = self._evaluate(tensors, F, particles)
+        launch(kernels(F).stress_coefficients_adjoint, F, F, self.scale, grad_out, w.gy)
+        self._backpropagate(w, tensors, grad_tensors, F, particles)
+        launch(kernels(F).stress_adjoint, F, F, w.y, self.scale, grad_out, w.gx, grad_F)
+
+    def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
+        return isotropic_stress(F, self._twin(strain_features(*hencky_strain(F)), particles), self.scale)
+
+    def modulus(self) -> Tensor:
+        """Secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,)."""
+        return self._modulus()
+
+
+class ObjectivePlastic(_Objective, PlasticLaw):
+    """F_hat by a return map whose deviatoric and volumetric yield radii a network makes of the strain's invariants."""
+
+    identity = False
+    outputs = network_kernels.YIELD_COEFFICIENTS
+    unit = STRAIN_SCALE
+
+    def forward(self, tensors, F, out, particles=None) -> None:
+        w = self._evaluate(tensors, F, particles)
+        launch(kernels(F).correction, F, F, w.y, self.scale, out)
+
+    def adjoint(self, tensors, F, grad_out, grad_F, grad_tensors, particles=None) -> None:
+        w = self._evaluate(tensors, F, particles)
+        launch(kernels(F).correction_coefficients_adjoint, F, F, w.y, self.scale, 0, grad_out, w.gy)
+        self._backpropagate(w, tensors, grad_tensors, F, particles)
+        launch(kernels(F).correction_adjoint, F, F, w.y, self.scale, grad_out, w.gx, grad_F)
+
+    def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
+        return return_map(F, self._twin(strain_features(*hencky_strain(F)), particles), self.scale)
+
+
+def raw_features(F: Tensor) -> Tensor:
+    """10 (F - I), (..., 9)."""
+    return RAW_GAIN * (F - torch.eye(3, dtype=F.dtype, device=F.device)).flatten(-2)
+
+
+# The read-outs as functions of the coefficients alone: Stage I learns from given F, so nothing flows to F.
+
+
+class StressReadout(torch.autograd.Function):
+    """`isotropic_stress` by its kernel; differentiable with respect to the coefficients c (B, 4) only."""
+
+    @staticmethod
+    def forward(ctx, c: Tensor, F: Tensor, scale: float) -> Tensor:
+        out = torch.empty_like(F)
+        launch(kernels(F).stress, F, F, c.detach().contiguous(), scale, out)
+        ctx.save_for_backward(F)
+        ctx.scale = scale
+        return out
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        (F,) = ctx.saved_tensors
+        out = torch.empty(F.shape[0], network_kernels.STRESS_COEFFICIENTS, dtype=F.dtype, device=F.device)
+        launch(kernels(F).stress_coefficients_adjoint, F, F, ctx.scale, grad.contiguous(), out)
+        return out, None, None
+
+
+class CorrectionReadout(torch.autograd.Function):
+    """`return_map` by its kernel; differentiable with respect to the coefficients c (B, 3) only.
+
+    The gradient passes a clamp where descent moves the value back into the range, else a radius that has left it would
+    never learn; it is blocked where descent would move it further out.
+    """
+
+    @staticmethod
+    def forward(ctx, c: Tensor, F: Tensor, scale: float) -> Tensor:
+        c, out = c.detach().contiguous(), torch.empty_like(F)
+        launch(kernels(F).correction, F, F, c, scale, out)
+        ctx.save_for_backward(F, c)
+        ctx.scale = scale
+        return out
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        F, c = ctx.saved_tensors
+        out = torch.empty_like(c)
+        launch(kernels(F).correction_coefficients_adjoint, F, F, c, ctx.scale, 1, grad.contiguous(), out)
+        return out, None, None
+
+
+def compute_strain_features(F: Tensor) -> Tensor:
+    """`strain_features` of F (B, 3, 3) by its kernel, (B, 9); no gradient."""
+    out = torch.empty(F.shape[0], network_kernels.FEATURES, dtype=F.dtype, device=F.device)
+    launch(kernels(F).features, F, F.detach().contiguous(), out)
+    return out

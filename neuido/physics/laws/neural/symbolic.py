@@ -1,0 +1,148 @@
+"""Symbolic laws: the coefficients of an isotropic stress and of a yield surface as polynomials of the strain's invariants.
+
+The read-outs are those of the objective networks (`network_kernels`), with a polynomial in the network's place. With l the trace, A the
+deviator and q the norm of the deviator of the left Hencky strain, and r = det A / q^2:
+
+    stress   tau = 1e5 Pa (c0 l I + c1 A + c2 dev(A A)/q + c3 (A:A)/q I),   each c a sum over `TERMS`
+    yield    radii 1e-2 c0 + c1 max(-l, 0) of q and 1e-2 c2 of l > 0, each c a constant
+
+A term counts l, q and r tenfold. The engine form is batched and owns its memory, so that CUDA graphs hold it.
+"""
+
+from collections.abc import Hashable, Sequence
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.laws.base import ElasticLaw, Engine, EngineLaw, PlasticLaw
+from neuido.physics.laws.neural import networks
+from neuido.physics.laws.neural.layers import linear, linear_adjoint
+from neuido.physics.laws.neural.network_kernels import LINEAR, STRESS_COEFFICIENTS, YIELD_COEFFICIENTS
+from neuido.types import Particles
+
+TERMS = ("1", "l", "q", "r", "l^2", "l q", "q^2")
+GENERATORS = ("l I", "A", "dev(A A)/q", "(A:A)/q I")
+DEGREE = (0, 1, 1, 1, 2, 2, 2)
+FIRST = 6
+"""Column of the features in which 10 l, 10 q and 10 r begin."""
+
+
+class SymbolicEngine(Engine):
+    """One polynomial for one rollout, with its own buffers."""
+
+    def __init__(self, law: "_Symbolic", tensors: Sequence[Tensor], particles: Particles):
+        super().__init__(law, [t.detach() for t in tensors], particles)
+        (W,) = self.tensors
+        count = particles.offsets[-1]
+        self.x, self.gx = W.new_zeros(count, 9), W.new_zeros(count, 9)  # columns that no term has keep a zero adjoint
+        self.terms, self.g_terms = (W.new_ones(count, W.shape[-1]) for _ in range(2))
+        self.c, self.gc = (W.new_empty(count, W.shape[1]) for _ in range(2))
+
+    def _evaluate(self, F: Tensor) -> None:
+        if self.terms.shape[1] > 1:
+            networks.launch(networks.kernels(F).features, F, F, self.x)
+            self.terms[:, 1:4].copy_(self.x[:, FIRST:])
+            l, q = self.x[:, FIRST], self.x[:, FIRST + 1]
+            for column, (a, b) in zip((4, 5, 6), ((l, l), (l, q), (q, q))):
+                torch.mul(a, b, out=self.terms[:, column])
+        linear(self.terms, self.tensors[0], None, self.particles.offsets, self.c)
+
+    def forward(self, F: Tensor, out: Tensor) -> None:
+        self._evaluate(F)
+        k = networks.kernels(F)
+        networks.launch(k.stress if self.law.elastic else k.correction, F, F, self.c, self.law.scale, out)
+
+    def adjoint(self, F: Tensor, grad_out: Tensor, grad_F: Tensor) -> None:
+        self._evaluate(F)
+        k, scale = networks.kernels(F), self.law.scale
+        if self.law.elastic:
+            networks.launch(k.stress_coefficients_adjoint, F, F, scale, grad_out, self.gc)
+        else:
+            networks.launch(k.correction_coefficients_adjoint, F, F, self.c, scale, 0, grad_out, self.gc)
+        linear_adjoint(self.terms, self.tensors[0], self.gc, self.particles.offsets, None, self.g_terms, self.grads[0], None)
+        if self.terms.shape[1] > 1:
+            g, (l, q) = self.g_terms, self.x[:, FIRST : FIRST + 2].unbind(1)
+            self.gx[:, FIRST:].copy_(g[:, 1:4])
+            self.gx[:, FIRST].addcmul_(g[:, 4], l, value=2).addcmul_(g[:, 5], q)
+            self.gx[:, FIRST + 1].addcmul_(g[:, 6], q, value=2).addcmul_(g[:, 5], l)
+        adjoint = k.stress_adjoint if self.law.elastic else k.correction_adjoint
+        networks.launch(adjoint, F, F, self.c, scale, grad_out, self.gx, grad_F)
+
+
+class _Symbolic(EngineLaw):
+    elastic: bool
+    outputs: int
+    columns: int
+    scale: float
+
+    def __init__(self, coefficients: Tensor):
+        if coefficients.ndim != 3 or tuple(coefficients.shape[1:]) != (self.outputs, self.columns):
+            needed = f"(S, {self.outputs}, {self.columns})"
+            raise UserError(f"{type(self).__name__}: the coefficients have shape {tuple(coefficients.shape)}; needed {needed}")
+        self.coefficients = coefficients
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """(coefficients,); see the class."""
+        return (self.coefficients,)
+
+    def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
+        return SymbolicEngine(self, tensors, particles)
+
+    def key(self, tensors: Sequence[Tensor]) -> Hashable:
+        return type(self).__name__
+
+    def _at(self, F: Tensor, particles: Particles | None) -> Tensor:
+        """The coefficients of each F in plain torch, (..., outputs)."""
+        W = self.coefficients.to(F.dtype)
+        terms = polynomial(F)[..., : self.columns]
+        if len(W) == 1:
+            return terms @ W[0].T
+        if particles is None:
+            raise UserError(f"{type(self).__name__} holds {len(W)} scenes: give `particles` to say which scene each F belongs to")
+        return (W[particles.scene.long()] @ terms[..., None])[..., 0]
+
+
+class SymbolicElastic(_Symbolic, ElasticLaw):
+    """Kirchhoff stress [Pa] by coefficients (S, 4, 7): of generators by terms."""
+
+    elastic, outputs, columns, scale = True, STRESS_COEFFICIENTS, len(TERMS), networks.STRESS_SCALE
+
+    def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
+        return networks.isotropic_stress(F, self._at(F, particles), self.scale)
+
+    def modulus(self) -> Tensor:
+        """P-wave modulus at rest [Pa], (S,): 1e5 (c0 + 2/3 c1) of the constant terms."""
+        return self.scale * (self.coefficients[:, 0, 0] + 2 / 3 * self.coefficients[:, 1, 0])
+
+
+class SymbolicPlastic(_Symbolic, PlasticLaw):
+    """Return to the yield surface of constants (S, 3, 1)."""
+
+    elastic, outputs, columns, identity, scale = False, YIELD_COEFFICIENTS, 1, False, networks.STRAIN_SCALE
+
+    def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
+        return networks.return_map(F, self._at(F, particles), self.scale)
+
+
+def polynomial(F: Tensor) -> Tensor:
+    """The terms of F (..., 3, 3) in plain torch, (..., 7), in the order of `TERMS`."""
+    l, q, r = networks.strain_features(*networks.hencky_strain(F))[..., FIRST:].unbind(-1)
+    return torch.stack([torch.ones_like(l), l, q, r, l * l, l * q, q * q], -1)
+
+
+def generators(F: Tensor) -> Tensor:
+    """The four generators of F (..., 3, 3) in plain torch, (..., 4, 3, 3), in the order of `GENERATORS`."""
+    units = torch.eye(4, dtype=F.dtype, device=F.device)
+    return torch.stack([networks.isotropic_stress(F, unit.expand(*F.shape[:-2], 4), 1.0) for unit in units], -3)
+
+
+def formula(coefficients: Tensor) -> str:
+    """A stress as text, tau/kPa, from coefficients (4, 7) of which zeros are left out."""
+    parts = []
+    for row, generator in zip(coefficients.detach().cpu().tolist(), GENERATORS):
+        for value, term, degree in zip(row, TERMS, DEGREE):
+            if value:
+                factor = 1e-3 * networks.STRESS_SCALE * LINEAR**degree * value
+                parts.append(f"{factor:+.4g} {'' if term == '1' else term + ' '}{generator}")
+    return " ".join(parts) or "0"

@@ -1,0 +1,205 @@
+"""Singular value and polar decompositions of (..., 3, 3) matrices, with derivatives that hold at repeated singular values.
+
+Convention throughout: F = U diag(sigma) V^T with rotations U and V, sigma_1 >= sigma_2 >= |sigma_3|; sigma_3 carries the sign of det F.
+In the frame P = U^T dF V the derivatives split into a symmetric part, divided by sigma_j - sigma_i, and a skew part, divided by
+sigma_i + sigma_j. Only the first is singular at repeated singular values, and for an isotropic function it is a divided difference.
+Everything here is plain torch, float32 or float64, the slow twin of `law_kernels`; on CUDA the frame itself comes from there.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from neuido.physics.laws.classical_kernels import GAP, kernels
+from neuido.physics.runtime.device import launch, real_of, torch_stream
+
+
+class Frame(NamedTuple):
+    """The principal frame of F. `sigma` is differentiable; `U` and `V` are constants (see `isotropic_map`)."""
+
+    U: Tensor
+    """Left rotation, (..., 3, 3)."""
+    sigma: Tensor
+    """Singular values, descending, the last one with the sign of det F, (..., 3)."""
+    V: Tensor
+    """Right rotation, (..., 3, 3)."""
+
+
+def _decompose(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    if F.is_cuda:  # torch decomposes large batches of small matrices slowly there
+        flat = F.detach().reshape(-1, 3, 3).contiguous()
+        U, V, sigma = torch.empty_like(flat), torch.empty_like(flat), flat.new_empty(len(flat), 3)
+        with torch_stream(F.device):
+            launch(kernels(real_of(F.dtype)).decompose, len(flat), [flat, U, sigma, V], F.device)
+        return U.view(F.shape), sigma.view(F.shape[:-1]), V.view(F.shape)
+    U, sigma, Vh = torch.linalg.svd(F)
+    V = Vh.mT
+    flip_u, flip_v = torch.linalg.det(U).sign(), torch.linalg.det(V).sign()
+    last = torch.tensor([0.0, 0.0, 1.0], dtype=F.dtype, device=F.device)
+
+    def scale(flip: Tensor) -> Tensor:
+        return 1 + last * (flip - 1).unsqueeze(-1)
+
+    return U * scale(flip_u).unsqueeze(-2), sigma * scale(flip_u * flip_v), V * scale(flip_v).unsqueeze(-2)
+
+
+def _pair_sums(sigma: Tensor) -> Tensor:
+    """sigma_i + sigma_j, bounded below (only an inverted F can come near zero)."""
+    return (sigma.unsqueeze(-1) + sigma.unsqueeze(-2)).clamp(min=GAP)
+
+
+def _skew(A: Tensor) -> Tensor:
+    return A - A.mT
+
+
+class _SVD(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, F: Tensor, gap: float) -> tuple[Tensor, Tensor, Tensor]:
+        U, sigma, V = _decompose(F)
+        s1, s2, s3 = sigma.unbind(-1)
+        width = gap * s1.abs().clamp(min=torch.finfo(F.dtype).tiny)
+        sigma = torch.stack([torch.maximum(s1, s2 + width), s2, torch.minimum(s3, s2 - width)], -1)
+        ctx.save_for_backward(U, sigma, V)
+        ctx.gap = gap
+        return U, sigma, V
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_U: Tensor, grad_sigma: Tensor, grad_V: Tensor):
+        U, sigma, V = ctx.saved_tensors
+        a, b = _skew(U.mT @ grad_U), _skew(V.mT @ grad_V)
+        difference = sigma.unsqueeze(-2) - sigma.unsqueeze(-1)
+        eye = torch.eye(3, dtype=U.dtype, device=U.device)
+        symmetric = (a + b) / (difference + eye) * (1 - eye)
+        P = (symmetric + (a - b) / _pair_sums(sigma)) / 2 + torch.diag_embed(grad_sigma)
+        return U @ P @ V.mT, None
+
+
+def svd(F: Tensor, *, gap: float | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """F = U diag(sigma) V^T with rotations U and V, and a derivative at every F with sigma_2 + sigma_3 > 0.
+
+    Singular values closer than `gap` (relative to the largest; default: the square root of the machine epsilon) are returned pushed
+    apart to it, so that differences of a smooth function of sigma, divided by differences of sigma in the backward pass, tend to its
+    derivative. At repeated singular values the gradient of anything built from U, sigma and V that does not depend on the choice of the
+    singular vectors (polar parts, isotropic functions) is thus right to O(gap), and so is its value. Elsewhere both are exact.
+    Isotropic functions that need more digits go through `frame` and `isotropic_map`.
+
+    Args:
+        F: Matrices, (..., 3, 3).
+        gap: Smallest relative distance of two singular values.
+
+    Returns:
+        U (..., 3, 3), sigma (..., 3) descending with the sign of det F on the last, V (..., 3, 3).
+    """
+    return _SVD.apply(F, torch.finfo(F.dtype).eps ** 0.5 if gap is None else gap)
+
+
+class _Rotation(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, F: Tensor) -> Tensor:
+        U, sigma, V = _decompose(F)
+        ctx.save_for_backward(U, sigma, V)
+        return U @ V.mT
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> Tensor:
+        U, sigma, V = ctx.saved_tensors
+        return U @ (_skew(U.mT @ grad @ V) / _pair_sums(sigma)) @ V.mT
+
+
+def polar(F: Tensor) -> tuple[Tensor, Tensor]:
+    """Polar decomposition F = R S: the rotation nearest to F (det R = +1 even where det F < 0) and the symmetric stretch.
+
+    The derivative has no singularity at repeated singular values, F = I included.
+
+    Args:
+        F: Matrices, (..., 3, 3).
+
+    Returns:
+        R (..., 3, 3), S (..., 3, 3).
+    """
+    R = _Rotation.apply(F)
+    S = R.mT @ F
+    return R, (S + S.mT) / 2
+
+
+class _Values(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        U, sigma, V = _decompose(F)
+        ctx.save_for_backward(U, V)
+        ctx.mark_non_differentiable(U, V)
+        return U, sigma, V
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, _U: Tensor, grad: Tensor, _V: Tensor) -> Tensor:
+        U, V = ctx.saved_tensors
+        return (U * grad.unsqueeze(-2)) @ V.mT
+
+
+def frame(F: Tensor) -> Frame:
+    """The principal frame of F, (..., 3, 3): `sigma` differentiable, the rotations constant."""
+    return Frame(*_Values.apply(F))
+
+
+class _Spectral(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, F: Tensor, values: Tensor, U: Tensor, sigma: Tensor, V: Tensor, slopes: Tensor, stress: bool) -> Tensor:
+        ctx.save_for_backward(values, U, sigma, V, slopes)
+        ctx.stress = stress
+        return (U * values.unsqueeze(-2)) @ (U if stress else V).mT
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor):
+        values, U, sigma, V, slopes = ctx.saved_tensors
+        A = U.mT @ grad @ (U if ctx.stress else V)
+        sums = _pair_sums(sigma)
+        if ctx.stress:
+            B = (A + A.mT) * slopes * sigma.unsqueeze(-2) / sums
+        else:
+            B = (slopes * (A + A.mT) + (values.unsqueeze(-1) + values.unsqueeze(-2)) / sums * _skew(A)) / 2
+        B = B - torch.diag_embed(B.diagonal(dim1=-2, dim2=-1))
+        return U @ B @ V.mT, A.diagonal(dim1=-2, dim2=-1), None, None, None, None, None
+
+
+def isotropic_map(F: Tensor, at: Frame, values: Tensor, slopes: Tensor) -> Tensor:
+    """U diag(z) V^T, with the exact derivative with respect to F: return maps.
+
+    Args:
+        F: Matrices, (..., 3, 3).
+        at: `frame(F)`.
+        values: z (..., 3), computed differentiably from `at.sigma` and parameters.
+        slopes: Divided differences (z_j - z_i) / (sigma_j - sigma_i), (..., 3, 3), finite at repeated singular values; no diagonal needed.
+    """
+    U, sigma, V = (part.detach() for part in at)
+    return _Spectral.apply(F, values, U, sigma, V, slopes.detach(), False)
+
+
+def isotropic_stress(F: Tensor, at: Frame, values: Tensor, slopes: Tensor) -> Tensor:
+    """U diag(t) U^T, with the exact derivative with respect to F: stresses. Arguments as in `isotropic_map`."""
+    U, sigma, V = (part.detach() for part in at)
+    return _Spectral.apply(F, values, U, sigma, V, slopes.detach(), True)
+
+
+def log_difference(sigma: Tensor, floor: float) -> Tensor:
+    """Divided differences of ln(max(sigma, floor)): (..., 3) -> (..., 3, 3), finite at repeated values."""
+    a, b = sigma.unsqueeze(-1), sigma.unsqueeze(-2)
+    ca, cb = a.clamp(min=floor), b.clamp(min=floor)
+    x = (cb - ca) / ca
+    slope = torch.where(x == 0, torch.ones_like(x), torch.log1p(x) / torch.where(x == 0, torch.ones_like(x), x)) / ca
+    low_a, low_b = (a < floor).expand_as(x), (b < floor).expand_as(x)
+    mixed = low_a ^ low_b
+    share = torch.where(mixed, (cb - ca) / torch.where(mixed, b - a, torch.ones_like(x)), (~low_a).to(x))
+    return slope * share
+
+
+def exp_difference(h: Tensor) -> Tensor:
+    """Divided differences of exp at h: (..., 3) -> (..., 3, 3), finite at repeated values."""
+    a, b = h.unsqueeze(-1), h.unsqueeze(-2)
+    x = b - a
+    return torch.exp(a) * torch.where(x == 0, torch.ones_like(x), torch.expm1(x) / torch.where(x == 0, torch.ones_like(x), x))

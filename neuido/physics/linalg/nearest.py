@@ -1,0 +1,54 @@
+"""Nearest points of many frames at once, by all pairs: for a GPU, where a tree would have to be built on the host for each frame."""
+
+import functools
+from types import SimpleNamespace
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuido.physics.runtime.device import launch, real_of, start_warp, torch_stream
+
+
+@functools.cache
+def build(real: type) -> SimpleNamespace:
+    """The kernel for one scalar type.
+
+    Args:
+        real: `wp.float32` or `wp.float64`.
+    """
+    start_warp()
+    vec3 = wp.types.vector(length=3, dtype=real)
+
+    @wp.kernel(module=f"neuido.nearest.{real.__name__}", enable_backward=False)
+    def nearest(a: wp.array(dtype=vec3), b: wp.array(dtype=vec3), many: int, others: int, out: wp.array(dtype=real)):
+        """One thread a point of `a`; all threads of a warp read the same point of `b`, so that memory is read once for all of them."""
+        i = wp.tid()
+        first = (i // many) * others
+        p = a[i]
+        least = wp.length_sq(b[first] - p)
+        for j in range(first + 1, first + others):
+            least = wp.min(least, wp.length_sq(b[j] - p))
+        out[i] = least
+
+    return SimpleNamespace(nearest=nearest)
+
+
+def nearest_by_pairs(a: Tensor, b: Tensor) -> Tensor:
+    """Squared distance of each point to its nearest in the same frame, exact differences throughout [unit of a, squared].
+
+    Args:
+        a: Points of K frames, (K, P, 3).
+        b: Points of K frames, (K, Q, 3), Q >= 1, of the same type and on the same device.
+
+    Returns:
+        (K, P).
+    """
+    frames, many = a.shape[:2]
+    a, b = a.detach().contiguous(), b.detach().contiguous()
+    out = torch.empty(frames, many, dtype=a.dtype, device=a.device)
+    if out.numel():
+        with torch_stream(a.device):
+            arguments = [a.view(-1, 3), b.view(-1, 3), many, b.shape[1], out.view(-1)]
+            launch(build(real_of(a.dtype)).nearest, frames * many, arguments, a.device)
+    return out

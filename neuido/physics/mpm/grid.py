@@ -1,0 +1,336 @@
+"""Warp kernels of what happens on the grid (gravity, body forces, colliders, clamps) and of viscous stress, with adjoints.
+
+Collider loops carry a velocity from plane to plane, which Warp's own autodiff gets wrong without a word (dynamic loops);
+the hand-written adjoint recomputes the velocity before each plane instead.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+STICKY, SLIP, SEPARATE = 1, 2, 3
+CONTACTS = {"sticky": STICKY, "slip": SLIP, "separate": SEPARATE}
+
+
+@functools.cache
+def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
+    """The kernels for one scalar type; arguments as in `transfers.build`.
+
+    Body forces come as a table (S, 6): linear drag [1/s], quadratic drag [1/m], pull [1/s^2], its centre x, y, z [m]. With five
+    columns more it holds Magnus' vector [1/s], stick and restitution [1/s] (`effects.Effects.force_table`).
+    """
+    vec3 = wp.types.vector(length=3, dtype=real)
+    vec4 = wp.types.vector(length=4, dtype=real)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+    name = f"neuido.grid.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
+    func = functools.partial(wp.func, module=name)
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
+    adjoint_kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+
+    @kernel
+    def add_viscous_stress(
+        scene: wp.array(dtype=wp.int32),
+        viscosity: wp.array2d(dtype=real),
+        C: wp.array(dtype=mat33),
+        F: wp.array(dtype=mat33),
+        tau: wp.array(dtype=mat33),
+    ):
+        """tau += J (2 eta dev D + zeta tr(D) I), D = sym C: Kelvin-Voigt, columns eta (shear) and zeta (bulk) in Pa s."""
+        p = wp.tid()
+        s = wp.min(scene[p], viscosity.shape[0] - 1)
+        D = real(0.5) * (C[p] + wp.transpose(C[p]))
+        t = wp.trace(D)
+        eta = viscosity[s, 0]
+        i3 = wp.identity(n=3, dtype=real)
+        tau[p] = tau[p] + wp.determinant(F[p]) * (real(2.0) * eta * D + (viscosity[s, 1] - real(2.0) / real(3.0) * eta) * t * i3)
+
+    @adjoint_kernel
+    def add_viscous_stress_adjoint(
+        scene: wp.array(dtype=wp.int32),
+        viscosity: wp.array2d(dtype=real),
+        C: wp.array(dtype=mat33),
+        F: wp.array(dtype=mat33),
+        a_tau: wp.array(dtype=mat33),
+        a_C: wp.array(dtype=mat33),
+        a_F: wp.array(dtype=mat33),
+        a_viscosity: wp.array2d(dtype=real),
+    ):
+        p = wp.tid()
+        s = wp.min(scene[p], viscosity.shape[0] - 1)
+        D = real(0.5) * (C[p] + wp.transpose(C[p]))
+        t = wp.trace(D)
+        J = wp.determinant(F[p])
+        eta = viscosity[s, 0]
+        zeta = viscosity[s, 1]
+        A = real(0.5) * (a_tau[p] + wp.transpose(a_tau[p]))
+        tA = wp.trace(A)
+        AD = wp.ddot(A, D)
+        shear = real(2.0) * (AD - t * tA / real(3.0))
+        i3 = wp.identity(n=3, dtype=real)
+        a_C[p] = a_C[p] + J * (real(2.0) * eta * (A - (tA / real(3.0)) * i3) + zeta * tA * i3)
+        c0 = vec3(F[p][0, 0], F[p][1, 0], F[p][2, 0])
+        c1 = vec3(F[p][0, 1], F[p][1, 1], F[p][2, 1])
+        c2 = vec3(F[p][0, 2], F[p][1, 2], F[p][2, 2])
+        cofactor = wp.matrix_from_cols(wp.cross(c1, c2), wp.cross(c2, c0), wp.cross(c0, c1))
+        a_F[p] = a_F[p] + (eta * shear + zeta * t * tA) * cofactor
+        wp.atomic_add(a_viscosity, s, 0, J * shear)
+        wp.atomic_add(a_viscosity, s, 1, J * t * tA)
+
+    @func
+    def contact(v: vec3, n: vec3, kind: int, friction: real):
+        """Velocity of a node inside a collider, from its velocity before."""
+        vn = wp.dot(v, n)
+        out = v
+        if kind == wp.static(STICKY):
+            out = vec3(real(0.0), real(0.0), real(0.0))
+        elif kind == wp.static(SLIP):
+            out = v - vn * n
+        elif kind == wp.static(SEPARATE):
+            if vn < real(0.0):
+                t = v - vn * n
+                speed = wp.length(t)
+                if speed <= -friction * vn:
+                    out = vec3(real(0.0), real(0.0), real(0.0))
+                else:
+                    out = t * (real(1.0) + friction * vn / wp.max(speed, real(1.0e-30)))
+        return out
+
+    @func
+    def contact_adjoint(v: vec3, n: vec3, kind: int, friction: real, a: vec3):
+        """Adjoint of `contact`: that of v (first three) and of the friction (last)."""
+        vn = wp.dot(v, n)
+        out = vec4(a[0], a[1], a[2], real(0.0))
+        if kind == wp.static(STICKY):
+            out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
+        elif kind == wp.static(SLIP):
+            b = a - wp.dot(a, n) * n
+            out = vec4(b[0], b[1], b[2], real(0.0))
+        elif kind == wp.static(SEPARATE):
+            if vn < real(0.0):
+                t = v - vn * n
+                speed = wp.length(t)
+                if speed <= -friction * vn:
+                    out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
+                else:
+                    s = wp.max(speed, real(1.0e-30))
+                    e = t / s
+                    ea = wp.dot(e, a)
+                    at = a + (friction * vn / s) * (a - ea * e)
+                    at = at - wp.dot(at, n) * n
+                    b = at + (friction * ea) * n
+                    out = vec4(b[0], b[1], b[2], vn * ea)
+        return out
+
+    @func
+    def place(c: wp.vec4i, origin: vec3, h: real):
+        """Position of a node [m] from its three indices."""
+        return origin + vec3(real(c[0]), real(c[1]), real(c[2])) * h
+
+    @func
+    def turn(v: vec3, q: vec3):
+        """v turned by Cayley's rotation of q, half the angle's vector: a force across v that does no work."""
+        t = wp.cross(q, v)
+        return v + (real(2.0) / (real(1.0) + wp.dot(q, q))) * (t + wp.cross(q, t))
+
+    @func
+    def turn_adjoint(v: vec3, q: vec3, a: vec3):
+        """Adjoint of q; that of v is `turn(a, -q)`."""
+        s = real(2.0) / (real(1.0) + wp.dot(q, q))
+        t = wp.cross(q, v)
+        both = wp.dot(a, t + wp.cross(q, t))
+        return s * (wp.cross(v, a) + wp.cross(t, a) + wp.cross(v, wp.cross(a, q))) - (s * s * both) * q
+
+    @func
+    def lose(v: vec3, n: vec3, dt: real, force: wp.array2d(dtype=real), row: int):
+        """Stick and restitution: what a node in a collider keeps of its velocity."""
+        out = wp.exp(-dt * force[row, 9]) * v
+        vn = wp.dot(out, n)
+        if vn > real(0.0):
+            out = out + ((wp.exp(-dt * force[row, 10]) - real(1.0)) * vn) * n
+        return out
+
+    @func
+    def push(v0: vec3, x: vec3, dt: real, g: vec3, force: wp.array2d(dtype=real), row: int):
+        """Nodal velocity after gravity and the body forces; drag is implicit in its size, so any coefficient is stable."""
+        centre = vec3(force[row, 3], force[row, 4], force[row, 5])
+        u = v0 + dt * (g - force[row, 2] * (x - centre))
+        if force.shape[1] > 6:
+            u = turn(u, real(0.5) * dt * vec3(force[row, 6], force[row, 7], force[row, 8]))
+        return u / (real(1.0) + dt * (force[row, 0] + force[row, 1] * wp.length(u)))
+
+    @func
+    def clamped(x: vec3, s: int, lower: wp.array2d(dtype=vec3), upper: wp.array2d(dtype=vec3)):
+        inside = bool(False)
+        for b in range(lower.shape[1]):
+            l = lower[s, b]
+            u = upper[s, b]
+            if x[0] >= l[0] and x[1] >= l[1] and x[2] >= l[2] and x[0] <= u[0] and x[1] <= u[1] and x[2] <= u[2]:
+                inside = True
+        return inside
+
+    @func
+    def normal_of(plane: vec4):
+        return vec3(plane[0], plane[1], plane[2])
+
+    @func
+    def collide(
+        v: vec3,
+        x: vec3,
+        s: int,
+        count: int,
+        plane: wp.array2d(dtype=vec4),
+        kind: wp.array2d(dtype=wp.int32),
+        friction: wp.array2d(dtype=real),
+        dt: real,
+        force: wp.array2d(dtype=real),
+    ):
+        """The velocity after the first `count` colliders, in their order."""
+        out = v
+        for c in range(count):
+            n = normal_of(plane[s, c])
+            if wp.dot(n, x) <= plane[s, c][3]:
+                out = contact(out, n, kind[s, c], friction[s, c])
+                if force.shape[1] > 6:
+                    if kind[s, c] > 0:
+                        out = lose(out, n, dt, force, s)
+        return out
+
+    @kernel
+    def update_grid(
+        origin: wp.array(dtype=vec3),
+        dx: wp.array(dtype=real),
+        dt: wp.array(dtype=real),
+        gravity: wp.array(dtype=vec3),
+        force: wp.array2d(dtype=real),
+        plane: wp.array2d(dtype=vec4),
+        kind: wp.array2d(dtype=wp.int32),
+        friction: wp.array2d(dtype=real),
+        lower: wp.array2d(dtype=vec3),
+        upper: wp.array2d(dtype=vec3),
+        index: wp.array(dtype=wp.vec4i),
+        chunk: int,
+        grid: wp.array(dtype=vec4),
+        velocity: wp.array(dtype=vec4),
+        clear: bool,
+    ):
+        """(momentum, mass) -> (velocity, 0) of each node; an empty node gets zero.
+
+        `clear` empties the nodes for the next scatter, and leaves what an empty one has: no particle gives it weight.
+        """
+        first = wp.tid() * chunk
+        for node in range(first, first + chunk):
+            g = grid[node]
+            out = vec3(real(0.0), real(0.0), real(0.0))
+            if g[3] > real(0.0):
+                if clear:
+                    grid[node] = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
+                s = index[node][3]
+                x = place(index[node], origin[s], dx[s])
+                if not clamped(x, s, lower, upper):
+                    v0 = vec3(g[0], g[1], g[2]) / g[3]
+                    u = push(v0, x, dt[s], gravity[s], force, s)
+                    out = collide(u, x, s, kind.shape[1], plane, kind, friction, dt[s], force)
+            if g[3] > real(0.0) or not clear:
+                velocity[node] = vec4(out[0], out[1], out[2], real(0.0))
+
+    @adjoint_kernel
+    def update_grid_adjoint(
+        origin: wp.array(dtype=vec3),
+        dx: wp.array(dtype=real),
+        dt: wp.array(dtype=real),
+        gravity: wp.array(dtype=vec3),
+        force: wp.array2d(dtype=real),
+        plane: wp.array2d(dtype=vec4),
+        kind: wp.array2d(dtype=wp.int32),
+        friction: wp.array2d(dtype=real),
+        lower: wp.array2d(dtype=vec3),
+        upper: wp.array2d(dtype=vec3),
+        index: wp.array(dtype=wp.vec4i),
+        chunk: int,
+        grid: wp.array(dtype=vec4),
+        a_velocity: wp.array(dtype=vec4),
+        a_grid: wp.array(dtype=vec4),
+        a_gravity: wp.array(dtype=vec3),
+        a_force: wp.array2d(dtype=real),
+        a_friction: wp.array2d(dtype=real),
+        parameters: bool,
+    ):
+        """Writes a_grid; adds to the adjoints of gravity, body forces and friction where `parameters` is set."""
+        first = wp.tid() * chunk
+        for node in range(first, first + chunk):
+            g = grid[node]
+            out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
+            if g[3] > real(0.0):
+                s = index[node][3]
+                x = place(index[node], origin[s], dx[s])
+                if not clamped(x, s, lower, upper):
+                    v0 = vec3(g[0], g[1], g[2]) / g[3]
+                    u = push(v0, x, dt[s], gravity[s], force, s)
+                    av = a_velocity[node]
+                    a = vec3(av[0], av[1], av[2])
+                    planes = kind.shape[1]
+                    for r in range(planes):
+                        c = planes - 1 - r
+                        n = normal_of(plane[s, c])
+                        if wp.dot(n, x) <= plane[s, c][3]:
+                            before = collide(u, x, s, c, plane, kind, friction, dt[s], force)
+                            if force.shape[1] > 6:
+                                if kind[s, c] > 0:
+                                    met = contact(before, n, kind[s, c], friction[s, c])
+                                    keep = wp.exp(-dt[s] * force[s, 9])
+                                    bounce = wp.exp(-dt[s] * force[s, 10])
+                                    vn = wp.dot(met, n)
+                                    an = wp.dot(a, n)
+                                    lost = wp.dot(a, met)
+                                    if vn > real(0.0):
+                                        lost = lost + (bounce - real(1.0)) * vn * an
+                                        a = a + ((bounce - real(1.0)) * an) * n
+                                        if parameters:
+                                            wp.atomic_add(a_force, s, 10, -dt[s] * keep * bounce * vn * an)
+                                    a = keep * a
+                                    if parameters:
+                                        wp.atomic_add(a_force, s, 9, -dt[s] * keep * lost)
+                            b = contact_adjoint(before, n, kind[s, c], friction[s, c], a)
+                            a = vec3(b[0], b[1], b[2])
+                            if parameters:
+                                wp.atomic_add(a_friction, s, c, b[3])
+                    # the implicit drag: v = u / D, D = 1 + dt (c1 + c2 |u|)
+                    centre = vec3(force[s, 3], force[s, 4], force[s, 5])
+                    u = v0 + dt[s] * (gravity[s] - force[s, 2] * (x - centre))
+                    q = vec3(real(0.0), real(0.0), real(0.0))
+                    straight = u
+                    if force.shape[1] > 6:
+                        q = real(0.5) * dt[s] * vec3(force[s, 6], force[s, 7], force[s, 8])
+                        u = turn(u, q)
+                    speed = wp.length(u)
+                    D = real(1.0) + dt[s] * (force[s, 0] + force[s, 1] * speed)
+                    aD = -wp.dot(a, u) / (D * D)
+                    au = a / D
+                    if speed > real(0.0):
+                        au = au + (aD * dt[s] * force[s, 1] / speed) * u
+                    if force.shape[1] > 6:
+                        if parameters:
+                            aq = real(0.5) * dt[s] * turn_adjoint(straight, q, au)
+                            wp.atomic_add(a_force, s, 6, aq[0])
+                            wp.atomic_add(a_force, s, 7, aq[1])
+                            wp.atomic_add(a_force, s, 8, aq[2])
+                        au = turn(au, -q)
+                    if parameters:
+                        wp.atomic_add(a_gravity, s, dt[s] * au)
+                        wp.atomic_add(a_force, s, 0, dt[s] * aD)
+                        wp.atomic_add(a_force, s, 1, dt[s] * speed * aD)
+                        wp.atomic_add(a_force, s, 2, -dt[s] * wp.dot(au, x - centre))
+                        wp.atomic_add(a_force, s, 3, dt[s] * force[s, 2] * au[0])
+                        wp.atomic_add(a_force, s, 4, dt[s] * force[s, 2] * au[1])
+                        wp.atomic_add(a_force, s, 5, dt[s] * force[s, 2] * au[2])
+                    out = vec4(au[0], au[1], au[2], -wp.dot(au, v0)) / g[3]
+            a_grid[node] = out
+
+    return SimpleNamespace(
+        add_viscous_stress=add_viscous_stress,
+        add_viscous_stress_adjoint=add_viscous_stress_adjoint,
+        update_grid=update_grid,
+        update_grid_adjoint=update_grid_adjoint,
+        functions=SimpleNamespace(push=push, contact=contact, lose=lose),
+    )

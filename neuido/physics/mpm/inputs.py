@@ -1,0 +1,157 @@
+"""What a caller gives a rollout beside the laws, brought to the solver's type and checked: the same for every discretisation."""
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.colliders.tables import ColliderTable
+from neuido.physics.effects import coefficients as effect_tables
+from neuido.physics.effects.coefficients import Tables
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.types import Particles, ParticleState
+
+
+class Solver(Protocol):
+    """What is read of `mpm.Simulator` and `finite_elements.FiniteElements`, which document it."""
+
+    device: torch.device
+    dtype: torch.dtype
+    particles: Particles
+    state: ParticleState
+    mass: Tensor
+    volume: Tensor
+    dt: Tensor
+    gravity: Tensor
+    colliders: ColliderTable
+
+    @property
+    def scene_count(self) -> int: ...
+
+
+class RolloutInputs(NamedTuple):
+    """Of S scenes with P particles and K colliders, in the type and on the device of the solver."""
+
+    state: ParticleState
+    effects: Effects
+    gravity: Tensor
+    """[m/s^2], (S, 3), without effects."""
+    force: Tensor
+    """`Effects.force_table`."""
+    friction: Tensor
+    """(S, K), that of the effects included."""
+    mass: Tensor
+    """[kg], (P,), added mass and relative density included."""
+    viscosity: Tensor | None
+    """`Effects.viscosity` [Pa s], (S, 2)."""
+    tables: Tables | None
+    """None where no effect acts on the law."""
+    stiffness: Tensor | None
+    """Factor of each particle's elastic stress, (P,)."""
+    growth: Tensor | None
+    """`Effects.growth` over the solver's own steps, (T, S)."""
+
+    def stiffening(self, solver: Solver) -> tuple[Tensor, Tensor] | None:
+        """What the effects add to each scene's P-wave modulus [Pa], and the factor on the sum, (S,) float64 each.
+
+        Of particles with factors of their own that one whose waves are fastest counts, and its factor is told at the least density.
+        """
+        if self.tables is None:
+            return None
+        added = self.tables.stiffening.double()
+        factor = torch.ones(len(self.gravity), dtype=torch.float64, device=self.mass.device)
+        if self.stiffness is not None:
+            rho = self.mass.detach().double() / solver.volume.double()
+            parts = zip(solver.particles.offsets[:-1], solver.particles.offsets[1:])
+            factor = torch.stack([(self.stiffness[i:j].detach() / rho[i:j]).max() * rho[i:j].min() for i, j in parts])
+        if self.growth is not None:
+            factor = factor * self.growth.detach().double().amax(dim=0)
+        return added, factor
+
+
+def check_frames(steps: int, every: int) -> None:
+    """Raise UserError where `steps` is no positive multiple of `every`."""
+    if steps < 1 or every < 1 or steps % every:
+        raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
+
+
+def prepare(
+    solver: Solver,
+    steps: int,
+    elasticity: ElasticLaw,
+    plasticity: PlasticLaw | None,
+    *,
+    state: ParticleState | None = None,
+    effects: Effects | None = None,
+    gravity: Tensor | None = None,
+    friction: Tensor | None = None,
+    mass: Tensor | None = None,
+) -> RolloutInputs:
+    """What `steps` steps read, differentiable in everything given; the arguments are those of `mpm.Simulator.rollout`.
+
+    Raises:
+        UserError: A shape that does not fit, an effect outside its range or without a law that it needs.
+    """
+    count, like = solver.scene_count, solver.mass
+
+    def own(t: Tensor) -> Tensor:
+        return t.to(solver.device, solver.dtype).contiguous()
+
+    state = solver.state if state is None else ParticleState(*(own(t) for t in state))
+    effects = Effects() if effects is None else effects
+    friction = solver.colliders.friction if friction is None else own(friction)
+    if friction.shape != solver.colliders.friction.shape:
+        raise UserError(f"friction has shape {tuple(friction.shape)}; it must be {tuple(solver.colliders.friction.shape)}")
+    if effects.friction is not None:
+        friction = (friction + effects.rows("friction", count, like)).clamp(min=0.0)
+    mass = like if mass is None else own(mass)
+    if effects.added_mass is not None:
+        mass = mass * (1 + effects.rows("added_mass", count, mass)[solver.particles.scene.long(), 0])
+    if effects.relative_density is not None:
+        mass = mass * effects.particle_factor("relative_density", len(mass), mass)
+    tables = stiffness = growth = None
+    if effects.of_material:
+        tables = effect_tables.tables(effects, elasticity, plasticity, count, like)
+        stiffness = effects.particle_stiffness(len(mass), mass)
+        growth = effects.growth(solver.dt, steps)
+    return RolloutInputs(
+        state=state,
+        effects=effects,
+        gravity=solver.gravity if gravity is None else gravity.to(solver.device, solver.dtype).expand(count, 3),
+        force=effects.force_table(count, like).contiguous(),
+        friction=friction.contiguous(),
+        mass=mass,
+        viscosity=effects.viscosity(count, like),
+        tables=tables,
+        stiffness=stiffness,
+        growth=growth,
+    )
+
+
+def waves(
+    solver: Solver, elasticity: ElasticLaw, mass: Tensor | None = None, stiffening: tuple[Tensor, Tensor] | None = None
+) -> list[tuple[float, float]]:
+    """The P-wave modulus at rest [Pa] and the least density [kg/m^3] of each scene, which bound its step.
+
+    Args:
+        solver: The scenes.
+        elasticity: The law.
+        mass: [kg], (P,); the solver's own where absent.
+        stiffening: Of `RolloutInputs.stiffening`.
+
+    Raises:
+        UserError: A modulus that is negative or not a number.
+    """
+    modulus = elasticity.modulus().detach().to(solver.device, torch.float64).expand(solver.scene_count)
+    if stiffening is not None:
+        modulus = (modulus + stiffening[0]) * stiffening[1]
+    rho = (solver.mass if mass is None else mass.detach()).double() / solver.volume.double()
+    out = []
+    for s, (i, j) in enumerate(zip(solver.particles.offsets[:-1], solver.particles.offsets[1:])):
+        value = float(modulus[s])
+        if not value >= 0.0:
+            raise UserError(f"the law of scene {s} has a P-wave modulus of {value:g} Pa at rest; it must not be negative")
+        out.append((value, float(rho[i:j].min())))
+    return out

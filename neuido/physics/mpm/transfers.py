@@ -1,0 +1,492 @@
+"""Warp kernels of the transfers between particles and grid, and their hand-written adjoints, for float32 and float64.
+
+A substep (paper, appendix "Material Point Method"; the MLS form of Hu et al. 2018) moves P particles of S scenes at once.
+The grid is one array over all nodes of all scenes, [scene, x, y, z] with z fastest, and each scene's part is padded by PAD
+nodes on each side so that the quadratic stencil of a particle in the domain never leaves it. Nodes hold four numbers:
+(momentum, mass) or (velocity, 0).
+
+    particles_to_grid   tau, C, v -> momentum and mass of the nodes          A = m C - dt V0 (4/dx^2) tau
+    (grid_kernels)      nodal velocity: gravity, body forces, colliders, clamps
+    grid_to_particles   v, C, x, and the trial F_tr = (I + dt C) F
+
+`*_adjoint` kernels take the adjoint of what the forward kernel wrote and add to the adjoint of what it read. The adjoint of
+the scatter is a gather and has no atomics; only the adjoint of the gather scatters. The 27 nodes are summed axis by axis,
+since weights, arms and slopes are products over the axes: about a third of the operations of the plain sum.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from neuido.physics.mpm import grid as grid_kernels
+from neuido.physics.mpm.reductions import ADD4, ARRANGE, GATHER, RUN, SPREAD
+from neuido.physics.runtime.device import start_warp
+
+PAD = 2
+"""Nodes added on each side of the domain."""
+
+LOST, FAST = 1, 2
+"""Codes in the `status` of a scene: a particle outside the padded grid; one that moves by more than a cell a substep, or is not finite."""
+
+
+@functools.cache
+def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
+    """All kernels of a substep for one scalar type, compiled on first launch.
+
+    Args:
+        real: `wp.float32` or `wp.float64`.
+        enable_backward: Also generate Warp's own adjoints of the forward kernels (the oracle of the tests).
+
+    Returns:
+        A namespace of kernels, those of `grid_kernels` included.
+    """
+    start_warp()
+    vec3 = wp.types.vector(length=3, dtype=real)
+    vec4 = wp.types.vector(length=4, dtype=real)
+    mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
+    mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
+    name = f"neuido.mpm.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
+    func = functools.partial(wp.func, module=name)
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
+    adjoint_kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+
+    @func
+    def velocity_of(q: vec4):
+        return vec3(q[0], q[1], q[2])
+
+    @func
+    def first_moment(w: vec3):
+        """Weights times the node's number in the stencil, 0, 1 or 2."""
+        return vec3(real(0.0), w[1], real(2.0) * w[2])
+
+    if real is wp.float32 and not enable_backward:
+
+        @wp.func_native(ARRANGE)
+        def arrange(node: int) -> int: ...
+
+        @wp.func_native(RUN)
+        def run_of(node: int) -> int: ...
+
+        @wp.func_native(ADD4)
+        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4, run: int): ...
+
+        @wp.func_native(SPREAD)
+        def spread(
+            grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3,
+            b: vec3, ax: vec3, ay: vec3, az: vec3, mass: real, run: int,
+        ): ...  # fmt: skip
+
+        @wp.func_native(GATHER)
+        def moments(velocity: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3) -> mat43: ...
+
+    else:
+
+        @func
+        def arrange(node: int):
+            return 0
+
+        @func
+        def run_of(node: int):
+            return 0
+
+        @func
+        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4, run: int):
+            wp.atomic_add(grid, node, value)
+
+        @func
+        def spread(
+            grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3,
+            b: vec3, ax: vec3, ay: vec3, az: vec3, mass: real, run: int,
+        ):  # fmt: skip
+            bi = b
+            for i in range(3):
+                bj = bi
+                for j in range(3):
+                    bk = bj
+                    wij = wx[i] * wy[j]
+                    row = node + (i * ny + j) * nz
+                    for k in range(3):
+                        w = wij * wz[k]
+                        wp.atomic_add(grid, row + k, vec4(w * bk[0], w * bk[1], w * bk[2], w * mass))
+                        bk = bk + az
+                    bj = bj + ay
+                bi = bi + ax
+
+        @func
+        def moments(velocity: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3):
+            ix = first_moment(wx)
+            iy = first_moment(wy)
+            iz = first_moment(wz)
+            v = vec3(real(0.0), real(0.0), real(0.0))
+            vx = v
+            vy = v
+            vz = v
+            for i in range(3):
+                ui = vec3(real(0.0), real(0.0), real(0.0))
+                uiy = ui
+                uiz = ui
+                for j in range(3):
+                    row = node + (i * ny + j) * nz
+                    u0 = velocity_of(velocity[row])
+                    u1 = velocity_of(velocity[row + 1])
+                    u2 = velocity_of(velocity[row + 2])
+                    uj = wz[0] * u0 + wz[1] * u1 + wz[2] * u2
+                    ui += wy[j] * uj
+                    uiy += iy[j] * uj
+                    uiz += wy[j] * (iz[1] * u1 + iz[2] * u2)
+                v += wx[i] * ui
+                vx += ix[i] * ui
+                vy += wx[i] * uiy
+                vz += wx[i] * uiz
+            return wp.matrix_from_rows(v, vx, vy, vz)
+
+    @func
+    def spline(f: real):
+        """Quadratic B-spline weights of the three nodes; f in [0.5, 1.5) is the distance to the first one in cells."""
+        a = real(1.5) - f
+        b = f - real(1.0)
+        c = f - real(0.5)
+        return vec3(real(0.5) * a * a, real(0.75) - b * b, real(0.5) * c * c)
+
+    @func
+    def spline_slope(f: real):
+        """Their derivative with respect to the position in cells."""
+        return vec3(f - real(1.5), real(-2.0) * (f - real(1.0)), f - real(0.5))
+
+    @func
+    def first_node(cells: vec3, nodes: wp.vec3i):
+        """The lowest node of a particle's stencil, clamped into the grid (a lost particle is flagged elsewhere)."""
+        return wp.vec3i(
+            wp.clamp(int(wp.floor(cells[0] - real(0.5))), 0, nodes[0] - 3),
+            wp.clamp(int(wp.floor(cells[1] - real(0.5))), 0, nodes[1] - 3),
+            wp.clamp(int(wp.floor(cells[2] - real(0.5))), 0, nodes[2] - 3),
+        )
+
+    @func
+    def flat(s: int, node: wp.vec3i, nodes: wp.vec3i):
+        return ((s * nodes[0] + node[0]) * nodes[1] + node[1]) * nodes[2] + node[2]
+
+    @func
+    def stencil(x: vec3, s: int, origin: wp.array(dtype=vec3), dx: wp.array(dtype=real), nodes: wp.vec3i):
+        return flat(s, first_node((x - origin[s]) / dx[s], nodes), nodes)
+
+    @func
+    def within(cells: vec3, base: wp.vec3i):
+        """Distance to the first node of the stencil, in cells."""
+        return vec3(cells[0] - real(base[0]), cells[1] - real(base[1]), cells[2] - real(base[2]))
+
+    @func
+    def column(A: mat33, c: int):
+        return vec3(A[0, c], A[1, c], A[2, c])
+
+    @func
+    def widen(span: wp.array(dtype=real), at: real):
+        """Take a figure into the least and the greatest one, where there is room for them."""
+        if span.shape[0] > 0:
+            wp.atomic_min(span, 0, at)
+            wp.atomic_max(span, 1, at)
+
+    @func
+    def cell_of(y: vec3, origin: vec3, h: real, nodes: wp.vec3i):
+        """Whether the stencil of a particle at y lies in the padded grid."""
+        c = (y - origin) / h
+        return (
+            c[0] >= real(0.5)
+            and c[1] >= real(0.5)
+            and c[2] >= real(0.5)
+            and c[0] <= real(nodes[0]) - real(1.5)
+            and c[1] <= real(nodes[1]) - real(1.5)
+            and c[2] <= real(nodes[2]) - real(1.5)
+        )
+
+    @kernel
+    def particles_to_grid(
+        scene: wp.array(dtype=wp.int32),
+        origin: wp.array(dtype=vec3),
+        dx: wp.array(dtype=real),
+        dt: wp.array(dtype=real),
+        nodes: wp.vec3i,
+        mass: wp.array(dtype=real),
+        volume: wp.array(dtype=real),
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        C: wp.array(dtype=mat33),
+        tau: wp.array(dtype=mat33),
+        grid: wp.array(dtype=vec4),
+    ):
+        """Nodes get (momentum [kg m/s], mass [kg]); `grid` must be zero before."""
+        p = wp.tid()
+        p += arrange(stencil(x[p], scene[p], origin, dx, nodes))
+        s = scene[p]
+        h = dx[s]
+        m = mass[p]
+        cells = (x[p] - origin[s]) / h
+        base = first_node(cells, nodes)
+        f = within(cells, base)
+        wx = spline(f[0])
+        wy = spline(f[1])
+        wz = spline(f[2])
+        hA = h * m * C[p] - (dt[s] * volume[p] * real(4.0) / h) * tau[p]
+        ax = column(hA, 0)
+        ay = column(hA, 1)
+        az = column(hA, 2)
+        bi = m * v[p] - hA * f
+        node = flat(s, base, nodes)
+        spread(grid, node, nodes[1], nodes[2], wx, wy, wz, bi, ax, ay, az, m, run_of(node))
+
+    @adjoint_kernel
+    def particles_to_grid_adjoint(
+        scene: wp.array(dtype=wp.int32),
+        origin: wp.array(dtype=vec3),
+        dx: wp.array(dtype=real),
+        dt: wp.array(dtype=real),
+        nodes: wp.vec3i,
+        mass: wp.array(dtype=real),
+        volume: wp.array(dtype=real),
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        C: wp.array(dtype=mat33),
+        tau: wp.array(dtype=mat33),
+        a_grid: wp.array(dtype=vec4),
+        a_mass: wp.array(dtype=real),
+        a_x: wp.array(dtype=vec3),
+        a_v: wp.array(dtype=vec3),
+        a_C: wp.array(dtype=mat33),
+        a_tau: wp.array(dtype=mat33),
+    ):
+        """Adds to a_mass and a_x; writes a_v, a_C and a_tau."""
+        p = wp.tid()
+        s = scene[p]
+        h = dx[s]
+        m = mass[p]
+        cells = (x[p] - origin[s]) / h
+        base = first_node(cells, nodes)
+        f = within(cells, base)
+        wx = spline(f[0])
+        wy = spline(f[1])
+        wz = spline(f[2])
+        ix = first_moment(wx)
+        iy = first_moment(wy)
+        iz = first_moment(wz)
+        gx = spline_slope(f[0])
+        gy = spline_slope(f[1])
+        gz = spline_slope(f[2])
+        ratio = dt[s] * volume[p] * real(4.0) / (h * h)
+        hA = h * (m * C[p] - ratio * tau[p])
+        ax = column(hA, 0)
+        ay = column(hA, 1)
+        az = column(hA, 2)
+        bi = m * v[p] - hA * f
+        node = flat(s, base, nodes)
+        zero = vec3(real(0.0), real(0.0), real(0.0))
+        s0 = zero
+        sx = zero
+        sy = zero
+        sz = zero
+        slope = zero
+        sm = real(0.0)
+        for i in range(3):
+            bj = bi
+            ti = zero
+            tiy = zero
+            tiz = zero
+            pi = real(0.0)
+            piy = real(0.0)
+            piz = real(0.0)
+            mi = real(0.0)
+            for j in range(3):
+                bk = bj
+                tj = zero
+                tjz = zero
+                pj = real(0.0)
+                pjz = real(0.0)
+                mj = real(0.0)
+                row = node + (i * nodes[1] + j) * nodes[2]
+                for k in range(3):
+                    g = a_grid[row + k]
+                    a = velocity_of(g)
+                    phi = wp.dot(a, bk) + m * g[3]
+                    tj += wz[k] * a
+                    tjz += iz[k] * a
+                    pj += wz[k] * phi
+                    pjz += gz[k] * phi
+                    mj += wz[k] * g[3]
+                    bk = bk + az
+                ti += wy[j] * tj
+                tiy += iy[j] * tj
+                tiz += wy[j] * tjz
+                pi += wy[j] * pj
+                piy += gy[j] * pj
+                piz += wy[j] * pjz
+                mi += wy[j] * mj
+                bj = bj + ay
+            s0 += wx[i] * ti
+            sx += ix[i] * ti
+            sy += wx[i] * tiy
+            sz += wx[i] * tiz
+            slope += vec3(gx[i] * pi, wx[i] * piy, wx[i] * piz)
+            sm += wx[i] * mi
+            bi = bi + ax
+        s1 = h * wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
+        a_v[p] = m * s0
+        a_C[p] = m * s1
+        a_tau[p] = -ratio * s1
+        a_x[p] = a_x[p] + (slope - wp.transpose(hA) * s0) / h
+        a_mass[p] = a_mass[p] + wp.dot(s0, v[p]) + wp.ddot(s1, C[p]) + sm
+
+    @kernel
+    def grid_to_particles(
+        scene: wp.array(dtype=wp.int32),
+        held: wp.array(dtype=wp.uint8),
+        origin: wp.array(dtype=vec3),
+        dx: wp.array(dtype=real),
+        dt: wp.array(dtype=real),
+        nodes: wp.vec3i,
+        velocity: wp.array(dtype=vec4),
+        x: wp.array(dtype=vec3),
+        F: wp.array(dtype=mat33),
+        x_next: wp.array(dtype=vec3),
+        v_next: wp.array(dtype=vec3),
+        C_next: wp.array(dtype=mat33),
+        F_trial: wp.array(dtype=mat33),
+        step: int,
+        status: wp.array(dtype=wp.int32),
+        span: wp.array(dtype=real),
+    ):
+        """Gather; the first particle of a scene that is lost, too fast or not finite leaves its code, index and step in `status`.
+
+        Where `span` has room for two figures, it is widened to the x of all particles.
+        """
+        p = wp.tid()
+        s = scene[p]
+        h = dx[s]
+        zero = vec3(real(0.0), real(0.0), real(0.0))
+        if held[p] == wp.uint8(1):
+            x_next[p] = x[p]
+            widen(span, x[p][0])
+            v_next[p] = zero
+            C_next[p] = wp.outer(zero, zero)
+            F_trial[p] = F[p]
+            return
+        cells = (x[p] - origin[s]) / h
+        base = first_node(cells, nodes)
+        f = within(cells, base)
+        wx = spline(f[0])
+        wy = spline(f[1])
+        wz = spline(f[2])
+        node = flat(s, base, nodes)
+        m = moments(velocity, node, nodes[1], nodes[2], wx, wy, wz)
+        v = m[0]
+        C = (real(4.0) / h) * wp.matrix_from_cols(m[1] - f[0] * v, m[2] - f[1] * v, m[3] - f[2] * v)
+        y = x[p] + dt[s] * v
+        x_next[p] = y
+        widen(span, y[0])
+        v_next[p] = v
+        C_next[p] = C
+        F_trial[p] = F[p] + dt[s] * (C * F[p])
+        code = int(0)
+        if not (wp.length(v) * dt[s] < h):
+            code = wp.static(FAST)
+        if not cell_of(y, origin[s], h, nodes):
+            code = wp.max(code, wp.static(LOST))
+        if code > 0:
+            if wp.atomic_cas(status, 3 * s, 0, code) == 0:
+                status[3 * s + 1] = p
+                status[3 * s + 2] = step
+
+    @adjoint_kernel
+    def grid_to_particles_adjoint(
+        scene: wp.array(dtype=wp.int32),
+        held: wp.array(dtype=wp.uint8),
+        origin: wp.array(dtype=vec3),
+        dx: wp.array(dtype=real),
+        dt: wp.array(dtype=real),
+        nodes: wp.vec3i,
+        velocity: wp.array(dtype=vec4),
+        x: wp.array(dtype=vec3),
+        F: wp.array(dtype=mat33),
+        v_next: wp.array(dtype=vec3),
+        C_next: wp.array(dtype=mat33),
+        a_x_next: wp.array(dtype=vec3),
+        a_v_next: wp.array(dtype=vec3),
+        a_C_next: wp.array(dtype=mat33),
+        a_F_trial: wp.array(dtype=mat33),
+        a_velocity: wp.array(dtype=vec4),
+        a_x: wp.array(dtype=vec3),
+        a_F: wp.array(dtype=mat33),
+    ):
+        """Adds to a_velocity (zero before); writes a_x and a_F."""
+        p = wp.tid()
+        p += arrange(stencil(x[p], scene[p], origin, dx, nodes))
+        s = scene[p]
+        h = dx[s]
+        free = real(1.0)  # a held particle takes part with nothing: the lanes of a warp add together
+        if held[p] == wp.uint8(1):
+            free = real(0.0)
+        cells = (x[p] - origin[s]) / h
+        base = first_node(cells, nodes)
+        f = within(cells, base)
+        wx = spline(f[0])
+        wy = spline(f[1])
+        wz = spline(f[2])
+        gx = spline_slope(f[0])
+        gy = spline_slope(f[1])
+        gz = spline_slope(f[2])
+        aF = a_F_trial[p]
+        a_F[p] = aF + (free * dt[s]) * (wp.transpose(C_next[p]) * aF)
+        hB = (free * real(4.0) / h) * (a_C_next[p] + dt[s] * (aF * wp.transpose(F[p])))
+        bx = column(hB, 0)
+        by = column(hB, 1)
+        bz = column(hB, 2)
+        qi = free * (a_v_next[p] + dt[s] * a_x_next[p]) - hB * f
+        node = flat(s, base, nodes)
+        run = run_of(node)
+        slope = vec3(real(0.0), real(0.0), real(0.0))
+        for i in range(3):
+            qj = qi
+            pi = real(0.0)
+            piy = real(0.0)
+            piz = real(0.0)
+            for j in range(3):
+                qk = qj
+                pj = real(0.0)
+                pjz = real(0.0)
+                wij = wx[i] * wy[j]
+                row = node + (i * nodes[1] + j) * nodes[2]
+                for k in range(3):
+                    w = wij * wz[k]
+                    phi = wp.dot(qk, velocity_of(velocity[row + k]))
+                    pj += wz[k] * phi
+                    pjz += gz[k] * phi
+                    add4(a_velocity, row + k, vec4(w * qk[0], w * qk[1], w * qk[2], real(0.0)), run)
+                    qk = qk + bz
+                pi += wy[j] * pj
+                piy += gy[j] * pj
+                piz += wy[j] * pjz
+                qj = qj + by
+            slope += vec3(gx[i] * pi, wx[i] * piy, wx[i] * piz)
+            qi = qi + bx
+        a_x[p] = a_x_next[p] + (slope - wp.transpose(hB) * v_next[p]) / h
+
+    @adjoint_kernel
+    def trial_gradient(
+        scene: wp.array(dtype=wp.int32),
+        dt: wp.array(dtype=real),
+        F: wp.array(dtype=mat33),
+        C_next: wp.array(dtype=mat33),
+        F_trial: wp.array(dtype=mat33),
+    ):
+        """The trial gradient again, as `grid_to_particles` wrote it."""
+        p = wp.tid()
+        F_trial[p] = F[p] + dt[scene[p]] * (C_next[p] * F[p])
+
+    return SimpleNamespace(
+        module=name,
+        trial_gradient=trial_gradient,
+        particles_to_grid=particles_to_grid,
+        particles_to_grid_adjoint=particles_to_grid_adjoint,
+        grid_to_particles=grid_to_particles,
+        grid_to_particles_adjoint=grid_to_particles_adjoint,
+        **vars(grid_kernels.build(real, enable_backward)),
+    )

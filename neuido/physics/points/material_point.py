@@ -1,0 +1,287 @@
+"""The material point: a law with effects along a measured path of the deformation gradient, which is the same all over the specimen.
+
+The machine prescribes some principal stretches (or an amount of shear) in the specimen's own axes; the others follow from zero lateral
+stress, by Newton's method, or, where the body is incompressible, the pressure does. Shear stresses that a skew fibre calls forth are
+carried by the grips: F stays diagonal. Many parameter sets run as one batch, on the torch twin `constitutive.Constitutive`.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.effects.constitutive import Constitutive, History
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, StackedElastic
+from neuido.types import Particles, Vector
+
+MODES = ("uniaxial", "equibiaxial", "pure_shear", "biaxial", "simple_shear")
+PROBE = 1e-6
+"""Step in a logarithmic stretch by which the slope of the lateral stress is taken."""
+TOLERANCE = 1e-9
+"""Lateral stress that counts as zero, as a share of the P-wave modulus or, where it is larger, of the axial stress."""
+ITERATIONS = 60
+RATES = ("viscosity_shear", "viscosity_bulk", "maxwell_ratio", "hysteresis", "rate_yield", "stiffness_change")
+"""Effects that need times."""
+
+
+class Specimen(NamedTuple):
+    """A law with effects for P parameter sets."""
+
+    elasticity: ElasticLaw
+    plasticity: PlasticLaw | None
+    effects: Effects
+    points: int
+    """Parameter sets P; each parameter of the laws and effects has one row for all or P."""
+    incompressible: bool = False
+    """The lateral stress is zero by pressure, and the volume constant."""
+
+
+def stress_along(
+    specimen: Specimen,
+    mode: str,
+    path: Tensor,
+    *,
+    direction: Vector = (1.0, 0.0, 0.0),
+    time: Tensor | None = None,
+    true_stress: bool = False,
+    step: float = 0.1,
+) -> Tensor:
+    """The stress that a machine measures, row by row.
+
+    The specimen is virgin and at rest before the first row; where that is deformed already it is reached within the first interval
+    of time. Without a history (no plasticity, no effect that remembers) rows do not depend on each other and run side by side.
+
+    Args:
+        specimen: The law.
+        mode: `uniaxial`, `equibiaxial`, `pure_shear` (1 column: the stretch along axis 1, in equibiaxial tension along 1 and 2; in pure
+            shear axis 2 is held), `biaxial` (2 columns), `simple_shear` (1 column: gamma of F = I + gamma e1 e2^T).
+        path: Stretches or shear [-], (n, 1) or (n, 2), float64.
+        direction: Axis 1 in the material's frame; the other axes come with it by the smallest rotation from the first one.
+        time: Times of the rows [s], (n,), rising; None: quasi-static.
+        true_stress: Cauchy's stress, not the nominal one (which it equals in simple shear).
+        step: Largest increment of a logarithmic stretch in one step, where there is a history.
+
+    Returns:
+        [Pa], (P, n, 1), or (P, n, 2) for `biaxial`; all NaN for a parameter set that finds no lateral equilibrium or has no finite stress.
+
+    Raises:
+        UserError: An unknown mode, a path of another width or with stretches that are not positive, a rate effect without times.
+    """
+    if mode not in MODES:
+        raise UserError(f"mode = {mode!r} is not known; one of {', '.join(MODES)}")
+    width = 2 if mode == "biaxial" else 1
+    if path.ndim != 2 or path.shape[1] != width or len(path) < 1:
+        raise UserError(f"path has the shape {tuple(path.shape)}; {mode} takes (n, {width})")
+    if mode != "simple_shear" and not bool((path > 0).all()):
+        raise UserError(f"path has the stretch {path.min().item():g}; stretches must be positive")
+    if time is not None and (len(time) != len(path) or bool((time.diff() <= 0).any())):
+        raise UserError(f"time must rise and have {len(path)} rows, got {len(time)}")
+    timed = [name for name in RATES if getattr(specimen.effects, name) is not None]
+    if timed and time is None:
+        raise UserError(f"{timed[0]} depends on the rate: give the times of the path")
+    if not step > 0:
+        raise UserError(f"step = {step} must be positive")
+    with torch.no_grad():
+        rig = _Rig(specimen, mode, path.double(), torch.tensor(direction, dtype=torch.float64))
+        tau, lateral = rig.side_by_side() if rig.forgets else rig.in_order(None if time is None else time.double(), step)
+        out = rig.measured(tau, lateral, true_stress)
+        bad = ~torch.isfinite(out).all(dim=2).all(dim=1)
+        out[bad] = torch.nan
+    return out
+
+
+class _Rig:
+    """One specimen in one machine: what is prescribed (logarithms, or the shear), what is solved for.
+
+    `lateral` (..., k) are the unknowns u: logarithms of the free stretches; one for two where the material cannot tell axes 2 and 3.
+    """
+
+    def __init__(self, specimen: Specimen, mode: str, path: Tensor, direction: Tensor) -> None:
+        self.specimen, self.mode = specimen, mode
+        self.path = path if mode == "simple_shear" else path.log()
+        self.R = turn(direction)
+        classical = isinstance(specimen.elasticity, (FixedCorotated, Sigma, NeoHookean, StackedElastic))
+        self.even = mode == "uniaxial" and classical and specimen.effects.fibre is None
+        free = 0 if mode == "simple_shear" else 2 if mode == "uniaxial" and not self.even else 1
+        if specimen.incompressible:
+            free = 1 if mode == "uniaxial" and not self.even else 0
+        self.free = free
+        self.scale = specimen.elasticity.modulus().double().detach().expand(specimen.points)
+        probe = Constitutive(specimen.elasticity, specimen.plasticity, specimen.effects, count=specimen.points)
+        self.forgets = (
+            probe.plasticity is None
+            and probe.tables.flow is None
+            and probe.tables.layout.width == 0
+            and not any(getattr(specimen.effects, name) is not None for name in RATES)
+        )
+
+    def material(self, each: int) -> Constitutive:
+        """The twin with `each` particles for every parameter set, point-major."""
+        P = self.specimen.points
+        particles = Particles(torch.arange(P, dtype=torch.int32).repeat_interleave(each), tuple(range(0, P * each + 1, each)))
+        s = self.specimen
+        return Constitutive(s.elasticity, s.plasticity, s.effects, count=P * each, particles=particles)
+
+    def log_stretches(self, given: Tensor, u: Tensor) -> Tensor:
+        """Logarithms of the three stretches (..., 3) from the prescribed ones (..., w) and the unknowns (..., k)."""
+        first = given[..., 0]
+        if self.mode == "uniaxial":
+            if self.specimen.incompressible:
+                split = torch.zeros_like(first) if self.even else u[..., 0]
+                return torch.stack([first, split - first / 2, -split - first / 2], -1)
+            return torch.stack([first, u[..., 0], u[..., -1]], -1)
+        second = {"equibiaxial": first, "pure_shear": torch.zeros_like(first), "biaxial": given[..., -1]}[self.mode]
+        return torch.stack([first, second, -first - second if self.specimen.incompressible else u[..., 0]], -1)
+
+    def gradient(self, given: Tensor, u: Tensor) -> Tensor:
+        """F in the specimen's axes, (..., 3, 3)."""
+        if self.mode == "simple_shear":
+            F = torch.eye(3, dtype=given.dtype).repeat(*given.shape[:-1], 1, 1)
+            F[..., 0, 1] = given[..., 0]
+            return F
+        return torch.diag_embed(self.log_stretches(given, u).exp())
+
+    def residual(self, tau: Tensor) -> Tensor:
+        """The lateral stress that must vanish (..., k) [Pa], of tau (..., 3, 3) in the specimen's axes."""
+        t = tau.diagonal(dim1=-2, dim2=-1)
+        if self.mode == "uniaxial" and not self.even:
+            return t[..., 1:2] - t[..., 2:] if self.specimen.incompressible else t[..., 1:]
+        return t[..., 2:][..., : self.free]
+
+    def turned(self, A: Tensor) -> Tensor:
+        """A tensor of the specimen's axes in those of the material."""
+        return self.R @ A @ self.R.mT
+
+    def back(self, A: Tensor) -> Tensor:
+        """The inverse of `turned`."""
+        return self.R.mT @ A @ self.R
+
+    def guess(self, given: Tensor) -> Tensor:
+        """Unknowns of a virgin specimen at constant volume, (..., k)."""
+        if self.mode == "uniaxial" and not self.specimen.incompressible:
+            return (-given[..., :1] / 2).expand(*given.shape[:-1], self.free).clone()
+        volume = {"pure_shear": 1.0, "equibiaxial": 2.0}.get(self.mode, 1.0) * given.sum(-1, keepdim=True)
+        zero = self.specimen.incompressible or self.mode == "simple_shear"
+        return torch.zeros(*given.shape[:-1], self.free, dtype=given.dtype) if zero else -volume[..., : self.free]
+
+    def solve(self, u: Tensor, evaluate, scale: Tensor) -> tuple[Tensor, Tensor, object]:
+        """Newton's method for u (..., k) with slopes by finite differences, all of them as copies in one evaluation.
+
+        `evaluate` takes (..., 1 + k, k) and returns tau (..., 1 + k, 3, 3) and what else it found. Points that do not converge get NaN.
+        """
+        k = self.free
+        probes = torch.cat([torch.zeros(1, k, dtype=u.dtype), PROBE * torch.eye(k, dtype=u.dtype)])
+        for _ in range(ITERATIONS if k else 1):
+            tau, more = evaluate(u.unsqueeze(-2) + probes)
+            r = self.residual(tau)
+            here = r[..., 0, :]
+            largest = tau[..., 0, :, :].diagonal(dim1=-2, dim2=-1).abs().amax(-1)
+            off = here.abs().amax(-1) > TOLERANCE * torch.maximum(scale, largest) if k else torch.zeros(u.shape[:-1], dtype=torch.bool)
+            if not bool(off.any()):
+                break
+            J = ((r[..., 1:, :] - r[..., :1, :]) / PROBE).mT
+            singular = ~torch.isfinite(J).all(-1).all(-1) | (torch.linalg.det(J).abs() < 1e-12 * scale**k)
+            J = torch.where(singular[..., None, None], scale[..., None, None] * torch.eye(k, dtype=u.dtype), J)
+            move = torch.linalg.solve(J, here)
+            u = torch.where((off & torch.isfinite(move).all(-1)).unsqueeze(-1), u - move.clamp(-0.2, 0.2), u)
+        tau = torch.where(off[..., None, None], torch.nan, tau[..., 0, :, :])
+        return u, tau, more
+
+    def side_by_side(self) -> tuple[Tensor, Tensor]:
+        """tau (P, n, 3, 3) and the unknowns (P, n, k), every row on its own."""
+        P, n, copies = self.specimen.points, len(self.path), 1 + self.free
+        material = self.material(n * copies)
+        history = material.start()
+        still = torch.zeros(P * n * copies, 3, 3, dtype=torch.float64)
+        given = self.path.expand(P, n, -1)
+
+        def evaluate(u: Tensor) -> tuple[Tensor, None]:
+            F = self.turned(self.gradient(given.unsqueeze(-2).expand(P, n, copies, -1), u))
+            tau = material.stress(F.reshape(-1, 3, 3), still, history)
+            return self.back(tau.reshape(P, n, copies, 3, 3)), None
+
+        u, tau, _ = self.solve(self.guess(given), evaluate, self.scale[:, None].expand(P, n))
+        return tau, u
+
+    def in_order(self, time: Tensor | None, step: float) -> tuple[Tensor, Tensor]:
+        """As `side_by_side`, one row after the other, with the history carried."""
+        P, n, copies = self.specimen.points, len(self.path), 1 + self.free
+        material = self.material(copies)
+        start = torch.zeros(1, self.path.shape[1], dtype=torch.float64)
+        path = torch.cat([start, self.path])
+        if time is not None:
+            first = time[1] - time[0] if n > 1 else torch.ones((), dtype=torch.float64)
+            time = torch.cat([(time[0] - first)[None], time]) - time[0]
+        u = torch.zeros(P, self.free, dtype=torch.float64)
+        ratio = torch.zeros(P, self.free, dtype=torch.float64)
+        whole = torch.eye(3, dtype=torch.float64).expand(P, 3, 3)  # the total F in the specimen's axes
+        F = torch.eye(3, dtype=torch.float64).repeat(P, 1, 1)  # the elastic one in the material's
+        history = History(*(part.reshape(P, copies, *part.shape[1:])[:, 0] for part in material.start()))
+        taus, us = [], []
+        for i in range(n):
+            jump = path[i + 1] - path[i]
+            pieces = max(math.ceil(float(jump.abs().max()) / step - 1e-9), 1)
+            dt = 1.0 if time is None else float(time[i + 1] - time[i]) / pieces
+            for piece in range(pieces):
+                given = path[i] + jump * ((piece + 1) / pieces)
+                now = 0.0 if time is None else float(time[i]) + dt * piece
+                inverse = torch.linalg.inv(whole)
+                begun = History(*(part.repeat_interleave(copies, 0) for part in history))
+
+                def evaluate(unknown: Tensor, given=given, inverse=inverse, begun=begun, now=now, dt=dt, F=F):
+                    total = self.gradient(given.expand(P, copies, -1), unknown)
+                    increment = total @ inverse[:, None]
+                    C = self.turned(_log(increment, self.mode) / dt).reshape(-1, 3, 3)
+                    trial = (self.turned(increment) @ F[:, None]).reshape(-1, 3, 3)
+                    corrected, after = material.advance(trial, C, begun, dt, now)
+                    tau = self.back(material.stress(corrected, C, after, now + dt).reshape(P, copies, 3, 3))
+                    return tau, (total, corrected, after)
+
+                ahead = u + ratio * (jump[0] / pieces)
+                before = u
+                u, tau, (total, corrected, after) = self.solve(ahead, evaluate, self.scale)
+                if float(jump[0].abs()) > 0:
+                    slope = (u - before) / (jump[0] / pieces)
+                    ratio = torch.where(torch.isfinite(slope), slope.clamp(-2, 2), ratio)
+                whole = total[:, 0]
+                F = corrected.reshape(P, copies, 3, 3)[:, 0]
+                history = History(*(part.reshape(P, copies, *part.shape[1:])[:, 0] for part in after))
+            taus.append(tau)
+            us.append(u)
+        return torch.stack(taus, 1), torch.stack(us, 1)
+
+    def measured(self, tau: Tensor, u: Tensor, true_stress: bool) -> Tensor:
+        """What the machine reads (P, n, m) of tau (P, n, 3, 3) and the unknowns (P, n, k)."""
+        if self.mode == "simple_shear":
+            return tau[..., 0, 1:2]  # J = 1, and F^-T leaves the component as it is
+        e = self.log_stretches(self.path.expand(*tau.shape[:2], -1), u)
+        t = tau.diagonal(dim1=-2, dim2=-1)
+        if self.specimen.incompressible:
+            t = t - t[..., 2:]
+        t = t * torch.exp(-e.sum(-1, keepdim=True) if true_stress else -e)
+        if self.mode == "equibiaxial":
+            return t[..., :2].mean(-1, keepdim=True)
+        return t[..., :2] if self.mode == "biaxial" else t[..., :1]
+
+
+def _log(increment: Tensor, mode: str) -> Tensor:
+    """The logarithm of an increment of F, (..., 3, 3): of a diagonal one, or of I + gamma e1 e2^T."""
+    if mode == "simple_shear":
+        return increment - torch.eye(3, dtype=increment.dtype)
+    return torch.diag_embed(increment.diagonal(dim1=-2, dim2=-1).log())
+
+
+def turn(direction: Tensor) -> Tensor:
+    """The smallest rotation that takes the first axis to `direction` (3,); half a turn about the third axis for the opposite."""
+    d = direction / direction.norm()
+    if d[0] < -1 + 1e-12:
+        return torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=d.dtype))
+    w = torch.stack([torch.zeros_like(d[0]), -d[2], d[1]])  # e1 x d
+    W = torch.zeros(3, 3, dtype=d.dtype)
+    W[0, 1], W[0, 2], W[1, 2] = -w[2], w[1], -w[0]
+    W = W - W.mT
+    return torch.eye(3, dtype=d.dtype) + W + W @ W / (1 + d[0])

@@ -1,0 +1,181 @@
+"""Where torch and Warp meet: start-up, streams, and launches of Warp kernels on torch tensors."""
+
+import contextlib
+import ctypes
+import functools
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.runtime.launches import note
+
+
+def choose_device(name: str) -> torch.device:
+    """The device for `auto` (cuda where there is one), `cpu` or `cuda`.
+
+    Raises:
+        UserError: Another name, or cuda where there is none.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise UserError(f"device must be auto, cpu or cuda, got {name!r}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("device cuda was asked for and there is none here: use device auto or cpu")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def start_warp() -> None:
+    """Initialise Warp without its banner, and without its remark on a missing driver; safe to call again."""
+    level = max(wp.config.log_level, wp.LOG_WARNING)
+    wp.config.log_level = wp.LOG_ERROR
+    with contextlib.nullcontext() if torch.cuda.is_available() else _silent_stderr():
+        wp.init()
+    wp.config.log_level = level
+
+
+@contextlib.contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """The remark comes from Warp's C library, so the descriptor itself is turned away."""
+    kept, hole = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(hole, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(hole)
+
+
+def real_of(dtype: torch.dtype) -> type:
+    """The Warp scalar type of a torch float type."""
+    return {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
+
+
+@contextlib.contextmanager
+def torch_stream(device: torch.device) -> Iterator[None]:
+    """Warp launches go to torch's current stream while this is open."""
+    if device.type == "cuda":
+        # no events between streams: everything is on torch's, and a capture forbids them
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False):
+            yield
+    else:
+        yield
+
+
+def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, *, block: int = 256) -> None:
+    """Launch a kernel with torch tensors in place of Warp arrays, typed by the kernel's own annotations.
+
+    Inside `torch_stream` it goes to torch's current stream. The tensors keep their memory and must outlive the launch. None is
+    an absent array; `block` is the number of threads a block on a GPU.
+    """
+    if device.type == "cpu":
+        if dim:
+            _launch_again(kernel, dim, arguments, device)
+        return
+    wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), block_dim=block)
+
+
+def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, *, block: int = 256) -> Callable[[int], None]:
+    """A launch for many steps, of a kernel whose first argument is the step; `arguments` are the others.
+
+    On a GPU they are packed once, which takes longer than a launch. They must outlive the last one.
+    """
+    if device.type == "cpu":
+        return lambda step: launch(kernel, dim, [step, *arguments], device)
+    inputs = _inputs(kernel, [0, *arguments])
+    command = wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), block_dim=block, record_cmd=True)
+
+    def again(step: int) -> None:
+        command.set_param_at_index(0, step)
+        command.launch()
+
+    return again
+
+
+@functools.cache
+def _contract(kernel: wp.Kernel) -> None:
+    """On the CPU let products and sums be rounded once: a tenth less time. Warp's default is to do so within an expression.
+
+    Before the module is first loaded, on whatever device: its options are part of its name there.
+    """
+    module = kernel.module
+    if kernel.func.__module__.startswith("neuido.") and module.options["cpu_compiler_flags"] is None:
+        flags = wp.config.cpu_compiler_flags
+        flags = "-march=native" if flags is None else flags
+        wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast".strip()}, module=module)
+
+
+def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:
+    """What Warp takes for the arguments of a kernel, whose module has its options from here on."""
+    _contract(kernel)
+    return [
+        _array(value, arg.type.dtype) if isinstance(value, Tensor) else value for value, arg in zip(arguments, kernel.adj.args, strict=True)
+    ]
+
+
+class _Command:
+    """A launch on the CPU with its arguments packed, for the next time: Warp's own packing takes as long as the work of 500 particles.
+
+    It keeps no tensor: who calls it again brings tensors that lie in the same places.
+    """
+
+    __slots__ = ("arguments", "bounds", "forward", "kept", "module")
+
+    def __init__(self, kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
+        recorded = wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), record_cmd=True)
+        layout = _layouts.get(kernel)
+        if layout is None:
+            fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, recorded.params[1:], strict=True)]
+            layout = _layouts[kernel] = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+        packed = layout(*recorded.params[1:])
+        self.bounds, self.arguments, self.forward, self.module = recorded.bounds, packed, recorded.hooks.forward, recorded.module_exec
+        self.kept = [value for value in arguments if not isinstance(value, Tensor)]  # what the key knows by its address
+
+
+MOST_COMMANDS = 12_000
+"""Packed launches that are kept: those of a thousand substeps with their adjoints."""
+_making = threading.Lock()
+_layouts: dict[wp.Kernel, type[ctypes.Structure]] = {}
+_commands: dict[tuple, _Command] = {}
+
+
+def _launch_again(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
+    key: list = [kernel, dim]
+    scalars = []
+    for i, value in enumerate(arguments):
+        if isinstance(value, Tensor):
+            key += (value.data_ptr(), value.shape, value.stride())
+        elif isinstance(value, int | float):  # bool too
+            scalars.append((i, value))
+        else:
+            key.append(id(value))
+    command = _commands.get(tuple(key))
+    if command is None:
+        with _making:  # two threads that load one module at a time would leave one of them with the other's code, or with none
+            if len(_commands) > MOST_COMMANDS:
+                _commands.clear()
+            command = _commands[tuple(key)] = _Command(kernel, dim, arguments, device)
+    packed = command.arguments
+    for i, value in scalars:
+        setattr(packed, kernel.adj.args[i].label, value)
+    note(command.forward, command.bounds, packed, command)
+    command.forward(ctypes.byref(command.bounds), ctypes.byref(packed))
+
+
+_arrays: dict[tuple, object] = {}
+
+
+def _array(t: Tensor, dtype: type) -> object:
+    """Warp's descriptor of a tensor. It is address, shape and strides alone, so one serves whatever lies there next: 4 us saved."""
+    key = (t.data_ptr(), t.shape, t.stride(), dtype)
+    found = _arrays.get(key)
+    if found is None:
+        if len(_arrays) > 20_000:
+            _arrays.clear()
+        found = _arrays[key] = wp.from_torch(t.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+        found._ref = found._gradref = None  # Warp would hold the tensor's memory for as long as the descriptor is kept
+    return found
