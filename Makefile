@@ -46,7 +46,7 @@ test-slow: $(installed)
 
 # The rollout's tests with every array on the GPU, then the tests that need one (fused laws, graphs, splatting).
 test-gpu: $(installed)
-	NEUIDO_TEST_DEVICE=cuda $(bin)/python -m pytest tests/physics/test_mpm.py tests/physics/test_invariants.py
+	NEUIDO_TEST_DEVICE=cuda $(bin)/python -m pytest tests/physics/mpm/test_simulator.py tests/physics/mpm/test_conservation.py
 	$(bin)/python -m pytest -m gpu
 
 lint: $(installed)

@@ -1,7 +1,7 @@
 """The README's tables of laws read from video, from the scores that `neuido test` and `neuido fit` wrote.
 
-    python benchmarks/tables.py stage2 benchmarks/results/stage2.csv benchmarks/results/stage2_ten.csv [--before FILE ...]
-    python benchmarks/tables.py methods benchmarks/results/table1.csv
+    python benchmarks/tables.py stage2 research/results/stage2.csv research/results/stage2_ten.csv [--before FILE ...]
+    python benchmarks/tables.py methods research/results/table1.csv
 
 CD and its floor are times 1e4 as in the files, RMSE in 1e-3 of the unit cube.
 """

@@ -30,7 +30,7 @@ from neuido.models.stages.image_module import image_losses
 from neuido.physics.effects.parameters import Effects
 from tests.models.visual_samples import TinyScenes, tiny_scene
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def module(tmp_path, *, start="mean", **options):

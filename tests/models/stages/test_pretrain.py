@@ -154,7 +154,7 @@ def test_killed_and_resumed_ends_with_the_same_weights(folder, tmp_path):
     def start(out, *resume):
         (tmp_path / out).mkdir(exist_ok=True)
         command = [sys.executable, "-c", RUN, str(folder), str(tmp_path / out), *resume]
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2])
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[3])
 
     def finish(process):
         _, errors = process.communicate(timeout=120)

@@ -10,7 +10,7 @@ from neuido.physics.linalg import decompositions as linalg
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Particles, Scene
 from tests.physics.bodies import DEVICES, block
-from tests.physics.test_networks import OFFSETS, deformations, particles, run
+from tests.physics.laws.neural.test_networks import OFFSETS, deformations, particles, run
 
 LAWS = {InvariantElastic: 1e4, InvariantPlastic: 1e2}
 

@@ -9,8 +9,8 @@ from neuido.physics.laws.neural.symbolic import SymbolicElastic, SymbolicPlastic
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Scene
 from tests.physics.bodies import DEVICES, block
-from tests.physics.test_invariant_networks import adjoint, on, weights_of
-from tests.physics.test_networks import deformations, run
+from tests.physics.laws.neural.test_invariant_networks import adjoint, on, weights_of
+from tests.physics.laws.neural.test_networks import deformations, run
 
 
 def elastic(scenes=3):
