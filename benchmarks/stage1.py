@@ -2,10 +2,12 @@
 
     python benchmarks/stage1.py --data data/trajectories --out runs/stage1 [--runs objective-64-128 raw-128-128 ...]
 
-A run is named TRUNK-WIDTH-DIM: the trunk, its hidden width, and the latent dimension d.
+A run is named TRUNK-WIDTH-DIM[-KEY=VALUE ...]: the trunk, its hidden width, the latent dimension d, and further options of the model.
+The paper's own Stage I: `--config configs/paper/stage1.yaml --setup configs/paper/trajectories.yaml --data data/trajectories_paper
+--runs raw-256-128-lr=0.003-basis_dim=64 ...`.
 
 Makes the trajectories first where they are missing. The fits run side by side, one or more for each GPU (`--per-device`),
-each as a process `neuido fit --config configs/stage1.yaml`; OUT gets their logs, their weights (safetensors) and table.md.
+each as a process `neuido fit --config CONFIG`; OUT gets their logs, their weights (safetensors) and table.md.
 """
 
 import argparse
@@ -27,6 +29,9 @@ COLUMNS = [
     ("val/plastic_mse", "plastic MSE"),
     ("val/stress_error", "stress error, median"),
     ("val/plastic_error_yielding", "plastic error where it flows, median"),
+    ("val/stress_mse_zero", "stress MSE of zero stress"),
+    ("val/plastic_mse_identity", "plastic MSE of the identity"),
+    ("val/plastic_error_yielding_identity", "plastic error of the identity"),
     ("instance/stress_error", "stress error, held-out instances"),
     ("instance/plastic_error_yielding", "plastic error, held-out instances"),
     ("instance/plastic_mse", "plastic MSE, held-out instances"),
@@ -34,13 +39,14 @@ COLUMNS = [
 
 
 def command(options: argparse.Namespace, name: str) -> list[str]:
-    trunk, width, dim = name.split("-")
+    trunk, width, dim, *more = name.split("-")
+    extra = [word for option in more for word in (f"--model.{option.split('=')[0]}", option.split("=")[1])]
     arguments = [
-        "fit", "--config", str(ROOT / "configs" / "stage1.yaml"),
+        "fit", "--config", str(options.config),
         "--model.trunk", trunk, "--model.hidden_dim", width, "--model.latent_dim", dim,
         "--model.save_to", str(options.out / f"{name}.safetensors"), "--data.root", str(options.data),
         "--trainer.logger.save_dir", str(options.out), "--trainer.logger.name", name,
-        "--trainer.enable_progress_bar", "false", *options.extra,
+        "--trainer.enable_progress_bar", "false", *extra, *options.extra,
     ]  # fmt: skip
     return [sys.executable, "-m", "neuido", *arguments]
 
@@ -56,14 +62,17 @@ def figures(folder: Path) -> dict[str, float]:
 
 
 def table(options: argparse.Namespace, seconds: dict[str, float]) -> str:
-    head = ["trunk", "width", "d", *(title for _, title in COLUMNS), "minutes"]
+    head = ["trunk", "width", "d", "options", *(title for _, title in COLUMNS), "minutes"]
     lines = ["| " + " | ".join(head) + " |", "| " + " | ".join("---" for _ in head) + " |"]
     for name in options.runs:
         found = figures(options.out / name)
         cells = [f"{found[key]:.3g}" if key in found else "missing" for key, _ in COLUMNS]
-        lines.append("| " + " | ".join([*name.split("-"), *cells, f"{seconds.get(name, float('nan')) / 60:.1f}"]) + " |")
+        trunk, width, dim, *more = name.split("-")
+        lines.append("| " + " | ".join([trunk, width, dim, " ".join(more), *cells, f"{seconds.get(name, float('nan')) / 60:.1f}"]) + " |")
     for dim, (stress, plastic) in PAPER.items():
-        lines.append("| " + " | ".join(["paper, Table 3", "", str(dim), f"{stress:g}", f"{plastic:g}", *[""] * (len(COLUMNS) - 1)]) + " |")
+        lines.append(
+            "| " + " | ".join(["paper, Table 3", "", str(dim), "", f"{stress:g}", f"{plastic:g}", *[""] * (len(COLUMNS) - 1)]) + " |"
+        )
     return "\n".join(lines)
 
 
@@ -74,6 +83,8 @@ def main() -> None:
     parser.add_argument(
         "--runs", nargs="+", default=[f"{trunk}-{dim}" for trunk in ("objective-64", "raw-128") for dim in (32, 64, 128, 256)]
     )
+    parser.add_argument("--config", type=Path, default=ROOT / "configs" / "stage1.yaml", help="of the fits")
+    parser.add_argument("--setup", type=Path, default=ROOT / "configs" / "trajectories.yaml", help="of the trajectories")
     parser.add_argument("--per-device", type=int, default=1, help="fits at a time on each GPU")
     parser.add_argument("extra", nargs="*", help="further arguments of `neuido fit`, after --")
     options = parser.parse_args()
@@ -81,7 +92,7 @@ def main() -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     if not (options.data / "index.json").exists():
         start = time.time()
-        arguments = ["simulate", "--config", str(ROOT / "configs" / "trajectories.yaml"), "--out", str(options.data), "--batch", "40"]
+        arguments = ["simulate", "--config", str(options.setup), "--out", str(options.data), "--batch", "40"]
         subprocess.run([sys.executable, "-m", "neuido", *arguments], check=True, env=environment)
         print(f"trajectories made in {time.time() - start:.0f} s", flush=True)
     devices = max(1, torch.cuda.device_count())

@@ -32,6 +32,8 @@ class Answers(NamedTuple):
     """Relative error of the stress, (M, n)."""
     plastic_error: Tensor
     """Relative error of the plastic residual F_hat - F_tr (or of F_hat), (M, n)."""
+    residual_epsilon: Tensor
+    """Floor of the residual norm for each trajectory [-], (M,)."""
 
 
 def answer(
@@ -60,7 +62,7 @@ def answer(
         plastic_error = relative_errors(returned - trial, corrected - trial, residual_epsilon[:, None])
     else:
         plastic_error = relative_errors(returned, corrected)
-    return Answers(predicted, returned, stress_error, plastic_error)
+    return Answers(predicted, returned, stress_error, plastic_error, residual_epsilon)
 
 
 def fit_latents(
@@ -132,7 +134,9 @@ class ConstitutiveMetrics(nn.Module):
     """Stress MSE [Pa^2], plastic MSE (both as in the paper's Table 3, mean over components), and median relative errors.
 
     `stress_error` and `plastic_error` are medians over all samples, `plastic_error_yielding` over those that flow, and
-    `stress_error/<family>` and `plastic_error/<family>` over the samples of a family. Memory does not grow with the samples.
+    `stress_error/<family>` and `plastic_error/<family>` over the samples of a family. Beside them stand the scores of predictors that
+    learned nothing: `stress_mse_zero` of zero stress, `plastic_mse_identity` and `plastic_error_yielding_identity` of no correction.
+    Memory does not grow with the samples.
 
     Args:
         prefix: Prepended to the names, e.g. `val/`.
@@ -148,6 +152,9 @@ class ConstitutiveMetrics(nn.Module):
         self.plastic = response.clone(prefix=f"{prefix}plastic_")
         errors = MetricCollection({"yielding": MedianRelativeError()}, compute_groups=False)
         self.yielding = errors.clone(prefix=f"{prefix}plastic_error_")
+        zero = MetricCollection({"stress_mse_zero": MeanSquaredError(), "plastic_mse_identity": MeanSquaredError()}, compute_groups=False)
+        self.zero = zero.clone(prefix=prefix)
+        self.unchanged = errors.clone(prefix=f"{prefix}plastic_error_", postfix="_identity")
         by_family = MetricCollection({name: MedianRelativeError() for name in self.names}, compute_groups=False)
         self.stress_by_family = by_family.clone(prefix=f"{prefix}stress_error/")
         self.plastic_by_family = by_family.clone(prefix=f"{prefix}plastic_error/")
@@ -157,8 +164,12 @@ class ConstitutiveMetrics(nn.Module):
         trial, corrected, stress = (t.view_as(answers.stress) for t in batch[:3])
         self.stress.update(preds=answers.stress.flatten(), target=stress.flatten(), errors=answers.stress_error)
         self.plastic.update(preds=answers.corrected.flatten(), target=corrected.flatten(), errors=answers.plastic_error)
-        flows = (corrected - trial).flatten(-2).norm(dim=-1) > RESIDUAL_FLOOR
+        self.zero["stress_mse_zero"].update(torch.zeros_like(stress).flatten(), stress.flatten())
+        self.zero["plastic_mse_identity"].update(trial.flatten(), corrected.flatten())
+        residual = (corrected - trial).flatten(-2).norm(dim=-1)
+        flows = residual > RESIDUAL_FLOOR
         self.yielding.update(errors=answers.plastic_error[flows])
+        self.unchanged.update(errors=(residual / (residual + answers.residual_epsilon[:, None]))[flows])
         for name in self.names:
             rows = [i for i, family in enumerate(self.families) if family == name]
             self.stress_by_family[name].update(answers.stress_error[rows])
@@ -172,7 +183,7 @@ class ConstitutiveMetrics(nn.Module):
             collection.reset()
 
     def _all(self) -> tuple[MetricCollection, ...]:
-        return self.stress, self.plastic, self.yielding, self.stress_by_family, self.plastic_by_family
+        return self.stress, self.plastic, self.zero, self.yielding, self.unchanged, self.stress_by_family, self.plastic_by_family
 
 
 class PretrainModule(LightningModule):
@@ -300,15 +311,15 @@ class PretrainModule(LightningModule):
                 self.latents.lerp_(self.family_mean @ self.latents, rate)
 
     def training_step(self, batch: TrajectoryBatch, batch_idx: int) -> Tensor:
-        answers = self._answer(batch)
+        answers = self._answer(batch, self.hparams.plastic_target)
         stress, plastic = answers.stress_error.mean(), answers.plastic_error.mean()
         if self.global_step % self.trainer.log_every_n_steps == 0:
             values = {"train/stress_loss": stress.detach(), "train/plastic_loss": plastic.detach()}
             self.log_dict(values, prog_bar=True)
         return stress + plastic
 
-    def _answer(self, batch: TrajectoryBatch) -> Answers:
-        target = self.hparams.plastic_target
+    def _answer(self, batch: TrajectoryBatch, target: str = "residual") -> Answers:
+        """Evaluate a batch of the training trajectories; scores compare residuals, whatever the loss compares."""
         return answer(self.operator, self.latents, batch, self.stress_epsilon, self.residual_epsilon, target)
 
     def on_train_end(self) -> None:
