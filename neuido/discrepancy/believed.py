@@ -3,7 +3,6 @@
 `ready` turns a model (a `model_after.yaml`, or the key `model` of experiment.yaml) into what `Simulator.rollout` wants.
 """
 
-import functools
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -26,6 +25,7 @@ from neuido.physics.fem.finite_elements import FiniteElements
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical import material
 from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.once import cached
 
 CLASSICAL = {
     name: "the law is a neural one, whose flow has no such parameter"
@@ -158,6 +158,6 @@ def _load(path: str) -> tuple[Any, Any]:
     return _loaded(str(file), file.stat().st_mtime_ns)
 
 
-@functools.lru_cache(maxsize=4)
+@cached(most=4)
 def _loaded(path: str, changed: int) -> tuple[Any, Any]:
     return load_law(path)

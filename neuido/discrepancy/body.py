@@ -4,7 +4,6 @@ Points that follow a particle are compared with that particle; points with an an
 moving least-squares map of the nearest particles that reproduces every affine motion exactly.
 """
 
-import functools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,6 +28,7 @@ from neuido.physics.fem.meshing import follow
 from neuido.physics.laws import classical_kernels as law_kernels
 from neuido.physics.mpm.threads import one_thread_each, pool
 from neuido.physics.runtime.device import real_of
+from neuido.physics.runtime.once import cached
 
 POISSON = 0.0, 0.495
 """What the simulators take: waves grow without bound towards 0.5."""
@@ -308,7 +308,7 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
     )
 
 
-@functools.cache
+@cached
 def _workers() -> ThreadPoolExecutor:
     """Threads for single scenes; what they launch is built before, for two threads must not build the same kernels."""
     for build in (effect_kernels.build, law_kernels.kernels):

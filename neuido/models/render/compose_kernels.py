@@ -12,6 +12,7 @@ import warp as wp
 
 from neuido.models.render.splat_kernels import ROWS
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 OPAQUE = 0.999
 """Largest alpha (gsplat)."""
@@ -53,7 +54,7 @@ ADD = """
 """The first `count` of four numbers, summed over the warp, which must call it as one."""
 
 
-@functools.cache
+@cached
 def build(real: type, tile: int, appearance: bool = False) -> SimpleNamespace:
     """All kernels for one scalar type and tile size, compiled on first launch.
 

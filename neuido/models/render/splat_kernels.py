@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 CUT = 1.0 / 255.0
 """Smallest alpha that counts (3DGS, gsplat)."""
@@ -34,7 +35,7 @@ SLACK = 1e-3
 """By how much sigma may exceed the limit before a tile is left out: rounding must not cost a pixel."""
 
 
-@functools.cache
+@cached
 def build(real: type, tile: int) -> SimpleNamespace:
     """All kernels for one scalar type and tile size, compiled on first launch.
 

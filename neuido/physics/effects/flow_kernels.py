@@ -15,9 +15,10 @@ from neuido.physics.effects.history_functions import tools
 from neuido.physics.laws import classical_kernels as law_kernels
 from neuido.physics.linalg import warp_functions as warp_linalg
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 
-@functools.cache
+@cached
 def build(real: type) -> SimpleNamespace:
     """The kernels for `wp.float32` or `wp.float64`."""
     start_warp()

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.runtime.once import cached
 
 
 class Tools(NamedTuple):
@@ -34,7 +35,7 @@ class Tools(NamedTuple):
     """(p, s, stiffness, growth) -> the factor of `stiffness` and `stiffness_change` on the elastic stress"""
 
 
-@functools.cache
+@cached
 def tools(real: type, module: str) -> Tools:
     """Build them for `wp.float32` or `wp.float64`."""
     vec3 = wp.types.vector(length=3, dtype=real)

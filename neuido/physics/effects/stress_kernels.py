@@ -14,9 +14,10 @@ from neuido.physics.effects.history_functions import tools
 from neuido.physics.laws.classical_kernels import GAP, LOCKED
 from neuido.physics.linalg import warp_functions as warp_linalg
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 
-@functools.cache
+@cached
 def build(real: type) -> SimpleNamespace:
     """The kernels for `wp.float32` or `wp.float64`, those of `history_kernels` included."""
     start_warp()

@@ -12,9 +12,10 @@ import warp as wp
 
 from neuido.physics.mpm import grid as grid_kernels
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 
-@functools.cache
+@cached
 def build(real: type) -> SimpleNamespace:
     """The kernels for `wp.float32` or `wp.float64`; contact and body forces are those of `grid_kernels`."""
     start_warp()

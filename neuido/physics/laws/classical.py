@@ -99,8 +99,8 @@ class _Classical(Law):
 
     def _kinds(self, device: torch.device) -> Tensor:
         cache = self.__dict__.setdefault("_kind_cache", {})
-        if device not in cache:
-            cache[device] = torch.tensor([law.kind for law in self.scene_laws()], dtype=torch.int32, device=device)
+        if device not in cache:  # of two threads the first one's is kept: launches know it by its address
+            cache.setdefault(device, torch.tensor([law.kind for law in self.scene_laws()], dtype=torch.int32, device=device))
         return cache[device]
 
     def _launch(

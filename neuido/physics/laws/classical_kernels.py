@@ -6,7 +6,6 @@ the frame of U and V are divided differences of t and z, finite at repeated sing
 The decomposition is `warp_linalg`'s; Warp's own `svd3` and its adjoint are not used.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import warp as wp
@@ -14,6 +13,7 @@ import warp as wp
 from neuido.physics.linalg import warp_functions as warp_linalg
 from neuido.physics.linalg.warp_functions import FLOOR
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 FIXED_COROTATED, SIGMA, NEO_HOOKEAN = 0, 1, 2
 IDENTITY, VON_MISES, DRUCKER_PRAGER = 0, 1, 2
@@ -42,7 +42,7 @@ class LawKernels(NamedTuple):
     """(F, U, sigma, V): the principal frame, sigma with the sign of det F on the last."""
 
 
-@functools.cache
+@cached
 def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = False) -> LawKernels:
     """Build the kernels for `wp.float32` or `wp.float64`.
 

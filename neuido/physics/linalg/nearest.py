@@ -1,6 +1,5 @@
 """Nearest points of many frames at once, by all pairs: for a GPU, where a tree would have to be built on the host for each frame."""
 
-import functools
 from types import SimpleNamespace
 
 import torch
@@ -8,9 +7,10 @@ import warp as wp
 from torch import Tensor
 
 from neuido.physics.runtime.device import launch, real_of, start_warp, torch_stream
+from neuido.physics.runtime.once import cached
 
 
-@functools.cache
+@cached
 def build(real: type) -> SimpleNamespace:
     """The kernel for one scalar type.
 

@@ -5,10 +5,11 @@ E = 1 MPa at rest). The frame below comes from a Jacobi iteration on the strain 
 minus one keep their relative accuracy, and it is faster on the CPU.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import warp as wp
+
+from neuido.physics.runtime.once import cached
 
 FLOOR = 1e-3
 """Lower bound of a principal stretch (of J in neo-Hookean) in a logarithm; below it the logarithm is constant, its gradient zero."""
@@ -53,7 +54,7 @@ class Functions(NamedTuple):
     """symmetric X -> exp(X) - I by a series, |X| at most `slight`"""
 
 
-@functools.cache
+@cached
 def functions(real: type, *, builtin_svd: bool = False) -> Functions:
     """Build the functions for `wp.float32` or `wp.float64`.
 

@@ -58,7 +58,8 @@ class _Rollout(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         wanted = ctx.needs_input_grad[1:]
-        out = ctx.kept.backward(ctx.plan, ctx.saved_tensors, ctx.serial, gradients, wanted)
+        with ctx.plan.simulator.lock:
+            out = ctx.kept.backward(ctx.plan, ctx.saved_tensors, ctx.serial, gradients, wanted)
         return (None, *(g if want else None for g, want in zip(out, wanted, strict=True)))
 
 
@@ -101,9 +102,10 @@ class _Segments(torch.autograd.Function):
                     part[0 if i == 0 else 1 :] = gradient[i * length + (0 if i == 0 else 1) : (i + 1) * length + 1]
                 part[-1] += a
                 own.append(part)
-            kept = cache.find(piece, inputs, keep_all=True)
-            serial = kept.forward(piece, inputs)
-            out = kept.backward(piece, inputs, serial, own, (True,) * STATES + tuple(wanted[STATES:]))
+            with piece.simulator.lock:
+                kept = cache.find(piece, inputs, keep_all=True)
+                serial = kept.forward(piece, inputs)
+                out = kept.backward(piece, inputs, serial, own, (True,) * STATES + tuple(wanted[STATES:]))
             carry = out[:STATES]
             for t, kind, new in zip(total, kinds, out[STATES:], strict=True):
                 if new is not None:

@@ -9,11 +9,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from neuido.physics.runtime.once import cached
+
 STICKY, SLIP, SEPARATE = 1, 2, 3
 CONTACTS = {"sticky": STICKY, "slip": SLIP, "separate": SEPARATE}
 
 
-@functools.cache
+@cached
 def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     """The kernels for one scalar type; arguments as in `transfers.build`.
 

@@ -6,6 +6,7 @@ G2P, F_tr = (I + dt C) F, F = F_hat(F_tr). The slow twin is `reference.py`.
 """
 
 import math
+import threading
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -136,6 +137,8 @@ class Simulator:
         self.first_scene = self.first_particle = 0
         self._alone: dict[int, Simulator] = {}
         self._grid: dict[str, Tensor] = {}
+        self.lock = threading.RLock()
+        """Held by a rollout or an adjoint: tape, grid and graphs are one set, which threads that share a simulator take in turn."""
 
     def _load_scenes(self) -> None:
         def column(values: list) -> Tensor:
@@ -372,8 +375,9 @@ class Simulator:
         optional = [given.viscosity, None if given.stiffness is None else given.stiffness[self.order], given.growth]
         optional += [None] * 3 if tables is None else [tables.material, tables.branches, tables.flow]
         optional = [mass.new_empty(0) if t is None else t.contiguous() for t in optional]
-        frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment)
-        out = ParticleState(*(t[:, self.inverse] for t in frames[:4]))
+        with self.lock:
+            frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment)
+            out = ParticleState(*(t[:, self.inverse] for t in frames[:4]))
         if lenient:
             refusing = torch.tensor([bool(why) for why in refused], device=self.device)
             scene = self.particles.scene.long()

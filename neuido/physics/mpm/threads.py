@@ -1,6 +1,7 @@
 """Several scenes on the CPU: a thread a scene, since Warp runs a kernel on one core there and lets go of Python meanwhile."""
 
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,16 +17,26 @@ T = TypeVar("T")
 FRICTION = 8
 """Which input the friction is; each scene has its own number of colliders."""
 
+_counting = threading.Lock()
+_inside: list[int] = []
+"""torch's number of threads before the first of the rollouts that run now, once for each."""
+
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
     """torch's own threads would crowd those of the scenes, and cost more than they bring where matrices are small."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    with _counting:
+        if not _inside:
+            _inside.append(torch.get_num_threads())
+        else:
+            _inside.append(_inside[0])  # the number is the process's own: what another rollout lowered is not what it was before
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        with _counting:
+            before = _inside.pop()
+            torch.set_num_threads(1 if _inside else before)
 
 
 class Scenes:
@@ -120,5 +131,6 @@ class ThreadedRollout(torch.autograd.Function):
             kept, serial = ctx.kept[s]
             return kept.backward(scenes.plans[s], scenes.part(inputs, s), serial, own, wanted)
 
-        out = scenes.whole_gradient(inputs, scenes.each(one))
+        with scenes.whole.simulator.lock:
+            out = scenes.whole_gradient(inputs, scenes.each(one))
         return (None, None, *(g if want else None for g, want in zip(out, wanted, strict=True)))

@@ -22,6 +22,7 @@ import warp as wp
 from neuido.physics.mpm import grid as grid_kernels
 from neuido.physics.mpm.reductions import ADD4, ARRANGE, GATHER, RUN, SPREAD
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 PAD = 2
 """Nodes added on each side of the domain."""
@@ -30,7 +31,7 @@ LOST, FAST = 1, 2
 """Codes in the `status` of a scene: a particle outside the padded grid; one that moves by more than a cell a substep, or is not finite."""
 
 
-@functools.cache
+@cached
 def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     """All kernels of a substep for one scalar type, compiled on first launch.
 

@@ -2,9 +2,7 @@
 
 import contextlib
 import ctypes
-import functools
 import os
-import threading
 from collections.abc import Callable, Iterator, Sequence
 
 import torch
@@ -13,6 +11,7 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics.runtime.launches import note
+from neuido.physics.runtime.once import BUILDING, cached
 
 
 def choose_device(name: str) -> torch.device:
@@ -28,8 +27,9 @@ def choose_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+@cached
 def start_warp() -> None:
-    """Initialise Warp without its banner, and without its remark on a missing driver; safe to call again."""
+    """Initialise Warp without its banner, and without its remark on a missing driver; safe to call again, and from several threads."""
     level = max(wp.config.log_level, wp.LOG_WARNING)
     wp.config.log_level = wp.LOG_ERROR
     with contextlib.nullcontext() if torch.cuda.is_available() else _silent_stderr():
@@ -76,6 +76,7 @@ def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.devic
         if dim:
             _launch_again(kernel, dim, arguments, device)
         return
+    _load(kernel, device, block)
     wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), block_dim=block)
 
 
@@ -86,6 +87,7 @@ def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.dev
     """
     if device.type == "cpu":
         return lambda step: launch(kernel, dim, [step, *arguments], device)
+    _load(kernel, device, block)
     inputs = _inputs(kernel, [0, *arguments])
     command = wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), block_dim=block, record_cmd=True)
 
@@ -96,7 +98,7 @@ def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.dev
     return again
 
 
-@functools.cache
+@cached
 def _contract(kernel: wp.Kernel) -> None:
     """On the CPU let products and sums be rounded once: a tenth less time. Warp's default is to do so within an expression.
 
@@ -107,6 +109,13 @@ def _contract(kernel: wp.Kernel) -> None:
         flags = wp.config.cpu_compiler_flags
         flags = "-march=native" if flags is None else flags
         wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast".strip()}, module=module)
+
+
+@cached
+def _load(kernel: wp.Kernel, device: torch.device, block: int) -> None:
+    """Load a kernel's code on a GPU, one thread at a time, since Warp's tables of modules are not for several."""
+    _contract(kernel)
+    kernel.module.load(wp.device_from_torch(device), block)
 
 
 def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:
@@ -138,7 +147,6 @@ class _Command:
 
 MOST_COMMANDS = 12_000
 """Packed launches that are kept: those of a thousand substeps with their adjoints."""
-_making = threading.Lock()
 _layouts: dict[wp.Kernel, type[ctypes.Structure]] = {}
 _commands: dict[tuple, _Command] = {}
 
@@ -155,7 +163,7 @@ def _launch_again(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torc
             key.append(id(value))
     command = _commands.get(tuple(key))
     if command is None:
-        with _making:  # two threads that load one module at a time would leave one of them with the other's code, or with none
+        with BUILDING:  # two threads that load one module at a time would leave one of them with the other's code, or with none
             if len(_commands) > MOST_COMMANDS:
                 _commands.clear()
             command = _commands[tuple(key)] = _Command(kernel, dim, arguments, device)

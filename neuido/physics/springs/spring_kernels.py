@@ -17,12 +17,13 @@ import warp as wp
 
 from neuido.physics.mpm.grid import SLIP, STICKY
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 SHORTEST = 1e-9
 """Lower bound of a spring's length in a denominator [m]."""
 
 
-@functools.cache
+@cached
 def build(real: type) -> SimpleNamespace:
     """The kernels for `wp.float32` or `wp.float64`.
 

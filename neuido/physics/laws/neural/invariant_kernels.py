@@ -19,6 +19,7 @@ import warp as wp
 from neuido.physics.laws.classical_kernels import GAP
 from neuido.physics.linalg import warp_functions as warp_linalg
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 FEATURES = 13
 
@@ -28,7 +29,7 @@ TIE = 4.0
 EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 
 
-@functools.cache
+@cached
 def build(real: type) -> SimpleNamespace:
     """The kernels for `wp.float32` or `wp.float64`; features (P, 13), outputs (P, 9)."""
     start_warp()

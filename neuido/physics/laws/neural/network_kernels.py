@@ -23,6 +23,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.once import cached
 
 DELTA = 1e-5
 """Floor of the deviatoric strain q [-]: keeps its derivative finite at F = I."""
@@ -281,7 +282,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
     )
 
 
-@functools.cache
+@cached
 def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     """The kernels for one scalar type, compiled on first launch; features (P, 9), coefficients (P, 4) or (P, 3).
 

@@ -11,7 +11,6 @@ a law is a small network F -> 9 -> hidden -> hidden -> outputs with SiLU (paper,
 recomputed in the adjoint. Calling a law runs its twin in plain torch, which autograd differentiates.
 """
 
-import functools
 import threading
 from collections.abc import Hashable, Sequence
 
@@ -25,6 +24,7 @@ from neuido.physics.laws.neural.layers import linear, linear_adjoint
 from neuido.physics.laws.neural.network_kernels import COARSE, DELTA, FINE, LINEAR, LODE
 from neuido.physics.runtime import device
 from neuido.physics.runtime.device import real_of, torch_stream
+from neuido.physics.runtime.once import cached
 from neuido.types import Particles
 
 RAW_GAIN = 10.0
@@ -135,7 +135,7 @@ class _Workspace:
         self.ones = torch.ones(rows, dtype=dtype, device=device)
 
 
-_workspace = functools.lru_cache(maxsize=8)(_Workspace)
+_workspace = cached(_Workspace, most=8)
 
 
 class _Network:
