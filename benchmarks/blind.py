@@ -105,15 +105,15 @@ def give_memory_back(device: str) -> None:
 
 def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: float = 0.0) -> str:
     """Diagnose a folder into `out`, which appears when it is whole, in so many minutes (0: no limit); returns what failed."""
-    from neuido.discrepancy import answer, attribution, command
+    from neuido.discrepancy import answer, attribution, workflow
 
     target = Path(out)
     try:
         if ablation == "no-discretisation":
-            kind, place = command.kind_of(folder)
+            kind, place = workflow.kind_of(folder)
             target.mkdir(parents=True, exist_ok=True)
             found = []
-            for problem in command.problems_of(kind, place, None, device):
+            for problem in workflow.problems_of(kind, place, None, device):
                 begun = time.monotonic()
                 if problem.settings > 1:
                     problem = dataclasses.replace(problem, settings=1, solvers=(0,))
@@ -123,7 +123,7 @@ def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: flo
             given = folder
             if ablation == "single-recording":
                 given = str(_with_one_recording(Path(folder), target.parent / ".inputs" / target.name))
-            command.diagnose(given, out=out, device=device, minutes=minutes, progress=False)
+            workflow.diagnose(given, out=out, device=device, minutes=minutes, progress=False)
     except Exception as error:  # a case that fails is scored as failed, and the others go on
         target.mkdir(parents=True, exist_ok=True)
         (target / "failed.txt").write_text(f"{type(error).__name__}: {error}\n")

@@ -30,7 +30,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from neuido.commands.demo.closed_loop import record
-from neuido.discrepancy.command import diagnose
+from neuido.commands.diagnose import diagnose
 
 out = Path(os.environ.get("NEUIDO_NOTEBOOK_OUT", "runs/notebooks/closed_loop"))
 small = os.environ.get("NEUIDO_NOTEBOOK_SMALL") == "1"

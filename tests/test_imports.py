@@ -82,7 +82,7 @@ def test_third_parties(module):
 
 
 LIGHT = ("", ".__main__", ".errors", ".data.trajectories.options", ".data.undeclared", ".data.files.html_page",
-         ".data.files.run_results", ".data.files.run_folder", ".data.files.score_tables", ".discrepancy.command",
+         ".data.files.run_results", ".data.files.run_folder", ".data.files.score_tables", ".commands.diagnose",
          *(f".commands.{name}" for name in ("main", "doctor", "simulate", "reconstruct", "film", "sweep", "config_files", "report",
                                             "latents", "demo.demo")))  # fmt: skip
 

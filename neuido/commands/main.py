@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 LIGHT = {  # name: (module, function, one line for the list); the module must import torch only inside its functions
     "simulate": ("neuido.commands.simulate", "simulate", "Generate the trajectories of Stage I, or filmed scenes."),
     "reconstruct": ("neuido.commands.reconstruct", "reconstruct", "Gaussians and particles of a filmed body's first frame."),
-    "diagnose": ("neuido.discrepancy.command", "diagnose", "Find the effect that a model lacks, from measured motion."),
+    "diagnose": ("neuido.commands.diagnose", "diagnose", "Find the effect that a model lacks, from measured motion."),
     "sweep": ("neuido.commands.sweep", "sweep", "Run a wandb sweep file without a server, offline, into one CSV."),
     "report": ("neuido.commands.report", "report", "One page of several runs: tables, curves, videos side by side."),
     "latents": ("neuido.commands.latents", "latents", "How the latents of Stage I lie, and what lies between two of them."),

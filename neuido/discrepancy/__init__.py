@@ -1,1 +1,35 @@
 """The closed loop: from measured data to the effect that a model lacks."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neuido.discrepancy.diagnosed import DiagnosedEffects as DiagnosedEffects
+    from neuido.discrepancy.diagnosis import Diagnosis as Diagnosis
+    from neuido.discrepancy.diagnosis import Effect as Effect
+    from neuido.discrepancy.diagnosis import ErrorChange as ErrorChange
+    from neuido.discrepancy.diagnosis import Quantity as Quantity
+    from neuido.discrepancy.workflow import diagnose as diagnose
+
+_PUBLIC = {
+    "DiagnosedEffects": ("diagnosed", "DiagnosedEffects"),
+    "Diagnosis": ("diagnosis", "Diagnosis"),
+    "Effect": ("diagnosis", "Effect"),
+    "ErrorChange": ("diagnosis", "ErrorChange"),
+    "Quantity": ("diagnosis", "Quantity"),
+    "diagnose": ("workflow", "diagnose"),
+}
+__all__ = ["DiagnosedEffects", "Diagnosis", "Effect", "ErrorChange", "Quantity", "diagnose"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name at its first use."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, own = _PUBLIC[name]
+    value = globals()[name] = getattr(import_module(f"{__name__}.{module}"), own)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -347,23 +347,6 @@ def _trial(r: Round, t: Trial) -> dict[str, Any]:
     }
 
 
-def summary(found: Found) -> str:
-    """One line for the terminal."""
-    lines = []
-    for d, _ in found:
-        after = errors(d, "after")
-        before = errors(d, "before")
-        key = "held_out" if after["held_out"] is not None else "fit"
-        names = " and ".join("|".join(dict.fromkeys(t.candidate.name for t in r.members)) for r in d.rounds if r.chosen is not None)
-        what = f"{d.answer}: {names}" if names else d.answer
-        where = f"{d.problem.labels['body']}: " if "body" in d.problem.labels and len(found) > 1 else ""
-        scored = "held-out" if key == "held_out" else "fitted"
-        floor = math.hypot(d.floors["noise"], d.floors["discretisation"])
-        line = f"{where}{what}; {scored} error {before[key]:.3g} -> {after[key]:.3g} {d.problem.unit} (floor {floor:.2g})"
-        lines.append(line + (f"; no time for {', '.join(d.left_out)}: give more minutes" if d.left_out else ""))
-    return "\n".join(lines)
-
-
 def write_json(path: Path, content: Any) -> None:
     """Write JSON all at once; figures that are not finite become null."""
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")

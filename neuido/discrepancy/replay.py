@@ -10,7 +10,7 @@ from tqdm import tqdm
 from neuido.data.files.storage import publish_folder
 from neuido.data.measured.experiment import read_experiment, write_experiment
 from neuido.discrepancy.believed import beside, read_model_file
-from neuido.discrepancy.command import choose_device, experiment_problem
+from neuido.discrepancy.workflow import choose_device, experiment_problem
 from neuido.errors import UserError
 
 

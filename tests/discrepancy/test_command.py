@@ -17,8 +17,8 @@ import neuido
 from neuido.commands.main import main
 from neuido.data.measured.experiment import read_experiment
 from neuido.discrepancy.body import body_problem
-from neuido.discrepancy.command import solved_by
 from neuido.discrepancy.rollouts import SETTINGS
+from neuido.discrepancy.workflow import solved_by
 from tests import command
 from tests.discrepancy import made
 

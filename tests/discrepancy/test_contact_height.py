@@ -9,8 +9,8 @@ import torch
 from neuido.discrepancy import answer
 from neuido.discrepancy.attribution import Inference, diagnose
 from neuido.discrepancy.body import body_problem
-from neuido.discrepancy.command import restricted, solved_by
 from neuido.discrepancy.rollouts import CONTACT_HEIGHT, SETTINGS
+from neuido.discrepancy.workflow import restricted, solved_by
 from neuido.types import Box
 from tests.discrepancy import made
 

@@ -10,8 +10,8 @@ import pytest
 from neuido.discrepancy import attribution, next_experiment
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.body import body_problem
-from neuido.discrepancy.command import restricted
 from neuido.discrepancy.deadline import AFTER, LEAST, SEARCH, Deadline
+from neuido.discrepancy.workflow import restricted
 from tests import command
 from tests.discrepancy import made
 

@@ -23,12 +23,12 @@ from neuido.discrepancy import answer, attribution, residual
 from neuido.discrepancy.answer import motions
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.body import BodyProblem, body_problem
-from neuido.discrepancy.command import restricted
 from neuido.discrepancy.material import MaterialProblem
 from neuido.discrepancy.problem import Problem
 from neuido.discrepancy.resume import CachedProblem
 from neuido.discrepancy.rounds import Inference, Round
 from neuido.discrepancy.track import track_problems
+from neuido.discrepancy.workflow import restricted
 from neuido.errors import UserError
 from neuido.types import Plane, Scene
 from tests.discrepancy import made

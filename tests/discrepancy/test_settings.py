@@ -10,10 +10,10 @@ from neuido.data.undeclared.motion import Solver, move
 from neuido.discrepancy import laboratory
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.body import body_problem
-from neuido.discrepancy.command import restricted
 from neuido.discrepancy.evidence import gain
 from neuido.discrepancy.floors import REACH, Floor, Part
 from neuido.discrepancy.rounds import Inference
+from neuido.discrepancy.workflow import restricted
 from tests.discrepancy.test_decisions import FALLS, over
 from tests.discrepancy.test_rounds import NOISE, Line, T
 

@@ -300,7 +300,7 @@ def test_wrong_video_is_one_line(name, folders, tmp_path, capsys, monkeypatch):
 
 
 def test_points_are_taken_where_they_are_unless_told_otherwise(folders, tmp_path, capsys):
-    from neuido.discrepancy.command import problems_of
+    from neuido.discrepancy.workflow import problems_of
 
     (points,), (film,), (alone,) = (
         problems_of("experiment", folders[name], None, "cpu", data=data)

@@ -91,7 +91,7 @@ def demo_loop(
         second_pass: Whether the model that comes out is diagnosed again.
         progress: Show a line of progress.
     """
-    from neuido.discrepancy.command import diagnose
+    from neuido.commands.diagnose import diagnose
 
     folder = Path(out)
     print("[loop 1/2] two throws of a block, with an effect that the model does not declare", flush=True)

@@ -1,18 +1,24 @@
-"""The `diagnose` command: signature, help and order of work; `--help` loads no torch."""
+"""The work of a diagnosis: from measured data, in a folder or read already, to the folder of its results."""
 
 import csv
+import hashlib
+import json
 import math
+import os
 import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from neuido.discrepancy.diagnosis import Diagnosis
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
     from neuido.data.measured.experiment import Experiment
-    from neuido.discrepancy.attribution import Diagnosis
+    from neuido.data.measured.material_test import MaterialTests
+    from neuido.data.measured.track import Tracks
     from neuido.discrepancy.body import BodyProblem
     from neuido.discrepancy.memo import Work
     from neuido.discrepancy.problem import Problem
@@ -20,16 +26,18 @@ if TYPE_CHECKING:
 DATA = ("auto", "points", "video")
 SOLVERS = ("both", "material_points", "finite_elements")
 KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}
+PLAIN_SECONDS = 30.0
+"""Seconds between two lines of progress where there is no terminal."""
 
 
 def diagnose(
-    folder: str,
+    source: "str | os.PathLike | Experiment | MaterialTests | Tracks",
     *,
-    out: str,
-    model: str | None = None,
-    law: str | None = None,
+    out: str | os.PathLike | None = None,
+    model: str | os.PathLike | Mapping[str, Any] | None = None,
+    law: str | os.PathLike | None = None,
     data: str = "auto",
-    effects: str | None = None,
+    effects: str | Sequence[str] | None = None,
     solver: str = "both",
     draws: int = 199,
     seed: int = 0,
@@ -37,32 +45,32 @@ def diagnose(
     minutes: float = 15.0,
     device: str = "auto",
     resume: bool = True,
-    progress: bool = True,
-) -> None:
-    """Find the physical effect that a declared model lacks, from measured motion; add it and report the error before and after.
-
-    The answer is an effect, a class of effects that the data cannot tell apart, none, unknown, or insufficient. A run that was killed
-    goes on where it stopped when the same command is given again.
+    progress: bool = False,
+) -> Diagnosis:
+    """Find the physical effect that a declared model lacks, from measured motion, and add it.
 
     Args:
-        folder: Measured data: a folder with experiment.yaml, test.yaml or track.yaml.
-        out: Folder to write: diagnosis.json, report.html, model_after.yaml, trace.json, log.csv and the predicted motion.
-        model: File with a model in place of the folder's own, for example an earlier model_after.yaml.
-        law: Neural law of `neuido predict` in place of the folder's elasticity and plasticity; a factor on its stress is fitted.
+        source: Measured data: a folder with experiment.yaml, test.yaml or track.yaml, or what `read_experiment`, `read_material_tests` or
+            `read_tracks` returned.
+        out: Folder for the results. None: a temporary folder, removed with the diagnosis.
+        model: Model in place of the folder's own: a file, for example an earlier model_after.yaml, or its content. Folders only.
+        law: Neural law of `neuido predict` in place of the elasticity and plasticity of an experiment; a factor on its stress is fitted.
         data: Of an experiment: points (tracked ones), video (silhouettes), or auto: points where every recording has them.
-        effects: Names of the effects to consider, with commas; all that make sense where absent.
+        effects: Names of the effects to consider, as a list or with commas. None: all that the data could show.
         solver: What may predict the motion of a body: material_points, finite_elements, or both, so that the data choose.
-        draws: Draws of the parametric bootstrap; p-values come in steps of 1 / (draws + 1).
+        draws: Draws of the parametric bootstrap, at least 19; p-values come in steps of 1 / (draws + 1).
         seed: Seed of the draws.
         most: Effects that may be added, 1 to 3.
-        minutes: After which the search ends with what it has, for each body; 0: as long as it takes. What was left out is told, and
-            the same command with more minutes goes on from there.
-        device: auto, cpu or cuda.
-        resume: Go on with the predictions that a killed run left in DIR/.work.
-        progress: Show a line of progress.
+        minutes: Time limit of the search for each body [min]; 0: none. A search that ends early names what it left out.
+        device: auto, cpu, cuda or cuda:N.
+        resume: Continue from the predictions that an interrupted run left in `out`/.work. Folders only.
+        progress: Show progress on stderr.
+
+    Returns:
+        The diagnosis, read from the folder of results.
 
     Raises:
-        UserError: The folder is no measured data in one of the three formats, or an option is out of range.
+        UserError: Data that are in none of the three formats, or an option out of range.
     """
     begun = time.monotonic()
     if draws < 19:
@@ -71,9 +79,9 @@ def diagnose(
         raise UserError(f"most = {most} must be 1, 2 or 3")
     if not minutes >= 0:
         raise UserError(f"minutes = {minutes} must not be negative; 0 sets no limit")
-    kind, place = kind_of(folder)
-    target = Path(out).expanduser()
-    if target.exists() and not target.is_dir():
+    folder = os.fspath(source) if isinstance(source, str | os.PathLike) else None
+    kind, place = ("", Path()) if folder is None else kind_of(folder)
+    if out is not None and Path(out).expanduser().exists() and not Path(out).expanduser().is_dir():
         raise UserError(f"out = {out} is a file: give a folder")
 
     from neuido.discrepancy import answer
@@ -81,18 +89,24 @@ def diagnose(
     from neuido.discrepancy.attribution import diagnose as infer
 
     chosen = choose_device(device)
-    problems = [restricted(solved_by(p, solver), effects) for p in problems_of(kind, place, model, chosen, law=law, data=data)]
-    files = {"model": model, "law": law}
-    given = {key: Path(file).expanduser().read_bytes().hex() if file else None for key, file in files.items()}
-    options = {"effects": effects, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": answer.VERSION, "data": data}
+    if folder is None:
+        kind, problems = problems_of_data(source, chosen, model=model, law=law, data=data)
+    else:
+        problems = problems_of(kind, place, model, chosen, law=law, data=data)
+    names = effects if effects is None or isinstance(effects, str) else ",".join(effects)
+    problems = [restricted(solved_by(p, solver), names) for p in problems]
+    temporary = tempfile.TemporaryDirectory(prefix="neuido-diagnosis-") if out is None else None
+    target = Path(temporary.name if temporary else out or "").expanduser()
+    given = {"model": _content(model), "law": _content(law)}
+    options = {"effects": names, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": answer.VERSION, "data": data}
     options |= given | {"solver": solver}
-    plan = store.plan_of(place, options, out=target)
+    plan = "read-data" if folder is None else store.plan_of(place, options, out=target)
     target.mkdir(parents=True, exist_ok=True)
-    work = store.workplace(target, plan, resume=resume)
-    if not any(work.iterdir()):  # a run that goes on keeps its log
+    work = store.workplace(target, plan, resume=resume and folder is not None)
+    if not any(work.iterdir()):  # a run that continues keeps its log
         (target / "log.csv").unlink(missing_ok=True)
     log = Log(target / "log.csv", shown=progress, begun=begun)
-    found: list[tuple[Diagnosis, float]] = []
+    found = []
     for i, problem in enumerate(problems):
         started = time.monotonic()
         cached = store.CachedProblem(problem, work / str(i), tick=log.tick)
@@ -102,15 +116,25 @@ def diagnose(
         found.append((infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds), time.monotonic() - started))
     log.name = ""
     answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
-    if not any(diagnosis.left_out for diagnosis, _ in found):  # else more minutes go on from what is kept
+    if not any(own.left_out for own, _ in found):  # otherwise a run with more minutes continues from what is kept
         store.clear(target)
-    for diagnosis, _ in found:
-        log.work(diagnosis.work)
-    log.close(answer.summary(found))
+    for own, _ in found:
+        log.work(own.work)
+    log.close()
+    return Diagnosis.read(target, keep=temporary)
+
+
+def _content(given: str | os.PathLike | Mapping[str, Any] | None) -> str | None:
+    """Return what identifies the content of a file or a mapping."""
+    if given is None:
+        return None
+    if isinstance(given, Mapping):
+        return hashlib.sha256(json.dumps(given, sort_keys=True, default=str).encode()).hexdigest()
+    return Path(given).expanduser().read_bytes().hex()
 
 
 def kind_of(folder: str) -> tuple[str, Path]:
-    """Which of the three formats a folder has, and the folder.
+    """Return which of the three formats a folder has, and the folder.
 
     Raises:
         UserError: It is missing, or holds none of the three files or several.
@@ -128,9 +152,15 @@ def kind_of(folder: str) -> tuple[str, Path]:
 
 
 def problems_of(
-    kind: str, folder: Path, model: str | None, device: str, *, law: str | None = None, data: str = "auto"
+    kind: str,
+    folder: Path,
+    model: str | os.PathLike | Mapping[str, Any] | None,
+    device: str,
+    *,
+    law: str | os.PathLike | None = None,
+    data: str = "auto",
 ) -> "Sequence[Problem]":
-    """The problems of a folder: one, or one for each body of a track folder.
+    """Return the problems of a folder: one, or one for each body of a track folder.
 
     Raises:
         UserError: The folder, the model's file or the law is not as its format says, or an option that is for experiments alone.
@@ -139,12 +169,12 @@ def problems_of(
         raise UserError(f"data = {data!r} is not known; use {', '.join(DATA)}")
     from neuido.discrepancy.believed import read_model_file, with_law
 
-    given = None if model is None else read_model_file(model)
+    given = dict(model) if isinstance(model, Mapping) else None if model is None else read_model_file(os.fspath(model))
     if kind == "experiment":
         from neuido.data.measured.experiment import read_experiment
 
         found = read_experiment(folder, model=given)
-        return [experiment_problem(found if law is None else with_law(found, law), data, device)]
+        return [experiment_problem(found if law is None else with_law(found, os.fspath(law)), data, device)]
     if law is not None or data != "auto":
         raise UserError(f"{'law' if law is not None else 'data'} is for experiments, and {folder} is a {kind}: leave it out")
     if kind == "material test":
@@ -163,8 +193,41 @@ def problems_of(
     return [TrackProblem(read_tracks(folder, model=given["bodies"][body]), body) for body in bodies]
 
 
+def problems_of_data(
+    source: Any, device: str, *, model: Any = None, law: str | os.PathLike | None = None, data: str = "auto"
+) -> "tuple[str, Sequence[Problem]]":
+    """Return the kind and the problems of data that are read already: one problem, or one for each body of tracks.
+
+    Raises:
+        UserError: An object that is none of the three kinds of data, or an option that it does not take.
+    """
+    from neuido.data.measured.experiment import Experiment
+    from neuido.data.measured.material_test import MaterialTests
+    from neuido.data.measured.track import Tracks
+
+    if not isinstance(source, Experiment | MaterialTests | Tracks):
+        raise UserError(f"a diagnosis takes a folder, an Experiment, MaterialTests or Tracks, not {type(source).__name__}")
+    if model is not None:
+        raise UserError("model replaces that of a folder: give the folder, or give the model to the function that reads the data")
+    if data not in DATA:
+        raise UserError(f"data = {data!r} is not known; use {', '.join(DATA)}")
+    if isinstance(source, Experiment):
+        from neuido.discrepancy.believed import with_law
+
+        return "experiment", [experiment_problem(source if law is None else with_law(source, os.fspath(law)), data, device)]
+    if law is not None or data != "auto":
+        raise UserError(f"{'law' if law is not None else 'data'} is for experiments, not {type(source).__name__}: leave it out")
+    if isinstance(source, MaterialTests):
+        from neuido.discrepancy.material import MaterialProblem
+
+        return "material test", [MaterialProblem(source)]
+    from neuido.discrepancy.track import track_problems
+
+    return "track", track_problems(source)
+
+
 def experiment_problem(experiment: "Experiment", data: str, device: str) -> "BodyProblem":
-    """The problem of an experiment: its tracked points, or its videos.
+    """Return the problem of an experiment: its tracked points, or its videos.
 
     Raises:
         UserError: Recordings that lack what is asked for.
@@ -182,7 +245,7 @@ def experiment_problem(experiment: "Experiment", data: str, device: str) -> "Bod
 
 
 def solved_by(problem: "Problem", solver: str) -> "Problem":
-    """The problem with one method of prediction alone.
+    """Return the problem with one method of prediction alone.
 
     Raises:
         UserError: Another name, or a problem where nothing is discretised.
@@ -203,7 +266,7 @@ def solved_by(problem: "Problem", solver: str) -> "Problem":
 
 
 def restricted(problem: "Problem", effects: str | None) -> "Problem":
-    """The problem with the named candidates alone.
+    """Return the problem with the named candidates alone.
 
     Raises:
         UserError: A name that is no effect, or none that this problem could show.
@@ -226,7 +289,7 @@ def restricted(problem: "Problem", effects: str | None) -> "Problem":
 
 
 def choose_device(device: str) -> str:
-    """`cpu` or `cuda`.
+    """Return `cpu` or `cuda`, or the device that is named.
 
     Raises:
         UserError: Another name, or cuda where there is none.
@@ -241,17 +304,19 @@ def choose_device(device: str) -> str:
 
 
 class Log:
-    """One updating line of progress on stderr, and each stage as a row of log.csv.
+    """Show progress on stderr, and write each stage as a row of log.csv.
+
+    A terminal has one line that is updated; elsewhere a plain line comes every half minute.
 
     Args:
         path: The CSV file; a resumed run adds to it.
-        shown: Whether the line is shown; it needs a terminal.
+        shown: Whether progress is shown.
         begun: When the work began, in `time.monotonic`.
     """
 
     def __init__(self, path: Path, *, shown: bool, begun: float) -> None:
         self.begun, self.count, self.stage, self.name, self.last = begun, 0, "", "", 0.0
-        self.shown, self.terminal = shown, sys.stderr.isatty()
+        self.shown, self.terminal, self.printed = shown, sys.stderr.isatty(), begun
         fresh = not path.is_file() or not path.stat().st_size
         self.file = path.open("a", newline="")
         self.rows = csv.writer(self.file)
@@ -259,7 +324,7 @@ class Log:
             self.rows.writerow(["seconds", "body", "stage", "simulations"])
 
     def tick(self, count: int) -> None:
-        """So many more points were simulated."""
+        """Count further simulations."""
         self.count += count
         if time.monotonic() - self.last > 0.2:
             self._show()
@@ -272,7 +337,7 @@ class Log:
             self._show()
 
     def work(self, steps: "Mapping[str, Work]") -> None:
-        """What each step of a diagnosis ran, the dearest first."""
+        """Write what each step of a diagnosis ran, the most expensive first."""
         for step, w in sorted(steps.items(), key=lambda item: -item[1].effort):
             line = f"{step}: {w.simulations} simulations, {w.reused} reused, {w.effort:.3g} particle-substeps or data, {w.seconds:.1f} s"
             self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, line, self.count])
@@ -281,14 +346,18 @@ class Log:
 
     def _show(self) -> None:
         self.last = time.monotonic()
-        if self.shown and self.terminal:
-            line = f"{self.last - self.begun:6.0f} s  {self.count:5d} simulations  {self.name}{': ' if self.name else ''}{self.stage}"
+        if not self.shown:
+            return
+        line = f"{self.last - self.begun:6.0f} s  {self.count:5d} simulations  {self.name}{': ' if self.name else ''}{self.stage}"
+        if self.terminal:
             print(f"\r\x1b[K{line[:118]}", end="", file=sys.stderr, flush=True)
+        elif self.last - self.printed > PLAIN_SECONDS:
+            self.printed = self.last
+            print(line.strip(), file=sys.stderr, flush=True)
 
-    def close(self, line: str) -> None:
-        """The last line, on stdout."""
+    def close(self) -> None:
+        """End the log and the line of progress."""
         self("written")
         self.file.close()
         if self.shown and self.terminal:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-        print(line)

@@ -1,0 +1,65 @@
+"""The `diagnose` command: its options, and what it prints."""
+
+
+def diagnose(
+    folder: str,
+    *,
+    out: str,
+    model: str | None = None,
+    law: str | None = None,
+    data: str = "auto",
+    effects: str | None = None,
+    solver: str = "both",
+    draws: int = 199,
+    seed: int = 0,
+    most: int = 3,
+    minutes: float = 15.0,
+    device: str = "auto",
+    resume: bool = True,
+    progress: bool = True,
+) -> None:
+    """Find the physical effect that a declared model lacks, from measured motion; add it and report the error before and after.
+
+    The answer is an effect, a class of effects that the data cannot tell apart, none, unknown, or insufficient. The same command given
+    again continues an interrupted run.
+
+    Args:
+        folder: Measured data: a folder with experiment.yaml, test.yaml or track.yaml.
+        out: Folder to write: diagnosis.json, report.html, model_after.yaml, trace.json, log.csv and the predicted motion.
+        model: File with a model in place of the folder's own, for example an earlier model_after.yaml.
+        law: Neural law of `neuido predict` in place of the folder's elasticity and plasticity; a factor on its stress is fitted.
+        data: Of an experiment: points (tracked ones), video (silhouettes), or auto: points where every recording has them.
+        effects: Names of the effects to consider, with commas; all that the data could show where absent.
+        solver: What may predict the motion of a body: material_points, finite_elements, or both, so that the data choose.
+        draws: Draws of the parametric bootstrap; p-values come in steps of 1 / (draws + 1).
+        seed: Seed of the draws.
+        most: Effects that may be added, 1 to 3.
+        minutes: Time limit of the search for each body; 0: none. What was left out is reported, and the same command with more minutes
+            continues from there.
+        device: auto, cpu or cuda.
+        resume: Continue from the predictions that an interrupted run left in OUT/.work.
+        progress: Show progress: one line on a terminal, otherwise a line every half minute.
+
+    Raises:
+        UserError: The folder is no measured data in one of the three formats, or an option is out of range.
+    """
+    from neuido.discrepancy import workflow
+
+    found = workflow.diagnose(
+        folder,
+        out=out,
+        model=model,
+        law=law,
+        data=data,
+        effects=effects,
+        solver=solver,
+        draws=draws,
+        seed=seed,
+        most=most,
+        minutes=minutes,
+        device=device,
+        resume=resume,
+        progress=progress,
+    )
+    print(found.line)
+    print(f"results in {found.folder}: open report.html, go on with model_after.yaml")

@@ -1,0 +1,304 @@
+"""What a diagnosis found, read from the folder of its results (`neuido-diagnosis/1`)."""
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from neuido.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMAT = "neuido-diagnosis/1"
+LEADING = ("yield_stress", "damping_ratio", "coefficient", "ratio")
+"""Derived figures that say more about an effect than the fitted ones."""
+BEFORE, AFTER, INK = "#c0392b", "#1f77b4", "#333333"
+MOST_PANELS = 4
+
+
+class Quantity(NamedTuple):
+    """A fitted figure."""
+
+    value: float | list[float]
+    interval: tuple[Any, Any]
+    """90 % interval."""
+    unit: str
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect that the declared model lacks.
+
+    `value`, `interval` and `unit` are those of its leading figure, `parameter`.
+    """
+
+    name: str
+    alternatives: tuple[str, ...]
+    """Other effects that the data cannot tell apart from it."""
+    parameters: dict[str, Quantity]
+    p_value: float
+    """Probability of such a gain by chance, over all candidates."""
+    where: str
+    """Stage of the motion in which the residual stands out."""
+    body: str = ""
+    """Body of a track folder that holds several."""
+
+    @property
+    def parameter(self) -> str:
+        """Name of the leading figure."""
+        return next((name for name in LEADING if name in self.parameters), next(iter(self.parameters)))
+
+    @property
+    def value(self) -> float | list[float]:
+        """Value of the leading figure."""
+        return self.parameters[self.parameter].value
+
+    @property
+    def interval(self) -> tuple[Any, Any]:
+        """90 % interval of the leading figure."""
+        return self.parameters[self.parameter].interval
+
+    @property
+    def unit(self) -> str:
+        """Unit of the leading figure."""
+        return self.parameters[self.parameter].unit
+
+    def __str__(self) -> str:
+        """Return the name, and the leading figure with its interval and unit."""
+        return f"{self.name}: {self.parameter} = {_figure(self.parameters[self.parameter])}"
+
+
+class ErrorChange(NamedTuple):
+    """The error of the prediction before and after the effects were added."""
+
+    before: float
+    after: float
+    unit: str
+    floor: float
+    """What noise and discretisation leave."""
+    held_out: bool
+    """Whether it is that of recordings that no fit has seen; otherwise of the fitted ones."""
+
+
+class Diagnosis:
+    """The answer of a diagnosis, its effects, and the error before and after.
+
+    Args:
+        folder: Folder of the results.
+        content: Content of its diagnosis.json, or of one body's part.
+        keep: What has to live as long as the diagnosis, for example a temporary folder.
+    """
+
+    def __init__(self, folder: Path, content: Mapping[str, Any], keep: Any = None) -> None:
+        self.folder, self._content, self._keep = folder, content, keep
+
+    @classmethod
+    def read(cls, folder: str | os.PathLike, *, keep: Any = None) -> "Diagnosis":
+        """Read the results of an earlier diagnosis.
+
+        Raises:
+            UserError: A folder without a diagnosis.json of this format.
+        """
+        path = Path(folder).expanduser() / "diagnosis.json"
+        if not path.is_file():
+            raise UserError(f"{folder} holds no diagnosis.json: give the folder that `neuido diagnose --out` wrote")
+        try:
+            content = json.loads(path.read_text())
+        except ValueError as error:
+            raise UserError(f"{path} is no valid JSON: {error}") from error
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise UserError(f"{path}: format must be {FORMAT}; run `neuido diagnose` again")
+        return cls(path.parent, content, keep)
+
+    @property
+    def name(self) -> str:
+        """Name of what was measured."""
+        return self._content["experiment"]
+
+    @property
+    def bodies(self) -> "dict[str, Diagnosis]":
+        """The diagnosis of each body of a track folder; of other data one, by the name of what was measured."""
+        if "bodies" not in self._content:
+            return {self._content.get("body", self.name): self}
+        return {own["body"]: Diagnosis(self.folder, own, self._keep) for own in self._content["bodies"]}
+
+    @property
+    def answer(self) -> str:
+        """`effect`, `class`, `none`, `unknown` or `insufficient`; `several` where the answers of bodies differ."""
+        if "answer" in self._content:
+            return self._content["answer"]
+        answers = {own.answer for own in self.bodies.values()}
+        return answers.pop() if len(answers) == 1 else "several"
+
+    @cached_property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects that were added, the one of the largest gain first."""
+        if "bodies" in self._content:
+            return tuple(effect for own in self.bodies.values() for effect in own.effects)
+        return tuple(
+            Effect(
+                name=e["name"],
+                alternatives=tuple(name for name in e["class"] if name != e["name"]),
+                parameters={key: Quantity(p["value"], tuple(p["interval90"]), p["unit"]) for key, p in e["parameters"].items()},
+                p_value=e["p_value"],
+                where=e["where"],
+                body=self._content.get("body", ""),
+            )
+            for e in self._content["effects"]
+        )
+
+    @cached_property
+    def error(self) -> ErrorChange:
+        """The error before and after: of held-out recordings where there are any. Of several bodies: their root mean square."""
+        if "bodies" in self._content:
+            own = [body.error for body in self.bodies.values()]
+            before, after, floor = (math.sqrt(sum(row[i] ** 2 for row in own) / len(own)) for i in (0, 1, 3))
+            return ErrorChange(before, after, own[0].unit, floor, all(row.held_out for row in own))
+        e = self._content["error"]
+        key = "held_out" if "held_out" in e["after"] and e["after"]["held_out"] is not None else "fit"
+        before, after = (math.nan if e[when][key] is None else e[when][key] for when in ("before", "after"))
+        floor = math.hypot(*(e[name] or 0.0 for name in ("noise_floor", "discretisation_floor")))
+        return ErrorChange(before, after, e["unit"], floor, key == "held_out")
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Steps for which there was no time."""
+        if "bodies" in self._content:
+            return tuple(step for own in self.bodies.values() for step in own.left_out)
+        return tuple(self._content.get("left_out", ()))
+
+    @property
+    def model_after(self) -> Path:
+        """File of the model with the effects added; `diagnose(..., model=...)` takes it."""
+        return self.folder / "model_after.yaml"
+
+    @property
+    def line(self) -> str:
+        """The answer in one line; of several bodies a line each."""
+        if "bodies" in self._content:
+            return "\n".join(f"{body}: {own.line}" for body, own in self.bodies.items())
+        error = self.error
+        names = " and ".join("|".join((e.name, *e.alternatives)) for e in self.effects)
+        out = f"{self.answer}: {names}" if names else self.answer
+        scored = "held-out" if error.held_out else "fitted"
+        out += f"; {scored} error {error.before:.3g} -> {error.after:.3g} {error.unit} (floor {error.floor:.2g})"
+        return out + (f"; no time for {', '.join(self.left_out)}: give more minutes" if self.left_out else "")
+
+    def summary(self) -> str:
+        """Return the answer in plain words: what is missing, how large it is, and what the error was and is."""
+        if "bodies" in self._content:
+            return "\n\n".join(own.summary() for own in self.bodies.values())
+        error, lines = self.error, [f"{self.name}: {self._sentence()}"]
+        equations = _equations()
+        for e in self.effects:
+            figure = _figure(e.parameters[e.parameter])
+            lines.append(
+                f"{e.name} ({equations.get(e.name, 'an effect')}): {e.parameter} = {figure}; p = {e.p_value:.3g}. Where: {e.where}."
+            )
+        scored = "recordings that no fit has seen" if error.held_out else "the fitted recordings"
+        change = f"falls from {error.before:.3g} to {error.after:.3g}" if self.effects else f"is {error.after:.3g}"
+        lines.append(f"The error of {scored} {change} {error.unit}; noise and discretisation leave {error.floor:.3g} {error.unit}.")
+        if self.left_out:
+            lines.append(f"There was no time for {', '.join(self.left_out)}: give more minutes.")
+        return "\n".join(lines)
+
+    def _sentence(self) -> str:
+        names = " and ".join(" or ".join((e.name, *e.alternatives)) for e in self.effects)
+        return {
+            "effect": f"the declared model lacks {names}.",
+            "class": f"the declared model lacks an effect, {names}; these data cannot tell the alternatives apart.",
+            "none": "nothing is missing. What remains is noise and the error of the discretisation.",
+            "unknown": "something is missing that no effect of the library explains.",
+            "insufficient": "the data are too few, too short or too noisy to say.",
+        }[self.answer]
+
+    def plot(self) -> "Figure":
+        """Return a matplotlib figure: the error over time before and after, or the data with both predictions, a panel a recording."""
+        import numpy as np
+        from matplotlib.figure import Figure
+
+        names = [name for own in self.bodies.values() for name in own._content["error"]["after"]["by_recording"]]
+        paths = [path for name in names if (path := self._motion(name)) is not None][:MOST_PANELS]
+        figure = Figure(figsize=(3.6 * max(len(paths), 1), 2.8), layout="constrained")
+        for i, path in enumerate(paths):
+            ax = figure.add_subplot(1, len(paths), i + 1)
+            with np.load(path, allow_pickle=False) as archive:
+                arrays = dict(archive)
+            (_curves if "positions" in arrays else _data)(ax, arrays, self.error)
+            ax.set_title(path.stem, fontsize=9)
+        if paths:
+            figure.axes[0].legend(fontsize=7, frameon=False)
+        figure.suptitle(self.line.splitlines()[0], fontsize=9)
+        return figure
+
+    def _motion(self, name: str) -> Path | None:
+        path = self.folder / "predicted" / f"{name}.npz"
+        return path if path.is_file() else None
+
+    def report(self, path: str | os.PathLike | None = None) -> Path:
+        """Copy the report, one self-contained HTML page, to a path; return where it is.
+
+        Args:
+            path: File, or an existing folder. None: the report stays in the folder of the results.
+        """
+        made = self.folder / "report.html"
+        if path is None:
+            return made
+        target = Path(path).expanduser()
+        target = target / made.name if target.is_dir() else target
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(made, target)
+        return target
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a copy of the content of diagnosis.json."""
+        return json.loads(json.dumps(self._content))
+
+    def __repr__(self) -> str:
+        """Return the answer, the effects, the error and the folder."""
+        effects = ", ".join(str(e) for e in self.effects)
+        e = self.error
+        return f"Diagnosis({self.name!r}, {self.answer}: [{effects}], error {e.before:.3g} -> {e.after:.3g} {e.unit}, '{self.folder}')"
+
+
+def _figure(q: Quantity) -> str:
+    if isinstance(q.value, list):
+        return f"({', '.join(f'{v:.3g}' for v in q.value)}) {q.unit}"
+    low, high = ("infinite" if end is None else f"{end:.3g}" for end in q.interval)
+    return f"{q.value:.3g}{'' if q.unit == '1' else f' {q.unit}'} (90 %: {low} to {high})"
+
+
+def _equations() -> dict[str, str]:
+    from neuido.physics.effects.library import LIBRARY
+
+    return {entry.name: entry.equation for entry in LIBRARY}
+
+
+def _curves(ax: Any, arrays: Mapping[str, Any], error: ErrorChange) -> None:
+    """Draw the root mean square distance of the points over time."""
+    import numpy as np
+
+    for when, colour in (("before", BEFORE), ("after", AFTER)):
+        square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
+        seen = np.isfinite(square).any(axis=1)
+        ax.plot(arrays["t"][seen], 1e3 * np.sqrt(np.nanmean(square[seen], axis=1)), color=colour, label=when, lw=1.2)
+    ax.axhline(1e3 * error.floor, color=INK, ls=":", lw=1, label="floor")
+    ax.set(xlabel="t [s]", ylabel="RMS distance [mm]")
+    ax.set_ylim(bottom=0.0)
+
+
+def _data(ax: Any, arrays: Mapping[str, Any], error: ErrorChange) -> None:
+    """Draw the data and the predictions; a channel after the other."""
+    for i, group in enumerate(dict.fromkeys(arrays["groups"].tolist())):
+        own = arrays["groups"] == group
+        labels = ("measured", "before", "after") if i == 0 else (None, None, None)
+        ax.plot(arrays["times"][own], arrays["measured"][own], ".", color=INK, ms=3, label=labels[0])
+        ax.plot(arrays["times"][own], arrays["before"][own], color=BEFORE, lw=1, label=labels[1])
+        ax.plot(arrays["times"][own], arrays["after"][own], color=AFTER, lw=1.2, label=labels[2])
+    ax.set(xlabel="t [s], or row", ylabel=f"measured [{error.unit}]")
