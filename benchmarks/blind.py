@@ -35,7 +35,7 @@ import yaml
 sys.path.insert(0, str(Path(__file__).parent))
 import blind_scores
 
-from neuido.data.bodies.scene_files import read_yaml
+from neuido.data.files.parsing import read_yaml
 from neuido.data.files.storage import write
 from neuido.data.undeclared import Case, make_undeclared
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE

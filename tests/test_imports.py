@@ -62,7 +62,7 @@ def test_direction(module):
             assert not wrong, f"{module} imports {sorted(wrong)}; {room} may import {allowed} alone"
 
 
-SPEAK_WANDB = ("neuido.commands.main", "neuido.commands.sweep", "neuido.commands.sweep_file", "neuido.data.files.run_folder")
+SPEAK_WANDB = ("neuido.commands.main", "neuido.commands.sweep", "neuido.commands.sweep_file", "neuido.data.files.sweep_run")
 """They speak the language of its files and its environment, and import nothing of it."""
 
 
@@ -82,7 +82,7 @@ def test_third_parties(module):
 
 
 LIGHT = ("", ".__main__", ".errors", ".data.trajectories.options", ".data.undeclared", ".data.files.html_page",
-         ".data.files.run_results", ".data.files.run_folder", ".data.files.score_tables", ".commands.diagnose",
+         ".data.files.results", ".data.files.sweep_run", ".data.files.score_tables", ".commands.diagnose",
          *(f".commands.{name}" for name in ("main", "doctor", "simulate", "reconstruct", "film", "sweep", "config_files", "report",
                                             "latents", "demo.demo")))  # fmt: skip
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, get_origin
 import neuido
 from neuido.commands.config_files import find_config
 from neuido.commands.console import quiet_lightning
-from neuido.data.files.run_folder import own_folder, redirect
+from neuido.data.files.sweep_run import own_folder, redirect
 from neuido.errors import UserError, one_line
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from neuido.data.files.html_page import Best, escaped, figure, page, small, svg, table, video
-from neuido.data.files.run_results import Entry, curves, mean, open_runs, scenes_of
+from neuido.data.files.results import Entry, curves, mean, open_runs, scenes_of
 from neuido.data.files.score_tables import read_rows
 from neuido.errors import UserError
 

@@ -1,21 +1,21 @@
 """The `sweep` command: the runs of a wandb sweep file, one after the other and without a server."""
 
 import contextlib
-import fcntl
 import math
 import os
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from neuido.commands.config_files import find_config
 from neuido.commands.sweep_file import Metric, Run, SweepFile, command_of, read_sweep, runs_of
-from neuido.data.files.run_folder import FOLDER, FORMAT, note, status_of
+from neuido.data.files.lock import Held, OwnedLock
 from neuido.data.files.score_tables import read_rows, write_rows
+from neuido.data.files.sweep_run import FOLDER, FORMAT, note, status_of
 from neuido.errors import UserError
 
 
@@ -70,9 +70,11 @@ def sweep(
 def _one(plan: SweepFile, run: Run, folder: Path) -> str:
     """Run one run unless it is finished or held elsewhere; how it went, as a word or two."""
     folder.mkdir(exist_ok=True)
-    with _held(folder) as lock:
-        if lock is None:
-            return "another process runs it"
+    with contextlib.ExitStack() as stack:
+        try:
+            lock = stack.enter_context(OwnedLock(folder / ".lock", f"the run {run.name}"))
+        except Held as error:
+            return f"another process runs it: {error}"
         environment = _environment(plan, run, folder)
         words = command_of(plan, run, environment)
         before = status_of(folder)
@@ -96,14 +98,15 @@ def _environment(plan: SweepFile, run: Run, folder: Path) -> dict[str, str]:
     return {**os.environ, "PATH": beside, "WANDB_MODE": "offline", "PYTHONUNBUFFERED": "1", **own}
 
 
-def _execute(words: list[str], environment: Mapping[str, str], log: Path, lock: IO) -> int:
-    """Run a command and wait; its exit status. It inherits the lock, which so outlasts a sweep that is killed before it."""
+def _execute(words: list[str], environment: Mapping[str, str], log: Path, lock: OwnedLock) -> int:
+    """Run a command, wait, and return its exit status. It holds the lock on, should the sweep be killed before it."""
     with log.open("w") as file:
         try:
-            process = subprocess.Popen(words, env=environment, stdout=file, stderr=subprocess.STDOUT, pass_fds=[lock.fileno()])
+            process = subprocess.Popen(words, env=environment, stdout=file, stderr=subprocess.STDOUT)
         except OSError as error:
             raise UserError(f"the command {words[0]!r} of the sweep cannot be run: {error.strerror}") from error
         try:
+            lock.hand_to(process.pid)
             return process.wait()
         except BaseException:
             process.terminate()
@@ -111,21 +114,9 @@ def _execute(words: list[str], environment: Mapping[str, str], log: Path, lock: 
             raise
 
 
-@contextlib.contextmanager
-def _held(folder: Path) -> Iterator[IO | None]:
-    """The lock of a folder, or none where another process has it."""
-    with (folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            yield None
-            return
-        yield file
-
-
 def _empty(folder: Path) -> None:
     """Remove what an earlier try left; a folder that is no run of a sweep is left alone."""
-    there = [path for path in folder.iterdir() if path.name != ".lock"]
+    there = [path for path in folder.iterdir() if not path.name.startswith(".lock")]
     if there and not status_of(folder):
         raise UserError(f"{folder} holds something that is no run of this sweep: give another folder by --out")
     for path in sorted(there, key=lambda path: path.name == "run.json"):  # what tells whose folder it is goes last
@@ -151,7 +142,7 @@ def scored(folder: Path) -> dict[str, float]:
 
     `scores/failed` counts the scenes whose law could not run; their means are over the others.
     """
-    from neuido.data.files.run_results import tables
+    from neuido.data.files.results import tables
 
     values: dict[str, float] = {}
     for rows in tables(folder).values():
@@ -169,8 +160,7 @@ def scored(folder: Path) -> dict[str, float]:
 def collect(plan: SweepFile, runs: list[Run], folder: Path) -> list[dict[str, Any]]:
     """Write results.csv, a row a run that was begun: name, status, seconds, parameters, the metric, then all that it logged and scored."""
     first = [plan.metric.name] if plan.metric else []
-    with (folder / ".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # of two shards the later one has all rows
+    with OwnedLock(folder / ".lock", f"the sweep {folder}", wait=-1):  # of two shards the later one has all rows
         rows = []
         for run in runs:
             state = status_of(folder / run.name)

@@ -1,1 +1,78 @@
-"""Bodies, trajectories and scenes."""
+"""Data: recordings of any known format, experiments, tests of materials, tracks, scenes and bodies.
+
+The names of `__all__` are imported when they are first used, so that `import neuido.data` loads no torch.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neuido.data import cameras
+    from neuido.data.bodies import shapes
+    from neuido.data.bodies.scene_files import SceneSetup, load_scene, scene_names
+    from neuido.data.formats.layout import MultiView
+    from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
+    from neuido.data.measured.material_test import read_material_tests
+    from neuido.data.measured.track import read_tracks
+    from neuido.data.scenes.clips import FilmDataModule
+    from neuido.data.scenes.filmed_scene_module import VisualDataModule
+    from neuido.data.scenes.multiview import MultiViewDataModule
+    from neuido.data.scenes.readers import read as read_recording
+    from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
+
+__all__ = [
+    "Experiment",
+    "FilmDataModule",
+    "MultiView",
+    "MultiViewDataModule",
+    "Recording",
+    "SceneSetup",
+    "TrajectoryDataModule",
+    "VisualDataModule",
+    "cameras",
+    "load_scene",
+    "read_experiment",
+    "read_material_tests",
+    "read_recording",
+    "read_tracks",
+    "scene_names",
+    "shapes",
+    "write_experiment",
+]
+
+_PLACES = {
+    "Experiment": "measured.experiment",
+    "FilmDataModule": "scenes.clips",
+    "MultiView": "formats.layout",
+    "MultiViewDataModule": "scenes.multiview",
+    "Recording": "measured.experiment",
+    "SceneSetup": "bodies.scene_files",
+    "TrajectoryDataModule": "trajectories.trajectory_module",
+    "VisualDataModule": "scenes.filmed_scene_module",
+    "cameras": "cameras",
+    "load_scene": "bodies.scene_files",
+    "read_experiment": "measured.experiment",
+    "read_material_tests": "measured.material_test",
+    "read_recording": "scenes.readers:read",
+    "read_tracks": "measured.track",
+    "scene_names": "bodies.scene_files",
+    "shapes": "bodies.shapes",
+    "write_experiment": "measured.experiment",
+}
+"""The module of each public name below this package; after a colon its name there, where it is another one."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    place, _, own = _PLACES[name].partition(":")
+    module = import_module(f"{__name__}.{place}")
+    value = module if name in ("cameras", "shapes") else getattr(module, own or name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names beside the module's own."""
+    return sorted({*globals(), *__all__})

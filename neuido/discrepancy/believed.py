@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neuido.data.bodies.scene_files import read_yaml
+from neuido.data.files.parsing import read_yaml
 from neuido.data.files.storage import publish
 from neuido.data.measured.experiment import Experiment, read_belief
 from neuido.discrepancy.library import effects_of

@@ -10,7 +10,7 @@ import torch
 from neuido.commands.main import main
 from neuido.commands.report import report
 from neuido.data.files.html_page import Best, table, webm
-from neuido.data.files.run_results import open_runs
+from neuido.data.files.results import open_runs
 from neuido.data.files.score_tables import read_rows, write_rows
 from neuido.errors import UserError
 from neuido.models.inference.outputs import write_video

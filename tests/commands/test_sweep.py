@@ -16,8 +16,8 @@ import neuido
 from neuido.commands.main import main
 from neuido.commands.sweep import scored, sweep
 from neuido.commands.sweep_file import command_of, read_sweep, runs_of
-from neuido.data.files.run_folder import own_folder, redirect
 from neuido.data.files.score_tables import write_rows
+from neuido.data.files.sweep_run import own_folder, redirect
 from neuido.errors import UserError
 
 ROOT = Path(neuido.__file__).parents[1]

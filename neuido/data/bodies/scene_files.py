@@ -6,19 +6,19 @@ a scene file adds `body`, `name`, `source` and `steps`.
 
 import math
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import yaml
 
 from neuido.data.bodies import shapes
+from neuido.data.files.parsing import check_limit, read_arrays, read_yaml
+from neuido.data.files.values import check_keys, inside, mapping, number, vector
 from neuido.errors import UserError
 from neuido.physics.laws.classical import material
-from neuido.types import AttachedMass, Body, Box, Plane, Scene, Vector, Walls
+from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
 
 FORMAT = "neuido-scene/1"
 VARIABLE = "NEUIDO_DATA"
@@ -51,7 +51,7 @@ def data_root(option: str | os.PathLike | None = None) -> Path:
 
 def scene_names() -> list[str]:
     """Names that `load_scene` knows: the files of configs/scenes of its format (others hold lists of scenes for `neuido simulate`)."""
-    return sorted(path.stem for path in _folder().glob("*.yaml") if f"\nformat: {FORMAT}\n" in path.read_text())
+    return sorted(path.stem for path in scenes_folder().glob("*.yaml") if f"\nformat: {FORMAT}\n" in path.read_text())
 
 
 def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -> SceneSetup:
@@ -66,13 +66,13 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
     Raises:
         UserError: An unknown name or key, a missing file, a figure outside its physical range, a path that leaves the data folder.
     """
-    path = Path(name) if str(name).endswith((".yaml", ".yml")) else _folder() / f"{name}.yaml"
+    path = Path(name) if str(name).endswith((".yaml", ".yml")) else scenes_folder() / f"{name}.yaml"
     if not path.is_file():
-        known = "" if path.parent != _folder() else f"; known scenes: {', '.join(scene_names())}"
+        known = "" if path.parent != scenes_folder() else f"; known scenes: {', '.join(scene_names())}"
         raise UserError(f"no scene file {path}{known}")
     content = read_yaml(path)
     try:
-        _keys(content, "the file", ("format", "name", "source", "scene", "model", "body", "discretisation", "steps"), ("source",))
+        check_keys(content, "the file", ("format", "name", "source", "scene", "model", "body", "discretisation", "steps"), ("source",))
         if content["format"] != FORMAT:
             raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
         steps = content["steps"]
@@ -80,7 +80,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
             raise UserError(f"steps must be a positive whole number, got {steps!r}")
         scene = scene_from_dict(content["scene"], content["discretisation"])
         model = model_from_dict(content["model"])
-        body = _body(content["body"], root)
+        body = body_from_dict(content["body"], root)
         outside = ((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any(dim=1)
         if outside.any():
             raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain")
@@ -88,21 +88,6 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         raise UserError(f"{path}: {error}") from error
     info = {"name": content["name"], "source": content.get("source", ""), "steps": steps, **model}
     return SceneSetup(scene, body, info)
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file's mapping; 1e5 and 1.0e5 are numbers, as YAML 1.2 has them.
-
-    Raises:
-        UserError: The file is not valid YAML, or not a mapping.
-    """
-    try:
-        content = yaml.load(path.read_text(), Loader=_Loader)  # noqa: S506 (a SafeLoader)
-    except yaml.YAMLError as error:
-        raise UserError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict):
-        raise UserError(f"{path} holds no mapping of keys to values")
-    return content
 
 
 def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any]) -> Scene:
@@ -117,8 +102,8 @@ def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any])
         UserError: An unknown or missing key, a wrong type, a figure outside its range; the message names the key.
     """
     optional = ("colliders", "clamps", "attached_masses", "walls")
-    _keys(scene, "scene", ("domain", "gravity", *optional), optional)
-    _keys(discretisation, "discretisation", ("grid", "dt"))
+    check_keys(scene, "scene", ("domain", "gravity", *optional), optional)
+    check_keys(discretisation, "discretisation", ("grid", "dt"))
     domain = _box(scene["domain"], "scene.domain")
     cells = discretisation["grid"]
     if not isinstance(cells, int) or isinstance(cells, bool) or cells < 4:
@@ -127,8 +112,8 @@ def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any])
         lower=domain.lower,
         upper=domain.upper,
         cells=cells,
-        dt=_number(discretisation["dt"], "discretisation.dt", above=0.0),
-        gravity=_vector(scene["gravity"], "scene.gravity"),
+        dt=number(discretisation["dt"], "discretisation.dt", above=0.0),
+        gravity=vector(scene["gravity"], "scene.gravity"),
         colliders=tuple(_plane(c, f"scene.colliders[{i}]") for i, c in enumerate(_list(scene, "colliders"))),
         walls=_walls(scene["walls"]) if "walls" in scene else Walls(),
         clamps=tuple(_boxed(c, f"scene.clamps[{i}]") for i, c in enumerate(_list(scene, "clamps"))),
@@ -142,10 +127,10 @@ def model_from_dict(model: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         UserError: An unknown or missing key, or an impossible material.
     """
-    _keys(model, "model", ("density", "elasticity", "plasticity"), ("plasticity",))
-    density = _number(model["density"], "model.density", above=0.0)
-    elasticity = _mapping(model["elasticity"], "model.elasticity")
-    plasticity = _mapping(model.get("plasticity", {"law": "identity"}), "model.plasticity")
+    check_keys(model, "model", ("density", "elasticity", "plasticity"), ("plasticity",))
+    density = number(model["density"], "model.density", above=0.0)
+    elasticity = mapping(model["elasticity"], "model.elasticity")
+    plasticity = mapping(model.get("plasticity", {"law": "identity"}), "model.plasticity")
     try:
         material(elasticity, plasticity)
     except UserError as error:
@@ -184,26 +169,15 @@ def _occupied(x: np.ndarray) -> float:
     return (2 * occupied.sum() + inside.sum()) / 3
 
 
-class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 1e5 as a number (PyYAML follows YAML 1.1, where it is text)."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$"),
-    list("-+0123456789."),
-)
-
-
-def _folder() -> Path:
+def scenes_folder() -> Path:
     """configs/scenes beside the package in a checkout, else inside the installed package."""
     package = Path(__file__).resolve().parents[2]
     checkout = package.parent / "configs" / "scenes"
     return checkout if checkout.is_dir() else package / "configs" / "scenes"
 
 
-def _body(given: Any, root: str | os.PathLike | None) -> Body:
-    given = _mapping(given, "body")
+def body_from_dict(given: Any, root: str | os.PathLike | None) -> Body:
+    given = mapping(given, "body")
     makers = {"cube": shapes.cube, "box": shapes.box, "ball": shapes.ball, "cylinder": shapes.cylinder}
     if "shape" in given:
         options = {key: value for key, value in given.items() if key != "shape"}
@@ -217,21 +191,20 @@ def _body(given: Any, root: str | os.PathLike | None) -> Body:
             return maker(**options)
         except TypeError as error:
             raise UserError(f"body: {error}") from error
-    _keys(given, "body", ("particles",))
+    check_keys(given, "body", ("particles",))
     return _particles(str(given["particles"]), data_root(root))
 
 
 def _particles(relative: str, root: Path) -> Body:
-    path = (root / relative).resolve()
-    if not path.is_relative_to(root.resolve()):
-        raise UserError(f"body.particles = {relative} leaves the data folder {root}")
+    path = inside(root, relative, "body.particles", kind="data folder")
     if not path.is_file():
         raise UserError(f"body.particles: there is no {relative} in the data folder {root}; check data_root or {VARIABLE}")
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            x, v = arrays["x"], arrays["v"]
-    except (ValueError, KeyError, OSError) as error:
-        raise UserError(f"body.particles: {path} is no archive with x and v: {error}") from error
+        arrays = read_arrays(path, ("x", "v"), what="archive with x and v")
+    except UserError as error:
+        raise UserError(f"body.particles: {error}") from error
+    x, v = arrays["x"], arrays["v"]
+    check_limit(len(x) if x.ndim else 0, "NEUIDO_MAX_PARTICLES", f"body.particles: {path} has {len(x) if x.ndim else 0} particles")
     if x.ndim != 2 or x.shape[1] != 3 or v.shape != x.shape or len(x) < 2:
         raise UserError(f"body.particles: {path} has x of shape {x.shape} and v of shape {v.shape}, not (P, 3) both")
     if not (np.isfinite(x).all() and np.isfinite(v).all()):
@@ -241,63 +214,49 @@ def _particles(relative: str, root: Path) -> Body:
 
 
 def _plane(given: Any, where: str) -> Plane:
-    given = _mapping(given, where)
-    _keys(given, where, ("type", "point", "normal", "contact", "friction"), ("friction",))
+    given = mapping(given, where)
+    check_keys(given, where, ("type", "point", "normal", "contact", "friction"), ("friction",))
     if given["type"] != "plane":
         raise UserError(f"{where}.type = {given['type']!r} is not known; it must be plane")
-    normal = _vector(given["normal"], f"{where}.normal")
+    normal = vector(given["normal"], f"{where}.normal")
     if not math.hypot(*normal) > 0:
         raise UserError(f"{where}.normal must not be zero")
-    return Plane(_vector(given["point"], f"{where}.point"), normal, *_contact(given, where))
+    return Plane(vector(given["point"], f"{where}.point"), normal, *_contact(given, where))
 
 
 def _walls(given: Any) -> Walls | None:
     if given is None:
         return None
-    given = _mapping(given, "scene.walls")
-    _keys(given, "scene.walls", ("contact", "friction", "inset"), ("friction", "inset"))
-    return Walls(*_contact(given, "scene.walls"), inset=_number(given.get("inset", 0.0), "scene.walls.inset", least=0.0))
+    given = mapping(given, "scene.walls")
+    check_keys(given, "scene.walls", ("contact", "friction", "inset"), ("friction", "inset"))
+    return Walls(*_contact(given, "scene.walls"), inset=number(given.get("inset", 0.0), "scene.walls.inset", least=0.0))
 
 
 def _contact(given: Mapping[str, Any], where: str) -> tuple[str, float]:
     if given["contact"] not in CONTACTS:
         raise UserError(f"{where}.contact = {given['contact']!r} is not known; one of {', '.join(CONTACTS)}")
-    return given["contact"], _number(given.get("friction", 0.0), f"{where}.friction", least=0.0, infinite=True)
+    return given["contact"], number(given.get("friction", 0.0), f"{where}.friction", least=0.0, infinite=True)
 
 
 def _attached(given: Any, where: str) -> AttachedMass:
-    given = _mapping(given, where)
-    _keys(given, where, ("box", "mass"))
-    return AttachedMass(_box(given["box"], f"{where}.box"), _number(given["mass"], f"{where}.mass", above=0.0))
+    given = mapping(given, where)
+    check_keys(given, where, ("box", "mass"))
+    return AttachedMass(_box(given["box"], f"{where}.box"), number(given["mass"], f"{where}.mass", above=0.0))
 
 
 def _boxed(given: Any, where: str) -> Box:
-    given = _mapping(given, where)
-    _keys(given, where, ("box",))
+    given = mapping(given, where)
+    check_keys(given, where, ("box",))
     return _box(given["box"], f"{where}.box")
 
 
 def _box(given: Any, where: str) -> Box:
     if not isinstance(given, list) or len(given) != 2:
         raise UserError(f"{where} must be [lower corner, upper corner], got {given!r}")
-    lower, upper = (_vector(corner, where) for corner in given)
+    lower, upper = (vector(corner, where) for corner in given)
     if any(u <= l for l, u in zip(lower, upper)):
         raise UserError(f"{where} needs lower < upper on each axis, got {given!r}")
     return Box(lower, upper)
-
-
-def _vector(given: Any, where: str) -> Vector:
-    if not isinstance(given, list) or len(given) != 3:
-        raise UserError(f"{where} must be three numbers, got {given!r}")
-    return tuple(_number(c, where) for c in given)  # type: ignore[return-value]
-
-
-def _number(given: Any, where: str, *, above: float = -math.inf, least: float = -math.inf, infinite: bool = False) -> float:
-    if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given) or (math.isinf(given) and not infinite):
-        raise UserError(f"{where} must be a {'' if infinite else 'finite '}number, got {given!r}")
-    if not (given > above and given >= least):
-        raise UserError(f"{where} must be {f'above {above:g}' if above > -math.inf else f'at least {least:g}'}, got {given!r}")
-    return float(given)
 
 
 def _list(scene: Mapping[str, Any], key: str) -> list[Any]:
@@ -305,20 +264,3 @@ def _list(scene: Mapping[str, Any], key: str) -> list[Any]:
     if not isinstance(given, list):
         raise UserError(f"scene.{key} must be a list, got {given!r}")
     return given
-
-
-def _mapping(given: Any, where: str) -> dict[str, Any]:
-    if not isinstance(given, Mapping):
-        raise UserError(f"{where} must be a mapping of keys to values, got {given!r}")
-    return dict(given)
-
-
-def _keys(given: Any, where: str, allowed: tuple[str, ...], optional: tuple[str, ...] = ()) -> None:
-    """Refuse unknown keys and require those that are not optional."""
-    given = _mapping(given, where)
-    for key in given:
-        if key not in allowed:
-            raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(allowed)}")
-    for key in allowed:
-        if key not in given and key not in optional:
-            raise UserError(f"{where} lacks the key {key!r}")

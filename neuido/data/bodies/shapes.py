@@ -6,10 +6,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from neuido.data.files.parsing import limit
 from neuido.errors import UserError
 from neuido.types import Body, Vector
-
-PARTICLE_LIMIT = 20_000_000
 
 
 def cube(
@@ -191,5 +190,6 @@ def _positive(name: str, value: float) -> None:
 
 
 def _affordable(count: int, option: str) -> None:
-    if count > PARTICLE_LIMIT:
-        raise UserError(f"{count} particles asked for, more than {PARTICLE_LIMIT}: change {option}")
+    if count > limit("NEUIDO_MAX_PARTICLES"):
+        largest = limit("NEUIDO_MAX_PARTICLES")
+        raise UserError(f"{count} particles asked for, more than {largest}: change {option}, or set NEUIDO_MAX_PARTICLES")

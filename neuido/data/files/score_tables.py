@@ -31,7 +31,7 @@ def read_rows(path: str | os.PathLike) -> list[dict[str, Any]]:
         UserError: A file that is missing or no text.
     """
     try:
-        with Path(path).open(newline="") as file:
+        with Path(path).open(newline="", encoding="utf-8-sig") as file:
             return [{k: number(v) for k, v in row.items() if k is not None and v} for row in csv.DictReader(file)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{path} cannot be read as a table: {error}") from error

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from neuido.data import cameras as convert
-from neuido.data.formats.layout import MultiView, Shot, assemble, inside, natural
+from neuido.data.files.values import inside
+from neuido.data.formats.layout import MultiView, Shot, assemble, natural
 from neuido.errors import UserError
 
 MODELS = {0: ("f", "cx", "cy"), 1: ("fx", "fy", "cx", "cy"), 2: ("f", "cx", "cy", "k1"), 3: ("f", "cx", "cy", "k1", "k2"),

@@ -1,19 +1,17 @@
 """What each reader returns, and the checks that all of them share. The files are not trusted."""
 
-import json
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from neuido.data import cameras as convert
+from neuido.data.files.parsing import image_size
 from neuido.errors import UserError
 from neuido.types import Body, Cameras
 
@@ -131,48 +129,6 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
     )
 
 
-def inside(folder: Path, relative: Any, where: str) -> Path:
-    """The path that a file names, which must stay in the folder.
-
-    Raises:
-        UserError: Not text, absolute, with a `..` in it, or outside the folder by way of a link.
-    """
-    if not isinstance(relative, str) or not relative or "\0" in relative:
-        raise UserError(f"{where} must be the path of a file, got {relative!r}")
-    pure = PureWindowsPath(relative)  # which knows both kinds of slashes
-    if pure.drive or pure.root or ".." in pure.parts or not (folder / relative).resolve().is_relative_to(folder.resolve()):
-        raise UserError(f"{where} = {relative!r} leaves the folder {folder}")
-    return folder / PurePosixPath(relative)
-
-
-def read_json(path: Path) -> Any:
-    """The content of a JSON file.
-
-    Raises:
-        UserError: The file is missing or is not JSON.
-    """
-    if not path.is_file():
-        raise UserError(f"{path} is missing")
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not valid JSON: {error}") from error
-
-
-def listed(content: Any, where: str) -> list[dict[str, Any]]:
-    """A list of mappings that is not empty, as most formats are."""
-    if not isinstance(content, list) or not content or not all(isinstance(entry, dict) for entry in content):
-        raise UserError(f"{where} must be a list of frames, each a mapping of keys to values, and not empty")
-    return content
-
-
-def take(entry: dict[str, Any], key: str, where: str) -> Any:
-    """A key that must be there."""
-    if key not in entry:
-        raise UserError(f"{where} lacks the key {key!r}")
-    return entry[key]
-
-
 def matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
     """Numbers of one of the shapes, float64.
 
@@ -188,19 +144,6 @@ def matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
     if not np.isfinite(array).all():
         raise UserError(f"{where} holds a NaN or an infinity")
     return torch.from_numpy(array)
-
-
-def number(value: Any, where: str, *, least: float = -math.inf, above: float = -math.inf) -> float:
-    """A finite number within its range."""
-    try:
-        wrong = isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value)
-    except OverflowError:  # a whole number that no float holds
-        wrong, value = True, "one too large"
-    if wrong:
-        raise UserError(f"{where} must be a finite number, got {value!r}")
-    if not (value >= least and value > above):
-        raise UserError(f"{where} must be {f'above {above:g}' if above > -math.inf else f'at least {least:g}'}, got {value!r}")
-    return float(value)
 
 
 def opengl(value: Any, where: str) -> Tensor:
@@ -228,14 +171,6 @@ def calibration(value: Any, where: str) -> Tensor:
     if K[0, 1] != 0 or not torch.equal(K[2], K.new_tensor([0.0, 0.0, 1.0])) or K[1, 0] != 0:
         raise UserError(f"{where} is no pinhole's matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     return K
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height [px] of an image file."""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
-    if image is None:
-        raise UserError(f"{path} is missing or no image that OpenCV can read")
-    return image.shape[1], image.shape[0]
 
 
 def natural(text: str) -> list[tuple[int, str]]:

@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from neuido.data import cameras as convert
-from neuido.data.formats.layout import MultiView, Shot, assemble, image_size, inside, listed, natural, number, opengl, read_json, take
+from neuido.data.files.parsing import image_size, read_json
+from neuido.data.files.values import inside, listed, number, take
+from neuido.data.formats.layout import MultiView, Shot, assemble, natural, opengl
 from neuido.errors import UserError
 from neuido.types import Cameras
 

@@ -4,7 +4,6 @@ Its synthetic rotations may carry a scale (0.41 in BouncyBall), which no project
 """
 
 import re
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,21 +13,10 @@ import torch
 from torch import Tensor
 
 from neuido.data import cameras as convert
+from neuido.data.files.parsing import image_size, read_arrays, read_json
+from neuido.data.files.values import inside, listed, take
 from neuido.data.formats import colmap
-from neuido.data.formats.layout import (
-    MultiView,
-    Shot,
-    assemble,
-    calibration,
-    image_size,
-    inside,
-    listed,
-    matrix,
-    natural,
-    opengl,
-    read_json,
-    take,
-)
+from neuido.data.formats.layout import MultiView, Shot, assemble, calibration, matrix, natural, opengl
 from neuido.errors import UserError
 
 INTERVALS = {"bouncyball": 1e-3, "jellyduck": 1e-3, "claycat": 5e-4, "honeybottle": 5e-4, "rubberpawn": 5e-4, "sandfish": 5e-4}
@@ -196,11 +184,8 @@ def _flat(size: Any) -> Iterator[Any]:
 
 
 def _volume(path: Path, particle_count: int | None) -> Tensor:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            points, volume = arrays["p_x"], np.asarray(arrays["vol"], dtype=np.float32)
-    except (ValueError, KeyError, IndexError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} is no archive with p_x and vol: {error}") from error
+    arrays = read_arrays(path, ("p_x", "vol"), what="archive with p_x and vol")
+    points, volume = arrays["p_x"], np.asarray(arrays["vol"], dtype=np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or particle_count not in (None, len(points)):
         raise UserError(f"{path}: p_x has the shape {points.shape}; it must be (P, 3), with the P of init.pt")
     if volume.size not in (1, len(points)) or not (np.isfinite(volume).all() and (volume > 0).all()):

@@ -7,7 +7,9 @@ mask is, in this order: the alpha of `a_<camera>_<frame>.png` (written by GIC), 
 import re
 from pathlib import Path
 
-from neuido.data.formats.layout import MultiView, Shot, assemble, calibration, inside, listed, number, opengl, read_json, take
+from neuido.data.files.parsing import read_json
+from neuido.data.files.values import inside, listed, number, take
+from neuido.data.formats.layout import MultiView, Shot, assemble, calibration, opengl
 from neuido.errors import UserError
 
 NAME = re.compile(r"^(?:.*/)?r_([0-9]+)_(-?[0-9]+)\.png$")

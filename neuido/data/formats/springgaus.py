@@ -10,8 +10,10 @@ dynamic/{videos_images/<camera>/*.jpg,videos_masks/<camera>/*.png}
 
 from pathlib import Path
 
+from neuido.data.files.parsing import image_size, read_json
+from neuido.data.files.values import inside, listed, take
 from neuido.data.formats import colmap
-from neuido.data.formats.layout import MultiView, Shot, assemble, calibration, image_size, inside, listed, natural, opengl, read_json, take
+from neuido.data.formats.layout import MultiView, Shot, assemble, calibration, natural, opengl
 from neuido.data.formats.neuma import dynamic_lens, extrinsics
 from neuido.errors import UserError
 

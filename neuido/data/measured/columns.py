@@ -1,15 +1,14 @@
 """What the readers of measured data share: columns of a CSV file, effects that a model declares, roles. The files are not trusted."""
 
 import contextlib
-import csv
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from neuido.data.bodies import scene_files as scenes
-from neuido.data.formats.layout import inside, number
+from neuido.data.files.parsing import read_table, read_yaml
+from neuido.data.files.values import check_keys, inside, mapping, number
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY, Effects
 
@@ -29,10 +28,7 @@ def read_header(folder: Path, name: str, form: str) -> tuple[Path, dict[str, Any
     file = given if given.is_file() else given / name
     if not file.is_file():
         raise UserError(f"{file} is missing: {given} is no folder of the format {form}")
-    try:
-        content = scenes.read_yaml(file)
-    except (UnicodeDecodeError, RecursionError, OverflowError) as error:
-        raise UserError(f"{file} is not valid YAML: {error}") from error
+    content = read_yaml(file)
     if content.get("format") != form:
         raise UserError(f"{file}: format is {content.get('format')!r}, not {form!r}")
     return file, content
@@ -89,15 +85,14 @@ def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: M
     path = inside(folder, entry["file"], f"{where}.file")
     if not path.is_file():
         raise UserError(f"{where}: the file {path} is missing")
-    columns = scenes._mapping(entry["columns"], f"{where}.columns")
+    columns = mapping(entry["columns"], f"{where}.columns")
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            header, *lines = (row for row in csv.reader(stream, strict=True) if row)
-    except ValueError as error:
-        reason = "is empty" if "unpack" in str(error) else f"is no CSV file: {error}"
-        raise UserError(f"{where}: {path} {reason}") from error
-    except (csv.Error, OSError) as error:
-        raise UserError(f"{where}: {path} is no CSV file: {error}") from error
+        table = read_table(path)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error
+    if not table:
+        raise UserError(f"{where}: {path} is empty")
+    header, *lines = table
     header = [title.strip() for title in header]
     rows = _rows(entry.get("rows"), len(lines), where)
     out = {}
@@ -130,7 +125,7 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
     library = {entry.name: [parameter.name for parameter in entry.parameters] for entry in LIBRARY}
     library["time_force"] += WAVES
     flat: dict[str, float] = {}
-    for name, value in scenes._mapping({} if given is None else given, where).items():
+    for name, value in mapping({} if given is None else given, where).items():
         name, _, part = str(name).partition(".")
         value = {part: value} if part else value
         if name not in known:
@@ -141,7 +136,7 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
             if len(values) > len(own) or (len(values) < len(own) and not own[0] == "x"):
                 raise UserError(f"{where}.{name} takes {', '.join(own)}, got {value!r}")
             value = dict(zip(own, values))
-        scenes._keys(value, f"{where}.{name}", tuple(own), tuple(own))
+        check_keys(value, f"{where}.{name}", tuple(own), tuple(own))
         for key, figure in value.items():
             flat[f"{name}.{key}"] = number(figure, f"{where}.{name}.{key}")
     try:

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,10 @@ import yaml
 from torch import Tensor
 
 from neuido.data.bodies import scene_files as scenes
+from neuido.data.files.parsing import read_arrays
+from neuido.data.files.values import check_keys, inside, mapping, number
 from neuido.data.formats import nerfstudio
-from neuido.data.formats.layout import MultiView, inside, number
+from neuido.data.formats.layout import MultiView
 from neuido.data.measured.columns import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY
@@ -102,7 +103,7 @@ def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None 
     file, content = read_header(Path(path), "experiment.yaml", FORMAT)
     folder = file.parent
     with errors_of(file):
-        scenes._keys(content, "the file", ("format", "name", "scene", "model", "discretisation", "recordings"))
+        check_keys(content, "the file", ("format", "name", "scene", "model", "discretisation", "recordings"))
         name = read_text(content["name"], "name")
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
         believed, free = read_belief(content["model"] if model is None else model, folder=folder)
@@ -173,11 +174,11 @@ def read_belief(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any]
     Raises:
         UserError: An unknown key, an impossible material, an unknown effect.
     """
-    given = scenes._mapping(given, "model")
+    given = mapping(given, "model")
     if "law" not in given:
         return read_model(given)
-    law = scenes._mapping(given.pop("law"), "model.law")
-    scenes._keys(law, "model.law", ("file", "stiffness"), ("stiffness",))
+    law = mapping(given.pop("law"), "model.law")
+    check_keys(law, "model.law", ("file", "stiffness"), ("stiffness",))
     file = folder / Path(read_text(law["file"], "model.law.file")).expanduser()
     stiffness = number(law.get("stiffness", 1.0), "model.law.stiffness", above=0.0)
     free = given.get("free", [])
@@ -190,7 +191,7 @@ def read_belief(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any]
 
 def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
     """The key `model` of a file: what is believed, and which of its figures are free."""
-    given = scenes._mapping(given, "model")
+    given = mapping(given, "model")
     free = given.pop("free", [])
     effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY))
     for part in ("elasticity", "plasticity"):
@@ -205,7 +206,7 @@ def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
 
 
 def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path) -> Recording:
-    scenes._keys(entry, where, ("name", "role", "frame_interval", "noise", *OVERRIDES), ("noise", *OVERRIDES))
+    check_keys(entry, where, ("name", "role", "frame_interval", "noise", *OVERRIDES), ("noise", *OVERRIDES))
     name = read_text(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     role = read_role(entry["role"], where)
@@ -291,19 +292,7 @@ def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            unknown = set(archive.files) - {*NEEDED, *OPTIONAL}
-            if unknown:
-                raise UserError(f"{path}: unknown array {sorted(unknown)[0]!r}; it takes {', '.join((*NEEDED, *OPTIONAL))}")
-            arrays = {key: archive[key] for key in archive.files}
-    except UserError:
-        raise
-    except (ValueError, AttributeError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} is no archive of arrays: {error}") from error
-    for key in NEEDED:
-        if key not in arrays:
-            raise UserError(f"{path} lacks the array {key!r}")
+    arrays = read_arrays(path, NEEDED, OPTIONAL, what="archive of arrays", others=False)
     if ("track" in arrays) == ("anchor" in arrays):
         raise UserError(f"{path} must have either track or anchor, got {'both' if 'track' in arrays else 'neither'}")
     return arrays

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.data.bodies import scene_files as scenes
-from neuido.data.formats.layout import number
+from neuido.data.files.values import check_keys, mapping, number, vector
 from neuido.data.measured.columns import errors_of, read_columns, read_effects, read_entries, read_header, read_role, read_text, rising
 from neuido.data.measured.experiment import read_model
 from neuido.errors import UserError
@@ -114,9 +113,9 @@ def read_material_tests(path: str | os.PathLike, *, model: Mapping[str, Any] | N
     file, content = read_header(Path(path), "test.yaml", FORMAT)
     folder = file.parent
     with errors_of(file):
-        scenes._keys(content, "the file", ("format", "name", "model", "tests"))
+        check_keys(content, "the file", ("format", "name", "model", "tests"))
         name = read_text(content["name"], "name")
-        given = scenes._mapping(content["model"] if model is None else model, "model")
+        given = mapping(content["model"] if model is None else model, "model")
         incompressible = given.pop("incompressible", False)
         if not isinstance(incompressible, bool):
             raise UserError(f"model.incompressible must be true or false, got {incompressible!r}")
@@ -132,23 +131,23 @@ def read_material_tests(path: str | os.PathLike, *, model: Mapping[str, Any] | N
 
 def _test(entry: Any, where: str, folder: Path) -> MaterialTest:
     optional = ("scale", "rows", "direction")
-    scenes._keys(entry, where, ("name", "file", "mode", "columns", "role", *optional), optional)
+    check_keys(entry, where, ("name", "file", "mode", "columns", "role", *optional), optional)
     name = read_text(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     if not isinstance(entry["mode"], str) or entry["mode"] not in MODES:
         raise UserError(f"{where}.mode = {entry['mode']!r} is not known; one of {', '.join(MODES)}")
     role = read_role(entry["role"], where)
     path_keys, stress_keys = MODES[entry["mode"]]
-    columns = scenes._mapping(entry["columns"], f"{where}.columns")
+    columns = mapping(entry["columns"], f"{where}.columns")
     path_keys, stress_keys = _choose(columns, path_keys, STRAINS, where), _choose(columns, stress_keys, STRESSES, where)
-    scenes._keys(columns, f"{where}.columns", (*path_keys, *stress_keys, "time"), ("time",))
-    scale = scenes._mapping(entry.get("scale", {}), f"{where}.scale")
+    check_keys(columns, f"{where}.columns", (*path_keys, *stress_keys, "time"), ("time",))
+    scale = mapping(entry.get("scale", {}), f"{where}.scale")
     for key, factor in scale.items():
         if key not in columns:
             raise UserError(f"unknown key {key!r} in {where}.scale; it takes {', '.join(columns)}")
         scale[key] = number(factor, f"{where}.scale.{key}", above=0.0)
     direction = entry.get("direction", [1, 0, 0])
-    direction = np.array(scenes._vector(direction, f"{where}.direction"))
+    direction = np.array(vector(direction, f"{where}.direction"))
     if not np.linalg.norm(direction) > 0:
         raise UserError(f"{where}.direction must not be zero")
     data, rows = read_columns(folder, entry, where, scale=scale)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.data.bodies import scene_files as scenes
-from neuido.data.formats.layout import number
+from neuido.data.files.values import check_keys, mapping, number, vector
 from neuido.data.measured.columns import (
     errors_of,
     read_columns,
@@ -86,12 +85,12 @@ def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = No
     """
     file, content = read_header(Path(path), "track.yaml", FORMAT)
     with errors_of(file):
-        scenes._keys(content, "the file", ("format", "name", "model", "nuisances", "bodies", "recordings"), ("nuisances",))
+        check_keys(content, "the file", ("format", "name", "model", "nuisances", "bodies", "recordings"), ("nuisances",))
         name = read_text(content["name"], "name")
         gravity, effects, free = _model(content["model"] if model is None else model)
         nuisances = dict.fromkeys(NUISANCES, 0.0)
-        given = scenes._mapping(content.get("nuisances") or {}, "nuisances")
-        scenes._keys(given, "nuisances", NUISANCES, NUISANCES)
+        given = mapping(content.get("nuisances") or {}, "nuisances")
+        check_keys(given, "nuisances", NUISANCES, NUISANCES)
         nuisances |= {key: number(value, f"nuisances.{key}", least=0.0) for key, value in given.items()}
         bodies = _bodies(content["bodies"])
         recordings = read_entries(
@@ -104,35 +103,35 @@ def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = No
 
 
 def _model(given: Any) -> tuple[Vector, dict[str, float], tuple[str, ...]]:
-    scenes._keys(given, "model", ("gravity", "effects", "free"), ("effects", "free"))
-    gravity = scenes._vector(given["gravity"], "model.gravity")
+    check_keys(given, "model", ("gravity", "effects", "free"), ("effects", "free"))
+    gravity = vector(given["gravity"], "model.gravity")
     effects = read_effects(given.get("effects"), "model.effects", known=EFFECTS)
     return gravity, effects, read_free(given.get("free", []), ("gravity", *effects))
 
 
 def _bodies(given: Any) -> dict[str, dict[str, float]]:
-    bodies = scenes._mapping(given, "bodies")
+    bodies = mapping(given, "bodies")
     if not bodies:
         raise UserError("bodies names no body")
     out = {}
     for name, figures in bodies.items():
         read_text(name, "the name of a body")
-        figures = scenes._mapping(figures or {}, f"bodies.{name}")
-        scenes._keys(figures, f"bodies.{name}", FIGURES, FIGURES)
+        figures = mapping(figures or {}, f"bodies.{name}")
+        check_keys(figures, f"bodies.{name}", FIGURES, FIGURES)
         out[name] = {key: number(value, f"bodies.{name}.{key}", above=0.0) for key, value in figures.items()}
     return out
 
 
 def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) -> Track:
     optional = ("rows", "spin", "noise")
-    scenes._keys(entry, where, ("name", "body", "file", "columns", "role", *optional), optional)
+    check_keys(entry, where, ("name", "body", "file", "columns", "role", *optional), optional)
     name = read_text(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     if not isinstance(entry["body"], str) or entry["body"] not in bodies:
         raise UserError(f"{where}.body = {entry['body']!r} is not known; one of {', '.join(bodies)}")
     role = read_role(entry["role"], where)
-    columns = scenes._mapping(entry["columns"], f"{where}.columns")
-    scenes._keys(columns, f"{where}.columns", ("t", *AXES), AXES)
+    columns = mapping(entry["columns"], f"{where}.columns")
+    check_keys(columns, f"{where}.columns", ("t", *AXES), AXES)
     axes = tuple(a for a, key in enumerate(AXES) if key in columns)
     if not axes:
         raise UserError(f"{where}.columns names none of {', '.join(AXES)}")
@@ -144,6 +143,6 @@ def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) 
         t=rising(data["t"], where),
         x=np.stack([data[AXES[a]] for a in axes], 1),
         axes=axes,
-        spin=scenes._vector(entry["spin"], f"{where}.spin") if entry.get("spin") is not None else None,
+        spin=vector(entry["spin"], f"{where}.spin") if entry.get("spin") is not None else None,
         noise=number(entry["noise"], f"{where}.noise", above=0.0) if entry.get("noise") is not None else None,
     )

@@ -5,7 +5,6 @@ flow (V, T - 1, S, S, 2) float16 [m/s], cell (V,) [m], frame_interval [s], and n
 corrected (n, 3, 3) and stress (n, 3, 3) [Pa], float32.
 """
 
-import json
 import zipfile
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +16,7 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, TensorDataset
 
+from neuido.data.files.parsing import read_arrays, read_json
 from neuido.errors import UserError
 
 FORMAT = "neuido-films/1"
@@ -57,12 +57,11 @@ def read_clip(path: Path) -> Clip:
     Raises:
         UserError: A file that is missing, cut short or no clip.
     """
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            parts = {name: torch.from_numpy(arrays[name]) for name in Clip._fields if name != "frame_interval"}
-            interval = float(arrays["frame_interval"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} is no clip of `neuido film`: {error}") from error
+    arrays = read_arrays(path, Clip._fields, what="clip of `neuido film`")
+    parts = {name: torch.from_numpy(arrays[name]) for name in Clip._fields if name != "frame_interval"}
+    if arrays["frame_interval"].size != 1:
+        raise UserError(f"{path} is no clip of `neuido film`: frame_interval must be one number")
+    interval = float(arrays["frame_interval"])
     return Clip(**parts, frame_interval=interval)
 
 
@@ -128,7 +127,9 @@ class FilmDataModule(LightningDataModule):
         path = self.root / "index.json"
         if not path.is_file():
             raise UserError(f"data.root = {self.root} holds no finished clips: make them with `neuido film --out {self.root}`")
-        content = json.loads(path.read_text())
+        content = read_json(path)
+        if not isinstance(content, dict):
+            raise UserError(f"{path} must be a mapping of keys to values")
         if content.get("format") != FORMAT:
             raise UserError(f"{path} has format {content.get('format')!r}, not {FORMAT!r}")
         return content

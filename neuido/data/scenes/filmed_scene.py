@@ -18,7 +18,6 @@ The believed `model` of an experiment is what its file says; the true law is in 
 """
 
 import os
-import zipfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -31,7 +30,9 @@ import yaml
 from torch import Tensor
 
 from neuido.data.bodies import scene_files as scenes
+from neuido.data.files.parsing import read_arrays, read_yaml
 from neuido.data.files.storage import write
+from neuido.data.files.values import check_keys, mapping, number, vector
 from neuido.data.measured.experiment import read_experiment, scene_to_dict
 from neuido.data.scenes.multiview import DIFFERENT, UP, SceneViews
 from neuido.data.scenes.readers import read
@@ -241,19 +242,19 @@ def read_setting(path: Path, *, recording: str | None = None) -> Setting:
         return Setting(experiment.name, experiment[recording or filmed[0]].scene, experiment.model["density"], experiment.model)
     if not path.is_file():
         raise UserError(f"{path} is missing")
-    content = scenes.read_yaml(path)
+    content = read_yaml(path)
     try:
-        scenes._keys(content, "the file", ("format", "name", "scene", "discretisation", "model", "placing"))
+        check_keys(content, "the file", ("format", "name", "scene", "discretisation", "model", "placing"))
         if content["format"] != FORMAT:
             raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
         model = scenes.model_from_dict(content["model"])
-        given = scenes._mapping(content["placing"], "placing")
-        scenes._keys(given, "placing", ("scale", "shift", "up"))
+        given = mapping(content["placing"], "placing")
+        check_keys(given, "placing", ("scale", "shift", "up"))
         if given["up"] not in UP:
             raise UserError(f"placing.up = {given['up']!r}; one of {', '.join(UP)}")
-        scale = scenes._number(given["scale"], "placing.scale", above=0.0)
-        placing = Placing(scale, scenes._vector(given["shift"], "placing.shift"), given["up"])
+        scale = number(given["scale"], "placing.scale", above=0.0)
+        placing = Placing(scale, vector(given["shift"], "placing.shift"), given["up"])
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     return Setting(str(content["name"]), scene, model["density"], model, placing)
@@ -277,12 +278,12 @@ def read_motion(folder: Path) -> Motion | None:
     path = folder / "motion.yaml"
     if not path.is_file():
         return None
-    content = scenes.read_yaml(path)
+    content = read_yaml(path)
     try:
-        scenes._keys(content, "the file", ("format", "velocity", "angular_velocity", "centre"), ("angular_velocity", "centre"))
+        check_keys(content, "the file", ("format", "velocity", "angular_velocity", "centre"), ("angular_velocity", "centre"))
         if content["format"] != MOTION:
             raise UserError(f"format is {content['format']!r}, not {MOTION!r}")
-        vectors = {key: scenes._vector(value, key) for key, value in content.items() if key != "format"}
+        vectors = {key: vector(value, key) for key, value in content.items() if key != "format"}
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     return Motion(**vectors)
@@ -325,7 +326,7 @@ def read_truth(folder: Path, *, frame_step: int = 1, frames: int | None = None) 
     arrays = _arrays(path, {"x": (-1, -1, 3), "x0": (-1, 3), "volume": (-1,), "times": (-1,)})
     if len({arrays["x"].shape[1], len(arrays["x0"]), len(arrays["volume"])}) != 1 or len(arrays["x"]) != len(arrays["times"]):
         raise UserError(f"{path}: the shapes of x, x0, volume and times do not fit one another")
-    content = scenes.read_yaml(folder / "truth.yaml")
+    content = read_yaml(folder / "truth.yaml")
     try:
         law = scenes.model_from_dict(content.get("law", {}))
     except UserError as error:
@@ -337,11 +338,7 @@ def read_truth(folder: Path, *, frame_step: int = 1, frames: int | None = None) 
 
 
 def _arrays(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in shapes}
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} is no archive of {', '.join(shapes)}: {error}") from error
+    arrays = read_arrays(path, shapes)
     for key, shape in shapes.items():
         array = arrays[key]
         if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape)) or not np.isfinite(array).all():

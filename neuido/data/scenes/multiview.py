@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from neuido.data import cameras as convert
-from neuido.data.formats.layout import MultiView, matrix, number
+from neuido.data.files.values import number
+from neuido.data.formats.layout import MultiView, matrix
 from neuido.data.scenes.readers import read
 from neuido.errors import UserError
 from neuido.types import Cameras, MultiViewBatch, Vector

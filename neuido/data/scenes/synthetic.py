@@ -25,7 +25,9 @@ from tqdm import tqdm
 from neuido.data import cameras as convert
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.bodies.shapes import rigid_velocity
+from neuido.data.files.parsing import read_yaml
 from neuido.data.files.storage import claim, publish_folder, write
+from neuido.data.files.values import check_keys, mapping, vector
 from neuido.data.formats import nerfstudio
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
 from neuido.data.scenes.filmed_scene import Motion, write_motion
@@ -103,28 +105,28 @@ def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.Path
     Raises:
         UserError: An unknown or missing key, a figure outside its range, a body outside the domain.
     """
-    given = scenes._mapping(given, "a scene")
+    given = mapping(given, "a scene")
     name = given.get("name")
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
         raise UserError(f"scenes: a name must be letters, digits, - and _, got {name!r}")
     try:
         content, source = dict[str, Any](), ""
         if "base" in given:
-            path = scenes._folder() / f"{given['base']}.yaml"
+            path = scenes.scenes_folder() / f"{given['base']}.yaml"
             if given["base"] not in scenes.scene_names():
                 raise UserError(f"base = {given['base']!r} is no scene; known: {', '.join(scenes.scene_names())}")
-            content = scenes.read_yaml(path)
+            content = read_yaml(path)
             source = str(content.get("source", ""))
         for part in PARTS:
-            own = scenes._mapping(given.get(part, {}), part)
+            own = mapping(given.get(part, {}), part)
             content[part] = own if part == "body" and own else {**content.get(part, {}), **own}
-        scenes._keys(given, "the scene", (*OWN, *PARTS), (*OWN[1:], *PARTS))
+        check_keys(given, "the scene", (*OWN, *PARTS), (*OWN[1:], *PARTS))
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
         law = scenes.model_from_dict(content["model"])
         belief = scenes.model_from_dict(given.get("belief") or {**JELLY, "density": law["density"]})
-        body = scenes._body(content["body"], data_root)
+        body = scenes.body_from_dict(content["body"], data_root)
         if "shift" in given:
-            body = body._replace(x=body.x + torch.tensor(scenes._vector(given["shift"], "shift")))
+            body = body._replace(x=body.x + torch.tensor(vector(given["shift"], "shift")))
         body, motion = _set_off(body, given)
         split, substeps = given.get("split", "train"), given.get("substeps", film.substeps)
         if split not in SPLITS:
@@ -328,8 +330,8 @@ def _set_off(body: Body, given: Mapping[str, Any]) -> tuple[Body, Motion]:
     """The body with the velocity that the entry gives, else with its own, and that motion, which must be rigid."""
     centre = tuple(round(c, 6) for c in body.x.double().mean(0).tolist())
     if "velocity" in given or "angular_velocity" in given:
-        velocity = scenes._vector(given.get("velocity", [0.0, 0.0, 0.0]), "velocity")
-        spin = scenes._vector(given.get("angular_velocity", [0.0, 0.0, 0.0]), "angular_velocity")
+        velocity = vector(given.get("velocity", [0.0, 0.0, 0.0]), "velocity")
+        spin = vector(given.get("angular_velocity", [0.0, 0.0, 0.0]), "angular_velocity")
     else:
         velocity, spin = _rigid(body, centre)
     motion = Motion(velocity, spin, centre)  # type: ignore[arg-type]

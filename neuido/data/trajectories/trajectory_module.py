@@ -1,7 +1,6 @@
 """The Stage I samples (F_tr, F_hat, stress, trajectory) in balanced batches from the files of `neuido simulate`."""
 
 import inspect
-import json
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,9 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
+from neuido.data.files.parsing import read_json
 from neuido.data.files.storage import COLUMNS, FORMAT, Files, complete, split
+from neuido.data.files.values import inside, listed, take
 from neuido.data.trajectories.options import simulate
 from neuido.data.trajectories.sampling import Batches, Order, Step, Steps
 from neuido.errors import UserError
@@ -96,10 +97,14 @@ class TrajectoryDataModule(LightningDataModule):
         if not path.is_file():
             state = "is not complete" if (self.root / "plan.json").is_file() else "holds no trajectories"
             raise UserError(f"data.root = {self.root} {state} (no index.json): make it with `{command}`")
-        content = json.loads(path.read_text())
-        if content.get("format") != FORMAT:
+        content = read_json(path)
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            content = content if isinstance(content, dict) else {}
             raise UserError(f"{path} has format {content.get('format')!r}, not {FORMAT!r}: make it anew with `{command}`")
-        for entry in content["trajectories"]:
+        for i, entry in enumerate(listed(take(content, "trajectories", str(path)), f"{path}: trajectories")):
+            for key in ("name", "family", "split", "parameters", "stress_rms", "residual_rms"):
+                take(entry, key, f"{path}: trajectories[{i}]")
+            inside(self.root, entry["name"], f"{path}: trajectories[{i}].name")
             if not complete(self.root / f"{entry['name']}.npy", self._shape(content)):
                 raise UserError(f"{self.root / entry['name']}.npy is missing or cut short: repair it with `{command}`")
         return content

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
-from neuido.data.undeclared import Case
 from neuido.data.undeclared import random_bodies as bodies
+from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.instruments import Markers, fastest, recorded, vector, wrong_nuisances
 from neuido.data.undeclared.motion import Motion, Solver, move
 from neuido.data.undeclared.random_effects import (

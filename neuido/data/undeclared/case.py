@@ -1,97 +1,28 @@
-"""From a seed to a folder that `neuido diagnose` reads and a sealed key, both written all at once."""
+"""The options of a case with an undeclared effect. No torch at import, so that `--help` stays light."""
 
-import hashlib
-import re
-import shutil
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any
-
-import numpy as np
-import yaml
-from tqdm import tqdm
-
-from neuido.data.bodies.scene_files import read_yaml
-from neuido.data.files.storage import publish_folder, write
-from neuido.data.undeclared import Case
-from neuido.data.undeclared.body_case import SOLVERS, body_case
-from neuido.data.undeclared.curves import curve_case
-from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
-from neuido.data.undeclared.sizing import LEAST, MOST, Again
-from neuido.errors import UserError
-from neuido.physics.runtime.device import choose_device
-
-TRIES = 12
-"""Draws before a seed is given up."""
+from dataclasses import dataclass
 
 
-def make(seed: int, out: str | Path, *, case: Case, device: str, progress: bool) -> Path:
-    """`undeclared.make_undeclared`."""
-    folder = Path(out).expanduser().absolute()
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", folder.name):
-        raise UserError(f"out = {out}: the folder's name is the case's; give letters, digits, - and _")
-    _check(case)
-    key = folder.parent / "keys" / f"{folder.name}.yaml"
-    plan = {"seed": int(seed), "options": asdict(case)}
-    if folder.exists():
-        if key.is_file() and _plan_of(key) == plan and (folder / "README.md").is_file():
-            return key
-        raise UserError(f"out = {folder} exists and is not the case of seed {seed} with these options: give another folder")
-    maker = body_case if case.measured == "body" else curve_case
-    chosen = str(choose_device(device))
-    with tqdm(desc=folder.name, unit=" simulations", disable=not progress) as bar:
-        for attempt in range(TRIES):
-            rng = np.random.default_rng([int(seed), attempt])
-            try:
-                write_folder, truth = maker(rng, case, folder.name, chosen, bar.update)
-                break
-            except Again as again:
-                reason = str(again)
-                bar.set_postfix_str(f"drawn again: {reason}")
-        else:
-            raise UserError(f"no case of seed {seed} with these options in {TRIES} draws (the last: {reason}); give another seed or kind")
-    text = yaml.safe_dump(
-        {**truth, "sealed": {**plan, "attempt": attempt, "salt": rng.bytes(16).hex()}}, sort_keys=False, default_flow_style=None, width=140
-    )
-    hidden = folder.with_name(f".{folder.name}.tmp")
-    shutil.rmtree(hidden, ignore_errors=True)
-    hidden.mkdir(parents=True)
-    write_folder(hidden)
-    (hidden / "README.md").write_text(_readme(folder.name, text))
-    key.parent.mkdir(exist_ok=True)
-    write(key, text)
-    publish_folder(hidden, folder)
-    return key
+@dataclass(frozen=True)
+class Case:
+    """The fixed part of a case with an undeclared effect; what is left out is drawn from the seed.
 
+    Args:
+        measured: body (an experiment folder), material_test or track.
+        kind: An effect of the vocabulary, one that is outside it, `none`, or two of them joined by a plus sign.
+        solver: Of a body: same (the grid and step that the folder suggests), finer (36 to 44 cells, half the step) or elements
+            (finite elements).
+        nuisances: Whether clock, latency, ruler, launch speed and spin of a body are off by one to two standard deviations; drawn
+            for a case without an effect, else no.
+        separation: How far the effect moves the recorded points, in standard deviations of the noise.
+        particles: About how many particles a body has; 0: 1500 to 3000.
+        seconds: Length of a body's recordings, s; 0: 0.4 to 0.6.
+    """
 
-def _check(case: Case) -> None:
-    if case.measured not in ("body", "material_test", "track"):
-        raise UserError(f"case.measured = {case.measured!r}; one of body, material_test, track")
-    if case.solver is not None and case.solver not in SOLVERS:
-        raise UserError(f"case.solver = {case.solver!r}; one of {', '.join(SOLVERS)}")
-    if case.kind is not None and case.kind != "none":
-        for kind in case.kind.split("+"):
-            if kind not in KINDS and kind not in OUTSIDE:
-                raise UserError(f"case.kind = {kind!r}; one of none, {', '.join((*KINDS, *OUTSIDE))}, or two of them joined by +")
-        kinds = case.kind.split("+")
-        if len(kinds) > 2 or len(set(kinds)) < len(kinds) or (len(kinds) == 2 and any(k in OUTSIDE for k in kinds)):
-            raise UserError(f"case.kind = {case.kind!r}; at most two different ones, and two only of the library")
-    if case.nuisances and case.kind not in (None, "none"):
-        raise UserError("case.nuisances goes with case.kind none: an effect beside them could not be scored")
-    if case.separation is not None and not LEAST <= case.separation <= MOST:
-        raise UserError(f"case.separation = {case.separation}; it must lie in {LEAST:g} to {MOST:g} standard deviations of the noise")
-    if case.particles < 0 or (0 < case.particles < 100) or case.seconds < 0 or (0 < case.seconds < 0.05):
-        raise UserError(f"case.particles = {case.particles}, case.seconds = {case.seconds}: give at least 100 and 0.05, or 0 to draw them")
-
-
-def _plan_of(key: Path) -> dict[str, Any]:
-    sealed = read_yaml(key).get("sealed", {})
-    return {name: sealed.get(name) for name in ("seed", "options")}
-
-
-def _readme(name: str, key: str) -> str:
-    digest = hashlib.sha256(key.encode()).hexdigest()
-    return (
-        f"# {name}\n\nMeasured data with the model that is believed. What the model lacks, if anything, is sealed in\n"
-        f"`../keys/{name}.yaml`; nothing that diagnoses may read it. The SHA-256 of that file is\n\n    {digest}\n"
-    )
+    measured: str = "body"
+    kind: str | None = None
+    solver: str | None = None
+    nuisances: bool | None = None
+    separation: float | None = None
+    particles: int = 0
+    seconds: float = 0.0

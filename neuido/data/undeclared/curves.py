@@ -13,7 +13,7 @@ import yaml
 
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
-from neuido.data.undeclared import Case
+from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, entry_of
 from neuido.data.undeclared.sizing import Again, rms, short, sized
 from neuido.errors import UserError

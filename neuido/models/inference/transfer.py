@@ -21,6 +21,8 @@ import torch
 
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.bodies.shapes import rigid_velocity
+from neuido.data.files.parsing import read_yaml
+from neuido.data.files.values import check_keys, vector
 from neuido.errors import UserError
 from neuido.models.inference import outputs as results
 from neuido.models.inference.pipeline import Laws, Prepared, folder_of
@@ -60,13 +62,13 @@ def read_conditions(path: str | os.PathLike) -> Condition:
     """
     path = Path(path)
     if not path.is_file():
-        own = scenes._folder().parent / "conditions" / f"{path.name.removesuffix('.yaml')}.yaml"
+        own = scenes.scenes_folder().parent / "conditions" / f"{path.name.removesuffix('.yaml')}.yaml"
         if not own.is_file():
             raise UserError(f"condition_files: there is no file {path}, neither here nor in {own.parent}")
         path = own
-    content = scenes.read_yaml(path)
+    content = read_yaml(path)
     try:
-        scenes._keys(content, "the file", ("format", "name", "frames", "bodies"), ("frames",))
+        check_keys(content, "the file", ("format", "name", "frames", "bodies"), ("frames",))
         if content["format"] != FORMAT:
             raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
         frames = content.get("frames")
@@ -83,11 +85,11 @@ def read_conditions(path: str | os.PathLike) -> Condition:
 
 def _body(entry: Any, where: str) -> BodyCondition:
     optional = ("velocity", "angular_velocity", "shift", "shape")
-    scenes._keys(entry, where, ("of", *optional), optional)
+    check_keys(entry, where, ("of", *optional), optional)
     if isinstance(entry["of"], bool) or not isinstance(entry["of"], int | str):
         raise UserError(f"{where}.of must be the number or the name of a scene, got {entry['of']!r}")
-    vectors = {key: scenes._vector(entry[key], f"{where}.{key}") for key in optional[:3] if key in entry}
-    shape = scenes._body(entry["shape"], None) if "shape" in entry else None
+    vectors = {key: vector(entry[key], f"{where}.{key}") for key in optional[:3] if key in entry}
+    shape = scenes.body_from_dict(entry["shape"], None) if "shape" in entry else None
     return BodyCondition(entry["of"], **vectors, shape=shape)
 
 

@@ -7,6 +7,7 @@ import yaml
 
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.bodies import shapes
+from neuido.data.files.parsing import read_yaml
 from neuido.errors import UserError
 from neuido.physics.laws.classical import material
 from neuido.types import AttachedMass, Box, Plane, Scene, Walls
@@ -36,7 +37,7 @@ GRID = {"grid": 32, "dt": 5.0e-4}
 
 
 def text(name: str) -> dict:
-    return scenes.read_yaml(scenes._folder() / f"{name}.yaml")
+    return read_yaml(scenes.scenes_folder() / f"{name}.yaml")
 
 
 def test_there_is_a_file_for_each_body():
@@ -201,7 +202,7 @@ def test_missing_things(tmp_path, monkeypatch):
 def test_numbers_with_exponents(tmp_path):
     path = tmp_path / "numbers.yaml"
     path.write_text("a: [1e5, 1.0e5, 5.0e-4, 1.0e+5, -2E3, 1e, e5, 12, 0x10]")
-    assert scenes.read_yaml(path)["a"] == [1e5, 1e5, 5e-4, 1e5, -2e3, "1e", "e5", 12, 16]
+    assert read_yaml(path)["a"] == [1e5, 1e5, 5e-4, 1e5, -2e3, "1e", "e5", 12, 16]
 
 
 @pytest.mark.parametrize("jitter", [0.5, 1.0])

@@ -150,7 +150,7 @@ def test_scene_to_dict():
         ("box: [[0.3, 0.3, 0.3], [0.7, 0.35, 0.7]]", "box: [[0, 0, 0], [0.1, 0.1, 0.1]]", r"clamps\[0\].box = .* picks no particle"),
         ("domain: [[0, 0, 0], [1, 1, 1]]", "domain: [[0, 0, 0], [0.5, 1, 1]]", "particles of x0 lie outside scene.domain"),
         ("scene:\n", "scene: [\n", "is not valid YAML"),
-        ("density: 1000.0", f"density: {10**400}", "a number is too large"),
+        ("density: 1000.0", f"density: {10**400}", "must be a finite number, got one that is too large"),
         ("noise: 0.0005", f"noise: {10**400}", "noise must be a finite number"),
         ("law: fixed_corotated", "law: [sigma]", "model.elasticity.law must be text"),
     ],

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from neuido.data.bodies import scene_files as scenes
+from neuido.data.files.parsing import read_yaml
 from neuido.data.scenes.filmed_scene import Motion, Placing, Setting, read_motion, read_setting, read_truth, write_motion, write_setting
 from neuido.data.scenes.synthetic import JELLY
 from neuido.errors import UserError
@@ -90,4 +91,4 @@ def test_an_experiment_file_is_a_setting_too(data_root):
     with pytest.raises(UserError, match="0 recordings with images"):
         read_setting(path)
     take = read_setting(path, recording="take1") if (path.parent / "take1").is_dir() else None
-    assert take is None or take.scene == scenes.scene_from_dict(*(scenes.read_yaml(path)[key] for key in ("scene", "discretisation")))
+    assert take is None or take.scene == scenes.scene_from_dict(*(read_yaml(path)[key] for key in ("scene", "discretisation")))

@@ -15,6 +15,7 @@ import torch
 from neuido.commands.simulate import simulate
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.cameras import project
+from neuido.data.files.parsing import read_yaml
 from neuido.data.measured.experiment import read_experiment
 from neuido.data.scenes import filmed_scene as visual
 from neuido.data.scenes import synthetic
@@ -69,7 +70,7 @@ def test_truth_is_the_simulation(ball):
     assert truth.x.shape[0] == 5 and truth.times.tolist() == pytest.approx([0, 0.02, 0.04, 0.06, 0.08])
     assert float(truth.volume.sum()) == pytest.approx(4 / 3 * np.pi * 0.2**3, rel=1e-5)
     motion = visual.read_motion(ball)
-    body = scenes._body(BALL["body"], None)
+    body = scenes.body_from_dict(BALL["body"], None)
     spin = torch.tensor(motion.angular_velocity)
     v = torch.tensor(motion.velocity) + torch.linalg.cross(spin.expand_as(body.x), body.x - torch.tensor(motion.centre))
     scene = scenes.scene_from_dict(BALL["scene"], BALL["discretisation"])
@@ -97,7 +98,7 @@ def test_images_show_the_particles(ball):
 
 
 def test_gaussians_follow_a_deformation():
-    body = scenes._body(BALL["body"], None)
+    body = scenes.body_from_dict(BALL["body"], None)
     dense = synthetic.dress(body, 3, seed="a")
     F = torch.tensor([[1.2, 0.3, 0.0], [0.0, 0.9, 0.0], [0.1, 0.0, 1.0]])
     means, covariances = dense.at((body.x @ F.T)[None], F.expand(1, len(body.x), 3, 3))
@@ -152,7 +153,7 @@ def test_killed_run_goes_on(ball, tmp_path):
 def test_lists_of_scenes(name, request):
     import neuido
 
-    content = scenes.read_yaml(neuido.configs_root() / "scenes" / f"{name}.yaml")
+    content = read_yaml(neuido.configs_root() / "scenes" / f"{name}.yaml")
     root = None if name.endswith("small") else request.getfixturevalue("data_root")
     film = Film(**{key: tuple(value) if isinstance(value, list) else value for key, value in content["film"].items()})
     plans = [plan_scene(entry, film, data_root=root) for entry in content["scenes"]]
@@ -203,7 +204,7 @@ def test_velocity_of_a_body_is_read_off():
     plan = plan_scene(given, FILM)
     assert plan.motion.velocity == pytest.approx((0.0, -1.0, 0.5), abs=1e-5)
     assert plan.motion.angular_velocity == pytest.approx((1.0, 0.0, -2.0), abs=1e-5)
-    torch.testing.assert_close(plan.body.v, scenes._body(given["body"], None).v, rtol=0, atol=1e-4)
+    torch.testing.assert_close(plan.body.v, scenes.body_from_dict(given["body"], None).v, rtol=0, atol=1e-4)
 
 
 def test_preview(ball):

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neuido.data.files.run_folder import status_of
 from neuido.data.files.score_tables import folder_of, read_rows
+from neuido.data.files.sweep_run import status_of
 from neuido.errors import UserError
 
 

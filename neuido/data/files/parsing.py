@@ -1,0 +1,266 @@
+"""Readers of untrusted files: JSON, YAML, CSV, NumPy archives and images.
+
+Each reader turns every failure of its parser into one line that names the file, and checks a size before it allocates memory.
+`LIMITS` has the sizes; an environment variable of the same name raises one of them.
+"""
+
+import contextlib
+import csv
+import json
+import math
+import os
+import re
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from neuido.errors import UserError
+
+LIMITS = {
+    "NEUIDO_MAX_TEXT_BYTES": 1 << 29,
+    "NEUIDO_MAX_YAML_NODES": 1_000_000,
+    "NEUIDO_MAX_ARRAY_ELEMENTS": 1 << 31,
+    "NEUIDO_MAX_IMAGE_PIXELS": 1 << 27,
+    "NEUIDO_MAX_PARTICLES": 20_000_000,
+}
+"""The largest bytes of a text file, nodes of a YAML file, elements of an array, pixels of an image, particles of a body or a PLY file."""
+
+
+def limit(name: str) -> int:
+    """Return a limit of `LIMITS`, or the environment variable of this name.
+
+    Raises:
+        UserError: The variable holds no positive whole number.
+    """
+    given = os.environ.get(name, "").strip()
+    if not given:
+        return LIMITS[name]
+    if not re.fullmatch(r"[0-9]{1,18}", given) or int(given) < 1:
+        raise UserError(f"the environment variable {name} must be a positive whole number, got {given!r}")
+    return int(given)
+
+
+def check_limit(count: int, name: str, what: str) -> None:
+    """Refuse a size above a limit.
+
+    Args:
+        count: The size.
+        name: A key of `LIMITS`.
+        what: What has that size, the beginning of the error.
+
+    Raises:
+        UserError: The size is too large; the message names the variable that raises the limit.
+    """
+    if count > limit(name):
+        raise UserError(f"{what}, more than {limit(name)}: set the environment variable {name} to read it all the same")
+
+
+@contextlib.contextmanager
+def parser_errors(path: str | os.PathLike, what: str) -> Iterator[None]:
+    """Turn any exception of a parser into a `UserError` of one line: the file, what it should be, and why it is not."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:  # parsers raise what their authors did not think of: zlib.error, TokenError, RecursionError, ...
+        raise UserError(f"{path} is no {what}: {one_line(error)}") from error
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an exception as one short line; its type where it has no message."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror.lower()
+    text = " ".join(str(error).split())
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(error, MemoryError):
+        return "it needs more memory than there is"
+    return text[:300] if text else type(error).__name__
+
+
+def read_text(path: str | os.PathLike, failure: str = "is not text in UTF-8") -> str:
+    """Return the content of a UTF-8 file, with or without a byte order mark.
+
+    Args:
+        path: The file.
+        failure: What the error says of a file that is not text.
+
+    Raises:
+        UserError: The file is missing, too large, or not UTF-8.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path} is missing" if not path.exists() else f"{path} is no file")
+    try:
+        check_limit(path.stat().st_size, "NEUIDO_MAX_TEXT_BYTES", f"{path} has {path.stat().st_size} bytes")
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} {failure}: {one_line(error)}") from error
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        UserError: The file is missing or is not JSON.
+    """
+    text = read_text(path, "is not valid JSON")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not valid JSON: {one_line(error)}") from error
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader that reads 1e5 as a number; PyYAML follows YAML 1.1, where it is text."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$"),
+    list("-+0123456789."),
+)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return the mapping in a YAML file; 1e5 and 1.0e5 are numbers, as YAML 1.2 has them.
+
+    Raises:
+        UserError: The file is missing, not valid YAML, not a mapping, or its aliases expand to too many values.
+    """
+    text = read_text(path, "is not valid YAML")
+    try:
+        loader = _Loader(text)
+        try:
+            root = loader.get_single_node()
+            check_limit(_expanded(root, {}), "NEUIDO_MAX_YAML_NODES", f"{path}: its aliases expand to too many values")
+            content = loader.construct_document(root) if root is not None else None
+        finally:
+            loader.dispose()
+    except UserError:
+        raise
+    except Exception as error:  # YAMLError; ValueError of a date or a huge integer; RecursionError; TypeError of a key
+        raise UserError(f"{path} is not valid YAML: {one_line(error)}") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path} holds no mapping of keys to values")
+    return content
+
+
+def _expanded(node: yaml.Node | None, sizes: dict[int, int]) -> int:
+    """Count the values below a node, those behind aliases each time that they are named."""
+    if node is None or isinstance(node, yaml.ScalarNode):
+        return 1
+    if id(node) in sizes:
+        if sizes[id(node)] == 0:
+            raise ValueError(f"an alias refers to what holds it, line {node.start_mark.line + 1}")
+        return sizes[id(node)]
+    sizes[id(node)] = 0
+    children = (part for pair in node.value for part in pair) if isinstance(node, yaml.MappingNode) else iter(node.value)
+    sizes[id(node)] = total = 1 + sum(_expanded(child, sizes) for child in children)
+    return total
+
+
+def read_table(path: Path) -> list[list[str]]:
+    """Return the rows of a CSV file that are not empty, the header first.
+
+    Raises:
+        UserError: The file is missing, or no CSV.
+    """
+    text = read_text(path, "is no CSV file")
+    try:
+        return [row for row in csv.reader(text.splitlines(keepends=True), strict=True) if row]
+    except (csv.Error, ValueError) as error:
+        raise UserError(f"{path} is no CSV file: {one_line(error)}") from error
+
+
+def read_arrays(
+    path: str | os.PathLike, needed: Iterable[str], optional: Iterable[str] = (), *, what: str = "", others: bool = True
+) -> dict[str, np.ndarray]:
+    """Return arrays of a NumPy archive (.npz); pickled objects are refused.
+
+    Args:
+        path: The file.
+        needed: Names of arrays that must be there.
+        optional: Names of arrays that may be there.
+        what: What the file should be, for the error; by default an archive of the needed arrays.
+        others: Whether arrays of other names are ignored; else they are refused.
+
+    Raises:
+        UserError: The file is missing, damaged or too large, or lacks an array.
+    """
+    path, needed, optional = Path(path), tuple(needed), tuple(optional)
+    what = what or f"archive of {', '.join(needed)}"
+    if not path.is_file():
+        raise UserError(f"{path} is missing")
+    with parser_errors(path, what), zipfile.ZipFile(path) as archive:
+        members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+        if not others and (unknown := sorted(set(members) - {*needed, *optional})):
+            raise UserError(f"{path}: unknown array {unknown[0]!r}; it takes {', '.join((*needed, *optional))}")
+        if missing := [name for name in needed if name not in members]:
+            raise UserError(f"{path} is no {what}: it lacks the array {missing[0]!r}; it has {', '.join(sorted(members)[:20]) or 'none'}")
+        return {name: _read_array(archive, members[name], path, what) for name in (*needed, *optional) if name in members}
+
+
+def _read_array(archive: zipfile.ZipFile, member: str, path: Path, what: str) -> np.ndarray:
+    with archive.open(member) as stream:
+        version = np.lib.format.read_magic(stream)
+        if version not in ((1, 0), (2, 0)):
+            raise UserError(f"{path}: {member} has the .npy version {version}, which is not read")
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = header(stream)
+    if dtype.kind not in "biufU":
+        raise UserError(f"{path} is no {what}: {member} holds values of the kind {dtype}, no plain numbers")
+    check_limit(math.prod(shape), "NEUIDO_MAX_ARRAY_ELEMENTS", f"{path}: {member} has {math.prod(shape)} elements")
+    with archive.open(member) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _size_in_header(path: Path) -> tuple[int, int] | None:
+    """Return width and height [px] from an image's header, none where Pillow does not know the format; refuse what is too large."""
+    from PIL import Image
+
+    if not path.is_file():
+        raise UserError(f"the image {path} is missing")
+    name = "NEUIDO_MAX_IMAGE_PIXELS"
+    try:
+        with Image.open(path) as image:
+            size = image.size
+    except Image.DecompressionBombError as error:
+        if limit(name) <= 2 * (Image.MAX_IMAGE_PIXELS or 0):
+            raise UserError(f"{path} has more than {limit(name)} pixels: set the environment variable {name} to read it") from error
+        return None
+    except Exception:  # a damaged header; OpenCV decides
+        return None
+    check_limit(size[0] * size[1], name, f"{path} has {size[0]} x {size[1]} pixels")
+    return size
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return width and height [px] of an image file, from its header where that is possible.
+
+    Raises:
+        UserError: The file is missing, no image, or too large.
+    """
+    return _size_in_header(path) or read_image(path).shape[1::-1]  # type: ignore[return-value]
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Return an image (H, W) or (H, W, C) of 8 or 16 bits as stored: BGR or BGRA, without EXIF rotation.
+
+    Raises:
+        UserError: The file is missing, no image that OpenCV can read, of another depth, or too large.
+    """
+    import cv2
+
+    _size_in_header(path)
+    try:
+        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise UserError(f"{path} is no image that OpenCV can read: {one_line(error)}") from error
+    if raw is None or raw.dtype not in (np.uint8, np.uint16):
+        raise UserError(f"{path} is missing or no image of 8 or 16 bits that OpenCV can read")
+    return raw
