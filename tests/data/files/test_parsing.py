@@ -132,7 +132,15 @@ def test_images(tmp_path):
     assert image_size(path) == (5, 3) and read_image(path).shape == (3, 5, 4)
     header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
     chunk = b"IHDR" + header
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk)))
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + struct.pack(">I", 13)
+        + chunk
+        + struct.pack(">I", zlib.crc32(chunk))
+        + struct.pack(">I", 9)
+        + b"IDAT"
+        + bytes(13)
+    )
     for call in (image_size, read_image):
         refused(call, path, "has more than 134217728 pixels: set the environment variable NEUIDO_MAX_IMAGE_PIXELS")
     path.write_bytes(io.BytesIO(b"no image").getvalue())
