@@ -158,6 +158,6 @@ def _load(path: str) -> tuple[Any, Any]:
     return _loaded(str(file), file.stat().st_mtime_ns)
 
 
-@cached(most=4)
+@cached(limit=4)
 def _loaded(path: str, changed: int) -> tuple[Any, Any]:
     return load_law(path)

@@ -26,9 +26,9 @@ from neuido.physics.effects import stress_kernels as effect_kernels
 from neuido.physics.effects.library import KNOTS
 from neuido.physics.fem.meshing import follow
 from neuido.physics.laws import classical_kernels as law_kernels
-from neuido.physics.mpm.threads import one_thread_each, pool
 from neuido.physics.runtime.device import real_of
 from neuido.physics.runtime.once import cached
+from neuido.physics.runtime.threads import one_thread_each, scene_pool
 
 POISSON = 0.0, 0.495
 """What the simulators take: waves grow without bound towards 0.5."""
@@ -313,7 +313,7 @@ def _workers() -> ThreadPoolExecutor:
     """Threads for single scenes; what they launch is built before, for two threads must not build the same kernels."""
     for build in (effect_kernels.build, law_kernels.kernels):
         build(real_of(torch.float32))
-    return pool()
+    return scene_pool()
 
 
 def _halves(runs: Sequence[Run]) -> list[list[Run]]:

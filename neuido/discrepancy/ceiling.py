@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.floors import Part
-from neuido.physics.mpm.threads import one_thread_each
+from neuido.physics.runtime.threads import one_thread_each
 
 WIDTH = 32
 ROWS = 12_000

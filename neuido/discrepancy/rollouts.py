@@ -320,8 +320,8 @@ class BodyRollouts(Problem):
             elements = FiniteElements(scenes, bodies, density=density, device=device, meshes=meshes)
             declared = [self._full({})] * len(scenes)
             effects = self._effects(elements, declared, [n for n in recordings for _ in range(count)], ())
-            needed = elements.most_inner / elements.step_margin(1, *self.laws(declared), effects=effects)
-            elements.most_inner = min(math.ceil(AFFORDED * max(needed, 1.0)), elements.most_inner)
+            needed = elements.max_inner_steps / elements.step_margin(1, *self.laws(declared), effects=effects)
+            elements.max_inner_steps = min(math.ceil(AFFORDED * max(needed, 1.0)), elements.max_inner_steps)
             return elements
         return Simulator(scenes, bodies, density=density, device=device)
 

@@ -38,7 +38,7 @@ def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "
     if not chosen:
         raise UserError(f"parts = {parts!r} names none: choose from {', '.join(PARTS)}")
 
-    from neuido.physics.mpm.threads import one_thread_each
+    from neuido.physics.runtime.threads import one_thread_each
 
     folder, sections = Path(out), []
     with one_thread_each():

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics.mpm.grid import CONTACTS
+from neuido.physics.colliders.contact import CONTACTS
 from neuido.types import Box, Plane, Scene
 
 NEAR = 1e-4

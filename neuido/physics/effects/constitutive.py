@@ -13,8 +13,9 @@ from neuido.physics.effects import coefficients as effect_tables
 from neuido.physics.effects.coefficients import DRUCKER_PRAGER, VON_MISES
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
-from neuido.physics.laws.classical_kernels import FLOOR, LOCKED
+from neuido.physics.laws.classical_kernels import LOCKED
 from neuido.physics.linalg import decompositions as linalg
+from neuido.physics.linalg.warp_functions import FLOOR
 from neuido.types import Particles
 
 

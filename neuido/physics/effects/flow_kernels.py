@@ -14,6 +14,7 @@ import warp as wp
 from neuido.physics.effects.history_functions import tools
 from neuido.physics.laws import classical_kernels as law_kernels
 from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg.warp_functions import GAP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
@@ -39,7 +40,7 @@ def build(real: type) -> SimpleNamespace:
     one = wp.constant(real(1.0))
     two = wp.constant(real(2.0))
     three = wp.constant(real(3.0))
-    gap = wp.constant(real(law_kernels.GAP))
+    gap = wp.constant(real(GAP))
     MISES = wp.constant(law_kernels.VON_MISES)
     CONE = wp.constant(law_kernels.DRUCKER_PRAGER)
 

@@ -11,8 +11,9 @@ import warp as wp
 
 from neuido.physics.effects import history_kernels
 from neuido.physics.effects.history_functions import tools
-from neuido.physics.laws.classical_kernels import GAP, LOCKED
+from neuido.physics.laws.classical_kernels import LOCKED
 from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg.warp_functions import GAP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 

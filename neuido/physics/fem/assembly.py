@@ -4,31 +4,50 @@ Order of an inner step as in the material point method: stress of F, nodal force
 its plastic correction and the history.
 """
 
-from collections.abc import Hashable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from neuido.physics.colliders.tables import NEAR, corners
+from neuido.physics.colliders.tables import NEAR, ColliderTable, corners
 from neuido.physics.effects.coefficients import Tables
-from neuido.physics.fem import element_loop
-from neuido.physics.fem.element_loop import Fields, Loop
 from neuido.physics.fem.meshing import Mesh, follow, locate, steepest
-from neuido.physics.laws.base import ElasticLaw, Law, PlasticLaw
-from neuido.types import Particles, ParticleState
+from neuido.types import Particles, ParticleState, Scene
 
-if TYPE_CHECKING:
-    from neuido.physics.fem.finite_elements import FiniteElements
-
-
-CAPACITY = 8
-"""Captured loops that an assembly keeps; each holds its memory."""
 DENSE = 3.0
 """Times the median density above which a particle's mass counts as attached to the body."""
 
 
-class Piece(NamedTuple):
+@dataclass(frozen=True)
+class SolverArrays:
+    """What all assemblies of a solver share: scenes, particles and how the elements are computed."""
+
+    scenes: tuple[Scene, ...]
+    device: torch.device
+    dtype: torch.dtype
+    kernels: SimpleNamespace
+    """Of `element_kernels.build`."""
+    smoothing: str
+    """`none` or `nodal`."""
+    colliders: ColliderTable
+    particles: Particles
+    state: ParticleState
+    """The start of the particles."""
+    volume: Tensor
+    """Of the particles [m^3], (P,)."""
+    held: Tensor
+    """Particles in a clamp, (P,) bool."""
+
+    @property
+    def scene_count(self) -> int:
+        """The number of scenes S."""
+        return len(self.scenes)
+
+
+class BodyMesh(NamedTuple):
     """The mesh of one body with its ties to the particles; tensors of the solver's type and device."""
 
     nodes: Tensor
@@ -49,24 +68,7 @@ class Piece(NamedTuple):
     """Of each element, `meshing.steepest` [1/m^2], (E,) float64."""
 
 
-class Inputs(NamedTuple):
-    """What a rollout of some scenes reads, their rows alone."""
-
-    state: ParticleState
-    mass: Tensor
-    pull: Tensor
-    """(1 or T, S, 3), T over the inner steps."""
-    force: Tensor
-    friction: Tensor
-    viscosity: Tensor | None
-    tables: Tables | None
-    stiffness: Tensor | None
-    growth: Tensor | None
-    dt: Tensor
-    """Inner step of each scene [s], (S,)."""
-
-
-def piece_of(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype: torch.dtype) -> Piece:
+def body_mesh(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype: torch.dtype) -> BodyMesh:
     """The ties of a mesh to the particles x (P, 3) of the given volumes (P,)."""
     nodes, own = mesh.nodes, mesh.volume
     element_of, weights = locate(mesh, x)
@@ -77,7 +79,7 @@ def piece_of(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype:
     def real(t: Tensor) -> Tensor:
         return t.to(device, dtype)
 
-    return Piece(
+    return BodyMesh(
         real(nodes),
         mesh.elements.to(device),
         real(own * (volume.sum() / own.sum())),
@@ -92,35 +94,34 @@ def piece_of(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype:
 class Assembly:
     """Scenes a to b - 1 of a solver in one set of arrays."""
 
-    def __init__(self, solver: "FiniteElements", pieces: Sequence[Piece], a: int, b: int) -> None:
-        self.solver, self.pieces, self.a, self.b = solver, tuple(pieces), a, b
+    def __init__(self, solver: SolverArrays, meshes: Sequence[BodyMesh], a: int, b: int) -> None:
+        self.solver, self.meshes, self.a, self.b = solver, tuple(meshes), a, b
         device = solver.device
-        nodes = [len(p.nodes) for p in pieces]
-        elements = [len(p.elements) for p in pieces]
-        shift = [sum(nodes[:s]) for s in range(len(pieces))]
-        self.nodes = torch.cat([p.nodes for p in pieces]).contiguous()
-        index = torch.cat([p.elements + n for p, n in zip(pieces, shift)])
+        nodes = [len(p.nodes) for p in meshes]
+        elements = [len(p.elements) for p in meshes]
+        shift = [sum(nodes[:s]) for s in range(len(meshes))]
+        self.nodes = torch.cat([p.nodes for p in meshes]).contiguous()
+        index = torch.cat([p.elements + n for p, n in zip(meshes, shift)])
         self.elements = index.to(torch.int32).contiguous()
-        self.volume = torch.cat([p.volume for p in pieces]).contiguous()
-        scenes = torch.arange(len(pieces), dtype=torch.int32)
+        self.volume = torch.cat([p.volume for p in meshes]).contiguous()
+        scenes = torch.arange(len(meshes), dtype=torch.int32)
         self.node_scene = scenes.repeat_interleave(torch.tensor(nodes)).to(device)
         self.particles = Particles(
-            scenes.repeat_interleave(torch.tensor(elements)).to(device), tuple(sum(elements[:s]) for s in range(len(pieces) + 1))
+            scenes.repeat_interleave(torch.tensor(elements)).to(device), tuple(sum(elements[:s]) for s in range(len(meshes) + 1))
         )
         first = solver.particles.offsets[a]
-        start = [solver.particles.offsets[a + s] - first for s in range(len(pieces))]
-        self.element_of = torch.cat([p.element_of + sum(elements[:s]) for s, p in enumerate(pieces)])
+        start = [solver.particles.offsets[a + s] - first for s in range(len(meshes))]
+        self.element_of = torch.cat([p.element_of + sum(elements[:s]) for s, p in enumerate(meshes)])
         self.corners = index[self.element_of]
-        self.weights = torch.cat([p.weights for p in pieces])
-        self.to_nodes = tuple(torch.cat([p.to_nodes[i] + (start[s] if i == 0 else 0) for s, p in enumerate(pieces)]) for i in (0, 1))
-        self.to_elements = tuple(torch.cat([p.to_elements[i] + (start[s] if i == 0 else 0) for s, p in enumerate(pieces)]) for i in (0, 1))
+        self.weights = torch.cat([p.weights for p in meshes])
+        self.to_nodes = tuple(torch.cat([p.to_nodes[i] + (start[s] if i == 0 else 0) for s, p in enumerate(meshes)]) for i in (0, 1))
+        self.to_elements = tuple(torch.cat([p.to_elements[i] + (start[s] if i == 0 else 0) for s, p in enumerate(meshes)]) for i in (0, 1))
         order = torch.argsort(index.reshape(-1), stable=True)
         self.corner = order.to(torch.int32).contiguous()
         counts = torch.bincount(index.reshape(-1), minlength=len(self.nodes))
         self.first = torch.cat([counts.new_zeros(1), counts.cumsum(0)]).to(torch.int32).contiguous()
         own = slice(first, solver.particles.offsets[b])
         self.x0 = solver.state.x[own]
-        self.loops: dict[Hashable, Loop] = {}
         self.last: tuple[ParticleState, Tensor, Tensor, Tensor, Tensor] | None = None
         self.held = self._held(solver.held[own]).to(torch.uint8)
         self.particle_volume = solver.volume[own]
@@ -177,7 +178,7 @@ class Assembly:
         """Positions and velocities of the nodes, C and F of the elements, for a state of the particles.
 
         Only the difference from a known start is interpolated: from the end of the last rollout where the particles are still there
-        (so that a motion may be run in pieces), else from the body as loaded.
+        (so that a motion may be run in meshes), else from the body as loaded.
         """
         index, weight = self.to_nodes
         around, mean = self.to_elements
@@ -195,82 +196,12 @@ class Assembly:
                 return x + at_nodes(change.x), v + at_nodes(change.v), C + at_elements(change.C), F + at_elements(change.F)
         return self.nodes + at_nodes(state.x - self.x0), at_nodes(state.v), at_elements(state.C), at_elements(state.F)
 
-    def run(
-        self,
-        steps: int,
-        every: int,
-        inner: int,
-        elasticity: ElasticLaw,
-        plasticity: PlasticLaw | None,
-        given: Inputs,
-        frames: ParticleState,
-    ) -> None:
-        """Fill the frames; launches alone but for the frames."""
-        count = every * inner
-        if plasticity is not None and (plasticity.identity or (given.tables is not None and given.tables.flow is not None)):
-            plasticity = None
-        x, v, C, F = self.start(given.state)
-        v = torch.where(self.held.bool()[:, None], 0.0, v)
-        fields = self._fields(given, count)
-        laws = [self._rows(law) for law in (elasticity, plasticity) if law is not None]
-        loop = self._loop(elasticity, plasticity, given.tables, fields, laws, count)
-        loop.begin((x, v, C, F), fields, laws)
-        self._frame(frames, 0, *loop.state)
-        for k in range(steps // every):
-            own = slice(k * count, (k + 1) * count)
-            loop.advance(given.pull[own] if len(given.pull) > 1 else None, None if given.growth is None else given.growth[own])
-            self._frame(frames, k + 1, *loop.state)
-        self.last = (ParticleState(*(t[-1].clone() for t in frames)), *(t.clone() for t in loop.state))
-
-    def _rows(self, law: Law) -> list[Tensor]:
-        """The tensors of a law, those of these scenes alone."""
-        tensors = [t.detach().to(self.solver.device, self.solver.dtype) for t in law.tensors()]
-        return [t if len(t) == 1 or not self._alone else t[self.a : self.b] for t in tensors]
-
     @property
-    def _alone(self) -> bool:
+    def is_part(self) -> bool:
+        """Whether the solver has scenes beside these."""
         return self.b - self.a < self.solver.scene_count
 
-    def _fields(self, given: Inputs, count: int) -> Fields:
-        """What the first of the intervals reads."""
-        stiffness = None
-        if given.stiffness is not None:
-            index, weight = self.to_elements
-            stiffness = torch.einsum("ek,ek->e", weight, given.stiffness[index].log()).exp()
-        tables = given.tables
-        return Fields(
-            self.node_mass(given.mass),
-            given.force,
-            given.friction,
-            given.dt,
-            given.pull[:count],
-            None if given.growth is None else given.growth[:count],
-            given.viscosity,
-            stiffness,
-            *((None,) * 3 if tables is None else (tables.material, tables.branches, tables.flow)),
-        )
-
-    def _loop(
-        self,
-        elasticity: ElasticLaw,
-        plasticity: PlasticLaw | None,
-        tables: Tables | None,
-        fields: Fields,
-        laws: Sequence[Sequence[Tensor]],
-        count: int,
-    ) -> Loop:
-        """A loop for these launches; those that are captured are kept, the least recently used dropped first."""
-        elastic: Law = elasticity.alone(self.a) if self._alone else elasticity
-        plastic: Law | None = plasticity.alone(self.a) if self._alone and plasticity is not None else plasticity
-        own = element_loop.key(elastic, plastic, tables, fields, laws, count) if self.solver.graphs else None
-        loop = self.loops.pop(own, None) or Loop(self, elastic, plastic, tables, fields, laws, count, own is not None)
-        if own is not None:
-            while len(self.loops) >= CAPACITY:
-                self.loops.pop(next(iter(self.loops)))
-            self.loops[own] = loop
-        return loop
-
-    def _frame(self, frames: ParticleState, n: int, x: Tensor, v: Tensor, C: Tensor, F: Tensor) -> None:
+    def frame(self, frames: ParticleState, n: int, x: Tensor, v: Tensor, C: Tensor, F: Tensor) -> None:
         for out, t in ((frames.x, x), (frames.v, v)):
             out[n] = torch.einsum("pk,pkc->pc", self.weights, t[self.corners])
         for out, t in ((frames.C, C), (frames.F, F)):

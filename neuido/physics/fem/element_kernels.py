@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from neuido.physics.colliders import contact as contact_functions
 from neuido.physics.mpm import grid as grid_kernels
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
@@ -26,7 +27,9 @@ def build(real: type) -> SimpleNamespace:
     func = functools.partial(wp.func, module=module)
     kernel = functools.partial(wp.kernel, module=module, enable_backward=False)
     grid = grid_kernels.build(real)
-    push, contact, lose = grid.functions.push, grid.functions.contact, grid.functions.lose
+    push = grid.functions.push
+    met = contact_functions.functions(real, module)
+    contact, lose = met.contact, met.lose
     zero = wp.constant(real(0.0))
 
     @func

@@ -5,20 +5,18 @@ length. What changes from one interval to the next (pulls and growth over time) 
 """
 
 from collections.abc import Hashable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from neuido.physics.effects import stress_kernels as effect_kernels
 from neuido.physics.effects.coefficients import Layout, Tables
+from neuido.physics.fem.assembly import Assembly
 from neuido.physics.laws.base import ElasticLaw, Engine, Law, PlasticLaw
 from neuido.physics.mpm.graphs import capture
 from neuido.physics.runtime.device import launch, real_of, torch_stream
 from neuido.physics.runtime.launches import Stretches
-
-if TYPE_CHECKING:
-    from neuido.physics.fem.assembly import Assembly
 
 
 class Fields(NamedTuple):
@@ -62,7 +60,7 @@ class Loop:
 
     def __init__(
         self,
-        assembly: "Assembly",
+        assembly: Assembly,
         elasticity: ElasticLaw,
         plasticity: PlasticLaw | None,
         tables: Tables | None,

@@ -15,19 +15,20 @@ from torch import Tensor
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.fem import element_kernels
-from neuido.physics.fem.assembly import Assembly, Inputs, Piece, piece_of
+from neuido.physics.fem.assembly import Assembly, BodyMesh, SolverArrays, body_mesh
+from neuido.physics.fem.assembly_rollout import AssemblyRollout, Inputs
 from neuido.physics.fem.meshing import Mesh, mesh_body
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm import inputs
 from neuido.physics.mpm.simulator import Simulator
-from neuido.physics.mpm.threads import one_thread_each, pool
 from neuido.physics.runtime.device import real_of
-from neuido.physics.runtime.invalidation import spoil
+from neuido.physics.runtime.invalidation import invalidate
+from neuido.physics.runtime.threads import one_thread_each, scene_pool
 from neuido.types import Body, ParticleState, Scene
 
 SAFETY = 0.5
 """Inner step over the stable step of the undeformed mesh: elements get thinner while a body is pressed."""
-MOST_INNER = 2000
+MAX_INNER_STEPS = 2000
 """Inner steps a step, at the most, where nothing else is said."""
 
 
@@ -38,7 +39,7 @@ class FiniteElements:
         scenes: One scene or a list of them; the grid (`cells`) plays no part.
         bodies: As many bodies.
         density: [kg/m^3], one number or one for each scene.
-        device: Where it runs.
+        device: `auto` (CUDA where there is one), `cpu`, `cuda`, or a `torch.device`.
         dtype: `torch.float32` for work, `torch.float64` for checks.
         threads: On the CPU, run several scenes in as many threads as there are cores.
         graphs: On CUDA, capture the launches between two frames once for each shape and replay them after.
@@ -47,7 +48,7 @@ class FiniteElements:
         smoothing: `none`, or `nodal`: the volume change of an element is the mean of its nodes' means, against the locking of
             nearly incompressible bodies (average nodal pressure, Bonet and Burton 1998).
         meshes: Meshes in place of the ones made here, one a body or one for all.
-        most_inner: Inner steps a step, at the most; what needs more is an error.
+        max_inner_steps: Inner steps a step, at the most; what needs more is an error.
 
     Raises:
         UserError: As `mpm.Simulator`, and a body that cannot be meshed.
@@ -66,7 +67,7 @@ class FiniteElements:
         bodies: Body | Sequence[Body],
         *,
         density: float | Sequence[float] = 1000.0,
-        device: str | torch.device = "cpu",
+        device: str | torch.device = "auto",
         dtype: torch.dtype = torch.float32,
         threads: bool = True,
         graphs: bool = True,
@@ -74,7 +75,7 @@ class FiniteElements:
         tetrahedra: int = 5,
         smoothing: Literal["none", "nodal"] = "none",
         meshes: Mesh | Sequence[Mesh] | None = None,
-        most_inner: int = MOST_INNER,
+        max_inner_steps: int = MAX_INNER_STEPS,
     ) -> None:
         if smoothing not in ("none", "nodal"):
             raise UserError(f"smoothing is {smoothing!r}; choose none or nodal")
@@ -82,16 +83,16 @@ class FiniteElements:
         self.scenes, self.device, self.dtype, self.smoothing = loaded.scenes, loaded.device, loaded.dtype, smoothing
         self.particles, self.state, self.mass, self.volume = loaded.particles, loaded.state, loaded.mass, loaded.volume
         self.dt, self.gravity, self.colliders = loaded.dt, loaded.gravity, loaded.colliders
-        self.graphs, self.most_inner = graphs and self.device.type == "cuda", most_inner
-        self.held = loaded.held.bool()
+        self.graphs, self.max_inner_steps = graphs and self.device.type == "cuda", max_inner_steps
+        self.held = loaded.setup.held.bool()
         self.kernels = element_kernels.build(real_of(dtype))
         bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
         if meshes is not None:
             meshes = (meshes,) * len(bodies) if isinstance(meshes, Mesh) else tuple(meshes)
             if len(meshes) != len(bodies):
                 raise UserError(f"{len(meshes)} meshes for {len(bodies)} bodies; give one mesh a body, or one for all")
-        made: dict[tuple[int, ...], tuple[Mesh, Piece]] = {}
-        pieces = []
+        made: dict[tuple[int, ...], tuple[Mesh, BodyMesh]] = {}
+        tied_meshes = []
         self.meshes: tuple[Mesh, ...] = ()
         self.sizes: list[float] = []
         for s, body in enumerate(bodies):
@@ -100,20 +101,30 @@ class FiniteElements:
             if key not in made:
                 x, volume = torch.as_tensor(body.x).double().cpu(), torch.as_tensor(body.volume).double().cpu()
                 mesh = mesh_body(x, volume, elements=elements, kind=tetrahedra) if given is None else given
-                made[key] = (mesh, piece_of(mesh, x, volume, self.device, self.dtype))
-            mesh, piece = made[key]
+                made[key] = (mesh, body_mesh(mesh, x, volume, self.device, self.dtype))
+            mesh, tied = made[key]
             self.meshes += (mesh,)
             self.sizes.append(self.sizes[-1] if s and mesh is self.meshes[-2] else _size(mesh))
-            pieces.append(piece)
+            tied_meshes.append(tied)
         # on the CPU a scene is an assembly of its own, which a thread runs; on a GPU all scenes share their launches
         count = len(self.scenes)
         ranges = [(s, s + 1) for s in range(count)] if self.device.type == "cpu" else [(0, count)]
-        self.assemblies = [Assembly(self, pieces[a:b], a, b) for a, b in ranges]
-        self.pool = pool() if threads and len(self.assemblies) > 1 else None
+        self.arrays = SolverArrays(
+            self.scenes, self.device, dtype, self.kernels, smoothing, self.colliders, self.particles, self.state, self.volume, self.held
+        )
+        assemblies = [Assembly(self.arrays, tied_meshes[a:b], a, b) for a, b in ranges]
+        self.runs = [AssemblyRollout(assembly, self.graphs) for assembly in assemblies]
+        self.pool = scene_pool() if threads and len(self.runs) > 1 else None
 
     @property
     def scene_count(self) -> int:
+        """The number of scenes S."""
         return len(self.scenes)
+
+    @property
+    def assemblies(self) -> list[Assembly]:
+        """The meshes as the kernels read them: one for each scene on the CPU, one for all on a GPU."""
+        return [run.assembly for run in self.runs]
 
     def inner_steps(
         self,
@@ -130,24 +141,24 @@ class FiniteElements:
             viscosity: `Effects.viscosity` [Pa s], (S, 2), or None; it acts with the velocity of half a step before.
             mass: Particle masses [kg], (P,).
             stiffening: What effects add to each scene's modulus [Pa], and the largest factor on the sum, (S,) each.
-            refused: Gets the scenes that need more than `most_inner`, in place of an error; they get no more than the others.
+            refused: Gets the scenes that need more than `max_inner_steps`, in place of an error; they get no more than the others.
 
         Raises:
-            UserError: A modulus that is negative, or more than `most_inner`.
+            UserError: A modulus that is negative, or more than `max_inner_steps`.
         """
         needs = [math.ceil(need - 1e-9) for need in self._needs(elasticity, viscosity, mass, stiffening)]
         out = []
         for assembly in self.assemblies:
-            most = 1
+            count = 1
             for s in range(assembly.a, assembly.b):
-                if needs[s] <= self.most_inner:
-                    most = max(most, needs[s])
+                if needs[s] <= self.max_inner_steps:
+                    count = max(count, needs[s])
                 elif refused is not None:
                     refused.append(s)
                 else:
-                    raise UserError(f"dt of scene {s} needs {needs[s]} inner steps of its smallest element, more than {self.most_inner}; "
-                                    "lower the stiffness, the viscosity or `elements`")  # fmt: skip
-            out += [most] * (assembly.b - assembly.a)
+                    raise UserError(f"dt of scene {s} needs {needs[s]} inner steps of its smallest element, more than max_inner_steps = "
+                                    f"{self.max_inner_steps}; lower the stiffness, the viscosity or `elements`")  # fmt: skip
+            out += [count] * (assembly.b - assembly.a)
         return out
 
     def _needs(
@@ -159,7 +170,7 @@ class FiniteElements:
         for assembly in self.assemblies:
             for s in range(assembly.a, assembly.b):
                 modulus, density = bounds[s]
-                steep = float(assembly.pieces[s - assembly.a].steepest.max())
+                steep = float(assembly.meshes[s - assembly.a].steepest.max())
                 omega = 2.0 * math.sqrt(modulus / density * steep)
                 damping = 0.0
                 if viscosity is not None:
@@ -173,13 +184,13 @@ class FiniteElements:
     def step_margin(
         self, steps: int, elasticity: ElasticLaw, plasticity: PlasticLaw | None = None, *, effects: Effects | None = None
     ) -> float:
-        """`most_inner` over the inner steps in need, of the scene that has least to spare; below 1 a `rollout` of these refuses.
+        """`max_inner_steps` over the inner steps in need, of the scene that has least to spare; below 1 a `rollout` of these refuses.
 
         Raises:
             UserError: As `rollout`, but for the inner steps.
         """
         given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
-        return self.most_inner / max(self._needs(elasticity, given.viscosity, given.mass, given.stiffening(self)))
+        return self.max_inner_steps / max(self._needs(elasticity, given.viscosity, given.mass, given.stiffening(self)))
 
     def rollout(
         self,
@@ -252,7 +263,8 @@ class FiniteElements:
         inner_of = [n * finer for n in inner_of]
         frames = ParticleState(*(t.new_empty(steps // every + 1, *t.shape) for t in state))
 
-        def one(assembly: Assembly) -> None:
+        def one(run: AssemblyRollout) -> None:
+            assembly = run.assembly
             a, b = assembly.a, assembly.b
             n = inner_of[a]
             scenes, own = slice(a, b), slice(self.particles.offsets[a], self.particles.offsets[b])
@@ -270,21 +282,21 @@ class FiniteElements:
                 None if growth is None else growth[:, scenes].contiguous(),
                 dt.contiguous(),
             )
-            assembly.run(steps, every, n, elasticity, plasticity, part, ParticleState(*(t[:, own] for t in frames)))
+            run.run(steps, every, n, elasticity, plasticity, part, ParticleState(*(t[:, own] for t in frames)))
 
         if self.pool is None:
-            for assembly in self.assemblies:
-                one(assembly)
+            for run in self.runs:
+                one(run)
         else:
             with one_thread_each():
-                list(self.pool.map(one, self.assemblies))
+                list(self.pool.map(one, self.runs))
         scene = self.particles.scene.long()
         dt = self.dt / torch.tensor(inner_of).to(self.dt)
         limit = (torch.tensor(self.sizes).to(self.dt) / dt)[scene]  # faster, and a point crosses an element in a step
         fine = torch.isfinite(frames.x).all(dim=2) & (frames.v.norm(dim=2) <= limit)
         if lenient:
             refusing = torch.tensor([s in refused for s in range(self.scene_count)], device=self.device)
-            spoil(frames, refusing[scene] | ~fine.all(dim=0), scene)
+            invalidate(frames, refusing[scene] | ~fine.all(dim=0), scene)
         elif not bool(fine.all()):
             self._raise(fine, steps, every, inner_of)
         return frames

@@ -47,8 +47,8 @@ class Law:
         """What runs this law in one rollout; a law with faster kernels for a device overrides it."""
         return Engine(self, tensors, particles)
 
-    def alone(self, s: int) -> "Law":
-        """This law for scene s alone, whose rows of the tensors `forward` then gets."""
+    def single_scene(self, s: int) -> "Law":
+        """Return this law for scene s; `forward` then gets that scene's rows of the tensors."""
         return self
 
     def key(self, tensors: Sequence[Tensor]) -> Hashable | None:

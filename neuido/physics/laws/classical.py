@@ -11,8 +11,8 @@ from torch import Tensor
 from neuido.errors import UserError
 from neuido.physics.laws import classical_kernels as law_kernels
 from neuido.physics.laws.base import AutogradElastic, AutogradLaw, AutogradPlastic, ElasticLaw, Law, Parameter, PlasticLaw
-from neuido.physics.laws.classical_kernels import FLOOR
 from neuido.physics.linalg import decompositions as linalg
+from neuido.physics.linalg.warp_functions import FLOOR
 from neuido.physics.runtime.device import launch, real_of, torch_stream
 from neuido.types import Particles
 
@@ -115,7 +115,7 @@ class _Classical(Law):
         with torch_stream(F.device):
             launch(kernel, len(F), inputs, F.device)
 
-    def alone(self, s: int) -> Law:
+    def single_scene(self, s: int) -> Law:
         laws = self.scene_laws()
         return _OfScene(laws[min(s, len(laws) - 1)], self._correct)
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from neuido.physics.linalg import warp_functions as warp_linalg
-from neuido.physics.linalg.warp_functions import FLOOR
+from neuido.physics.linalg.warp_functions import FLOOR, GAP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
@@ -20,9 +20,6 @@ IDENTITY, VON_MISES, DRUCKER_PRAGER = 0, 1, 2
 
 LOCKED = 0.05
 """Least share of its extensibility that `strain_stiffening` leaves a body: 1 - k (I1bar - 3) is bounded below by it."""
-GAP = 1e-6
-"""Lower bound of sigma_i + sigma_j in a denominator; only an inverted F can come near it."""
-
 FLAT = 0.1
 """det F below which a stretch is taken from the principal frame."""
 
@@ -38,8 +35,6 @@ class LawKernels(NamedTuple):
     """(F, kinds, params (S, 1), scene, corrected)"""
     correct_adjoint: Any
     """(F, kinds, params, scene, grad_corrected, grad_F, grad_params or None): both gradients are added to."""
-    decompose: Any
-    """(F, U, sigma, V): the principal frame, sigma with the sign of det F on the last."""
 
 
 @cached
@@ -330,12 +325,4 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
                         wp.atomic_add(grad_params, s, 0, weight * along)
                 grad_F[p] = grad_F[p] + U * B * wp.transpose(V)
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def decompose(F: wp.array(dtype=mat), U: wp.array(dtype=mat), sigma: wp.array(dtype=vec), V: wp.array(dtype=mat)):
-        p = wp.tid()
-        u, excess, v = frame(F[p])
-        U[p] = u
-        sigma[p] = vec(one + excess[0], one + excess[1], one + excess[2])
-        V[p] = v
-
-    return LawKernels(stress, stress_adjoint, correct, correct_adjoint, decompose)
+    return LawKernels(stress, stress_adjoint, correct, correct_adjoint)

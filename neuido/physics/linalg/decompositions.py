@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from neuido.physics.laws.classical_kernels import GAP, kernels
+from neuido.physics.linalg import frame_kernels
+from neuido.physics.linalg.warp_functions import GAP
 from neuido.physics.runtime.device import launch, real_of, torch_stream
 
 
@@ -32,7 +33,7 @@ def _decompose(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         flat = F.detach().reshape(-1, 3, 3).contiguous()
         U, V, sigma = torch.empty_like(flat), torch.empty_like(flat), flat.new_empty(len(flat), 3)
         with torch_stream(F.device):
-            launch(kernels(real_of(F.dtype)).decompose, len(flat), [flat, U, sigma, V], F.device)
+            launch(frame_kernels.build(real_of(F.dtype)).decompose, len(flat), [flat, U, sigma, V], F.device)
         return U.view(F.shape), sigma.view(F.shape[:-1]), V.view(F.shape)
     U, sigma, Vh = torch.linalg.svd(F)
     V = Vh.mT

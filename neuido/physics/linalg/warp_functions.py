@@ -13,6 +13,8 @@ from neuido.physics.runtime.once import cached
 
 FLOOR = 1e-3
 """Lower bound of a principal stretch (of J in neo-Hookean) in a logarithm; below it the logarithm is constant, its gradient zero."""
+GAP = 1e-6
+"""Lower bound of sigma_i + sigma_j in a denominator; only an inverted F can come near it."""
 
 
 class Functions(NamedTuple):

@@ -1,123 +1,134 @@
-"""A rollout as one autograd function: whole, in segments that keep only the states between them, or a thread for each scene."""
+"""The backward pass of a rollout: hand-written adjoints of the kernels and of the laws, last substep first.
+
+It makes again what the tape of the forward pass lacks.
+"""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from neuido.physics.mpm.rollout import FIXED, KINDS, STATES, Plan
-from neuido.physics.mpm.threads import Scenes, ThreadedRollout
+from neuido.physics.laws.base import Engine
+from neuido.physics.mpm.plan import FIXED, STATES, Material, Plan, at_step
+from neuido.physics.mpm.rollout import Tape, flow_inputs, grid_inputs, stress, stress_inputs, to_grid, update_nodes
+from neuido.physics.runtime.device import torch_stream
 
 
-def run(plan: Plan, inputs: tuple[Tensor, ...], segment: int | None = None) -> tuple[Tensor, ...]:
-    """Frames of x, v, C, F and the history, in memory that the next rollout overwrites; differentiable where an input requires it.
-
-    Args:
-        plan: What to run.
-        inputs: As `KINDS` says, and the tensors of the laws.
-        segment: Substeps between checkpoints of a differentiable run; none: the tape spans the whole of it.
-
-    Raises:
-        UserError: What `Plan.check` finds.
-    """
-    differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-    captured = plan.simulator.device.type == "cuda"  # a graph of many thousand substeps would be large and slow to make
-    if (differentiable or captured) and segment is not None and segment < plan.steps:
-        return _Segments.apply(plan, segment, *inputs)
-    if plan.simulator.pool is not None:
-        return ThreadedRollout.apply(Scenes(plan), differentiable, *inputs)
-    if differentiable:
-        return _Rollout.apply(plan, *inputs)
-    return _frames(plan, tuple(t.detach() for t in inputs))
-
-
-def _frames(plan: Plan, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """A run without a tape."""
-    kept = plan.simulator.cache.find(plan, inputs, keep_all=False)
-    kept.forward(plan, inputs)
-    plan.check(kept.tape)
-    return kept.tape.states
-
-
-class _Rollout(torch.autograd.Function):
-    """Frames of x, v, C, F from the start, the parameters and the laws' tensors."""
-
-    @staticmethod
-    def forward(ctx: Any, plan: Plan, *inputs: Tensor) -> tuple[Tensor, ...]:
-        ctx.set_materialize_grads(False)
-        inputs = tuple(t.detach() for t in inputs)
-        # the tape belongs to the simulator: a later rollout may overwrite it, and the backward pass then runs this one again
-        ctx.plan, ctx.kept = plan, plan.simulator.cache.find(plan, inputs, keep_all=True)
-        ctx.serial = ctx.kept.forward(plan, inputs)
-        plan.check(ctx.kept.tape)
-        ctx.save_for_backward(*(t.clone() for t in inputs))
-        return tuple(t[:: plan.every] for t in ctx.kept.tape.states)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        wanted = ctx.needs_input_grad[1:]
-        with ctx.plan.simulator.lock:
-            out = ctx.kept.backward(ctx.plan, ctx.saved_tensors, ctx.serial, gradients, wanted)
-        return (None, *(g if want else None for g, want in zip(out, wanted, strict=True)))
-
-
-class _Segments(torch.autograd.Function):
-    """`_Rollout` in pieces: only the states between them are kept, and the backward pass makes the tape of one piece at a time."""
-
-    @staticmethod
-    def forward(ctx: Any, plan: Plan, segment: int, *inputs: Tensor) -> tuple[Tensor, ...]:
-        ctx.set_materialize_grads(False)
-        inputs = tuple(t.detach() for t in inputs)
-        ctx.piece, ctx.count = plan.piece(segment), plan.steps // segment
-        length = segment // plan.every
-        frames = tuple(t.new_empty(ctx.count * length + 1, *t.shape) for t in inputs[:STATES])
-        starts = [inputs[:STATES]]
-        for i in range(ctx.count):
-            rest = [_own(t, kind, i, segment) for t, kind in zip(inputs[STATES:], _kinds(inputs))]
-            for frame, part in zip(frames, _frames(ctx.piece, (*starts[i], *rest))):
-                frame[i * length : (i + 1) * length + 1] = part
-            starts.append(tuple(frame[(i + 1) * length].clone() for frame in frames))
-        ctx.save_for_backward(*inputs[STATES:], *(t for start in starts[:-1] for t in start))
-        return frames
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        piece, wanted, tensors = ctx.piece, ctx.needs_input_grad[2:], ctx.saved_tensors
-        rest, starts = tensors[: len(wanted) - STATES], tensors[len(wanted) - STATES :]
-        length = piece.steps // piece.every
-        cache = piece.simulator.cache
-        carry = [torch.zeros_like(t) for t in starts[:STATES]]
-        kinds = _kinds((*carry, *rest))
-        total = [torch.zeros_like(t) for t in rest]
-        for i in reversed(range(ctx.count)):
-            inputs = (*starts[STATES * i : STATES * (i + 1)], *(_own(t, kind, i, piece.steps) for t, kind in zip(rest, kinds)))
-            own = []
-            for a, gradient in zip(carry, gradients):
-                part = a.new_zeros(length + 1, *a.shape)
-                if gradient is not None:
-                    # a piece's first frame is the last one of the piece before
-                    part[0 if i == 0 else 1 :] = gradient[i * length + (0 if i == 0 else 1) : (i + 1) * length + 1]
-                part[-1] += a
-                own.append(part)
-            with piece.simulator.lock:
-                kept = cache.find(piece, inputs, keep_all=True)
-                serial = kept.forward(piece, inputs)
-                out = kept.backward(piece, inputs, serial, own, (True,) * STATES + tuple(wanted[STATES:]))
-            carry = out[:STATES]
-            for t, kind, new in zip(total, kinds, out[STATES:], strict=True):
-                if new is not None:
-                    _own(t, kind, i, piece.steps).add_(new)
-        return (None, None, *(g if want else None for g, want in zip([*carry, *total], wanted, strict=True)))
+def run_backward(
+    plan: Plan, inputs: Sequence[Tensor], tape: Tape, gradients: Sequence[Tensor | None], wanted: Sequence[bool], steps: int | None = None
+) -> list[Tensor | None]:
+    """The adjoint of every input that is wanted, from the gradients of the frames of x, v, C and F (None: zero)."""
+    setup, k = plan.setup, plan.setup.kernels
+    mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
+    a_fixed = [torch.zeros_like(t) for t in inputs[STATES:FIXED]]
+    a_mass, a_pull, a_force, a_friction, a_viscosity = a_fixed[:5]
+    parameters = any(wanted[STATES + 1 : STATES + 4])
+    now = [torch.zeros_like(t) for t in inputs[:STATES]]
+    then = [torch.empty_like(t) for t in now]
+    scratch, a_tau, other, a_trial = (torch.empty_like(now[3]) for _ in range(4))
+    a_velocity, a_grid = setup.scratch("a_velocity"), setup.scratch("a_grid")
+    with torch_stream(setup.device):
+        elastic, plastic = plan.engines(inputs)
+        elastic.start_adjoint(wanted[FIXED : plan.split])
+        if plastic is not None:
+            plastic.start_adjoint(wanted[plan.split :])
+        for n in reversed(range(plan.steps if steps is None else steps)):
+            if (n + 1) % plan.every == 0:
+                _add(now, gradients, (n + 1) // plan.every)
+            x, v, C, F, history = state = tuple(t[n] for t in tape.states)
+            v_next, C_next, F_next = tape.v[n + 1], tape.C[n + 1], tape.F[n + 1]
+            material, a_material = plan.material(inputs, n), plan.material((*inputs[:STATES], *a_fixed), n)
+            tau, grid, velocity = recompute(plan, inputs, tape, n, state, elastic, material, scratch)
+            a_x, a_v, a_C, a_F, a_history = then
+            a_out = now[3]
+            trial = None
+            if plan.corrects:
+                trial = trial_gradient(plan, F, C_next, other) if tape.trial is None else tape.trial[n]
+                a_out = a_trial.zero_()
+            if material is not None:
+                update_history_adjoint(plan, material, a_material, trial, C_next, history, F_next, now, a_out, a_history.zero_())
+            if plastic is not None:
+                plastic.adjoint(trial, now[3], a_trial)
+            plan.launch(k.grid_to_particles_adjoint, len(x),
+                        [setup.particles.scene, setup.sorted_held, setup.origin, setup.dx, setup.dt, setup.nodes, velocity, x, F, v_next,
+                         C_next, *now[:3], a_out, a_velocity.zero_(), a_x, a_F], plan.block)  # fmt: skip
+            arguments = [grid, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters]
+            inputs_n = grid_inputs(plan, at_step(pull, n), force, friction)
+            plan.launch(k.update_grid_adjoint, setup.node_count // setup.chunk, [*inputs_n, *arguments])
+            plan.launch(k.particles_to_grid_adjoint, len(x),
+                        [setup.particles.scene, setup.origin, setup.dx, setup.dt, setup.nodes, mass, setup.sorted_volume, x, v, C, tau,
+                         a_grid, a_mass, a_x, a_v, a_C, a_tau], plan.block)  # fmt: skip
+            if viscosity.numel():
+                plan.launch(k.add_viscous_stress_adjoint, len(x),
+                            [setup.particles.scene, viscosity, C, F, a_tau, a_C, a_F, a_viscosity])  # fmt: skip
+            if material is not None:
+                if material.stiffness is not None or material.growth is not None or plan.layout.e_max:
+                    elastic.forward(F, other)
+                plan.launch(plan.effects.add_effect_stress_adjoint, len(x),
+                            [*stress_inputs(plan, material), F, history, other, a_tau, a_F, a_history, *a_material[:4]])  # fmt: skip
+            elastic.adjoint(F, a_tau, a_F)
+            now, then = then, now
+        _add(now, gradients, 0)
+        of_laws = [*elastic.gradients(), *(() if plastic is None else plastic.gradients())]
+    return [*now, *a_fixed, *of_laws]
 
 
-def _kinds(inputs: Sequence[Tensor]) -> tuple[str, ...]:
-    """The kinds of the inputs after the start."""
-    return (*KINDS[STATES:], *("law",) * (len(inputs) - FIXED))
+def recompute(
+    plan: Plan,
+    inputs: Sequence[Tensor],
+    tape: Tape,
+    n: int,
+    state: Sequence[Tensor],
+    elastic: Engine,
+    material: Material | None,
+    scratch: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Stress, grid and nodal velocities of substep n, from the tape, or made again from the state before it."""
+    setup = plan.setup
+    mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
+    x, v, C, F, history = state
+    tau = scratch if tape.tau is None else tape.tau[n]
+    if tape.tau is None:
+        stress(plan, elastic, F, C, history, viscosity, material, tau)
+    grid = to_grid(plan, x, v, C, tau, mass, setup.scratch("grid")) if tape.grid is None else tape.grid[n]
+    velocity = setup.scratch("velocity") if tape.velocity is None else tape.velocity[n]
+    if tape.velocity is None:
+        update_nodes(plan, grid, at_step(pull, n), force, friction, velocity)
+    return tau, grid, velocity
 
 
-def _own(t: Tensor, kind: str, i: int, steps: int) -> Tensor:
-    """The part of an input that piece i of `steps` substeps reads."""
-    return t[i * steps : (i + 1) * steps] if kind == "time" and t.numel() and len(t) > 1 else t
+def update_history_adjoint(
+    plan: Plan,
+    material: Material,
+    a_material: Material,
+    trial: Tensor | None,
+    C: Tensor,
+    history: Tensor,
+    F: Tensor,
+    a_next: Sequence[Tensor],
+    a_trial: Tensor,
+    a_history: Tensor,
+) -> None:
+    """Adds to the adjoints of C and F after the substep (in `a_next`), of the trial gradient and of the history before."""
+    setup, k = plan.setup, plan.effects
+    a_C, a_F, a_history_next = a_next[2:]
+    if plan.layout.e_max:
+        plan.launch(k.remember_adjoint, len(F), [F, plan.layout.at_e_max, history, a_history_next, a_F, a_history])
+    if material.flow is not None:
+        adjoints = [a_F, a_history_next, a_trial, a_C, a_history, a_material.flow, a_material.stiffness, a_material.growth]
+        plan.launch(k.flow_adjoint, len(F), [*flow_inputs(plan, material), trial, C, history, *adjoints])
+    if material.branches is not None:
+        arguments = [C, history, a_history_next, a_C, a_history, a_material.branches]
+        plan.launch(k.relax_adjoint, len(F), [setup.particles.scene, setup.dt, material.branches, *arguments])
+
+
+def trial_gradient(plan: Plan, F: Tensor, C_next: Tensor, out: Tensor) -> Tensor:
+    """F_tr = (I + dt C) F, as grid_to_particles wrote it."""
+    plan.launch(plan.setup.kernels.trial_gradient, len(F), [plan.setup.particles.scene, plan.setup.dt, F, C_next, out])
+    return out
+
+
+def _add(now: Sequence[Tensor], gradients: Sequence[Tensor | None], frame: int) -> None:
+    for a, gradient in zip(now, gradients):
+        if gradient is not None:
+            a.add_(gradient[frame])

@@ -6,15 +6,17 @@ CPU the page faults of a fresh tape cost more than the substeps.)
 """
 
 import gc
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from neuido.physics.mpm.rollout import Plan
+from neuido.physics.mpm.adjoint import run_backward
+from neuido.physics.mpm.plan import Plan
+from neuido.physics.mpm.rollout import new_tape, run_forward
 
 T = TypeVar("T")
 
@@ -25,57 +27,57 @@ CAPACITY = 4
 class KeptRollout:
     """A tape for rollouts of one shape, eagerly run."""
 
-    def __init__(self, plan: "Plan", keep_all: bool) -> None:
-        self.tape = plan.tape(keep_all)
+    def __init__(self, plan: Plan, keep_all: bool) -> None:
+        self.tape = new_tape(plan, keep_all)
         self.serial = 0
 
-    def forward(self, plan: "Plan", inputs: Sequence[Tensor]) -> int:
+    def forward(self, plan: Plan, inputs: Sequence[Tensor]) -> int:
         """Run with new inputs; returns the serial number of this run."""
         self._forward(plan, inputs)
         self.serial += 1
         return self.serial
 
     def backward(
-        self, plan: "Plan", inputs: Sequence[Tensor], serial: int, gradients: Sequence[Tensor | None], wanted: Sequence[bool]
+        self, plan: Plan, inputs: Sequence[Tensor], serial: int, gradients: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
         """The adjoint of the run `serial` with these inputs."""
         if serial != self.serial:
             self.forward(plan, inputs)
         return self._backward(plan, inputs, gradients, wanted)
 
-    def _forward(self, plan: "Plan", inputs: Sequence[Tensor]) -> None:
-        plan.forward(inputs, self.tape)
+    def _forward(self, plan: Plan, inputs: Sequence[Tensor]) -> None:
+        run_forward(plan, inputs, self.tape)
 
     def _backward(
-        self, plan: "Plan", inputs: Sequence[Tensor], gradients: Sequence[Tensor | None], wanted: Sequence[bool]
+        self, plan: Plan, inputs: Sequence[Tensor], gradients: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
-        return plan.backward(inputs, self.tape, gradients, wanted)
+        return run_backward(plan, inputs, self.tape, gradients, wanted)
 
 
 class CapturedRollout(KeptRollout):
     """The forward graph of a plan, and a backward graph for each set of wanted gradients."""
 
-    def __init__(self, plan: "Plan", inputs: Sequence[Tensor], keep_all: bool) -> None:
+    def __init__(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> None:
         super().__init__(plan, keep_all)
         self.plan = plan
         self.inputs = [t.clone() for t in inputs]
         self._adjoints: dict[tuple, tuple[torch.cuda.CUDAGraph, list, list]] = {}
-        plan.forward(self.inputs, self.tape, steps=1)  # compiles and loads the kernels
-        self.graph, _ = capture(lambda: plan.forward(self.inputs, self.tape))
+        run_forward(plan, self.inputs, self.tape, steps=1)  # compiles and loads the kernels
+        self.graph, _ = capture(lambda: run_forward(plan, self.inputs, self.tape))
 
-    def _forward(self, plan: "Plan", inputs: Sequence[Tensor]) -> None:
+    def _forward(self, plan: Plan, inputs: Sequence[Tensor]) -> None:
         for own, given in zip(self.inputs, inputs, strict=True):
             own.copy_(given)
         self.graph.replay()
 
     def _backward(
-        self, plan: "Plan", inputs: Sequence[Tensor], gradients: Sequence[Tensor | None], wanted: Sequence[bool]
+        self, plan: Plan, inputs: Sequence[Tensor], gradients: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
         key = (tuple(g is not None for g in gradients), tuple(wanted))
         if key not in self._adjoints:
             own = [None if g is None else g.clone() for g in gradients]
-            self.plan.backward(self.inputs, self.tape, own, wanted, steps=1)
-            graph, out = capture(lambda: self.plan.backward(self.inputs, self.tape, own, wanted))
+            run_backward(self.plan, self.inputs, self.tape, own, wanted, steps=1)
+            graph, out = capture(lambda: run_backward(self.plan, self.inputs, self.tape, own, wanted))
             self._adjoints[key] = (graph, own, out)
         graph, own_gradients, out = self._adjoints[key]
         for own, given in zip(own_gradients, gradients):
@@ -114,9 +116,16 @@ class RolloutCache:
 
     def __init__(self, graphs: bool) -> None:
         self.graphs = graphs
+        self.lock = threading.RLock()
+        """Held by a rollout or an adjoint: tape, grid and graphs are one set, which threads that share a simulator take in turn."""
         self._kept: OrderedDict[tuple, KeptRollout] = OrderedDict()
+        self._single: dict[int, RolloutCache] = {}
 
-    def find(self, plan: "Plan", inputs: Sequence[Tensor], keep_all: bool) -> KeptRollout:
+    def single_scene(self, s: int) -> "RolloutCache":
+        """Return the cache for the rollouts of scene s alone."""
+        return self._single.setdefault(s, RolloutCache(self.graphs))
+
+    def find(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> KeptRollout:
         """The kept rollout for a plan with inputs of these shapes; captured where graphs are on and its laws may be captured."""
         own = plan.key(inputs) if self.graphs else None
         key = (own, plan.steps, plan.every, plan.plasticity is None, keep_all, *(tuple(t.shape) for t in inputs))

@@ -9,10 +9,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from neuido.physics.colliders import contact as contact_functions
 from neuido.physics.runtime.once import cached
-
-STICKY, SLIP, SEPARATE = 1, 2, 3
-CONTACTS = {"sticky": STICKY, "slip": SLIP, "separate": SEPARATE}
 
 
 @cached
@@ -29,6 +27,9 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
     adjoint_kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+
+    met = contact_functions.functions(real, name)
+    contact, contact_adjoint, lose, normal_of = met.contact, met.contact_adjoint, met.lose, met.normal_of
 
     @kernel
     def add_viscous_stress(
@@ -80,51 +81,6 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         wp.atomic_add(a_viscosity, s, 1, J * t * tA)
 
     @func
-    def contact(v: vec3, n: vec3, kind: int, friction: real):
-        """Velocity of a node inside a collider, from its velocity before."""
-        vn = wp.dot(v, n)
-        out = v
-        if kind == wp.static(STICKY):
-            out = vec3(real(0.0), real(0.0), real(0.0))
-        elif kind == wp.static(SLIP):
-            out = v - vn * n
-        elif kind == wp.static(SEPARATE):
-            if vn < real(0.0):
-                t = v - vn * n
-                speed = wp.length(t)
-                if speed <= -friction * vn:
-                    out = vec3(real(0.0), real(0.0), real(0.0))
-                else:
-                    out = t * (real(1.0) + friction * vn / wp.max(speed, real(1.0e-30)))
-        return out
-
-    @func
-    def contact_adjoint(v: vec3, n: vec3, kind: int, friction: real, a: vec3):
-        """Adjoint of `contact`: that of v (first three) and of the friction (last)."""
-        vn = wp.dot(v, n)
-        out = vec4(a[0], a[1], a[2], real(0.0))
-        if kind == wp.static(STICKY):
-            out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
-        elif kind == wp.static(SLIP):
-            b = a - wp.dot(a, n) * n
-            out = vec4(b[0], b[1], b[2], real(0.0))
-        elif kind == wp.static(SEPARATE):
-            if vn < real(0.0):
-                t = v - vn * n
-                speed = wp.length(t)
-                if speed <= -friction * vn:
-                    out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
-                else:
-                    s = wp.max(speed, real(1.0e-30))
-                    e = t / s
-                    ea = wp.dot(e, a)
-                    at = a + (friction * vn / s) * (a - ea * e)
-                    at = at - wp.dot(at, n) * n
-                    b = at + (friction * ea) * n
-                    out = vec4(b[0], b[1], b[2], vn * ea)
-        return out
-
-    @func
     def place(c: wp.vec4i, origin: vec3, h: real):
         """Position of a node [m] from its three indices."""
         return origin + vec3(real(c[0]), real(c[1]), real(c[2])) * h
@@ -144,15 +100,6 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         return s * (wp.cross(v, a) + wp.cross(t, a) + wp.cross(v, wp.cross(a, q))) - (s * s * both) * q
 
     @func
-    def lose(v: vec3, n: vec3, dt: real, force: wp.array2d(dtype=real), row: int):
-        """Stick and restitution: what a node in a collider keeps of its velocity."""
-        out = wp.exp(-dt * force[row, 9]) * v
-        vn = wp.dot(out, n)
-        if vn > real(0.0):
-            out = out + ((wp.exp(-dt * force[row, 10]) - real(1.0)) * vn) * n
-        return out
-
-    @func
     def push(v0: vec3, x: vec3, dt: real, g: vec3, force: wp.array2d(dtype=real), row: int):
         """Nodal velocity after gravity and the body forces; drag is implicit in its size, so any coefficient is stable."""
         centre = vec3(force[row, 3], force[row, 4], force[row, 5])
@@ -170,10 +117,6 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
             if x[0] >= l[0] and x[1] >= l[1] and x[2] >= l[2] and x[0] <= u[0] and x[1] <= u[1] and x[2] <= u[2]:
                 inside = True
         return inside
-
-    @func
-    def normal_of(plane: vec4):
-        return vec3(plane[0], plane[1], plane[2])
 
     @func
     def collide(
@@ -279,12 +222,12 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                             before = collide(u, x, s, c, plane, kind, friction, dt[s], force)
                             if force.shape[1] > 6:
                                 if kind[s, c] > 0:
-                                    met = contact(before, n, kind[s, c], friction[s, c])
+                                    after = contact(before, n, kind[s, c], friction[s, c])
                                     keep = wp.exp(-dt[s] * force[s, 9])
                                     bounce = wp.exp(-dt[s] * force[s, 10])
-                                    vn = wp.dot(met, n)
+                                    vn = wp.dot(after, n)
                                     an = wp.dot(a, n)
-                                    lost = wp.dot(a, met)
+                                    lost = wp.dot(a, after)
                                     if vn > real(0.0):
                                         lost = lost + (bounce - real(1.0)) * vn * an
                                         a = a + ((bounce - real(1.0)) * an) * n
@@ -334,5 +277,5 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         add_viscous_stress_adjoint=add_viscous_stress_adjoint,
         update_grid=update_grid,
         update_grid_adjoint=update_grid_adjoint,
-        functions=SimpleNamespace(push=push, contact=contact, lose=lose),
+        functions=SimpleNamespace(push=push),
     )

@@ -7,10 +7,10 @@ effects' parameters. The material is `constitutive.Constitutive`.
 import torch
 from torch import Tensor
 
+from neuido.physics.colliders.contact import SEPARATE, SLIP, STICKY
 from neuido.physics.effects.constitutive import Constitutive, History
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
-from neuido.physics.mpm.grid import SEPARATE, SLIP, STICKY
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import ParticleState
 
@@ -61,7 +61,7 @@ def substep(
         friction: As in `Simulator.rollout`.
         mass: As in `Simulator.rollout`, added mass included.
     """
-    effects = material.effects
+    effects, setup = material.effects, sim.setup
     friction = sim.colliders.friction if friction is None else friction
     mass = sim.mass if mass is None else mass
     force = effects.force_table(sim.scene_count, sim.mass)
@@ -75,12 +75,12 @@ def substep(
         x, v, C, F = (t[own] for t in state)
         tau, m, volume = tau_all[own], mass[own], sim.volume[own]
         dx, dt = sim.dx[s], sim.dt[s]
-        base, w = _splines((x - sim.origin[s]) / dx)
+        base, w = _splines((x - setup.origin[s]) / dx)
         offsets = torch.cartesian_prod(*[torch.arange(3, device=sim.device)] * 3)
         nodes = base[:, None, :] + offsets
         weight = w[:, offsets[:, 0], 0] * w[:, offsets[:, 1], 1] * w[:, offsets[:, 2], 2]
-        arm = sim.origin[s] + nodes * dx - x[:, None, :]
-        shape = sim.grid_shape[1:]
+        arm = setup.origin[s] + nodes * dx - x[:, None, :]
+        shape = setup.grid_shape[1:]
         flat = ((nodes[..., 0] * shape[1] + nodes[..., 1]) * shape[2] + nodes[..., 2]).reshape(-1)
         affine = m[:, None, None] * C - dt * volume[:, None, None] * 4.0 / dx**2 * tau
         momentum = weight[..., None] * (m[:, None, None] * v[:, None, :] + torch.einsum("pab,pnb->pna", affine, arm))
@@ -91,7 +91,7 @@ def substep(
         full = grid_m > 0
         u = grid_p / torch.where(full, grid_m, 1.0)[:, None]
         index = torch.cartesian_prod(*[torch.arange(n, device=sim.device) for n in shape])
-        place = sim.origin[s] + index * dx
+        place = setup.origin[s] + index * dx
         u = u + dt * (pull[s] - force[s, 2] * (place - force[s, 3:6]))
         w = 0.5 * dt * torch.linalg.cross(force[s, 6:9].expand(3, 3), eye).mT  # half of w x, for Cayley's rotation
         u = u @ torch.linalg.solve(eye - w, eye + w).mT
@@ -106,7 +106,7 @@ def substep(
                 outward = (met @ normal).clamp(min=0.0)[:, None] * normal
                 met = met - (1.0 - torch.exp(-dt * force[s, 10])) * outward
                 u = torch.where((inside & full)[:, None], met, u)
-        for lower, upper in zip(sim.clamp_lower[s], sim.clamp_upper[s]):
+        for lower, upper in zip(setup.clamp_lower[s], setup.clamp_upper[s]):
             u = torch.where(((place >= lower) & (place <= upper)).all(1, keepdim=True), 0.0, u)
         u = torch.where(full[:, None], u, 0.0)[flat].reshape(len(x), 27, 3)
         held = sim.held[own].bool()

@@ -27,6 +27,27 @@ def choose_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def as_device(device: str | torch.device) -> torch.device:
+    """Return the torch device, with its index, for `auto`, `cpu`, `cuda`, `cuda:1`, ... or a device.
+
+    Raises:
+        UserError: Another name, or a CUDA device that is not there.
+    """
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(device)
+    except RuntimeError as error:
+        raise UserError(f"device is {device!r}; give auto, cpu, cuda, or cuda:1 for a second GPU") from error
+    if device.type == "cuda":
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (device.index or 0) >= count:
+            raise UserError(f"device is {str(device)!r} and there are {count} CUDA devices here; use device auto or cpu")
+    elif device.type != "cpu":
+        raise UserError(f"device is {str(device)!r}; the simulators run on cpu and cuda")
+    return torch.empty(0, device=device).device  # with its index, which Warp needs
+
+
 @cached
 def start_warp() -> None:
     """Initialise Warp without its banner, and without its remark on a missing driver; safe to call again, and from several threads."""

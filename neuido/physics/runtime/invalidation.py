@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def spoil(frames: Sequence[Tensor], failed: Tensor, scene: Tensor) -> None:
+def invalidate(frames: Sequence[Tensor], failed: Tensor, scene: Tensor) -> None:
     """Make all frames NaN of every scene in which a particle failed, in place.
 
     Args:

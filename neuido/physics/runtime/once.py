@@ -13,7 +13,7 @@ BUILDING = threading.RLock()
 a builder may call another."""
 
 
-def cached(function: F | None = None, *, most: int | None = None) -> Any:
+def cached(function: F | None = None, *, limit: int | None = None) -> Any:
     """Keep the results of a function by its arguments; two threads never make the same one.
 
     `functools.cache` calls the function in both threads when two ask at once. For a builder of Warp kernels that means two modules of one
@@ -21,21 +21,21 @@ def cached(function: F | None = None, *, most: int | None = None) -> Any:
 
     Args:
         function: Decorated; its arguments must be hashable.
-        most: Results that are kept, the least recently used dropped first; none: all.
+        limit: Results that are kept, the least recently used dropped first; none: all.
     """
     if function is None:
-        return functools.partial(cached, most=most)
+        return functools.partial(cached, limit=limit)
     kept: OrderedDict[tuple, Any] = OrderedDict()
 
     @functools.wraps(function)
     def get(*args: Any, **options: Any) -> Any:
         key = (args, *sorted(options.items())) if options else args
-        if most is None and key in kept:  # whole as soon as it is there, and never dropped
+        if limit is None and key in kept:  # whole as soon as it is there, and never dropped
             return kept[key]
         with BUILDING:
             if key not in kept:
                 made = function(*args, **options)
-                while most is not None and len(kept) >= most:
+                while limit is not None and len(kept) >= limit:
                     kept.popitem(last=False)
                 kept[key] = made
             kept.move_to_end(key)

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.colliders.contact import SLIP, STICKY
 from neuido.physics.colliders.tables import collider_table
-from neuido.physics.mpm.grid import SLIP, STICKY
 from neuido.physics.runtime.device import real_of, repeated, torch_stream
 from neuido.physics.springs import spring_kernels
 from neuido.types import Scene

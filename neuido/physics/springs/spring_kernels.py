@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.mpm.grid import SLIP, STICKY
+from neuido.physics.colliders.contact import SLIP, STICKY
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 

@@ -11,6 +11,7 @@ from neuido.physics.effects.constitutive import Constitutive
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.fem import element_loop
 from neuido.physics.fem.assembly import Assembly
+from neuido.physics.fem.assembly_rollout import AssemblyRollout
 from neuido.physics.fem.finite_elements import FiniteElements
 from neuido.physics.fem.meshing import mesh_body
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identity, NeoHookean, VonMises, lame
@@ -23,6 +24,11 @@ FREE = Scene(gravity=(0.0, 0.0, 0.0), walls=None, dt=1e-3)
 
 def solver(scene, body, **options):
     return FiniteElements(scene, body, **{"density": 1000.0, "dtype": torch.float64} | options)
+
+
+def joined(sim, count, graphs=False):
+    """The scenes of a solver on the CPU in one set of arrays, as on a GPU."""
+    return AssemblyRollout(Assembly(sim.arrays, [a.meshes[0] for a in sim.assemblies], 0, count), graphs)
 
 
 def momenta(sim, out):
@@ -229,7 +235,7 @@ def test_parameter_sets_in_one_call_equal_single_ones():
         for a, b in zip(out, alone):
             assert torch.equal(a[:, own], b)
     # on a GPU the scenes share their launches: the same arrays, here on the CPU
-    sim.assemblies, sim.pool = [Assembly(sim, [a.pieces[0] for a in sim.assemblies], 0, 3)], None
+    sim.runs, sim.pool = [joined(sim, 3)], None
     together = sim.rollout(50, FixedCorotated(young, 0.3), effects=effects, every=25)
     for a, b in zip(out, together):
         assert torch.allclose(a, b, rtol=0, atol=1e-9 * float(a.abs().max()))
@@ -250,7 +256,7 @@ def replayed(name: str, device: str, graphs: bool, every: int, dtype: torch.dtyp
     body = block((0.3, 0.1, 0.3), (0.5, 0.3, 0.5), (4, 4, 4), (0.4, -3.0, 0.0), (3.0, 0.0, 2.0))
     sim = FiniteElements([scene] * 2, [body] * 2, density=1000.0, device=device, dtype=dtype, elements=320, graphs=graphs)
     if device == "cpu":  # as on a GPU, where the scenes share their launches
-        sim.assemblies, sim.pool, sim.graphs = [Assembly(sim, [a.pieces[0] for a in sim.assemblies], 0, 2)], None, graphs
+        sim.runs, sim.pool = [joined(sim, 2, graphs)], None
     out = []
     for factor in (1.0, 1.4):
         effects = dict(given)
@@ -266,7 +272,7 @@ def replayed(name: str, device: str, graphs: bool, every: int, dtype: torch.dtyp
 @pytest.mark.parametrize("every", [10, 15])
 def test_a_kept_loop_is_a_fresh_one(name, every, monkeypatch):
     """What a graph replays finds all that it reads in the loop's own memory; the graph is a stand-in, which launches anew."""
-    monkeypatch.setattr(element_loop, "_capture", lambda launches: (SimpleNamespace(replay=launches), None))
+    monkeypatch.setattr(element_loop, "capture", lambda launches: (SimpleNamespace(replay=launches), None))
     kept = replayed(name, "cpu", True, every, torch.float64)
     for a, b in zip(kept, replayed(name, "cpu", False, every, torch.float64)):
         for got, want in zip(a, b):
@@ -360,7 +366,7 @@ def test_steps_are_cut_as_the_stiffness_asks():
     viscous = sim.inner_steps(FixedCorotated(1e4, 0.3), torch.tensor([[2000.0, 0.0]]))[0]
     assert viscous > 3
     with pytest.raises(UserError, match=r"needs \d+ inner steps of its smallest element, more than 3;"):
-        solver(FREE, body, most_inner=3).rollout(3, FixedCorotated(1e4, 0.3), effects=Effects(viscosity_shear=2000.0))
+        solver(FREE, body, max_inner_steps=3).rollout(3, FixedCorotated(1e4, 0.3), effects=Effects(viscosity_shear=2000.0))
     body = body._replace(v=body.v + 2.0 * (body.x - body.x.mean(dim=0)))
     with pytest.raises(UserError, match="not finite from step 0 of 60"):
         solver(FREE, body).rollout(60, FixedCorotated(1e8, 0.3), every=10, inner=1)
@@ -375,7 +381,7 @@ def test_the_margin_is_where_a_rollout_refuses(effects):
     law = FixedCorotated(torch.tensor([1e5, 1e8]), torch.full((2,), 0.3))
 
     def bodies(most):
-        return FiniteElements([FREE] * 2, [body] * 2, most_inner=most)
+        return FiniteElements([FREE] * 2, [body] * 2, max_inner_steps=most)
 
     margin = bodies(1000).step_margin(5, law, effects=effects)
     needed = math.ceil(1000 / margin)
@@ -412,9 +418,8 @@ def test_scenes_that_fail_are_nan_and_the_others_as_alone():
     sim = solver([scene] * 4, [body] * 4)
     start = ParticleState(*(t.clone() for t in sim.state))
     start.v[sim.particles.offsets[2] : sim.particles.offsets[3]] *= 1e4
-    whole = [Assembly(sim, [a.pieces[0] for a in sim.assemblies], 0, 4)]
-    for assemblies in (sim.assemblies, whole):
-        sim.assemblies, sim.pool = assemblies, None
+    for runs in (sim.runs, [joined(sim, 4)]):
+        sim.runs, sim.pool = runs, None
         out = sim.rollout(20, FixedCorotated(young, 0.3), state=start, every=10, lenient=True)
         for s in range(4):
             own = slice(sim.particles.offsets[s], sim.particles.offsets[s + 1])

@@ -8,8 +8,10 @@ import torch
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identity, NeoHookean, Sigma, VonMises, stack
-from neuido.physics.mpm.rollout import Plan
-from neuido.physics.mpm.simulator import Simulator, affine_velocity
+from neuido.physics.mpm.plan import Plan
+from neuido.physics.mpm.rollout import to_grid
+from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.mpm.state import affine_velocity
 from neuido.types import AttachedMass, Body, Box, ParticleState, Plane, Scene, Walls
 from tests.physics.bodies import DEVICE, DEVICES, block, busy_scenes, same
 
@@ -39,9 +41,9 @@ def test_a_substep_conserves_mass_momentum_and_spin(device):
     g = torch.Generator().manual_seed(0)
     F = sim.state.F + 0.1 * torch.randn(sim.state.F.shape, generator=g, dtype=torch.float64).to(device)
     start = sim.state._replace(F=F)
-    plan = Plan(sim, SOFT, None, 1, 1)
+    plan = Plan(sim.setup, SOFT, None, 1, 1)
     tau = SOFT(F)
-    grid = plan.to_grid(start.x, start.v, start.C, tau, sim.mass, sim.scratch("grid"))
+    grid = to_grid(plan, start.x, start.v, start.C, tau, sim.mass, sim.setup.scratch("grid"))
     assert torch.isclose(grid[..., 3].sum(), sim.mass.sum(), rtol=1e-13)
     m = sim.mass[:, None]
     frames = sim.rollout(5, SOFT, state=start)

@@ -9,7 +9,8 @@ from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
 from neuido.physics.mpm import reference
 from neuido.physics.mpm import transfers as kernels
-from neuido.physics.mpm.rollout import Plan
+from neuido.physics.mpm.plan import Plan
+from neuido.physics.mpm.rollout import to_grid
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Box, ParticleState, Plane, Scene, Walls
 from tests.physics.bodies import DEVICE, DEVICES, block, busy_scenes, same
@@ -99,8 +100,8 @@ class Stage:
 
     def __init__(self):
         p = Problem()
-        self.sim, self.p = p.sim, p
-        self.plan = Plan(p.sim, *p.laws(), 1, 1)
+        self.sim, self.p = p.sim.setup, p
+        self.plan = Plan(p.sim.setup, *p.laws(), 1, 1)
         g = torch.Generator().manual_seed(1)
         self.g = g
         self.state = [t.detach().clone() for t in p.state]
@@ -114,7 +115,7 @@ class Stage:
 
     def grid(self):
         x, v, C, _ = self.state
-        return self.plan.to_grid(x, v, C, self.tau, self.sim.mass, self.sim.scratch("grid")).clone()
+        return to_grid(self.plan, x, v, C, self.tau, self.sim.mass, self.sim.scratch("grid")).clone()
 
 
 def kernel_cases(stage: Stage):

@@ -12,8 +12,8 @@ import torch
 from neuido.data.bodies.shapes import cube
 from neuido.physics.laws.classical import NeoHookean
 from neuido.physics.mpm.simulator import Simulator
-from neuido.physics.mpm.threads import one_thread_each
 from neuido.physics.runtime.once import cached
+from neuido.physics.runtime.threads import one_thread_each
 from neuido.types import Scene
 
 BUILD = """
@@ -82,7 +82,7 @@ def test_threads_get_the_one_result_of_a_slow_function():
 
 def test_the_least_recently_used_result_is_dropped():
     made = []
-    keep = cached(lambda key: made.append(key) or key, most=2)
+    keep = cached(lambda key: made.append(key) or key, limit=2)
     for key in (1, 2, 1, 3, 1, 2):
         keep(key)
     assert made == [1, 2, 3, 2]

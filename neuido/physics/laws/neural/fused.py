@@ -163,14 +163,14 @@ def build(width: int) -> SimpleNamespace:
     return SimpleNamespace(stress=stress, correct=correct, stress_adjoint=stress_adjoint, correct_adjoint=correct_adjoint)
 
 
-@cached(most=16)
+@cached(limit=16)
 def _warps(offsets: tuple[int, ...], device: torch.device) -> list[Tensor]:
     """Scene, first and last particle of every warp; kept, since a graph may not copy from the host while it is captured."""
     table = [(s, p, min(p + 32, j)) for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])) for p in range(i, j, 32)]
     return [torch.tensor(column, dtype=torch.int32, device=device) for column in zip(*table)]
 
 
-@cached(most=16)
+@cached(limit=16)
 def _order(rows: int, columns: int, device: torch.device) -> Tensor:
     """Where the two entries of each lane's fragment stand in a (rows, columns) matrix, (tiles, 32 lanes, 2)."""
     lane = torch.arange(32)

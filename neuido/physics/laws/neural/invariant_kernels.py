@@ -16,8 +16,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.laws.classical_kernels import GAP
 from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg.warp_functions import GAP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 

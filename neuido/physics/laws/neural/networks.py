@@ -135,7 +135,7 @@ class _Workspace:
         self.ones = torch.ones(rows, dtype=dtype, device=device)
 
 
-_workspace = cached(_Workspace, most=8)
+_workspace = cached(_Workspace, limit=8)
 
 
 class _Network:

@@ -1,0 +1,120 @@
+"""A finite-element rollout of one assembly: from the inputs of its scenes to frames at the particles."""
+
+from collections.abc import Hashable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuido.physics.effects.coefficients import Tables
+from neuido.physics.fem import element_loop
+from neuido.physics.fem.assembly import Assembly
+from neuido.physics.fem.element_loop import Fields, Loop
+from neuido.physics.laws.base import ElasticLaw, Law, PlasticLaw
+from neuido.types import ParticleState
+
+CAPACITY = 8
+"""Captured loops that an assembly keeps; each holds its memory."""
+
+
+class Inputs(NamedTuple):
+    """What a rollout of some scenes reads, their rows alone."""
+
+    state: ParticleState
+    mass: Tensor
+    pull: Tensor
+    """(1 or T, S, 3), T over the inner steps."""
+    force: Tensor
+    friction: Tensor
+    viscosity: Tensor | None
+    tables: Tables | None
+    stiffness: Tensor | None
+    growth: Tensor | None
+    dt: Tensor
+    """Inner step of each scene [s], (S,)."""
+
+
+class AssemblyRollout:
+    """Runs an assembly, and keeps its captured loops.
+
+    Args:
+        assembly: Meshes of some scenes.
+        graphs: Capture the launches between two frames (CUDA alone).
+    """
+
+    def __init__(self, assembly: Assembly, graphs: bool) -> None:
+        self.assembly, self.graphs = assembly, graphs
+        self.loops: dict[Hashable, Loop] = {}
+
+    def run(
+        self,
+        steps: int,
+        every: int,
+        inner: int,
+        elasticity: ElasticLaw,
+        plasticity: PlasticLaw | None,
+        given: Inputs,
+        frames: ParticleState,
+    ) -> None:
+        """Fill the frames; launches alone but for the frames."""
+        count, assembly = every * inner, self.assembly
+        if plasticity is not None and (plasticity.identity or (given.tables is not None and given.tables.flow is not None)):
+            plasticity = None
+        x, v, C, F = assembly.start(given.state)
+        v = torch.where(assembly.held.bool()[:, None], 0.0, v)
+        fields = self._fields(given, count)
+        laws = [self._rows(law) for law in (elasticity, plasticity) if law is not None]
+        loop = self._loop(elasticity, plasticity, given.tables, fields, laws, count)
+        loop.begin((x, v, C, F), fields, laws)
+        assembly.frame(frames, 0, *loop.state)
+        for k in range(steps // every):
+            own = slice(k * count, (k + 1) * count)
+            loop.advance(given.pull[own] if len(given.pull) > 1 else None, None if given.growth is None else given.growth[own])
+            assembly.frame(frames, k + 1, *loop.state)
+        assembly.last = (ParticleState(*(t[-1].clone() for t in frames)), *(t.clone() for t in loop.state))
+
+    def _rows(self, law: Law) -> list[Tensor]:
+        """Return the tensors of a law, the rows of these scenes."""
+        assembly = self.assembly
+        tensors = [t.detach().to(assembly.solver.device, assembly.solver.dtype) for t in law.tensors()]
+        return [t if len(t) == 1 or not assembly.is_part else t[assembly.a : assembly.b] for t in tensors]
+
+    def _fields(self, given: Inputs, count: int) -> Fields:
+        """What the first of the intervals reads."""
+        stiffness = None
+        if given.stiffness is not None:
+            index, weight = self.assembly.to_elements
+            stiffness = torch.einsum("ek,ek->e", weight, given.stiffness[index].log()).exp()
+        tables = given.tables
+        return Fields(
+            self.assembly.node_mass(given.mass),
+            given.force,
+            given.friction,
+            given.dt,
+            given.pull[:count],
+            None if given.growth is None else given.growth[:count],
+            given.viscosity,
+            stiffness,
+            *((None,) * 3 if tables is None else (tables.material, tables.branches, tables.flow)),
+        )
+
+    def _loop(
+        self,
+        elasticity: ElasticLaw,
+        plasticity: PlasticLaw | None,
+        tables: Tables | None,
+        fields: Fields,
+        laws: Sequence[Sequence[Tensor]],
+        count: int,
+    ) -> Loop:
+        """Return a loop for these launches; captured ones are kept, the least recently used dropped first."""
+        assembly = self.assembly
+        elastic: Law = elasticity.single_scene(assembly.a) if assembly.is_part else elasticity
+        plastic: Law | None = plasticity.single_scene(assembly.a) if assembly.is_part and plasticity is not None else plasticity
+        own = element_loop.key(elastic, plastic, tables, fields, laws, count) if self.graphs else None
+        loop = self.loops.pop(own, None) or Loop(assembly, elastic, plastic, tables, fields, laws, count, own is not None)
+        if own is not None:
+            while len(self.loops) >= CAPACITY:
+                self.loops.pop(next(iter(self.loops)))
+            self.loops[own] = loop
+        return loop

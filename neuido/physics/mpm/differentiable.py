@@ -1,0 +1,227 @@
+"""A rollout as one autograd function: whole, in segments that keep only the states between them, or a thread for each scene."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from neuido.physics.mpm.graphs import RolloutCache
+from neuido.physics.mpm.plan import FIXED, KINDS, STATES, Plan
+from neuido.physics.mpm.rollout import check
+from neuido.physics.runtime.threads import one_thread_each
+
+T = TypeVar("T")
+
+FRICTION = 8
+"""Which input the friction is; each scene has its own number of colliders."""
+
+
+def run(
+    plan: Plan, inputs: tuple[Tensor, ...], segment: int | None, cache: RolloutCache, pool: ThreadPoolExecutor | None
+) -> tuple[Tensor, ...]:
+    """Frames of x, v, C, F and the history, in memory that the next rollout overwrites; differentiable where an input requires it.
+
+    Args:
+        plan: What to run.
+        inputs: As `KINDS` says, and the tensors of the laws.
+        segment: Substeps between checkpoints of a differentiable run; none: the tape spans the whole of it.
+        cache: The kept rollouts of the simulator.
+        pool: Threads for the scenes, or None: all of them in the same launches.
+
+    Raises:
+        UserError: What `Plan.check` finds.
+    """
+    differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    captured = plan.setup.device.type == "cuda"  # a graph of many thousand substeps would be large and slow to make
+    if (differentiable or captured) and segment is not None and segment < plan.steps:
+        return _Segments.apply(plan, segment, cache, *inputs)
+    if pool is not None:
+        return _ThreadedRollout.apply(SingleScenes(plan, cache, pool), differentiable, *inputs)
+    if differentiable:
+        return _Rollout.apply(plan, cache, *inputs)
+    return _frames(plan, cache, tuple(t.detach() for t in inputs))
+
+
+def _frames(plan: Plan, cache: RolloutCache, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """A run without a tape."""
+    kept = cache.find(plan, inputs, keep_all=False)
+    kept.forward(plan, inputs)
+    check(plan, kept.tape)
+    return kept.tape.states
+
+
+class _Rollout(torch.autograd.Function):
+    """Frames of x, v, C, F from the start, the parameters and the laws' tensors."""
+
+    @staticmethod
+    def forward(ctx: Any, plan: Plan, cache: RolloutCache, *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        inputs = tuple(t.detach() for t in inputs)
+        # the tape belongs to the simulator: a later rollout may overwrite it, and the backward pass then runs this one again
+        ctx.plan, ctx.lock, ctx.kept = plan, cache.lock, cache.find(plan, inputs, keep_all=True)
+        ctx.serial = ctx.kept.forward(plan, inputs)
+        check(plan, ctx.kept.tape)
+        ctx.save_for_backward(*(t.clone() for t in inputs))
+        return tuple(t[:: plan.every] for t in ctx.kept.tape.states)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        wanted = ctx.needs_input_grad[2:]
+        with ctx.lock:
+            out = ctx.kept.backward(ctx.plan, ctx.saved_tensors, ctx.serial, gradients, wanted)
+        return (None, None, *(g if want else None for g, want in zip(out, wanted, strict=True)))
+
+
+class _Segments(torch.autograd.Function):
+    """`_Rollout` in segments: only the states between them are kept, and the backward pass makes the tape of one segment at a time."""
+
+    @staticmethod
+    def forward(ctx: Any, plan: Plan, segment: int, cache: RolloutCache, *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        inputs = tuple(t.detach() for t in inputs)
+        ctx.part, ctx.count, ctx.cache = plan.shortened(segment), plan.steps // segment, cache
+        length = segment // plan.every
+        frames = tuple(t.new_empty(ctx.count * length + 1, *t.shape) for t in inputs[:STATES])
+        starts = [inputs[:STATES]]
+        for i in range(ctx.count):
+            rest = [_own(t, kind, i, segment) for t, kind in zip(inputs[STATES:], _kinds(inputs))]
+            for frame, part in zip(frames, _frames(ctx.part, cache, (*starts[i], *rest))):
+                frame[i * length : (i + 1) * length + 1] = part
+            starts.append(tuple(frame[(i + 1) * length].clone() for frame in frames))
+        ctx.save_for_backward(*inputs[STATES:], *(t for start in starts[:-1] for t in start))
+        return frames
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        part, wanted, tensors = ctx.part, ctx.needs_input_grad[3:], ctx.saved_tensors
+        rest, starts = tensors[: len(wanted) - STATES], tensors[len(wanted) - STATES :]
+        length = part.steps // part.every
+        cache = ctx.cache
+        carry = [torch.zeros_like(t) for t in starts[:STATES]]
+        kinds = _kinds((*carry, *rest))
+        total = [torch.zeros_like(t) for t in rest]
+        for i in reversed(range(ctx.count)):
+            inputs = (*starts[STATES * i : STATES * (i + 1)], *(_own(t, kind, i, part.steps) for t, kind in zip(rest, kinds)))
+            own = []
+            for a, gradient in zip(carry, gradients):
+                of_frames = a.new_zeros(length + 1, *a.shape)
+                if gradient is not None:
+                    # the first frame of a segment is the last one of the segment before
+                    of_frames[0 if i == 0 else 1 :] = gradient[i * length + (0 if i == 0 else 1) : (i + 1) * length + 1]
+                of_frames[-1] += a
+                own.append(of_frames)
+            with cache.lock:
+                kept = cache.find(part, inputs, keep_all=True)
+                serial = kept.forward(part, inputs)
+                out = kept.backward(part, inputs, serial, own, (True,) * STATES + tuple(wanted[STATES:]))
+            carry = out[:STATES]
+            for t, kind, new in zip(total, kinds, out[STATES:], strict=True):
+                if new is not None:
+                    _own(t, kind, i, part.steps).add_(new)
+        return (None, None, None, *(g if want else None for g, want in zip([*carry, *total], wanted, strict=True)))
+
+
+def _kinds(inputs: Sequence[Tensor]) -> tuple[str, ...]:
+    """The kinds of the inputs after the start."""
+    return (*KINDS[STATES:], *("law",) * (len(inputs) - FIXED))
+
+
+def _own(t: Tensor, kind: str, i: int, steps: int) -> Tensor:
+    """The part of an input that segment i of `steps` substeps reads."""
+    return t[i * steps : (i + 1) * steps] if kind == "time" and t.numel() and len(t) > 1 else t
+
+
+class SingleScenes:
+    """The plans of single scenes that together do what one plan does; their inputs are its inputs' parts."""
+
+    def __init__(self, plan: Plan, cache: RolloutCache, pool: ThreadPoolExecutor) -> None:
+        self.whole, self.pool, self.lock = plan, pool, cache.lock
+        count, offsets = plan.setup.scene_count, plan.setup.particles.offsets
+        self.plans = [plan.single_scene(s) for s in range(count)]
+        self.caches = [cache.single_scene(s) for s in range(count)]
+        self.ranges = list(zip(offsets[:-1], offsets[1:]))
+
+    def part(self, inputs: Sequence[Tensor], s: int) -> tuple[Tensor, ...]:
+        """The inputs of scene s: its particles, its row of the scenes' tables, its row of a law (or the one that all share)."""
+        i, j = self.ranges[s]
+        parts = []
+        for n, t in enumerate(inputs):
+            kind = KINDS[n] if n < FIXED else "law"
+            if kind == "particle" and len(t):
+                t = t[i:j]
+            elif kind == "time" and t.numel():
+                t = t[:, s : s + 1]
+            elif (kind == "scene" or len(t) > 1) and t.numel():
+                t = t[s : s + 1]
+            parts.append(t)
+        parts[FRICTION] = parts[FRICTION][:, : self.plans[s].setup.colliders.friction.shape[1]]
+        return tuple(t.contiguous() for t in parts)
+
+    def whole_gradient(self, inputs: Sequence[Tensor], parts: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
+        """The gradients of the whole's inputs from those of the scenes."""
+        out: list[Tensor | None] = []
+        for n, t in enumerate(inputs):
+            if parts[0][n] is None:
+                out.append(None)
+                continue
+            kind = KINDS[n] if n < FIXED else "law"
+            total = torch.zeros_like(t)
+            for s, (i, j) in enumerate(self.ranges):
+                part = parts[s][n]
+                if not t.numel():
+                    continue
+                if kind == "particle":
+                    total[i:j] = part
+                elif kind == "time":
+                    total[:, s : s + 1] += part
+                else:
+                    row = total[0:1] if len(t) == 1 else total[s : s + 1]
+                    row[:, : part.shape[1]] += part
+            out.append(total)
+        return out
+
+    def each(self, function: Callable[[int], T]) -> list[T]:
+        """The function of every scene's number, as many at a time as there are cores; the first error is raised."""
+        with one_thread_each():
+            return list(self.pool.map(function, range(len(self.plans))))
+
+
+class _ThreadedRollout(torch.autograd.Function):
+    """`autograd._Rollout` of several scenes on the CPU."""
+
+    @staticmethod
+    def forward(ctx: Any, scenes: SingleScenes, keep_all: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        inputs = tuple(t.detach() for t in inputs)
+        ctx.scenes = scenes
+
+        def one(s: int):
+            plan, part = scenes.plans[s], scenes.part(inputs, s)
+            kept = scenes.caches[s].find(plan, part, keep_all)
+            serial = kept.forward(plan, part)
+            check(plan, kept.tape)
+            return kept, serial
+
+        ctx.kept = scenes.each(one)
+        ctx.save_for_backward(*(t.clone() for t in inputs))
+        stride = scenes.whole.every if keep_all else 1
+        return tuple(torch.cat([kept.tape.states[n][::stride] for kept, _ in ctx.kept], dim=1) for n in range(STATES))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        scenes, wanted, inputs = ctx.scenes, ctx.needs_input_grad[2:], ctx.saved_tensors
+
+        def one(s: int):
+            i, j = scenes.ranges[s]
+            own = [None if g is None else g[:, i:j] for g in gradients]
+            kept, serial = ctx.kept[s]
+            return kept.backward(scenes.plans[s], scenes.part(inputs, s), serial, own, wanted)
+
+        with scenes.lock:
+            out = scenes.whole_gradient(inputs, scenes.each(one))
+        return (None, None, *(g if want else None for g, want in zip(out, wanted, strict=True)))

@@ -1,0 +1,200 @@
+"""Scenes and bodies as the arrays that a rollout reads: what neither laws nor effects change."""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.colliders.tables import clamp_table, collider_table, inside_box
+from neuido.physics.mpm import transfers as kernels
+from neuido.physics.runtime.device import real_of
+from neuido.types import Body, Particles, ParticleState, Scene
+
+
+def affine_velocity(x: Tensor, v: Tensor, neighbours: int = 32, chunk: int = 2048) -> Tensor:
+    """The velocity gradient that belongs to a velocity field on particles, (P, 3, 3) [1/s].
+
+    A rollout starts with it (C = 0 would lose 6-8 % of a spin in the first step). One affine fit serves where it is exact
+    to 1e-3 (all rigid and uniform motions), else a fit over the nearest neighbours of each particle. Differentiable in v.
+
+    Args:
+        x: Positions [m], (P, 3).
+        v: Velocities [m/s], (P, 3).
+    """
+    dx = x - x.mean(dim=0)
+    dv = v - v.mean(dim=0)
+    spread = dx.T @ dx
+    ridge = 1e-9 * spread.trace() * torch.eye(3, dtype=x.dtype, device=x.device)
+    gradient = torch.linalg.solve(spread + ridge, dx.T @ dv).T
+    residual = (dv - dx @ gradient.T).detach().norm(dim=1).max()
+    if residual <= 1e-3 * v.detach().norm(dim=1).max() or x.shape[0] <= neighbours:
+        return gradient.expand(x.shape[0], 3, 3).contiguous()
+    out = []
+    for start in range(0, x.shape[0], chunk):
+        near = torch.cdist(x[start : start + chunk], x).topk(neighbours, largest=False).indices
+        nx, nv = x[near], v[near]
+        nx, nv = nx - nx.mean(dim=1, keepdim=True), nv - nv.mean(dim=1, keepdim=True)
+        normal = nx.transpose(1, 2) @ nx
+        ridge = 1e-6 * normal.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] * torch.eye(3, dtype=x.dtype, device=x.device)
+        out.append(torch.linalg.solve(normal + ridge, nx.transpose(1, 2) @ nv).transpose(1, 2))
+    return torch.cat(out).contiguous()
+
+
+class Setup:
+    """Scenes, bodies and scratch memory of a simulator. Nothing but the scratch memory changes once it is made.
+
+    Args:
+        scenes: S scenes.
+        bodies: As many bodies.
+        densities: [kg/m^3], one for each scene.
+        device: Where the arrays lie, with its index.
+        dtype: Their scalar type.
+        keep: Of `Simulator`.
+
+    Raises:
+        UserError: As `Simulator`.
+
+    Attributes:
+        particles: Which scene each particle belongs to.
+        state: The start, in the order of the bodies.
+        mass: [kg], (P,).
+        volume: [m^3], (P,).
+        held: Particles in a clamp, (P,) uint8.
+        order: The order in which the kernels see the particles, (P,): scene by scene, then by cell.
+        inverse: The inverse permutation.
+        nodes: Grid nodes along each axis, padding included.
+        keep_grid: Whether a tape holds stress and nodes too.
+        first_scene: Number of the first scene in the simulator that this is a part of.
+        first_particle: Likewise of the first particle.
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        bodies: Sequence[Body],
+        densities: Sequence[float],
+        device: torch.device,
+        dtype: torch.dtype,
+        keep: Literal["state", "all", "auto"],
+    ) -> None:
+        self.scenes, self.device, self.dtype = tuple(scenes), device, dtype
+        self.kernels = kernels.build(real_of(dtype))
+        self._load_scenes()
+        self._load_bodies(bodies, densities)
+        nodes = [max(scene.nodes[a] for scene in self.scenes) + 2 * kernels.PAD for a in range(3)]
+        self.nodes = wp.vec3i(*nodes)
+        self.grid_shape = (len(self.scenes), *nodes)
+        self.node_count = math.prod(self.grid_shape)
+        self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes a thread: on the CPU its call costs as much as a node
+        scene, *axes = (torch.arange(n, dtype=torch.int32) for n in self.grid_shape)
+        s, i, j, k = torch.meshgrid(scene, *axes, indexing="ij")
+        self.node_index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(self.device)
+        watched = self.device.type == "cpu" and len(self.scenes) == 1
+        self.span = torch.empty(2 if watched else 0, dtype=self.dtype, device=self.device)
+        """Least and greatest x [m] of the particles after a substep, of one scene on the CPU."""
+        self.ends = self.span.numpy() if watched else None
+        self._sort()
+        self.keep_grid = keep == "all" or (keep == "auto" and self.node_count <= 4 * len(self.mass))
+        self.first_scene = self.first_particle = 0
+        self._single: dict[int, Setup] = {}
+        self._scratch: dict[str, Tensor] = {}
+
+    def _load_scenes(self) -> None:
+        def column(values: list) -> Tensor:
+            return torch.tensor(values, dtype=torch.float64).to(self.device, self.dtype)
+
+        for scene in self.scenes:
+            if not (scene.cells >= 4 and scene.dt > 0 and all(u > l for l, u in zip(scene.lower, scene.upper))):
+                raise UserError(f"cells is {scene.cells}, dt {scene.dt:g}; a scene needs cells >= 4, dt > 0 and upper above lower")
+        self.dx = column([s.dx for s in self.scenes])
+        self.dt = column([s.dt for s in self.scenes])
+        self.origin = column([[l - kernels.PAD * s.dx for l in s.lower] for s in self.scenes])
+        self.gravity = column([list(s.gravity) for s in self.scenes])
+        self.colliders = collider_table(self.scenes, self.dtype, self.device)
+        self.clamp_lower, self.clamp_upper = clamp_table(self.scenes, self.dtype, self.device)
+
+    def _load_bodies(self, bodies: Sequence[Body], densities: Sequence[float]) -> None:
+        x, v, C, F, mass, volume, held, scene_index = [], [], [], [], [], [], [], []
+        for s, (scene, body, rho) in enumerate(zip(self.scenes, bodies, densities)):
+            bx = torch.as_tensor(body.x).to(self.device, torch.float64)
+            bv = torch.as_tensor(body.v).to(self.device, torch.float64)
+            V = torch.as_tensor(body.volume).to(self.device, torch.float64)
+            if bx.ndim != 2 or bx.shape[1] != 3 or bv.shape != bx.shape or V.shape != bx.shape[:1] or not len(bx):
+                raise UserError(f"body of scene {s} has shapes x {tuple(bx.shape)}, v {tuple(bv.shape)}, volume {tuple(V.shape)}; "
+                                "they must be (P, 3), (P, 3), (P,)")  # fmt: skip
+            if not bool(torch.isfinite(bx).all() & torch.isfinite(bv).all() & (V > 0).all()):
+                raise UserError(f"body of scene {s} holds a NaN, an infinity or a volume that is not positive")
+            lower, upper = bx.new_tensor(scene.lower), bx.new_tensor(scene.upper)
+            out = ((bx < lower) | (bx > upper)).any(dim=1)
+            if bool(out.any()):
+                p = int(out.nonzero()[0])
+                raise UserError(f"particle {p} of scene {s} at {short_vector(bx[p])} m lies outside the domain "
+                                f"{short_vector(lower)} to {short_vector(upper)}; move the body or enlarge `lower`/`upper`")  # fmt: skip
+            m = rho * V
+            for attached in scene.attached_masses:
+                picked = inside_box(bx, attached.box, name="attached mass")
+                m = m + torch.where(picked, V, 0.0) * (attached.mass / V[picked].sum())
+            hold = torch.zeros(len(bx), dtype=torch.bool, device=self.device)
+            for box in scene.clamps:
+                hold |= inside_box(bx, box, name="clamp")
+            x.append(bx)
+            v.append(bv)
+            mass.append(m)
+            volume.append(V)
+            held.append(hold)
+            C.append(affine_velocity(bx, bv))
+            eye = torch.eye(3, dtype=torch.float64, device=self.device).expand(len(bx), 3, 3)
+            F.append(eye if body.F is None else torch.as_tensor(body.F).to(self.device, torch.float64))
+            scene_index.append(torch.full((len(bx),), s, dtype=torch.int32, device=self.device))
+
+        def join(parts: list[Tensor]) -> Tensor:
+            return torch.cat(parts).to(self.dtype).contiguous()
+
+        offsets = [0]
+        for part in x:
+            offsets.append(offsets[-1] + len(part))
+        self.particles = Particles(torch.cat(scene_index), tuple(offsets))
+        self.state = ParticleState(join(x), join(v), join(C), join(F))
+        self.mass, self.volume = join(mass), join(volume)
+        self.held = torch.cat(held).to(torch.uint8)
+
+    def _sort(self) -> None:
+        """The order in which the kernels see the particles: scene by scene, then by cell, so that neighbours add to the same nodes."""
+        scene = self.particles.scene.long()
+        cell = ((self.state.x - self.origin[scene]) / self.dx[scene, None] - 0.5).floor().long()
+        ny, nz = self.grid_shape[2:]
+        key = ((scene * self.grid_shape[1] + cell[:, 0]) * ny + cell[:, 1]) * nz + cell[:, 2]
+        self.order = torch.argsort(key, stable=True)
+        self.inverse = torch.argsort(self.order)
+        self.sorted_volume, self.sorted_held = self.volume[self.order].contiguous(), self.held[self.order].contiguous()
+
+    def single_scene(self, s: int) -> "Setup":
+        """Return the set-up of scene s alone, with its particles in the order that they have here."""
+        if s not in self._single:
+            own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
+            body = Body(self.state.x[own], self.state.v[own], self.volume[own], self.state.F[own])
+            one = Setup(self.scenes[s : s + 1], [body], [1000.0], self.device, self.dtype, "all" if self.keep_grid else "state")
+            one.order = self.order[own] - own.start
+            one.sorted_volume, one.sorted_held = self.sorted_volume[own], self.sorted_held[own]
+            one.first_scene, one.first_particle = s, own.start
+            self._single[s] = one
+        return self._single[s]
+
+    @property
+    def scene_count(self) -> int:
+        """The number of scenes S."""
+        return len(self.scenes)
+
+    def scratch(self, name: str) -> Tensor:
+        """Return a buffer of four numbers a node, (S nx ny nz, 4), kept between rollouts."""
+        if name not in self._scratch:
+            self._scratch[name] = torch.empty(self.node_count, 4, dtype=self.dtype, device=self.device)
+        return self._scratch[name]
+
+
+def short_vector(t: Tensor) -> list[float]:
+    return [float(f"{value:.4g}") for value in t.tolist()]
