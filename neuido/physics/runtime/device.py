@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics.runtime.launches import note
+from neuido.physics.runtime import internals, launches
 from neuido.physics.runtime.once import BUILDING, cached
 
 
@@ -120,59 +120,58 @@ def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.dev
 
 
 @cached
-def _contract(kernel: wp.Kernel) -> None:
-    """On the CPU let products and sums be rounded once: a tenth less time. Warp's default is to do so within an expression.
-
-    Before the module is first loaded, on whatever device: its options are part of its name there.
-    """
-    module = kernel.module
-    if kernel.func.__module__.startswith("neuido.") and module.options["cpu_compiler_flags"] is None:
-        flags = wp.config.cpu_compiler_flags
-        flags = "-march=native" if flags is None else flags
-        wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast".strip()}, module=module)
-
-
-@cached
 def _load(kernel: wp.Kernel, device: torch.device, block: int) -> None:
     """Load a kernel's code on a GPU, one thread at a time, since Warp's tables of modules are not for several."""
     _contract(kernel)
-    kernel.module.load(wp.device_from_torch(device), block)
+    internals.load(kernel, device, block)
+
+
+_contract = cached(internals.contract_products)
 
 
 def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:
-    """What Warp takes for the arguments of a kernel, whose module has its options from here on."""
+    """Return what Warp takes for the arguments of a kernel, whose module has its options from here on."""
     _contract(kernel)
     return [
-        _array(value, arg.type.dtype) if isinstance(value, Tensor) else value for value, arg in zip(arguments, kernel.adj.args, strict=True)
+        _array(value, arg.type.dtype) if isinstance(value, Tensor) else value
+        for value, arg in zip(arguments, internals.parameters(kernel), strict=True)
     ]
 
 
 class _Command:
-    """A launch on the CPU with its arguments packed, for the next time: Warp's own packing takes as long as the work of 500 particles.
+    """A packed launch, and the arguments that its key knows by their address."""
 
-    It keeps no tensor: who calls it again brings tensors that lie in the same places.
-    """
+    __slots__ = ("kept", "launch")
 
-    __slots__ = ("arguments", "bounds", "forward", "kept", "module")
-
-    def __init__(self, kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
-        recorded = wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), record_cmd=True)
-        layout = _layouts.get(kernel)
-        if layout is None:
-            fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, recorded.params[1:], strict=True)]
-            layout = _layouts[kernel] = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
-        packed = layout(*recorded.params[1:])
-        self.bounds, self.arguments, self.forward, self.module = recorded.bounds, packed, recorded.hooks.forward, recorded.module_exec
-        self.kept = [value for value in arguments if not isinstance(value, Tensor)]  # what the key knows by its address
+    def __init__(self, kernel: wp.Kernel, dim: int, arguments: Sequence) -> None:
+        self.launch = internals.PackedLaunch(kernel, dim, _inputs(kernel, arguments))
+        self.kept = [value for value in arguments if not isinstance(value, Tensor)]
 
 
-MOST_COMMANDS = 12_000
+COMMAND_CAPACITY = 12_000
 """Packed launches that are kept: those of a thousand substeps with their adjoints."""
-_layouts: dict[wp.Kernel, type[ctypes.Structure]] = {}
 _commands: dict[tuple, _Command] = {}
 
 
+def forget_launches() -> None:
+    """Drop all packed launches."""
+    with BUILDING:
+        _commands.clear()
+
+
+def packed_launches() -> int:
+    """Return how many packed launches are kept."""
+    return len(_commands)
+
+
 def _launch_again(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
+    """Launch on the CPU, with the arguments packed where a launch of these tensors was before."""
+    if not internals.WARP_TRIED:
+        with BUILDING:
+            inputs = _inputs(kernel, arguments)
+        launches.forbid_repetition()
+        wp.launch(kernel, dim=dim, inputs=inputs, device="cpu")
+        return
     key: list = [kernel, dim]
     scalars = []
     for i, value in enumerate(arguments):
@@ -185,26 +184,27 @@ def _launch_again(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torc
     command = _commands.get(tuple(key))
     if command is None:
         with BUILDING:  # two threads that load one module at a time would leave one of them with the other's code, or with none
-            if len(_commands) > MOST_COMMANDS:
+            if len(_commands) > COMMAND_CAPACITY:
                 _commands.clear()
-            command = _commands[tuple(key)] = _Command(kernel, dim, arguments, device)
-    packed = command.arguments
+            command = _commands[tuple(key)] = _Command(kernel, dim, arguments)
+    packed = command.launch
     for i, value in scalars:
-        setattr(packed, kernel.adj.args[i].label, value)
-    note(command.forward, command.bounds, packed, command)
-    command.forward(ctypes.byref(command.bounds), ctypes.byref(packed))
+        setattr(packed.arguments, internals.parameters(kernel)[i].label, value)
+    launches.note(packed.enter, packed.bounds, packed.arguments, command)
+    packed.enter(ctypes.byref(packed.bounds), ctypes.byref(packed.arguments))
 
 
 _arrays: dict[tuple, object] = {}
 
 
 def _array(t: Tensor, dtype: type) -> object:
-    """Warp's descriptor of a tensor. It is address, shape and strides alone, so one serves whatever lies there next: 4 us saved."""
+    """Return Warp's descriptor of a tensor. It is address, shape and strides, so one serves whatever lies there next: 4 us saved."""
+    if not internals.WARP_TRIED:
+        return internals.describe_array(t, dtype)
     key = (t.data_ptr(), t.shape, t.stride(), dtype)
     found = _arrays.get(key)
     if found is None:
         if len(_arrays) > 20_000:
             _arrays.clear()
-        found = _arrays[key] = wp.from_torch(t.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-        found._ref = found._gradref = None  # Warp would hold the tensor's memory for as long as the descriptor is kept
+        found = _arrays[key] = internals.describe_array(t, dtype)
     return found

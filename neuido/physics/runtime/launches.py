@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
-from torch.utils._python_dispatch import TorchDispatchMode
+from neuido.physics.runtime import internals
 
 _active = threading.local()
 
@@ -38,7 +38,14 @@ def note(enter: Callable[[Any, Any], None], bounds: Any, arguments: ctypes.Struc
         recording.launches.append(Launch(enter, ctypes.byref(bounds), own, by_step, (owner, bounds)))
 
 
-class Recording(TorchDispatchMode):
+def forbid_repetition() -> None:
+    """Mark the recording of this thread, if there is one, as one that lacks a launch."""
+    recording = getattr(_active, "recording", None)
+    if recording is not None:
+        recording.whole = False
+
+
+class Recording(internals.DispatchMode):
     """The launches of this thread while it is open; `repeat` runs them again, on the tensors that lay there.
 
     It keeps no tensor: theirs must outlive it.
@@ -81,6 +88,9 @@ class Stretches:
 
     def run(self, key: Hashable, stretch: Callable[[], None], step: int = 0) -> None:
         """Run a stretch; where it ran with this key it is repeated, if launches are all that it is."""
+        if not internals.TORCH_TRIED:  # an operation of torch between the launches would go unseen
+            stretch()
+            return
         if key not in self.kept:
             with Recording() as recording:
                 stretch()

@@ -57,18 +57,18 @@ def test_threads_that_meet_a_new_kernel_agree():
                 return False
         return True
 
-    device._commands.clear()
+    device.forget_launches()
     with ThreadPoolExecutor(8) as pool:
         assert all(pool.map(work, range(16)))
 
 
 def test_the_memory_of_launches_is_bounded(monkeypatch):
-    monkeypatch.setattr(device, "MOST_COMMANDS", 10)
+    monkeypatch.setattr(device, "COMMAND_CAPACITY", 10)
     x, box, kept = torch.arange(3.0), wp.vec3i(0, 0, 0), []
     for n in range(40):
         kept.append(torch.empty(3))
         device.launch(add, 3, [1.0, n, False, box, x, kept[-1]], CPU)
-    assert len(device._commands) <= 12
+    assert device.packed_launches() <= 12
     assert all(torch.equal(out, x + n) for n, out in enumerate(kept))
 
 

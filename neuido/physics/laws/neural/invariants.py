@@ -18,6 +18,7 @@ from neuido.physics.laws.neural.layers import linear, linear_adjoint
 from neuido.physics.linalg import decompositions as linalg
 from neuido.physics.runtime import device
 from neuido.physics.runtime.device import real_of, torch_stream
+from neuido.physics.runtime.internals import gelu_adjoint_into, gelu_into
 from neuido.types import Particles
 
 PLASTIC_SCALE = 1e-3
@@ -45,7 +46,7 @@ class InvariantEngine(Engine):
         self._launch(self.kernels.features, F, b["x"], self.R)
         for W, x, z, h in ((0, "x", "z1", "h1"), (1, "h1", "z2", "h2")):
             linear(b[x], self.tensors[W], None, offsets, b[z])
-            torch._C._nn.gelu(b[z], out=b[h])
+            gelu_into(b[z], b[h])
         linear(b["h2"], self.tensors[2], None, offsets, b["y"])
 
     def forward(self, F: Tensor, out: Tensor) -> None:
@@ -68,7 +69,8 @@ class InvariantEngine(Engine):
 
     def _through_gelu(self, h: str, z: str) -> Tensor:
         grad = self.adjoints[h]
-        return torch.ops.aten.gelu_backward.grad_input(grad, self.buffer[z], approximate="none", grad_input=grad)
+        gelu_adjoint_into(grad, self.buffer[z], grad)
+        return grad
 
     def _layer(self, i: int, x: str, grad: Tensor) -> None:
         linear_adjoint(self.buffer[x], self.tensors[i], grad, self.particles.offsets, None, self.adjoints[x], self.grads[i], None)

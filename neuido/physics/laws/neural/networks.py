@@ -24,6 +24,7 @@ from neuido.physics.laws.neural.layers import linear, linear_adjoint
 from neuido.physics.laws.neural.network_kernels import COARSE, DELTA, FINE, LINEAR, LODE
 from neuido.physics.runtime import device
 from neuido.physics.runtime.device import real_of, torch_stream
+from neuido.physics.runtime.internals import silu_adjoint_into, silu_into
 from neuido.physics.runtime.once import cached
 from neuido.types import Particles
 
@@ -192,9 +193,9 @@ class _Network:
         w = self._buffers(F, W1.shape[-2])
         self._features(F, w.x)
         linear(w.x, W1, b1, offsets, w.z1)
-        torch._C._nn.silu(w.z1, out=w.h1)
+        silu_into(w.z1, w.h1)
         linear(w.h1, W2, b2, offsets, w.z2)
-        torch._C._nn.silu(w.z2, out=w.h2)
+        silu_into(w.z2, w.h2)
         linear(w.h2, W3, b3, offsets, w.y)
         return w
 
@@ -206,9 +207,9 @@ class _Network:
         gW1, gb1, gW2, gb2, gW3, gb3 = grads
         offsets = self._offsets(F, particles)
         linear_adjoint(w.h2, W3, w.gy, offsets, w.ones, w.g2, gW3, gb3)
-        torch.ops.aten.silu_backward.grad_input(w.g2, w.z2, grad_input=w.g2)
+        silu_adjoint_into(w.g2, w.z2, w.g2)
         linear_adjoint(w.h1, W2, w.g2, offsets, w.ones, w.g1, gW2, gb2)
-        torch.ops.aten.silu_backward.grad_input(w.g1, w.z1, grad_input=w.g1)
+        silu_adjoint_into(w.g1, w.z1, w.g1)
         linear_adjoint(w.x, W1, w.g1, offsets, w.ones, w.gx, gW1, gb1)
 
     @staticmethod
