@@ -20,7 +20,7 @@ import torch
 from neuido.data.bodies.families import PUBLISHED, laws
 from neuido.data.bodies.scene_files import load_scene, scene_names
 from neuido.errors import UserError
-from neuido.models.baselines.learned import nclaw
+from neuido.models.baselines.nclaw import load_nclaw
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.physics.mpm.simulator import Simulator
 
@@ -60,7 +60,7 @@ def main() -> None:
                 errors = {}
                 for label, learned in (
                     ("ours", operator.laws(operator.latent(name))),
-                    ("nclaw", nclaw(Path(options.data) / f"peers/nclaw-{name}.npz")),
+                    ("nclaw", load_nclaw(Path(options.data) / f"peers/nclaw-{name}.npz")),
                 ):
                     try:
                         x = sim.rollout(options.steps, *learned, every=5).x

@@ -55,9 +55,9 @@ def film(
     Raises:
         UserError: An impossible material, a step above the stability limit, a folder that holds another set-up.
     """
-    from neuido.models.video.clip_generation import Plan, make
+    from neuido.models.video.clip_generation import ClipPlan, generate_clips
 
-    plan = Plan(
+    plan = ClipPlan(
         count=count,
         families={family: {name: tuple(bounds) for name, bounds in ranges.items()} for family, ranges in families.items()},
         views=views,
@@ -72,4 +72,4 @@ def film(
         samples=samples,
         seed=seed,
     )
-    make(plan, out, device=device, batch=batch, shard=shard, shards=shards, progress=progress)
+    generate_clips(plan, out, device=device, batch=batch, shard=shard, shards=shards, progress=progress)

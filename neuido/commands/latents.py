@@ -7,7 +7,7 @@ from neuido.errors import UserError
 
 if TYPE_CHECKING:
     from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-    from neuido.models.operator.latent_space import Interpolation
+    from neuido.models.operator.interpolation import Interpolation
 
 PARTS = ("space", "interpolation")
 COLOURS = ("C0", "C1", "C2", "C3", "C4", "C5")
@@ -64,15 +64,15 @@ def _space(operator: "IntrinsicDynamicsOperator", folder: Path, perplexity: floa
     import numpy as np
 
     from neuido.data.files.score_tables import write_rows
-    from neuido.models.operator.latent_space import embed, idle, silhouettes
+    from neuido.models.operator.latent_space import active_directions, silhouettes, tsne
 
-    points = embed(operator, perplexity=perplexity, seed=seed)
+    points = tsne(operator, perplexity=perplexity, seed=seed)
     write_rows(folder / "embedding.csv", points)
     found = silhouettes(operator, np.array([(p["x"], p["y"]) for p in points]))
     write_rows(folder / "silhouettes.csv", found)
     for row in found:
         print(f"silhouette by family, {row['space']:22s}{row['silhouette']:7.3f}  ({row['meaning']})")
-    write_rows(folder / "directions.csv", idle(operator))
+    write_rows(folder / "directions.csv", active_directions(operator))
     draw_embedding(points, folder / "embedding.png")
 
 
@@ -83,9 +83,9 @@ def _interpolation(
 
     from neuido.data.files.score_tables import write_rows
     from neuido.data.files.storage import publish
-    from neuido.models.operator.latent_space import all_pairs, interpolate, monotonicity, softest_and_stiffest
+    from neuido.models.operator.interpolation import interpolate, monotonicity, pairwise_monotonicity, softest_and_stiffest
 
-    pairs = [{"family": each, **all_pairs(operator, each)} for each in dict.fromkeys(operator.latent_families)]
+    pairs = [{"family": each, **pairwise_monotonicity(operator, each)} for each in dict.fromkeys(operator.latent_families)]
     write_rows(folder / "pairs.csv", pairs)
     found = interpolate(operator, ends or softest_and_stiffest(operator, family), count=count, device=device)
     write_rows(folder / "interpolation.csv", found.rows)

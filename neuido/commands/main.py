@@ -48,7 +48,7 @@ HEAVY = {
 
 MODULES = (  # so that their class names resolve without a path
     *(f"neuido.models.stages.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt")),
-    *(f"neuido.models.baselines.{name}" for name in ("learned", "spring_gaus", "sparse_law")),
+    *(f"neuido.models.baselines.{name}" for name in ("known_law", "nclaw", "spring_gaus", "sparse_law", "stage_one_latents")),
     "neuido.models.fewshot.low_rank",
     "neuido.data.trajectories.trajectory_module",
     "neuido.data.scenes.clips",

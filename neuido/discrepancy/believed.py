@@ -17,7 +17,7 @@ from neuido.data.files.storage import publish
 from neuido.data.measured.experiment import Experiment, read_belief
 from neuido.discrepancy.library import effects_of
 from neuido.errors import UserError
-from neuido.models.inference.outputs import load_law
+from neuido.models.inference.law_file import load_law
 from neuido.physics.effects.coefficients import shear_modulus
 from neuido.physics.effects.library import KNOTS
 from neuido.physics.effects.parameters import Effects

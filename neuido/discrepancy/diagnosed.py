@@ -2,7 +2,7 @@
 
 from neuido.discrepancy.believed import read_model_file, ready
 from neuido.models.fewshot.scene_fit import EffectSource
-from neuido.models.inference.pipeline import Prepared
+from neuido.models.inference.prepared_scene import PreparedScene
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.mpm.simulator import Simulator
 
@@ -21,7 +21,7 @@ class DiagnosedEffects(EffectSource):
         self.model = read_model_file(path)
         self._made: tuple[Simulator, Effects] | None = None
 
-    def of(self, scene: Prepared) -> Effects:
+    def of(self, scene: PreparedScene) -> Effects:
         """The effects on the scene's body."""
         if self._made is None or self._made[0] is not scene.simulator:
             times = scene.source.batch.times

@@ -15,7 +15,7 @@ from neuido.data.scenes.filmed_scene import read_truth
 from neuido.data.scenes.multiview import UP
 from neuido.data.scenes.synthetic import make_scenes
 from neuido.data.trajectories.options import Film
-from neuido.models.inference.outputs import load_law
+from neuido.models.inference.law_file import load_law
 from neuido.models.render.splatting import rasterize
 
 BOX = {

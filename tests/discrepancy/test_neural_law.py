@@ -11,7 +11,7 @@ import yaml
 from neuido.data.measured.experiment import read_experiment
 from neuido.discrepancy.believed import classical, laws_of, ready, scaled, with_law
 from neuido.discrepancy.body import body_problem
-from neuido.models.inference.outputs import load_law, save_law
+from neuido.models.inference.law_file import load_law, save_law
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.physics.mpm.simulator import Simulator
 from tests.command import run

@@ -1,0 +1,1 @@
+"""Baselines: other methods behind the interface of `Method`."""

@@ -13,17 +13,16 @@ import torch
 from torch import Tensor, nn
 
 from neuido.errors import UserError
-from neuido.models.baselines.learned import positive
-from neuido.models.fewshot.method import Laws, Method
-from neuido.models.inference.pipeline import Prepared
-from neuido.models.operator.branch import implausible_stress
+from neuido.models.fewshot.method import Method, require_positive
+from neuido.models.inference.prepared_scene import Laws, PreparedScene
+from neuido.models.operator.law_properties import implausible_stress
 from neuido.physics.laws.classical import lame
 from neuido.physics.laws.neural.network_kernels import LINEAR
 from neuido.physics.laws.neural.networks import STRAIN_SCALE, STRESS_SCALE, hencky_strain
 from neuido.physics.laws.neural.symbolic import DEGREE, SymbolicElastic, SymbolicPlastic, formula, generators, polynomial
 from neuido.types import ParticleState
 
-NEVER, NOTHING = 9.0, -30.0
+UNREACHABLE, ZERO_RADIUS = 9.0, -30.0
 """Logarithms of a radius that no strain reaches, and of one that is zero."""
 
 STRAIN = 0.3
@@ -80,7 +79,7 @@ class SparseLaw(Method):
     ):
         super().__init__()
         radii = {"cohesion": cohesion, "friction": friction, "expansion": expansion}
-        positive(young=young, **radii, stiffness_rate=stiffness_rate, shape_rate=shape_rate, yield_rate=yield_rate)
+        require_positive(young=young, **radii, stiffness_rate=stiffness_rate, shape_rate=shape_rate, yield_rate=yield_rate)
         for name, value, most in (("poisson", poisson, 0.5), ("threshold", threshold, 1.0)):
             if not 0 < value < most:
                 raise UserError(f"model.method.{name} = {value}: it must lie between 0 and {most:g}")
@@ -93,7 +92,7 @@ class SparseLaw(Method):
         self.plausibility_weight = plausibility_weight
         self.rates = (stiffness_rate, shape_rate, yield_rate)
 
-    def build(self, scene: Prepared) -> None:
+    def build(self, scene: PreparedScene) -> None:
         mu, lam = (float(t) for t in lame(torch.tensor(self.young), torch.tensor(self.poisson)))
         shape = torch.zeros(4, 7)
         shape[0, 0], shape[1, 0] = 1.0, 2 * mu / (lam + 2 * mu / 3)
@@ -101,7 +100,7 @@ class SparseLaw(Method):
         radii = [math.log10(radius / unit) for radius, unit in zip(self.radii, (STRAIN_SCALE, 1.0, STRAIN_SCALE))]
         self.level = nn.Parameter(torch.tensor(math.log10((lam + 2 * mu / 3) / STRESS_SCALE)))
         self.shape = nn.Parameter(shape)
-        self.surface = nn.Parameter(torch.tensor(radii if yields else [NEVER, NOTHING, NEVER]))
+        self.surface = nn.Parameter(torch.tensor(radii if yields else [UNREACHABLE, ZERO_RADIUS, UNREACHABLE]))
         self.register_buffer("gain", (1 / (LINEAR * STRAIN)) ** torch.tensor(DEGREE))
         self.register_buffer("active", torch.ones(4, 7))
         self.register_buffer("runs", torch.zeros((), dtype=torch.int64))
@@ -112,17 +111,17 @@ class SparseLaw(Method):
         """Of the stress, (4, 7); zero where a term was dropped."""
         return 10**self.level * self.active * self.shape * self.gain
 
-    def laws(self, scene: Prepared) -> Laws:
+    def laws(self, scene: PreparedScene) -> Laws:
         return SymbolicElastic(self.coefficients()[None]), SymbolicPlastic(10 ** self.surface[None, :, None])
 
-    def roll(self, scene: Prepared, frames: int, **options) -> ParticleState:
-        """As `Method.roll`. After `interval` more runs with gradients the terms are weighed, and before the next run some dropped."""
+    def rollout(self, scene: PreparedScene, frames: int, **options) -> ParticleState:
+        """As `Method.rollout`. After `interval` more runs with gradients the terms are weighed, and before the next run some dropped."""
         fitting = torch.is_grad_enabled()
         if fitting:
             if self._due():
                 self.drop()
             self.runs += 1
-        motion = super().roll(scene, frames, **options)
+        motion = super().rollout(scene, frames, **options)
         if fitting and self._due():
             F = motion.F.detach()[1:].reshape(-1, 3, 3)
             self.weigh(F[:: max(1, len(F) // SAMPLES)])
@@ -147,9 +146,9 @@ class SparseLaw(Method):
         share = (cohesion / (cohesion + friction))[flowed].mean()  # NaN where none flows: both comparisons are false
         never, expands = flowed.float().mean() < REACHED, (l >= 0.98 * STRAIN_SCALE * c2).float().mean() >= REACHED
         becomes = [torch.full_like(share, math.nan) for _ in range(3)]
-        becomes[0] = becomes[0].masked_fill(share < self.threshold, NOTHING).masked_fill(never, NEVER)
-        becomes[1] = becomes[1].masked_fill((share > 1 - self.threshold) | never, NOTHING)
-        becomes[2] = becomes[2].masked_fill(~expands, NEVER)
+        becomes[0] = becomes[0].masked_fill(share < self.threshold, ZERO_RADIUS).masked_fill(never, UNREACHABLE)
+        becomes[1] = becomes[1].masked_fill((share > 1 - self.threshold) | never, ZERO_RADIUS)
+        becomes[2] = becomes[2].masked_fill(~expands, UNREACHABLE)
         self.becomes.copy_(torch.stack(becomes))
 
     @torch.no_grad()
@@ -167,9 +166,9 @@ class SparseLaw(Method):
         law = SymbolicElastic(self.coefficients()[None])
         return self.sparsity * (size.sum() - size[:2, 0].sum()) + self.plausibility_weight * implausible_stress(law, law.modulus()[0])
 
-    def retreat(self) -> Tensor:
+    def recovery_loss(self) -> Tensor:
         """The way from the start, of what was not dropped."""
-        alive = (torch.ones_like(self.level), self.active, (self.surface.abs() < NEVER - 1).detach())
+        alive = (torch.ones_like(self.level), self.active, (self.surface.abs() < UNREACHABLE - 1).detach())
         ways = [(p - start.to(p)).mul(part).abs().sum() for p, start, part in zip(self.trainable().values(), self._start, alive)]
         return torch.stack(ways).sum()
 

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from neuido.errors import UserError
-from neuido.models.baselines.learned import positive
-from neuido.models.fewshot.method import Laws, Method
-from neuido.models.inference.pipeline import Prepared
+from neuido.models.fewshot.method import Method, require_positive
+from neuido.models.inference.prepared_scene import Laws, PreparedScene
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.springs.mass_spring import MassSpring, connect
 from neuido.types import ParticleState
@@ -61,12 +60,14 @@ class SpringMass(Method):
         for name, value in sizes.items():
             if value < 1:
                 raise UserError(f"model.method.{name} = {value + (name == 'anchors')}: at least {1 + (name == 'anchors')} is needed")
-        positive(young=young, stiffness_rate=stiffness_rate, other_rate=other_rate, **({} if damping == 0 else {"damping": damping}))
+        require_positive(
+            young=young, stiffness_rate=stiffness_rate, other_rate=other_rate, **({} if damping == 0 else {"damping": damping})
+        )
         self.count, self.neighbours, self.nearest, self.per, self.firm = anchors, neighbours, binding, per, firm
         self.power, self.young, self.fit_damping = power, young, fit_damping
         self.damping_start, self.stiffness_rate, self.other_rate = damping, stiffness_rate, other_rate
 
-    def build(self, scene: Prepared) -> None:
+    def build(self, scene: PreparedScene) -> None:
         simulator = scene.simulator
         x = simulator.state.x
         self.index = farthest_points(x, self.count)
@@ -103,19 +104,19 @@ class SpringMass(Method):
         """Share of the tangential velocity that a step on the ground leaves (Spring-Gaus, `fric_k`), (1,)."""
         return (1.2 * self.slide.sigmoid() - 0.1).clamp(0, 1)
 
-    def laws(self, scene: Prepared) -> Laws:
+    def laws(self, scene: PreparedScene) -> Laws:
         raise UserError("model.method = SpringMass has no law of F: leave condition_files out")
 
-    def roll(
+    def rollout(
         self,
-        scene: Prepared,
+        scene: PreparedScene,
         frames: int,
         *,
         state: ParticleState | None = None,
         effects: Effects | None = None,
         segment: int = 0,
     ) -> ParticleState:
-        """As `Method.roll`; F stays the identity, and `segment` has no use, since a state here is small.
+        """As `Method.rollout`; F stays the identity, and `segment` has no use, since a state here is small.
 
         Raises:
             UserError: Effects are given; the motion is not finite.
@@ -129,7 +130,7 @@ class SpringMass(Method):
         start = (state.x[self.index], state.v[self.index])
         every = scene.every * parts
         x, v = self.body.rollout(scene.substeps(frames) * parts, dt / parts, *start, stiffness, damping, self.grip(), every=every)
-        wanted = slice(frames) if scene.picks is None else list(scene.picks[:frames])
+        wanted = slice(frames) if scene.recorded_frames is None else list(scene.recorded_frames[:frames])
         x, v = x[wanted], v[wanted]
         both = torch.cat([x - x[:1], v - v[:1]], -1).transpose(0, 1)  # (A, K, 6)
         moved = torch.sparse.mm(self.follow, both.flatten(1)).view(len(state.x), frames, 6).transpose(0, 1)

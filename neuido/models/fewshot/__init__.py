@@ -1,0 +1,1 @@
+"""Few-shot adaptation: methods that fit one scene."""

@@ -6,13 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-LEAST = 0.01
+MIN_IMPROVEMENT = 0.01
 """The share by which a loss must fall to count as lower."""
-RECENT = 5
+FAILURE_WINDOW = 5
 """Steps after a failure within which another one counts as of the same row."""
-ENOUGH = 3
+MAX_FAILURES = 3
 """Failures in a row that say that the last parameters that ran are themselves at the edge."""
-RECOVERY = 2.0**0.1
+RATE_RECOVERY = 2.0**0.1
 """Factor on the rates of each step that runs, up to their own."""
 
 
@@ -31,7 +31,7 @@ class Progress:
     done: bool = False
     damping: float = 1.0
     """Factor on the rates; it is halved when a step has led to a law that does not run, and comes back in ten that do."""
-    failed_at: int = -RECENT - 1
+    failed_at: int = -FAILURE_WINDOW - 1
     """Step of the last failure."""
     failures: int = 0
     """In a row."""
@@ -46,31 +46,31 @@ class Progress:
     first: dict[str, Tensor] = field(default_factory=dict)
     """The first ones that did."""
 
-    def ran(self, fit: nn.Module) -> None:
+    def record_success(self, fit: nn.Module) -> None:
         """The parameters have run."""
         self.good = snapshot(fit)
         self.first = self.first or self.good
-        self.damping = min(1.0, self.damping * RECOVERY)
+        self.damping = min(1.0, self.damping * RATE_RECOVERY)
 
-    def undo(self, fit: nn.Module, *, ran: bool = False) -> bool:
+    def restore_last_good(self, fit: nn.Module, *, ran: bool = False) -> bool:
         """Go back to the last parameters that ran, halfway to the first ones where those lead nowhere; whether there were any.
 
         Args:
             fit: What to bring back.
             ran: The law ran and only its gradient is not finite: momentum may lead on, so that nothing else changes at first.
         """
-        self.failures = self.failures + 1 if self.steps - self.failed_at <= RECENT else 1
+        self.failures = self.failures + 1 if self.steps - self.failed_at <= FAILURE_WINDOW else 1
         self.failed_at = self.steps
-        if self.failures >= ENOUGH:
+        if self.failures >= MAX_FAILURES:
             self.good = {name: torch.lerp(value, self.first[name], 0.5) for name, value in self.good.items()}
         elif ran:
             return True
         self.damping *= 0.5
         return restore(fit, self.good)
 
-    def see(self, value: float, fit: nn.Module, patience: int) -> None:
+    def record_loss(self, value: float, fit: nn.Module, patience: int) -> None:
         """Take the loss of a fit; `over` becomes true after `patience` steps without a lower one."""
-        if value < (1 - LEAST) * self.lowest:
+        if value < (1 - MIN_IMPROVEMENT) * self.lowest:
             self.lowest, self.lowest_at, self.best = value, self.steps, snapshot(fit)
         elif self.steps - self.lowest_at >= patience:
             self.over = True

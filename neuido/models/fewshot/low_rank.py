@@ -16,11 +16,12 @@ from torch import Tensor, nn
 
 from neuido.errors import UserError
 from neuido.models.fewshot.method import Method, read_tensors, write_tensors
-from neuido.models.inference.outputs import FORMAT as LAW_FORMAT
-from neuido.models.inference.outputs import save_law
-from neuido.models.inference.pipeline import Laws, Prepared, infer
-from neuido.models.operator.branch import implausibility, small_strain_modulus
+from neuido.models.inference.law_file import FORMAT as LAW_FORMAT
+from neuido.models.inference.law_file import save_law
+from neuido.models.inference.pipeline import infer_latent
+from neuido.models.inference.prepared_scene import Laws, PreparedScene
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.operator.law_properties import implausibility, p_wave_modulus
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import read_weights
 
@@ -102,12 +103,12 @@ class LowRankAdaptation(Method):
             raise UserError(f"model.method.start = {self.start} holds no latent of {self.operator.latent_dim} numbers")
         return tensors["z"]
 
-    def build(self, scene: Prepared) -> None:
+    def build(self, scene: PreparedScene) -> None:
         """z at its start, and the adapter, whose product is zero."""
         device = scene.images.device
         self.tuned.to(device)
         if self.encoder is not None:
-            z = infer(self.encoder.to(device), self.operator, scene, repeat=1).z
+            z = infer_latent(self.encoder.to(device), self.operator, scene, repeat=1).z
         else:
             z = self._named_start()
         self.z = nn.Parameter(z.detach().clone().to(device))
@@ -120,7 +121,7 @@ class LowRankAdaptation(Method):
                 torch.manual_seed(self.seed)
                 self.tuned = get_peft_model(self.tuned.cpu(), config)
 
-    def laws(self, scene: Prepared) -> Laws:
+    def laws(self, scene: PreparedScene) -> Laws:
         return self.operator.laws(self.z)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
@@ -134,7 +135,7 @@ class LowRankAdaptation(Method):
             total = total + self.plausibility_weight * implausibility(self.operator, self.z)
         return total
 
-    def retreat(self) -> Tensor:
+    def recovery_loss(self) -> Tensor:
         """Towards the mean latent of Stage I, whose law runs, and an adapter of zero."""
         haven = self.operator.latents.mean(0).to(self.z) if len(self.operator.latents) else torch.zeros_like(self.z)
         adapter = [p.square().mean() for name, p in self.trainable().items() if "lora_B" in name]
@@ -147,7 +148,7 @@ class LowRankAdaptation(Method):
 
     @torch.no_grad()
     def describe(self) -> dict[str, Any]:
-        modulus = small_strain_modulus(self.operator, torch.stack([self.origin, self.z]))
+        modulus = p_wave_modulus(self.operator, torch.stack([self.origin, self.z]))
         moved = float((self.z - self.origin).norm())
         return {"modulus": float(modulus[1]), "latent_moved": moved, "rank": self.rank, "latent": self.z.tolist()}
 

@@ -1,6 +1,6 @@
 """Ways to fit the law of one scene to its images, behind one interface: ours (`adapter`) and those of the peers (`baselines`).
 
-`AdaptModule` trains any of them: it draws the motion of `Method.roll`, compares images, and steps over the method's parameters.
+`AdaptModule` trains any of them: it draws the motion of `Method.rollout`, compares images, and steps over the method's parameters.
 """
 
 import copy
@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 from neuido.data.files.storage import publish, write
 from neuido.errors import UserError
-from neuido.models.inference.pipeline import Laws, Prepared, roll_laws
+from neuido.models.inference.pipeline import rollout_laws
+from neuido.models.inference.prepared_scene import Laws, PreparedScene
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.physics.effects.parameters import Effects
 from neuido.types import ParticleState
@@ -34,14 +35,14 @@ class Method(nn.Module):
     Attributes:
         steps: Optimiser steps a scene takes unless told otherwise; 0: nothing is learned, the scene is only scored.
         lr: Rate of the one group of parameters of the default `parameter_groups`.
-        encoder: What embeds a scene's flow (`Prepared.volume`); none: the method needs no flow.
+        encoder: What embeds a scene's flow (`PreparedScene.volume`); none: the method needs no flow.
     """
 
     steps: int = 100
     lr: float = 1e-3
     encoder: DynamicsEncoder | None = None
 
-    def for_scene(self, scene: Prepared) -> Self:
+    def for_scene(self, scene: PreparedScene) -> Self:
         """A copy with the parameters of a scene, on its device; the encoder is shared."""
         own = copy.deepcopy(self, {id(self.encoder): self.encoder})
         own.build(scene)
@@ -49,16 +50,16 @@ class Method(nn.Module):
         own._start = [p.detach().clone() for p in own.trainable().values()]
         return own
 
-    def build(self, scene: Prepared) -> None:
+    def build(self, scene: PreparedScene) -> None:
         """Make the scene's parameters, with the values from which they start; the same ones each time (seed what is random)."""
 
-    def laws(self, scene: Prepared) -> Laws:
+    def laws(self, scene: PreparedScene) -> Laws:
         """The elastic and the plastic law for a rollout of the scene; their tensors are graph nodes of the parameters."""
         raise NotImplementedError
 
-    def roll(
+    def rollout(
         self,
-        scene: Prepared,
+        scene: PreparedScene,
         frames: int,
         *,
         state: ParticleState | None = None,
@@ -68,11 +69,11 @@ class Method(nn.Module):
         """The motion over the first `frames` frames, differentiable in parameters and `state`; another kind of simulation overrides it.
 
         Args:
-            scene: The scene; its step may be finer than that of `build` (`pipeline.roll_surely`).
+            scene: The scene; its step may be finer than that of `build` (`pipeline.rollout_with_retries`).
             frames: Number of frames K, the start included.
             state: Start, (P, ...); the scene's body where absent.
             effects: Effects that act on top of the laws.
-            segment: As `pipeline.roll_laws`, in frames.
+            segment: As `pipeline.rollout_laws`, in frames.
 
         Returns:
             x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3).
@@ -80,7 +81,7 @@ class Method(nn.Module):
         Raises:
             UserError: As `Simulator.rollout`.
         """
-        return roll_laws(scene, self.laws(scene), frames, segment=segment, state=state, effects=effects)
+        return rollout_laws(scene, self.laws(scene), frames, segment=segment, state=state, effects=effects)
 
     def trainable(self) -> dict[str, nn.Parameter]:
         """The parameters that are fitted, by name."""
@@ -102,7 +103,7 @@ class Method(nn.Module):
         """What is added to the loss of the images."""
         return 0.0
 
-    def retreat(self) -> Tensor:
+    def recovery_loss(self) -> Tensor:
         """The loss of a step whose law could not run: the mean square of the way from the start."""
         parts = [(p - start.to(p)).square().sum() for p, start in zip(self.trainable().values(), self._start)]
         return torch.stack(parts).sum() / max(1, sum(start.numel() for start in self._start))
@@ -183,3 +184,14 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 def scalars(found: dict[str, Any]) -> dict[str, Any]:
     """Those entries of `describe` that fit into a table: numbers and words."""
     return {name: value for name, value in found.items() if isinstance(value, int | float | str)}
+
+
+def require_positive(**values: float) -> None:
+    """Refuse options of a method that are not positive numbers.
+
+    Raises:
+        UserError: Names the option and the value.
+    """
+    for name, value in values.items():
+        if not 0 < value < math.inf:
+            raise UserError(f"model.method.{name} = {value}: it must be positive")

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from neuido.errors import UserError
 from neuido.models.fewshot.method import Method, read_tensors, write_tensors
 from neuido.models.fewshot.relative_density import RelativeDensity
-from neuido.models.inference.pipeline import Prepared
+from neuido.models.inference.prepared_scene import PreparedScene
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import ParticleState
@@ -20,7 +20,7 @@ START, DENSITY = "start.safetensors", "density.safetensors"
 class EffectSource:
     """Where effects come from that act on top of a scene's law, known and not fitted; YAML gives a subclass by `class_path`."""
 
-    def of(self, scene: Prepared) -> Effects:
+    def of(self, scene: PreparedScene) -> Effects:
         """The effects for a rollout of the scene, whose step may be finer than the recording's."""
         raise NotImplementedError
 
@@ -48,14 +48,14 @@ class SceneFit(nn.Module):
         self.twist = nn.Parameter(torch.zeros(2, 3)) if estimate_velocity else None
         """Velocity of the centre [m/s] and angular velocity about it [rad/s]."""
 
-    def roll(self, scene: Prepared, frames: int, segment: int = 0) -> ParticleState:
-        """`Method.roll` from the start of this fit."""
+    def rollout(self, scene: PreparedScene, frames: int, segment: int = 0) -> ParticleState:
+        """`Method.rollout` from the start of this fit."""
         effects = None if self.effects is None else self.effects.of(scene)
         if self.density is not None:
             effects, own = Effects() if effects is None else effects, self.density()
             given = effects.relative_density
             effects = effects._replace(relative_density=own if given is None else given * own)
-        return self.method.roll(scene, frames, state=self.start(scene.simulator), effects=effects, segment=segment)
+        return self.method.rollout(scene, frames, state=self.start(scene.simulator), effects=effects, segment=segment)
 
     def start(self, simulator: Simulator) -> ParticleState | None:
         """The state at t = 0; none: the body's own."""

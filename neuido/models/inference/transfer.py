@@ -22,11 +22,12 @@ import torch
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.files.parsing import read_yaml
+from neuido.data.files.score_tables import folder_of
 from neuido.data.files.values import check_keys, vector
 from neuido.errors import UserError
-from neuido.models.inference import outputs as results
-from neuido.models.inference.pipeline import Laws, Prepared, folder_of
-from neuido.models.render.gaussians import bind, colours_of, deform, dress
+from neuido.models.inference.outputs import contact_sheet, write_plys, write_video
+from neuido.models.inference.prepared_scene import Laws, PreparedScene
+from neuido.models.render.gaussians import attach_gaussians, bind, colours_of, deform
 from neuido.models.render.splatting import render
 from neuido.physics.laws.composite import by_body
 from neuido.physics.mpm.simulator import Simulator
@@ -93,7 +94,7 @@ def _body(entry: Any, where: str) -> BodyCondition:
     return BodyCondition(entry["of"], **vectors, shape=shape)
 
 
-def simulate_condition(condition: Condition, known: list[tuple[Prepared, Laws]]) -> tuple[ParticleState, Gaussians, Prepared]:
+def simulate_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]]) -> tuple[ParticleState, Gaussians, PreparedScene]:
     """Roll a condition out.
 
     Args:
@@ -141,19 +142,19 @@ def simulate_condition(condition: Condition, known: list[tuple[Prepared, Laws]])
     return motion, together, first
 
 
-def run_condition(condition: Condition, known: list[tuple[Prepared, Laws]], out: str | os.PathLike) -> Path:
+def run_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]], out: str | os.PathLike) -> Path:
     """`simulate_condition`, and write its particles, video and picture; the folder."""
     motion, gaussians, first = simulate_condition(condition, known)
     with torch.no_grad():
-        images = render(gaussians, first.views([first.scoring[0]]), background=first.background)[0][:, 0]
+        images = render(gaussians, first.views([first.scoring_views[0]]), background=first.background)[0][:, 0]
     folder = folder_of(out, f"condition-{condition.name}")
-    results.write_plys(folder / "particles", motion)
-    results.write_video(folder / "video.mp4", images)
-    results.contact_sheet(folder / "video.png", [images])
+    write_plys(folder / "particles", motion)
+    write_video(folder / "video.mp4", images)
+    contact_sheet(folder / "video.png", [images])
     return folder
 
 
-def _find(known: list[tuple[Prepared, Laws]], of: int | str) -> tuple[Prepared, Laws]:
+def _find(known: list[tuple[PreparedScene, Laws]], of: int | str) -> tuple[PreparedScene, Laws]:
     names = [prepared.source.name for prepared, _ in known]
     if isinstance(of, str):
         if of not in names:
@@ -164,7 +165,7 @@ def _find(known: list[tuple[Prepared, Laws]], of: int | str) -> tuple[Prepared, 
     return known[of]
 
 
-def _place(body: BodyCondition, prepared: Prepared) -> tuple[Body, Gaussians]:
+def _place(body: BodyCondition, prepared: PreparedScene) -> tuple[Body, Gaussians]:
     """The body and its Gaussians at t = 0."""
     own, gaussians = prepared.source.body, prepared.gaussians
     if body.shape is not None:
@@ -177,7 +178,7 @@ def _place(body: BodyCondition, prepared: Prepared) -> tuple[Body, Gaussians]:
         stripe = ((shape.x - shape.x.mean(0)) / (4 * spread)).floor().long().sum(1) % 2
         colours = torch.where(stripe[:, None] == 0, 0.8 * dark, light)
         like = gaussians.means
-        dressed = dress(shape.x, shape.volume, colours, spread=0.6)
+        dressed = attach_gaussians(shape.x, shape.volume, colours, spread=0.6)
         own, gaussians = shape, Gaussians(*(None if t is None else t.to(like) for t in dressed))
     shift = torch.tensor(body.shift, dtype=own.x.dtype)
     x, v = own.x + shift, own.v

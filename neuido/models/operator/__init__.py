@@ -1,0 +1,1 @@
+"""The neural operator: latents to laws, and what the latents mean."""

@@ -6,6 +6,7 @@ trunk's last layer once (exact), and what a rollout runs is a small effective ne
 """
 
 import json
+from collections import Counter
 from datetime import date
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -88,7 +89,7 @@ class IntrinsicDynamicsOperator(nn.Module):
         head_dim: Width of the heads.
 
     Attributes:
-        latents: (M, d), the latents of the training trajectories; empty until `name_latents` or `load`.
+        latents: (M, d), the latents of the training trajectories; empty until `set_latents` or `load`.
         latent_names, latent_families: M names and families; NCLaw's materials are `jelly`, `plasticine` and `sand`.
         card: What the weights file says about their making.
 
@@ -123,10 +124,16 @@ class IntrinsicDynamicsOperator(nn.Module):
         self.plastic_trunk = Trunk(basis_dim, hidden_dim, self._plastic_law.outputs)
         self.elastic_head = Head(latent_dim, head_dim, basis_dim)
         self.plastic_head = Head(latent_dim, head_dim, basis_dim)
-        self.name_latents(torch.zeros(0, latent_dim), [], [])
+        self.set_latents(torch.zeros(0, latent_dim), [], [])
         self.card: dict[str, Any] = {}
 
-    def name_latents(self, latents: Tensor, names: list[str], families: list[str]) -> None:
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{name}={value!r}" for name, value in self.config.items())
+        counts = Counter(self.latent_families)
+        known = ", ".join(f"{count} {family}" for family, count in counts.items())
+        return f"{type(self).__name__}({sizes}; {f'latents: {known}' if known else 'no latents'})"
+
+    def set_latents(self, latents: Tensor, names: list[str], families: list[str]) -> None:
         """Keep the latents of the training trajectories, for `save` and `latent`."""
         self.latents, self.latent_names, self.latent_families = latents.detach().clone(), list(names), list(families)
 
@@ -211,6 +218,15 @@ class IntrinsicDynamicsOperator(nn.Module):
         hidden.replace(path)
 
     @classmethod
+    def from_pretrained(cls, name: str | Path = "pretrained") -> Self:
+        """Load an operator that comes with neuido (`pretrained`, `pretrained-family`) or a file of `save`.
+
+        Raises:
+            UserError: As `load`.
+        """
+        return cls.load(name)
+
+    @classmethod
     def load(cls, path: str | Path = "pretrained") -> Self:
         """Read a file of `save`. `pretrained` comes with the package, and the encoders are made for it; so does `pretrained-family`, fitted
         with a prior that gathers the latents of each family.
@@ -233,7 +249,7 @@ class IntrinsicDynamicsOperator(nn.Module):
             raise UserError(f"init_from: {path} has format {metadata.get('format')!r}, not {FORMAT!r}")
         operator = cls(**json.loads(metadata["config"]))
         latents = json.loads(metadata["latents"])
-        operator.name_latents(tensors.pop("latents"), latents["names"], latents["families"])
+        operator.set_latents(tensors.pop("latents"), latents["names"], latents["families"])
         operator.load_state_dict(tensors)
         operator.card = json.loads(metadata["card"])
         return operator

@@ -21,7 +21,7 @@ REACH = 6
 """A Gaussian reaches at most this many grid cells to each side."""
 
 LEVEL = 0.5
-FAINT = 0.2
+STOPPING_OPACITY = 0.2
 """Opacity that stops a ray: a shell of Gaussians is thin in places."""
 
 JITTER = 0.5
@@ -50,7 +50,7 @@ class Volume(NamedTuple):
         grid = unit[:, [2, 1, 0]].view(1, -1, 1, 1, 3).to(self.values)  # grid_sample wants the last axis first
         return torch.nn.functional.grid_sample(self.values[None, None], grid, align_corners=False).view(-1)
 
-    def measure(self, level: float = LEVEL, finer: int = 3) -> float:
+    def measure_volume(self, level: float = LEVEL, finer: int = 3) -> float:
         """Volume where the field exceeds the level [m^3], counted on a grid `finer` times finer."""
         step = self.spacing / finer
         offsets = (torch.arange(finer, device=self.lower.device) + 0.5) * step - 0.5 * self.spacing
@@ -107,7 +107,7 @@ def opacity_volume(gaussians: Gaussians, *, spacing: float, hull: Volume | None 
     if math.prod(shape) > 2**28:
         raise UserError(f"a volume of {shape} cells is too large: raise its spacing, {spacing:g} m")
     clear = _transmittance(gaussians, lower, spacing, shape)
-    inside = _enclosed((clear < 1 - FAINT).cpu().numpy())
+    inside = _fill_enclosed((clear < 1 - STOPPING_OPACITY).cpu().numpy())
     inside = ndimage.uniform_filter(inside.astype(np.float32), 3) > 0.5
     field = torch.maximum(1 - clear, torch.from_numpy(inside).to(clear))
     volume = Volume(field, lower, spacing)
@@ -143,7 +143,7 @@ def fill(
         raise UserError(f"method = {method!r}; one of {', '.join(METHODS)}")
     if (count is not None and count < 1) or (spacing is not None and not spacing > 0):
         raise UserError(f"the number of particles and their spacing must be positive, got {count} and {spacing}")
-    size = volume.measure(level)
+    size = volume.measure_volume(level)
     if not size > 0:
         raise UserError("the opacity volume is empty: the Gaussians show no body")
     edge = spacing or (size / count) ** (1 / 3)  # type: ignore[operator]
@@ -200,7 +200,7 @@ def _transmittance(gaussians: Gaussians, lower: Tensor, spacing: float, shape: l
     return total.exp().view(shape)
 
 
-def _enclosed(solid: np.ndarray, share: int = 24) -> np.ndarray:
+def _fill_enclosed(solid: np.ndarray, share: int = 24) -> np.ndarray:
     """Cells from which at least `share` of the 26 rays to the sides, edges and corners of a cube meet another that is solid."""
     hits = np.zeros(solid.shape, dtype=np.int8)
     for direction in itertools.product((-1, 0, 1), repeat=3):
@@ -211,13 +211,13 @@ def _enclosed(solid: np.ndarray, share: int = 24) -> np.ndarray:
         slices, counts = np.moveaxis(solid, axis, 0), np.moveaxis(hits, axis, 0)
         carried = np.zeros_like(slices[0])  # whether the ray against the order of slices has met something
         for i in range(len(slices))[::-step]:
-            carried = _moved(carried, across)
+            carried = _shift(carried, across)
             counts[i] += carried
             carried |= slices[i]
     return hits >= share
 
 
-def _moved(plane: np.ndarray, by: list[int]) -> np.ndarray:
+def _shift(plane: np.ndarray, by: list[int]) -> np.ndarray:
     """plane[i + by[0], j + by[1]], and False from outside."""
     padded = np.pad(plane, 1)
     return padded[1 + by[0] : 1 + by[0] + plane.shape[0], 1 + by[1] : 1 + by[1] + plane.shape[1]]

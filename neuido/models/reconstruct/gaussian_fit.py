@@ -92,7 +92,7 @@ class ReconstructModule(LightningModule):
     def setup(self, stage: str) -> None:
         """Find the hull, and put the first Gaussians on it."""
         batch = self.trainer.datamodule.batch
-        self.batch = _first(batch, self.trainer.strategy.root_device)  # where the module itself goes only after this
+        self.batch = _first_frame(batch, self.trainer.strategy.root_device)  # where the module itself goes only after this
         masks, cameras = self.batch.masks[:, 0], self.batch.cameras
         self.hull = visual_hull(masks, cameras, self.hparams.lower, self.hparams.upper, resolution=self.hparams.resolution)
         if not len(self.means):
@@ -168,7 +168,7 @@ class ReconstructModule(LightningModule):
 
     @torch.no_grad()
     def _after(self, done: int) -> None:
-        self._note_gradient()
+        self._accumulate_gradient()
         low, high = math.log(1e-4 * float(self.size)), math.log(self.hparams.largest * float(self.size))
         self.log_scales.clamp_(low, high)
         if done % self.hparams.densify_every == 0 and done <= 0.6 * self.hparams.steps:
@@ -177,7 +177,7 @@ class ReconstructModule(LightningModule):
             if group["name"] == "means":
                 group["lr"] = RATES["means"] * self.hparams.lr * float(self.size) * 0.01 ** min(1.0, done / self.hparams.steps)
 
-    def _note_gradient(self) -> None:
+    def _accumulate_gradient(self) -> None:
         """Add to each Gaussian's record how the loss moves its projected centre, per half image."""
         cameras = self.batch.cameras
         depth = (self.means @ cameras.viewmats[:, 2, :3].T + cameras.viewmats[:, 2, 3]).mean(1).abs()
@@ -231,7 +231,7 @@ class ReconstructModule(LightningModule):
         self.gradient = torch.zeros_like(state["gradient"], device=self.device)
 
 
-def _first(batch: MultiViewBatch, device: torch.device) -> MultiViewBatch:
+def _first_frame(batch: MultiViewBatch, device: torch.device) -> MultiViewBatch:
     cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats.to(device), Ks=batch.cameras.Ks.to(device))
     images, masks = batch.images[:, :1].to(device), batch.masks[:, :1].to(device)
     return batch._replace(images=images, masks=masks, cameras=cameras, background=batch.background.to(device))

@@ -1,0 +1,1 @@
+"""Gaussian splatting: rasterizer, and Gaussians that move with particles."""

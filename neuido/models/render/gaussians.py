@@ -74,7 +74,7 @@ def harmonics_of(colours: Tensor) -> Tensor:
     return ((colours - 0.5) / C0).unsqueeze(-2)
 
 
-def dress(x: Tensor, volume: Tensor, colours: Tensor | None = None, *, spread: float = 0.3, opacity: float = 0.95) -> Gaussians:
+def attach_gaussians(x: Tensor, volume: Tensor, colours: Tensor | None = None, *, spread: float = 0.3, opacity: float = 0.95) -> Gaussians:
     """A body's particles as Gaussians, one each.
 
     Args:
@@ -130,8 +130,8 @@ def bind(gaussians: Gaussians, x: Tensor, *, nearest: int = 10, reach: float = R
     distance = torch.einsum("nki,nij,nkj->nk", d, conic, d)
     distance, order = distance.sort(1)
     chosen, inside = index.gather(1, order)[:, :nearest].clone(), distance[:, :nearest] <= reach
-    lonely = ~inside.any(1)
-    chosen[lonely, 0], inside[lonely, 0] = index[lonely, 0], True
+    outside = ~inside.any(1)
+    chosen[outside, 0], inside[outside, 0] = index[outside, 0], True
     weight = inside.double() / inside.sum(1, keepdim=True)
     rest = (points[chosen] * weight[..., None]).sum(1)
     like = gaussians.means

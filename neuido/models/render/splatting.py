@@ -25,11 +25,11 @@ BACKENDS = ("auto", "warp", "torch", "gsplat")
 TILE = {"cpu": 8, "cuda": 16}
 """Side of a tile: small ones cost least where there is no shared memory to fill."""
 
-LARGEST = 2**31 - 1
+INDEX_LIMIT = 2**31 - 1
 """Indices in the kernels are 32 bits."""
 
 
-def by_tile(device: torch.device) -> bool:
+def one_thread_per_tile(device: torch.device) -> bool:
     """Whether a thread does a whole tile, splat by splat (CPU), or one pixel (CUDA)."""
     return device.type == "cpu"
 
@@ -89,7 +89,7 @@ def rasterize(
     if width < 1 or height < 1:
         raise UserError(f"width and height are {width} and {height}; at least 1 each")
     viewmats, Ks = viewmats.detach().to(means), Ks.detach().to(means)
-    tints = _tints(colours, means, viewmats, sh_degree, rotations, frames)
+    tints = _view_colours(colours, means, viewmats, sh_degree, rotations, frames)
     arguments = (means, covariances, opacities, tints, viewmats, Ks, width, height, near, far, eps2d)
     if backend == "torch":
         images, alphas = splat_reference.rasterize(*arguments)
@@ -155,7 +155,7 @@ def _frames(means: Tensor, covariances: Tensor, opacities: Tensor, viewmats: Ten
     return frames, means.reshape(many, count, 3), covariances, opacities
 
 
-def _tints(colours: Tensor, means: Tensor, viewmats: Tensor, sh_degree: int | None, rotations: Tensor | None, frames) -> Tensor:
+def _view_colours(colours: Tensor, means: Tensor, viewmats: Tensor, sh_degree: int | None, rotations: Tensor | None, frames) -> Tensor:
     """RGB of each Gaussian, (1 or F, 1 or V, N, 3)."""
     count = means.shape[1]
     if colours.device != means.device:
@@ -204,7 +204,7 @@ def _gsplat(means, covariances, opacities, colours, viewmats, Ks, width, height,
     return images, alphas.squeeze(-1)
 
 
-class _Lists:
+class _TileLists:
     """Which splats each tile shows, front to back: `splats`, and `ranges` of it (C tiles, 2)."""
 
     splats: Tensor
@@ -213,10 +213,10 @@ class _Lists:
     """One bool on the device where nothing was read back: the capacity was too small, or a number not finite."""
 
 
-def _counted(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int) -> _Lists:
+def _lists_by_counting(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int) -> _TileLists:
     """Lists on the CPU: Gaussians in the order of depth, then a counting sort by tile."""
     images, count = depth.shape
-    lists = _Lists()
+    lists = _TileLists()
     length = torch.zeros(images * tiles, dtype=torch.int32)
     launch(kernels.tally, images, [splat[2], count, columns, tiles, length], depth.device)
     ends = length.cumsum(0)
@@ -232,11 +232,11 @@ def _counted(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles:
     return lists
 
 
-def _keyed(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int, capacity: int | None) -> _Lists:
+def _lists_by_key(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int, capacity: int | None) -> _TileLists:
     """Lists on CUDA: one sort of keys of tile and depth."""
     images, count = depth.shape
     device = depth.device
-    lists = _Lists()
+    lists = _TileLists()
     found = torch.empty(images * count, dtype=torch.int32, device=device)
     launch(kernels.count, images * count, [*splat, found], device)
     ends = found.cumsum(0)
@@ -259,7 +259,7 @@ def _keyed(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: i
 def _check(bad: int, total: int) -> None:
     if bad:
         raise UserError(f"{bad} projected Gaussians have numbers that are not finite: check means, covariances and opacities")
-    if total > LARGEST:
+    if total > INDEX_LIMIT:
         raise UserError(f"{total} entries of Gaussians in tiles exceed 2^31: render fewer frames or views in one call")
 
 
@@ -276,7 +276,7 @@ class _Splat(torch.autograd.Function):
             return means.new_zeros(frames, views, height, width, 3), means.new_zeros(frames, views, height, width)
         side = TILE[device.type]
         columns, tiles = -(-width // side), -(-width // side) * -(-height // side)
-        if max(images * count * ROWS, images * tiles * side * side) > LARGEST:
+        if max(images * count * ROWS, images * tiles * side * side) > INDEX_LIMIT:
             raise UserError(f"{images} images of {count} Gaussians exceed 2^31 entries: render fewer frames or views in one call")
         kernels = build(real_of(dtype), side)
         means, covariances, opacities, colours = (t.detach().contiguous() for t in (means, covariances, opacities, colours))
@@ -296,12 +296,12 @@ class _Splat(torch.autograd.Function):
             flat = depth.view(-1)
             launch(kernels.project, images * count, [*inputs, near, far, eps2d, centre, conic, box, flat, status], device)
             found = (kernels, (centre, conic, box), depth, status, columns, tiles)
-            lists = _counted(*found) if device.type == "cpu" else _keyed(*found, capacity)
+            lists = _lists_by_counting(*found) if device.type == "cpu" else _lists_by_key(*found, capacity)
             tables = [lists.ranges, lists.splats, centre, conic]
             rest = [colours.view(-1, 3), *strides, count, views, width, height, columns, tiles]
             result = [image.view(-1, 3), clear.view(-1), last.view(-1)]
             blend = compose_kernels.build(real_of(dtype), side)
-            if by_tile(device):
+            if one_thread_per_tile(device):
                 launch(blend.compose_tile, images * tiles, [*tables, box, *rest, *result], device)
             else:
                 launch(blend.compose, images * tiles * side * side, [*tables, *rest, *result], device)
@@ -333,7 +333,7 @@ class _Splat(torch.autograd.Function):
             tables = [ranges, splats, centre, conic]
             rest = [colours.view(-1, 3), *strides, count, views, width, height, columns, tiles]
             behind = -a_alpha * clear
-            if by_tile(device):
+            if one_thread_per_tile(device):
                 given = [clear.clone().view(-1), last.view(-1), a_image.view(-1, 3), behind.view(-1), rows]
                 launch(blend.compose_tile_adjoint, images * tiles, [*tables, box, *rest, *given], device)
             else:

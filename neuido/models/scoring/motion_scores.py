@@ -8,52 +8,52 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from neuido.data.files.score_tables import write_rows as write_rows
-from neuido.models.inference.pipeline import Prepared, draw, track
+from neuido.models.inference.pipeline import carry_points, render_motion
+from neuido.models.inference.prepared_scene import PreparedScene
 from neuido.models.scoring.lpips import LPIPS, Absent
 from neuido.models.scoring.metrics import chamfer_distance, resampling_floor
-from neuido.models.video.flow import window
+from neuido.models.video.flow import body_window
 from neuido.types import ParticleState
 
 CD_SCALE = 1e4
 """Of Chamfer distances, in coordinates of the unit cube (the paper's tables)."""
 
 
-def chamfer_by_frame(prepared: Prepared, motion: ParticleState) -> Tensor:
+def chamfer_per_frame(prepared: PreparedScene, motion: ParticleState) -> Tensor:
     """Chamfer distance times 1e4 to the true particles in each frame after the first, (K - 1,); the truth must be known."""
     target = prepared.source.truth.x[1 : len(motion.x)].to(motion.x)
     return CD_SCALE * chamfer_distance(motion.x[1 : len(target) + 1], target)
 
 
-def floor_by_frame(prepared: Prepared) -> Tensor:
+def floor_per_frame(prepared: PreparedScene) -> Tensor:
     """`resampling_floor` times 1e4 of the truth in each frame after the first, (T - 1,): the same whatever is predicted."""
     return CD_SCALE * resampling_floor(prepared.source.truth.x[1:].to(prepared.simulator.state.x))
 
 
-def score_motion(prepared: Prepared, motion: ParticleState, floor: Tensor | None = None) -> list[dict[str, float]]:
+def score_motion(prepared: PreparedScene, motion: ParticleState, floor: Tensor | None = None) -> list[dict[str, float]]:
     """Distances to the true particles of each frame after the first; none where the truth is not known.
 
     `cd` is the Chamfer distance times 1e4, `floor` what a perfect law with other particles would score (`resampling_floor`), `rmse` [m]
-    the root mean square distance of the true particles from where the prediction carries them (`pipeline.track`).
+    the root mean square distance of the true particles from where the prediction carries them (`pipeline.carry_points`).
 
     Args:
         prepared: The scene.
         motion: K frames.
-        floor: Of `floor_by_frame`, where it is at hand.
+        floor: Of `floor_per_frame`, where it is at hand.
     """
     truth = prepared.source.truth
     if truth is None:
         return []
     target = truth.x[: len(motion.x)].to(motion.x)
-    carried = track(motion.x[0], target[0], motion.x[: len(target)].detach())[1:]
+    carried = carry_points(motion.x[0], target[0], motion.x[: len(target)].detach())[1:]
     rmse = (carried - target[1:]).square().sum(-1).mean(-1).sqrt()
-    floor = (floor_by_frame(prepared) if floor is None else floor)[: len(rmse)]
-    table = torch.stack([chamfer_by_frame(prepared, motion), floor, rmse], 1).tolist()  # the one wait for the device
+    floor = (floor_per_frame(prepared) if floor is None else floor)[: len(rmse)]
+    table = torch.stack([chamfer_per_frame(prepared, motion), floor, rmse], 1).tolist()  # the one wait for the device
     return [{"frame": k, "cd": cd, "floor": low, "rmse": error} for k, (cd, low, error) in enumerate(table, 1)]
 
 
 @torch.no_grad()
-def score_images(prepared: Prepared, motion: ParticleState, views: Sequence[int], lpips: LPIPS | Absent) -> list[dict[str, Any]]:
+def score_images(prepared: PreparedScene, motion: ParticleState, views: Sequence[int], lpips: LPIPS | Absent) -> list[dict[str, Any]]:
     """PSNR [dB], SSIM, LPIPS and the silhouettes' intersection over union of each frame after the first and each view.
 
     The image measures are of the full frame, and of the crop around the body (`crop_`).
@@ -62,12 +62,12 @@ def score_images(prepared: Prepared, motion: ParticleState, views: Sequence[int]
     """
     rows = []
     for view in views:
-        images, alphas = draw(prepared, motion, [view])
+        images, alphas = render_motion(prepared, motion, [view])
         recorded = prepared.recorded([view], len(images))
         whole = _image_rows(images[1:, 0].clamp(0, 1), recorded[1:, 0], lpips)
         masks = prepared.silhouettes([view], len(images))[:, 0]
         overlap = intersection_over_union(alphas[1:, 0], masks[1:]).tolist()
-        top, left, side = window(masks)
+        top, left, side = body_window(masks)
         cut = (slice(1, None), 0, slice(top, top + side), slice(left, left + side))
         crop = _image_rows(images[cut].clamp(0, 1), recorded[cut], lpips)
         for k, (a, b, iou) in enumerate(zip(whole, crop, overlap)):
@@ -106,7 +106,9 @@ def mean_of(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, f
     return out
 
 
-def later(particles: Sequence[dict[str, Any]], pictures: Sequence[dict[str, Any]], first: int, names: Sequence[str]) -> dict[str, float]:
+def mean_from_frame(
+    particles: Sequence[dict[str, Any]], pictures: Sequence[dict[str, Any]], first: int, names: Sequence[str]
+) -> dict[str, float]:
     """`mean_of` the frames from `first` on, of the rows of particles and of images."""
     parts = [mean_of([row for row in rows if row["frame"] >= first], names) for rows in (particles, pictures)]
     return parts[0] | parts[1]

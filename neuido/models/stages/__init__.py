@@ -1,0 +1,1 @@
+"""The Lightning modules of all training stages."""

@@ -10,26 +10,37 @@ import torch
 import warp as wp
 from torch import Tensor, nn
 
+from neuido.data.files.score_tables import folder_of, write_rows
 from neuido.data.scenes.filmed_scene import VisualScene
 from neuido.errors import UserError
 from neuido.models.fewshot.fit_progress import Progress, restore
 from neuido.models.fewshot.method import CARD, Method, scalars
 from neuido.models.fewshot.relative_density import RelativeDensity
 from neuido.models.fewshot.scene_fit import DENSITY, EffectSource, SceneFit
-from neuido.models.inference.pipeline import Laws, Prepared, folder_of, prepare, roll_surely
+from neuido.models.inference.pipeline import rollout_with_retries
+from neuido.models.inference.prepared_scene import Laws, PreparedScene, prepare
 from neuido.models.inference.transfer import read_conditions, run_condition
 from neuido.models.scoring import motion_scores as scores
-from neuido.models.stages import image_module as filmed
-from neuido.models.stages.image_module import FIGURES, FilmedModule, plainly
+from neuido.models.stages.image_module import (
+    SCORES,
+    ImageModule,
+    check_options,
+    curriculum_frames,
+    image_losses,
+    sample_views,
+    without_gradients,
+    write_frame_scores,
+    write_prediction,
+)
 from neuido.types import ParticleState
 
 GIGABYTE = 1e9
 
 
-class AdaptModule(FilmedModule):
+class AdaptModule(ImageModule):
     """Fits a method to each scene by itself, and scores it before and after on views that were held out.
 
-    An epoch is one scene, so that `trainer.max_epochs` is left at -1. The loss is that of Stage II (`filmed.image_losses`). The data module
+    An epoch is one scene, so that `trainer.max_epochs` is left at -1. The loss is that of Stage II (`image_losses`). The data module
     is a `VisualDataModule`. `out/scores.csv` has two rows a scene, of `stage` before and after; `out/<scene>/fit` is of `SceneFit.save`.
 
     Args:
@@ -100,7 +111,7 @@ class AdaptModule(FilmedModule):
         counts |= {"views_per_step": views_per_step, "encoder_views": encoder_views}
         weights = {"image_weight": image_weight, "silhouette_weight": silhouette_weight, "velocity_lr": velocity_lr}
         weights |= {"density_lr": density_lr, "density_weight": density_weight}
-        filmed.check_options(counts, weights, {"curriculum_share": curriculum_share, "density_from": density_from}, curriculum)
+        check_options(counts, weights, {"curriculum_share": curriculum_share, "density_from": density_from}, curriculum)
         if image_weight + silhouette_weight == 0:
             raise UserError("model.image_weight and silhouette_weight are both 0: nothing would be compared")
         if fit_frames == 1 or velocity_frames < 2:
@@ -115,19 +126,19 @@ class AdaptModule(FilmedModule):
         """Steps of the velocity alone, before those of the method."""
         self.fits = nn.ModuleList()
         self._names: list[str] = []
-        self._current: tuple[str, Prepared] | None = None
+        self._current: tuple[str, PreparedScene] | None = None
         self._progress: dict[str, Progress] = {}
         self._rows: list[dict[str, Any]] = []
-        self._predicted: list[tuple[Prepared, Laws]] = []
+        self._predicted: list[tuple[PreparedScene, Laws]] = []
 
     # What there is of a scene.
 
-    def open_scene(self, scene: VisualScene, device: torch.device, *, watched: bool) -> Prepared:
+    def open_scene(self, scene: VisualScene, device: torch.device, *, watched: bool) -> PreparedScene:
         """The scene on the device; `watched`: with the flow that the method's encoder wants."""
         encoder = self.plan.encoder.to(device) if watched and self.plan.encoder is not None else None
         return prepare(scene, encoder, device=device, encoder_views=self.hparams.encoder_views, cache=self.hparams.cache)
 
-    def new_fit(self, prepared: Prepared, uneven: bool = False) -> SceneFit:
+    def new_fit(self, prepared: PreparedScene, uneven: bool = False) -> SceneFit:
         """A fit that has not begun; `uneven`: with a density, whatever the option says."""
         density = None
         if self.hparams.estimate_density or uneven:
@@ -154,15 +165,15 @@ class AdaptModule(FilmedModule):
         """The fit of a scene of this run."""
         return cast(SceneFit, self.fits[self._names.index(name)])
 
-    def _training_views(self, prepared: Prepared) -> list[int]:
+    def _training_views(self, prepared: PreparedScene) -> list[int]:
         """The views that are trained on."""
         if self.hparams.stop_on != "view":
-            return prepared.training
-        if len(prepared.training) < 2:
+            return prepared.training_views
+        if len(prepared.training_views) < 2:
             raise UserError(f"model.stop_on = view: {prepared.source.name} has one training view, and none would be left; use loss or none")
-        return prepared.training[:-1]
+        return prepared.training_views[:-1]
 
-    def _frames(self, prepared: Prepared) -> int:
+    def _frames(self, prepared: PreparedScene) -> int:
         """Frames that fitting sees."""
         return min(prepared.frames, self.hparams.fit_frames or prepared.frames)
 
@@ -188,16 +199,16 @@ class AdaptModule(FilmedModule):
                 self.fit_of(scene.name).save(folder_of(self.hparams.out, scene.name) / "fit")
             elif scene.name in self._progress and self._progress[scene.name].done:  # killed between its last step and its scores
                 self._begin(scene)
-                self._finish()
+                self._finish_scene()
 
     def on_train_batch_start(self, batch: VisualScene, batch_idx: int) -> int | None:
         self._begin(batch)
         return -1 if self._progress[batch.name].done else None
 
-    def _begin(self, scene: VisualScene) -> Prepared:
+    def _begin(self, scene: VisualScene) -> PreparedScene:
         """Bring the scene to the device, and score it before its first step."""
         if self._current is None or self._current[0] != scene.name:
-            self._finish()
+            self._finish_scene()
             self._current = None
             gc.collect()  # the last scene's tapes, before the next one's are made
             self._current = scene.name, self.open_scene(scene, self.device, watched=False)
@@ -210,41 +221,41 @@ class AdaptModule(FilmedModule):
 
     def training_step(self, scene: VisualScene, batch_idx: int) -> Tensor:
         prepared, fit, step = self._begin(scene), self.fit_of(scene.name), self._progress[scene.name].steps
-        frames = self.frames_now(prepared, step)
-        motion = self._roll_or_undo(prepared, fit, frames)
+        frames = self.rollout_frames(prepared, step)
+        motion = self._rollout_or_restore(prepared, fit, frames)
         if motion is None:
-            return fit.method.retreat()
-        views = filmed.some_views(self._training_views(prepared), self.hparams.views_per_step, step)
-        loss, silhouette = filmed.image_losses(prepared, motion, views)
+            return fit.method.recovery_loss()
+        views = sample_views(self._training_views(prepared), self.hparams.views_per_step, step)
+        loss, silhouette = image_losses(prepared, motion, views)
         regular = fit.regulariser(self.hparams.density_weight)
         self._log({"train/loss": loss, "train/silhouette": silhouette, "train/regulariser": regular, "train/frames": float(frames)})
         return self._weighted(loss, silhouette) + regular
 
-    def _roll_or_undo(self, prepared: Prepared, fit: SceneFit, frames: int) -> ParticleState | None:
+    def _rollout_or_restore(self, prepared: PreparedScene, fit: SceneFit, frames: int) -> ParticleState | None:
         """The motion; where it fails that of parameters that ran, to which the fit returns with half the rates; or none."""
         name = prepared.source.name
         progress = self._progress[name]
         for _ in range(2):
             try:
-                motion = fit.roll(prepared, frames, segment=self.hparams.segment)
-                progress.ran(fit)
+                motion = fit.rollout(prepared, frames, segment=self.hparams.segment)
+                progress.record_success(fit)
                 return motion
             except UserError as error:  # a law that cannot run has no image
                 print(f"{name}: {error}", file=sys.stderr)
                 self._log({"train/failed": 1.0})
-            if not progress.undo(fit):
+            if not progress.restore_last_good(fit):
                 return None
         return None
 
     def _weighted(self, loss: Tensor, silhouette: Tensor) -> Tensor:
         return self.hparams.image_weight * loss + self.hparams.silhouette_weight * silhouette
 
-    def frames_now(self, prepared: Prepared, step: int) -> int:
+    def rollout_frames(self, prepared: PreparedScene, step: int) -> int:
         """Frames of a rollout at this step of a scene."""
         frames = self._frames(prepared)
         if step < self.ahead:
             return min(frames, self.hparams.velocity_frames)
-        return filmed.frames_at((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
+        return curriculum_frames((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """A step whose gradient is not finite is left out; where that comes again the fit goes back as from a law that does not run."""
@@ -255,7 +266,7 @@ class AdaptModule(FilmedModule):
                 g.zero_()
             if self._current is not None:
                 name = self._current[0]
-                self._progress[name].undo(self.fit_of(name), ran=True)
+                self._progress[name].restore_last_good(self.fit_of(name), ran=True)
 
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
         name, prepared = self._current  # type: ignore[misc]
@@ -265,7 +276,7 @@ class AdaptModule(FilmedModule):
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         progress.steps += 1
         if self.hparams.stop_on != "none" and progress.steps >= self.ahead and progress.steps % self.hparams.check_every == 0:
-            self._look(prepared, progress)
+            self._check_early_stop(prepared, progress)
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
             progress.peak_memory_gb = max(progress.peak_memory_gb, torch.cuda.max_memory_allocated(self.device) / GIGABYTE)
@@ -281,26 +292,26 @@ class AdaptModule(FilmedModule):
         for group in optimizer.param_groups:
             group["lr"] = 0.0 if step < group["first"] or group["of"] != self._names.index(name) else factor * group["start_lr"]
 
-    @plainly
-    def _look(self, prepared: Prepared, progress: Progress) -> None:
+    @without_gradients
+    def _check_early_stop(self, prepared: PreparedScene, progress: Progress) -> None:
         """The loss of all frames on all training views, or on the one that is kept from training."""
         fit = self.fit_of(prepared.source.name)
         motion = self._try(prepared, fit)
         if motion is None:
             return
-        views = prepared.training[-1:] if self.hparams.stop_on == "view" else prepared.training
-        value = float(self._weighted(*filmed.image_losses(prepared, motion, views)))
+        views = prepared.training_views[-1:] if self.hparams.stop_on == "view" else prepared.training_views
+        value = float(self._weighted(*image_losses(prepared, motion, views)))
         self._log({"train/looked": value})
-        progress.see(value, fit, self.hparams.patience)
+        progress.record_loss(value, fit, self.hparams.patience)
 
     def on_train_epoch_end(self) -> None:
-        self._finish()
+        self._finish_scene()
 
     def on_train_end(self) -> None:
-        self._finish()
-        self._say_absent()
+        self._finish_scene()
+        self._report_missing_lpips()
 
-    def _finish(self) -> None:
+    def _finish_scene(self) -> None:
         """Score the current scene once its steps are done, and write what was found."""
         if self._current is None:
             return
@@ -315,15 +326,15 @@ class AdaptModule(FilmedModule):
         self._score_fit("after")
         self._current = None
 
-    @plainly
-    def _try(self, prepared: Prepared, fit: SceneFit) -> ParticleState | None:
+    @without_gradients
+    def _try(self, prepared: PreparedScene, fit: SceneFit) -> ParticleState | None:
         """The motion over all frames that fitting sees, none where it fails."""
         try:
-            return fit.roll(prepared, self._frames(prepared))
+            return fit.rollout(prepared, self._frames(prepared))
         except UserError:
             return None
 
-    @plainly
+    @without_gradients
     def _score_fit(self, stage: str) -> None:
         name, prepared = self._current  # type: ignore[misc]
         fit = self.fit_of(name)
@@ -332,25 +343,25 @@ class AdaptModule(FilmedModule):
             keys = ("steps", "seconds", "peak_memory_gb", "warp_memory_gb") if self.device.type == "cuda" else ("steps", "seconds")
             row |= {key: getattr(self._progress[name], key) for key in keys}
         self._rows.append(row | self.score(prepared, fit, stage))
-        scores.write_rows(Path(self.hparams.out) / "scores.csv", self._rows)
+        write_rows(Path(self.hparams.out) / "scores.csv", self._rows)
         self._show(self._rows[-1])
 
-    def score(self, prepared: Prepared, fit: SceneFit, stage: str) -> dict[str, Any]:
+    def score(self, prepared: PreparedScene, fit: SceneFit, stage: str) -> dict[str, Any]:
         """Means of the scores and what was found; the rows by time step go to files in `out/<scene>/<stage>`."""
         found = {f"found_{key}": value for key, value in scalars(fit.describe()).items()}
         try:
-            motion, halvings = roll_surely(prepared, lambda scene: fit.roll(scene, prepared.frames))
+            motion, halvings = rollout_with_retries(prepared, lambda scene: fit.rollout(scene, prepared.frames))
         except UserError as error:
             return {"failed": str(error), **found}
-        figures, particles, pictures = self.figures_of(prepared, motion)
-        filmed.write_by_frame(folder_of(self.hparams.out, prepared.source.name) / stage, particles, pictures)
+        figures, particles, pictures = self.score_motion(prepared, motion)
+        write_frame_scores(folder_of(self.hparams.out, prepared.source.name) / stage, particles, pictures)
         if self._frames(prepared) < prepared.frames:
-            later = scores.later(particles, pictures, self._frames(prepared), FIGURES)
+            later = scores.mean_from_frame(particles, pictures, self._frames(prepared), SCORES)
             figures |= {f"later_{key}": value for key, value in later.items()}
         return {**figures, "halvings": halvings, **found}
 
     def _show(self, row: dict[str, Any]) -> None:
-        shown = [f"{key} {row[key]:.4g}" for key in (*FIGURES, "later_iou", "steps", "seconds", "peak_memory_gb") if key in row]
+        shown = [f"{key} {row[key]:.4g}" for key in (*SCORES, "later_iou", "steps", "seconds", "peak_memory_gb") if key in row]
         self.print(f"{row['scene']:16s} {row['stage']:7s} {', '.join(shown)}{row.get('failed', '')}")
 
     # Checkpoints.
@@ -368,7 +379,7 @@ class AdaptModule(FilmedModule):
 
     # Test and prediction, with what a fit wrote.
 
-    def load_fit(self, scene: VisualScene) -> tuple[Prepared, SceneFit]:
+    def load_fit(self, scene: VisualScene) -> tuple[PreparedScene, SceneFit]:
         """The scene, and its fit: the one of this run, of `adapter`, or one that has not begun."""
         if scene.name in self._names:
             return self.open_scene(scene, self.device, watched=False), self.fit_of(scene.name)
@@ -387,7 +398,7 @@ class AdaptModule(FilmedModule):
                 return folder
         raise UserError(f"model.adapter = {given}: neither it nor {folder_of(given, name) / 'fit'} holds {CARD}")
 
-    @plainly
+    @without_gradients
     def test_step(self, scene: VisualScene, batch_idx: int) -> None:
         prepared, fit = self.load_fit(scene)
         row = {"scene": scene.name, "method": type(self.plan).__name__, "stage": "test", **self.score(prepared, fit, "test")}
@@ -396,28 +407,28 @@ class AdaptModule(FilmedModule):
 
     def on_test_epoch_end(self) -> None:
         rows, self._rows = self._rows, []
-        self.log_dict({f"test/{name}": value for name, value in scores.mean_of(rows, FIGURES).items()})
-        scores.write_rows(Path(self.hparams.out) / "test.csv", rows)
-        self._say_absent()
+        self.log_dict({f"test/{name}": value for name, value in scores.mean_of(rows, SCORES).items()})
+        write_rows(Path(self.hparams.out) / "test.csv", rows)
+        self._report_missing_lpips()
 
-    @plainly
+    @without_gradients
     def predict_step(self, scene: VisualScene, batch_idx: int) -> dict[str, Any]:
         """Write what was found, particles, video and picture of a scene; the paths."""
         prepared, fit = self.load_fit(scene)
         folder = folder_of(self.hparams.out, scene.name)
         fit.save(folder / "fit")
         try:
-            motion, _ = roll_surely(prepared, lambda refined: fit.roll(refined, prepared.frames))
+            motion, _ = rollout_with_retries(prepared, lambda refined: fit.rollout(refined, prepared.frames))
         except UserError as error:
             print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
             return {"scene": scene.name, "folder": str(folder), "failed": str(error)}
-        filmed.write_prediction(folder, prepared, motion)
+        write_prediction(folder, prepared, motion)
         if self.hparams.condition_files:
             self._predicted.append((prepared, fit.method.laws(prepared)))
         self.print(f"{scene.name}: {folder}")
         return {"scene": scene.name, "folder": str(folder)}
 
-    @plainly
+    @without_gradients
     def on_predict_epoch_end(self) -> None:
         for path in self.hparams.condition_files or []:
             condition = read_conditions(path)

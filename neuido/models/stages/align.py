@@ -8,28 +8,30 @@ import torch
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
+from neuido.data.files.score_tables import folder_of, write_rows
 from neuido.data.scenes.filmed_scene import VisualScene
 from neuido.errors import UserError
-from neuido.models.inference import outputs as results
-from neuido.models.inference.pipeline import Laws, Prepared, folder_of, infer, prepare, roll, roll_surely
+from neuido.models.inference.pipeline import infer_latent, rollout_latent, rollout_with_retries
+from neuido.models.inference.prepared_scene import Laws, PreparedScene, prepare
 from neuido.models.inference.transfer import read_conditions, run_condition
-from neuido.models.operator.branch import implausibility, open_branch, small_strain_modulus
+from neuido.models.inference.video_law import VideoLaw
+from neuido.models.operator.law_properties import implausibility, p_wave_modulus
 from neuido.models.scoring import motion_scores as scores
 from neuido.models.stages.image_module import (
-    FIGURES,
-    FilmedModule,
+    SCORES,
+    ImageModule,
     check_options,
-    frames_at,
+    curriculum_frames,
     image_losses,
-    plainly,
-    some_views,
-    write_by_frame,
+    sample_views,
+    without_gradients,
+    write_frame_scores,
     write_prediction,
 )
-from neuido.models.stages.training import publish, run_length
+from neuido.models.stages.training import open_operator_and_encoder, optimiser_steps, report_and_save
 
 
-class AlignModule(FilmedModule):
+class AlignModule(ImageModule):
     """Stage II, its scores, and zero-shot prediction. Trunks, heads and VAE are frozen; scenes take turns, one step each.
 
     The loss of a scene is the squared error of the images over all training views, divided by what a still image of the first frame would
@@ -102,16 +104,16 @@ class AlignModule(FilmedModule):
         self.save_hyperparameters()
         flow = {"flow_size": flow_size, "flow_encoding": flow_encoding, "speed_scale": speed_scale}
         sizes = {"width": width, "heads": heads, "conditions": conditions, "dropout": dropout}
-        self.operator, self.encoder = open_branch(operator, init_from, vae, **flow, **sizes)  # type: ignore[arg-type]
-        self._prepared: dict[str, Prepared] = {}
+        self.operator, self.encoder = open_operator_and_encoder(operator, init_from, vae, **flow, **sizes)  # type: ignore[arg-type]
+        self._prepared: dict[str, PreparedScene] = {}
         self._start: dict[str, Tensor] = {}
         self._rows: list[dict[str, Any]] = []
-        self._predicted: list[tuple[Prepared, Laws]] = []
+        self._predicted: list[tuple[PreparedScene, Laws]] = []
         self._total = 1
 
     # What there is of a scene.
 
-    def prepared(self, scene: VisualScene) -> Prepared:
+    def prepared(self, scene: VisualScene) -> PreparedScene:
         """The scene, prepared when it is first seen."""
         if scene.name not in self._prepared:
             options = {"encoder_views": self.hparams.encoder_views, "cache": self.hparams.cache}
@@ -121,29 +123,29 @@ class AlignModule(FilmedModule):
     # Fitting.
 
     def configure_optimizers(self) -> dict[str, Any]:
-        self._total = run_length(self.trainer)
+        self._total = optimiser_steps(self.trainer)
         parameters = self.encoder.projector.parameters()
         optimizer = torch.optim.AdamW(parameters, lr=self.hparams.lr, weight_decay=self.hparams.weight_decay)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self._total)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def frames_now(self, prepared: Prepared) -> int:
+    def rollout_frames(self, prepared: PreparedScene) -> int:
         """Frames of a rollout at this point of the run."""
         done = self.global_step / max(1, self._total)
-        return frames_at(done, prepared.frames, self.hparams.curriculum, self.hparams.curriculum_share)
+        return curriculum_frames(done, prepared.frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
     def training_step(self, scene: VisualScene, batch_idx: int) -> Tensor:
         prepared = self.prepared(scene)
-        frames = self.frames_now(prepared)
+        frames = self.rollout_frames(prepared)
         z = self.encoder(prepared.volume, prepared.conditions)
         start = self._start.setdefault(scene.name, z.detach().clone())
         try:
-            motion = roll(prepared, self.operator, z, frames, segment=self.hparams.segment)
+            motion = rollout_latent(prepared, self.operator, z, frames, segment=self.hparams.segment)
         except UserError as error:  # a law that cannot run has no image: back towards laws that can
             print(f"{scene.name}: {error}", file=sys.stderr)
             self._log({"train/failed": 1.0})
-            return (z - self._haven(z)).square().mean()
-        views = some_views(prepared.training, self.hparams.views_per_step, self.global_step)
+            return (z - self._mean_latent(z)).square().mean()
+        views = sample_views(prepared.training_views, self.hparams.views_per_step, self.global_step)
         loss, silhouette = image_losses(prepared, motion, views)
         total = loss + self.hparams.silhouette_weight * silhouette + self.hparams.prior_weight * (z - start).square().mean()
         if self.hparams.plausibility_weight:
@@ -153,7 +155,7 @@ class AlignModule(FilmedModule):
         self._log({"train/loss": loss, f"train/{scene.name}": loss, "train/silhouette": silhouette, "train/frames": float(frames)})
         return total
 
-    def _haven(self, z: Tensor) -> Tensor:
+    def _mean_latent(self, z: Tensor) -> Tensor:
         """The mean latent of Stage I, whose law runs."""
         return self.operator.latents.mean(0).to(z) if len(self.operator.latents) else torch.zeros_like(z)
 
@@ -162,25 +164,25 @@ class AlignModule(FilmedModule):
     def score(self, scene: VisualScene, *, images: bool = True) -> tuple[dict[str, Any], list[dict[str, Any]], list[dict[str, Any]]]:
         """Zero-shot scores of a scene: their means, and the rows by time step, of particles and of images."""
         prepared = self.prepared(scene)
-        found = infer(self.encoder, self.operator, prepared)
+        found = infer_latent(self.encoder, self.operator, prepared)
         summary: dict[str, Any] = {"scene": scene.name, "seconds": found.seconds}
-        summary["modulus"] = float(small_strain_modulus(self.operator, found.z[None])[0])
+        summary["modulus"] = float(p_wave_modulus(self.operator, found.z[None])[0])
         try:
             with torch.no_grad():
-                motion, halvings = roll_surely(prepared, lambda scene: roll(scene, self.operator, found.z))
+                motion, halvings = rollout_with_retries(prepared, lambda scene: rollout_latent(scene, self.operator, found.z))
             summary["halvings"] = halvings
         except UserError as error:
             return summary | {"failed": str(error)}, [], []
-        figures, particles, pictures = self.figures_of(prepared, motion, images=images)
+        figures, particles, pictures = self.score_motion(prepared, motion, images=images)
         return summary | figures, particles, pictures
 
-    @plainly
+    @without_gradients
     def validation_step(self, scene: VisualScene, batch_idx: int) -> None:
         self._rows.append(self.score(scene)[0])
 
     def on_validation_epoch_end(self) -> None:
         rows = self._gather()
-        values = {f"val/{name}": value for name, value in scores.mean_of(rows, FIGURES).items()}
+        values = {f"val/{name}": value for name, value in scores.mean_of(rows, SCORES).items()}
         values["val/failed"] = float(sum("failed" in row for row in rows))
         for row in rows:
             values |= {f"val/{row['scene']}/{name}": row[name] for name in ("cd", "rmse", "psnr", "modulus") if name in row}
@@ -197,17 +199,17 @@ class AlignModule(FilmedModule):
 
     # Test: everything, with baselines for unseen scenes.
 
-    @plainly
+    @without_gradients
     def test_step(self, scene: VisualScene, batch_idx: int) -> None:
         summary, particles, pictures = self.score(scene)
         unseen = scene.name in getattr(self.trainer.datamodule, "unseen_names", [])
         summary["unseen"] = int(unseen)
         if unseen and self.hparams.baselines and scene.truth is not None:
             summary |= self.score_baselines(self.prepared(scene))
-        write_by_frame(folder_of(self.hparams.out, scene.name), particles, pictures)
+        write_frame_scores(folder_of(self.hparams.out, scene.name), particles, pictures)
         self._rows.append(summary)
 
-    def score_baselines(self, prepared: Prepared) -> dict[str, float]:
+    def score_baselines(self, prepared: PreparedScene) -> dict[str, float]:
         """CD of Stage I's mean latent, of random ones (`random_latents`), and of its own at random (medians over those that run)."""
         generator = torch.Generator().manual_seed(0)
         latents, count = self.operator.latents, self.hparams.baselines
@@ -219,10 +221,10 @@ class AlignModule(FilmedModule):
             for z in candidates.to(self.device):
                 try:
                     with torch.no_grad():
-                        motion, _ = roll_surely(prepared, lambda scene, z=z: roll(scene, self.operator, z))
+                        motion, _ = rollout_with_retries(prepared, lambda scene, z=z: rollout_latent(scene, self.operator, z))
                 except UserError:
                     continue
-                values.append(float(scores.chamfer_by_frame(prepared, motion).mean()))
+                values.append(float(scores.chamfer_per_frame(prepared, motion).mean()))
             out[f"cd_{name}_failed"] = len(candidates) - len(values)
             if values:
                 out[f"cd_{name}"] = sorted(values)[len(values) // 2]
@@ -232,41 +234,41 @@ class AlignModule(FilmedModule):
         rows = self._gather()
         parts = {"test": rows, "unseen": [row for row in rows if row.get("unseen")], "seen": [row for row in rows if not row.get("unseen")]}
         for part, own in parts.items():
-            self.log_dict({f"{part}/{name}": value for name, value in scores.mean_of(own, (*FIGURES, "seconds")).items()})
+            self.log_dict({f"{part}/{name}": value for name, value in scores.mean_of(own, (*SCORES, "seconds")).items()})
         self._write_table(rows)
 
     @rank_zero_only
     def _write_table(self, rows: list[dict[str, Any]]) -> None:
-        scores.write_rows(Path(self.hparams.out) / "scores.csv", rows)
-        self._say_absent()
+        write_rows(Path(self.hparams.out) / "scores.csv", rows)
+        self._report_missing_lpips()
         for row in rows:
-            shown = [f"{name} {row[name]:.4g}" for name in (*FIGURES, "cd_mean", "cd_random", "cd_trained", "seconds") if name in row]
+            shown = [f"{name} {row[name]:.4g}" for name in (*SCORES, "cd_mean", "cd_random", "cd_trained", "seconds") if name in row]
             self.print(f"{row['scene']:16s} {'unseen ' if row.get('unseen') else ''}{', '.join(shown)}{row.get('failed', '')}")
 
     # Prediction.
 
-    @plainly
+    @without_gradients
     def predict_step(self, scene: VisualScene, batch_idx: int) -> dict[str, Any]:
-        """Write law, particles, video and picture of a scene; the paths, and the time that inference took."""
+        """Write law, particles, video and picture of a scene; return the moduli found, the folder, and the time of the inference."""
         prepared = self.prepared(scene)
-        found = infer(self.encoder, self.operator, prepared)
+        found = VideoLaw.infer(self.encoder, self.operator, prepared)
         folder = folder_of(self.hparams.out, scene.name)
-        card = {"scene": scene.name, "views": len(prepared.volume), "frames": prepared.frames, "seconds": found.seconds}
-        results.save_law(folder / "law.safetensors", self.operator, found.z, card)
-        with torch.no_grad():
-            try:
-                motion, halvings = roll_surely(prepared, lambda scene: roll(scene, self.operator, found.z))
-            except UserError as error:
-                print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
-                return {"scene": scene.name, "folder": str(folder), "seconds": found.seconds, "failed": str(error)}
-            if halvings:
-                print(f"{scene.name}: the law runs with a step of dt / {2**halvings} only", file=sys.stderr)
-            write_prediction(folder, prepared, motion)
-        self.print(f"{scene.name}: law in {1e3 * found.seconds:.1f} ms; {folder}")
-        self._predicted.append((prepared, self.operator.laws(found.z)))
-        return {"scene": scene.name, "folder": str(folder), "seconds": found.seconds}
+        found.save(folder / "law.safetensors")
+        answer: dict[str, Any] = {"scene": scene.name, "folder": str(folder), "seconds": found.seconds, **found.moduli._asdict()}
+        self.print(f"{scene.name}: {found.summary()}")
+        try:
+            motion, halvings = found.rollout()
+        except UserError as error:
+            print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
+            return answer | {"failed": str(error)}
+        if halvings:
+            print(f"{scene.name}: the law runs only with a time step of dt / {2**halvings}", file=sys.stderr)
+        write_prediction(folder, prepared, motion)
+        self.print(f"{scene.name}: results in {folder}")
+        self._predicted.append((prepared, found.law()))
+        return answer
 
-    @plainly
+    @without_gradients
     def on_predict_epoch_end(self) -> None:
         for path in self.hparams.condition_files or []:
             condition = read_conditions(path)
@@ -276,4 +278,4 @@ class AlignModule(FilmedModule):
 
     def on_train_end(self) -> None:
         names = [scene.name for scene in self.trainer.datamodule.scenes]
-        publish(self, self.encoder.save, {"stage": "II", "steps": self.global_step, "scenes": names})
+        report_and_save(self, self.encoder.save, {"stage": "II", "steps": self.global_step, "scenes": names})

@@ -10,19 +10,21 @@ import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor
 
+from neuido.data.files.score_tables import write_rows
 from neuido.errors import UserError
-from neuido.models.inference import outputs as results
-from neuido.models.inference.pipeline import Prepared, draw
+from neuido.models.inference.outputs import contact_sheet, write_plys, write_video
+from neuido.models.inference.pipeline import render_motion
+from neuido.models.inference.prepared_scene import PreparedScene
 from neuido.models.scoring import motion_scores as scores
 from neuido.models.scoring.lpips import LPIPS, Absent, open_lpips
 from neuido.types import ParticleState
 
-FIGURES = ("cd", "floor", "rmse", "psnr", "ssim", "lpips", "iou", "crop_psnr", "crop_ssim", "crop_lpips")
+SCORES = ("cd", "floor", "rmse", "psnr", "ssim", "lpips", "iou", "crop_psnr", "crop_ssim", "crop_lpips")
 STILL_IMAGE, STILL_MASK = 1e-6, 1e-5
 """Floors of the mean squared change from the first frame, of a body at rest."""
 
 
-def plainly(method: Callable) -> Callable:
+def without_gradients(method: Callable) -> Callable:
     """Without gradients, but outside Lightning's inference mode: rollouts keep buffers, and training could not write to them afterwards."""
 
     @functools.wraps(method)
@@ -49,7 +51,7 @@ def check_options(counts: dict[str, int], weights: dict[str, float], shares: dic
         raise UserError(f"model.curriculum = {curriculum}: each must be a share, above 0 and up to 1")
 
 
-def frames_at(done: float, frames: int, curriculum: Sequence[float], curriculum_share: float) -> int:
+def curriculum_frames(done: float, frames: int, curriculum: Sequence[float], curriculum_share: float) -> int:
     """Frames of a rollout when the share `done` of a run is done: shares of `frames`, one after the other, and then all."""
     if not curriculum or done >= curriculum_share:
         return frames
@@ -57,7 +59,7 @@ def frames_at(done: float, frames: int, curriculum: Sequence[float], curriculum_
     return min(frames, max(2, math.ceil(share * frames)))
 
 
-def some_views(views: list[int], count: int, step: int) -> list[int]:
+def sample_views(views: list[int], count: int, step: int) -> list[int]:
     """So many of the views (0: all), drawn anew in each step, by the step alone: a resumed run draws as the interrupted one would have."""
     if not 0 < count < len(views):
         return views
@@ -65,10 +67,10 @@ def some_views(views: list[int], count: int, step: int) -> list[int]:
     return [views[i] for i in order[:count].tolist()]
 
 
-def image_losses(prepared: Prepared, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:
+def image_losses(prepared: PreparedScene, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:
     """Squared errors of the images and of the silhouettes, over those of a still first frame."""
     frames = len(motion.x)
-    images, alphas = draw(prepared, motion, views)
+    images, alphas = render_motion(prepared, motion, views)
     recorded, masks = prepared.recorded(views, frames), prepared.silhouettes(views, frames)
     still = (recorded - recorded[:1]).square().mean(), (masks - masks[:1]).square().mean()
     floors = (STILL_IMAGE, STILL_MASK)
@@ -77,26 +79,26 @@ def image_losses(prepared: Prepared, motion: ParticleState, views: list[int]) ->
     )
 
 
-class FilmedModule(LightningModule):
+class ImageModule(LightningModule):
     """Scores and results of filmed scenes; its subclasses have the options `out`, `lpips_backbone` and `lpips_net`."""
 
     def __init__(self) -> None:
         super().__init__()
         self._floors: dict[str, Tensor] = {}
 
-    def figures_of(
-        self, prepared: Prepared, motion: ParticleState, *, images: bool = True
+    def score_motion(
+        self, prepared: PreparedScene, motion: ParticleState, *, images: bool = True
     ) -> tuple[dict[str, float], list[dict[str, Any]], list[dict[str, Any]]]:
         """Scores of a motion: their means, and the rows by time step, of particles and of images on the views that were held out."""
         particles = scores.score_motion(prepared, motion, self._floor(prepared))
-        pictures = scores.score_images(prepared, motion, prepared.scoring, self._lpips()) if images else []
-        return scores.mean_of(particles, FIGURES) | scores.mean_of(pictures, FIGURES), particles, pictures
+        pictures = scores.score_images(prepared, motion, prepared.scoring_views, self._lpips()) if images else []
+        return scores.mean_of(particles, SCORES) | scores.mean_of(pictures, SCORES), particles, pictures
 
-    def _floor(self, prepared: Prepared) -> Tensor | None:
+    def _floor(self, prepared: PreparedScene) -> Tensor | None:
         """Measured once a scene: it depends on the truth alone."""
         name = prepared.source.name
         if prepared.source.truth is not None and name not in self._floors:
-            self._floors[name] = scores.floor_by_frame(prepared)
+            self._floors[name] = scores.floor_per_frame(prepared)
         return self._floors.get(name)
 
     def _lpips(self) -> LPIPS | Absent:
@@ -110,22 +112,22 @@ class FilmedModule(LightningModule):
             plain = {name: value.detach() if isinstance(value, Tensor) else value for name, value in values.items()}
             self.log_dict(plain, prog_bar=False, batch_size=1)
 
-    def _say_absent(self) -> None:
+    def _report_missing_lpips(self) -> None:
         absent = self._lpips()
         if isinstance(absent, Absent):
             self.print(f"LPIPS is absent: {absent.reason}")
 
 
-def write_by_frame(folder: Path, particles: list[dict[str, Any]], pictures: list[dict[str, Any]]) -> None:
-    """Write the rows of `FilmedModule.figures_of`."""
-    scores.write_rows(folder / "particles.csv", particles)
-    scores.write_rows(folder / "images.csv", pictures)
+def write_frame_scores(folder: Path, particles: list[dict[str, Any]], pictures: list[dict[str, Any]]) -> None:
+    """Write the rows of `ImageModule.score_motion`."""
+    write_rows(folder / "particles.csv", particles)
+    write_rows(folder / "images.csv", pictures)
 
 
-def write_prediction(folder: Path, prepared: Prepared, motion: ParticleState) -> None:
+def write_prediction(folder: Path, prepared: PreparedScene, motion: ParticleState) -> None:
     """Write particles, and recorded frames beside predicted ones from one of the scoring views as a video and a picture."""
-    view = prepared.scoring[0]
-    images, recorded = draw(prepared, motion, [view])[0][:, 0], prepared.recorded([view])[:, 0]
-    results.write_plys(folder / "particles", motion)
-    results.write_video(folder / "prediction.mp4", torch.cat([recorded, images], 2))
-    results.contact_sheet(folder / "prediction.png", [recorded, images])
+    view = prepared.scoring_views[0]
+    images, recorded = render_motion(prepared, motion, [view])[0][:, 0], prepared.recorded([view])[:, 0]
+    write_plys(folder / "particles", motion)
+    write_video(folder / "prediction.mp4", torch.cat([recorded, images], 2))
+    contact_sheet(folder / "prediction.png", [recorded, images])

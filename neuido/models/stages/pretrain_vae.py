@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuido.data.scenes.clips import FlowBatch
 from neuido.errors import UserError
-from neuido.models.stages.training import figures_of, publish, run_length
+from neuido.models.stages.training import optimiser_steps, report_and_save, validation_scores
 from neuido.models.video.flow import encode_flow
 from neuido.models.video.flow_vae import FlowVAE
 
@@ -51,7 +51,7 @@ class FlowVAEModule(LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.hparams.lr, weight_decay=self.hparams.weight_decay, betas=(0.9, 0.99))
-        total = run_length(self.trainer)
+        total = optimiser_steps(self.trainer)
         first = min(100, max(1, total // 10))  # a full first step scatters the latents, and they do not come back
 
         def rate(step: int) -> float:
@@ -100,7 +100,7 @@ class FlowVAEModule(LightningModule):
         self.vae.scale.fill_(max(squares / count - (total / count) ** 2, 1e-12) ** -0.5)
 
     def on_validation_end(self) -> None:
-        figures = figures_of(self)
+        figures = validation_scores(self)
         if figures and not figures["val/error"] >= self.best.get("figures", {}).get("val/error", math.inf):
             weights = {name: t.detach().cpu().clone() for name, t in self.vae.state_dict().items()}
             self.best = {"steps": self.global_step, "figures": figures, "weights": weights}
@@ -115,4 +115,4 @@ class FlowVAEModule(LightningModule):
         best = self.best or {"steps": self.global_step, "figures": {}, "weights": self.vae.state_dict()}
         self.vae.load_state_dict(best["weights"])
         flow = {"flow_encoding": self.hparams.flow_encoding, "speed_scale": self.hparams.speed_scale}
-        publish(self, self.vae.save, {"steps": best["steps"], "flow": flow}, best["figures"])
+        report_and_save(self, self.vae.save, {"steps": best["steps"], "flow": flow}, best["figures"])

@@ -8,9 +8,11 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
 
 from neuido.errors import UserError
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.video.encoder import DynamicsEncoder
 
 
-def run_length(trainer: Trainer) -> int:
+def optimiser_steps(trainer: Trainer) -> int:
     """Optimiser steps of a whole run.
 
     `trainer.estimated_stepping_batches` would do, but it sets up the loaders before Lightning restores their state, and a run
@@ -26,13 +28,13 @@ def run_length(trainer: Trainer) -> int:
     return max(1, min(bounds))
 
 
-def figures_of(module: LightningModule) -> dict[str, float]:
+def validation_scores(module: LightningModule) -> dict[str, float]:
     """What the last validation logged, by names that begin with `val/`."""
     return {name: float(value) for name, value in module.trainer.callback_metrics.items() if name.startswith("val/")}
 
 
 @rank_zero_only
-def publish(
+def report_and_save(
     module: LightningModule,
     save: Callable[[str, dict[str, Any]], None],
     card: Mapping[str, Any],
@@ -46,9 +48,34 @@ def publish(
         card: What the card says beside the figures.
         figures: By names that begin with `val/`; those of the last validation where absent.
     """
-    figures = figures_of(module) if figures is None else figures
+    figures = validation_scores(module) if figures is None else figures
     for name, value in figures.items():
         if name.count("/") == 1:  # not of single scenes
             module.print(f"{name:40s} {value:.4g}")
     if module.hparams.save_to is not None:
         save(module.hparams.save_to, {**card, "figures": dict(figures)})
+
+
+def open_operator_and_encoder(operator: str, init_from: str | None, vae: str, **sizes) -> tuple[IntrinsicDynamicsOperator, DynamicsEncoder]:
+    """A frozen operator, and an encoder that reads latents for it.
+
+    Args:
+        operator: File of `IntrinsicDynamicsOperator.save`, or `pretrained`.
+        init_from: File of `DynamicsEncoder.save`, or `pretrained`, whose own VAE and sizes then count; none: a new projector, near
+            the mean latent of Stage I.
+        vae: Of a new projector, see `video_vae.open_vae`.
+        sizes: Options of a new `DynamicsEncoder`.
+
+    Raises:
+        UserError: A file that is missing, or latents of different lengths.
+    """
+    frozen = IntrinsicDynamicsOperator.load(operator)
+    frozen.eval().requires_grad_(False)
+    if init_from is not None:
+        encoder = DynamicsEncoder.load(init_from)
+    else:
+        encoder = DynamicsEncoder(vae, latent_dim=frozen.latent_dim, **sizes)
+        if len(frozen.latents) > 1:
+            encoder.projector.start_near(frozen.latents)
+    encoder.check_latents(frozen.latent_dim, f"model.init_from = {init_from}")
+    return frozen, encoder

@@ -1,7 +1,7 @@
 """The projector's warm-up: from the flow of simulated clips to laws that are known, before any scene's images (not in the paper).
 
 Stage II alone sees few scenes, and what it learns from their images holds for them. Here the projector sees many cheap clips of `neuido
-film`, and its latent is judged by the law that the frozen operator makes of it, on samples of the true law: as in Stage I, but with z
+film`, and its latent is errors by the law that the frozen operator makes of it, on samples of the true law: as in Stage I, but with z
 from a video.
 """
 
@@ -20,16 +20,16 @@ from tqdm import tqdm
 from neuido.data.bodies.families import laws
 from neuido.data.scenes.clips import Clip, FilmDataModule
 from neuido.errors import UserError
-from neuido.models.operator.branch import open_branch, small_strain_modulus
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.stages.training import publish, run_length
+from neuido.models.operator.law_properties import p_wave_modulus
+from neuido.models.stages.training import open_operator_and_encoder, optimiser_steps, report_and_save
 from neuido.models.video.flow import Velocities
 
 STRAIN_FLOOR = 3e-4
 """Floor of a plastic correction's norm [-] in its relative error."""
 
 
-class Judgement(NamedTuple):
+class LawErrors(NamedTuple):
     """How far laws are from true ones, one number each for B materials."""
 
     stress: Tensor
@@ -44,7 +44,7 @@ class Judgement(NamedTuple):
         return self.stress + self.plastic + size_weight * self.size
 
 
-def judge(operator: IntrinsicDynamicsOperator, z: Tensor, trial: Tensor, corrected: Tensor, stress: Tensor) -> Judgement:
+def compare_laws(operator: IntrinsicDynamicsOperator, z: Tensor, trial: Tensor, corrected: Tensor, stress: Tensor) -> LawErrors:
     """Compare the laws of z (B, d) with samples of true ones: trial, corrected (B, n, 3, 3) and stress [Pa] (B, n, 3, 3)."""
     predicted, returned = operator.elastic(z, corrected), operator.plastic(z, trial)
     norm = stress.flatten(2).norm(dim=2)
@@ -55,7 +55,7 @@ def judge(operator: IntrinsicDynamicsOperator, z: Tensor, trial: Tensor, correct
     a, b = (returned - trial).flatten(2), (corrected - trial).flatten(2)
     plastic_error = (a - b).norm(dim=2) / (a.norm(dim=2) + b.norm(dim=2) + STRAIN_FLOOR)
     size = ((other.square().mean(1) + 1e-6).sqrt() / (rms + 1e-3)).log().abs()
-    return Judgement(stress_error.mean(1), plastic_error.mean(1), size)
+    return LawErrors(stress_error.mean(1), plastic_error.mean(1), size)
 
 
 class WarmupModule(LightningModule):
@@ -70,7 +70,7 @@ class WarmupModule(LightningModule):
         flow_size, flow_encoding, speed_scale, width, heads, conditions, dropout: Of a new encoder (`DynamicsEncoder`).
         lr: AdamW with a cosine to zero over the run.
         weight_decay: Of the projector.
-        size_weight: Of `Judgement.size` in the loss.
+        size_weight: Of `LawErrors.size` in the loss.
         mirror: Show mirrored clips too.
         noise: Standard deviation of noise on the flow latents, in units of theirs, in training.
         samples: Samples of a clip's law in a step.
@@ -105,14 +105,14 @@ class WarmupModule(LightningModule):
         self.save_hyperparameters()
         flow = {"flow_size": flow_size, "flow_encoding": flow_encoding, "speed_scale": speed_scale}
         sizes = {"width": width, "heads": heads, "conditions": conditions, "dropout": dropout}
-        self.operator, self.encoder = open_branch(operator, init_from, vae, **flow, **sizes)  # type: ignore[arg-type]
+        self.operator, self.encoder = open_operator_and_encoder(operator, init_from, vae, **flow, **sizes)  # type: ignore[arg-type]
         self._clips: dict[str, Tensor] = {}
-        self._rows: list[tuple[Judgement, Tensor, Tensor, Tensor]] = []
+        self._rows: list[tuple[LawErrors, Tensor, Tensor, Tensor]] = []
 
     def configure_optimizers(self) -> dict[str, Any]:
         parameters = self.encoder.projector.parameters()
         optimizer = torch.optim.AdamW(parameters, lr=self.hparams.lr, weight_decay=self.hparams.weight_decay)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, run_length(self.trainer))
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, optimiser_steps(self.trainer))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_fit_start(self) -> None:
@@ -174,10 +174,10 @@ class WarmupModule(LightningModule):
         volume = volume + self.hparams.noise * torch.randn_like(volume)
         z = self.encoder.projector(volume, clips["conditions"][numbers, view])
         rows = torch.randint(clips["trial"].shape[1], (self.hparams.samples,), device=self.device)
-        judged = judge(self.operator, z, *(clips[name][numbers][:, rows] for name in ("trial", "corrected", "stress")))
-        values = {"train/stress": judged.stress, "train/plastic": judged.plastic, "train/size": judged.size}
+        errors = compare_laws(self.operator, z, *(clips[name][numbers][:, rows] for name in ("trial", "corrected", "stress")))
+        values = {"train/stress": errors.stress, "train/plastic": errors.plastic, "train/size": errors.size}
         self.log_dict({name: value.detach().mean() for name, value in values.items()}, prog_bar=True)
-        return judged.total(self.hparams.size_weight).mean()
+        return errors.total(self.hparams.size_weight).mean()
 
     def validation_step(self, numbers: Tensor, batch_idx: int) -> None:
         """All views of a clip give one z, as in Stage II."""
@@ -185,27 +185,27 @@ class WarmupModule(LightningModule):
         volume, conditions = clips["volume"][numbers, 0], clips["conditions"][numbers]
         views = volume.shape[1]
         z = self.encoder.projector(volume.flatten(0, 1), conditions.flatten(0, 1)).unflatten(0, (-1, views)).mean(1)
-        judged = judge(self.operator, z, *(clips[name][numbers] for name in ("trial", "corrected", "stress")))
-        self._rows.append((judged, small_strain_modulus(self.operator, z), clips["modulus"][numbers], clips["elastic"][numbers]))
+        errors = compare_laws(self.operator, z, *(clips[name][numbers] for name in ("trial", "corrected", "stress")))
+        self._rows.append((errors, p_wave_modulus(self.operator, z), clips["modulus"][numbers], clips["elastic"][numbers]))
 
     def on_validation_epoch_end(self) -> None:
         columns = list(zip(*self._rows))
-        judged = Judgement(*(torch.cat(column) for column in zip(*columns[0])))
+        errors = LawErrors(*(torch.cat(column) for column in zip(*columns[0])))
         found, true, elastic = (torch.cat(column) for column in columns[1:])
         self._rows.clear()
         error = (found.clamp(min=1.0) / true).log().abs()
-        values = {"val/stress": judged.stress.mean(), "val/plastic": judged.plastic.mean(), "val/size": judged.size.mean()}
-        values |= {"val/modulus_error": error.median().exp() - 1, "val/modulus_order": _rank_correlation(found, true)}
+        values = {"val/stress": errors.stress.mean(), "val/plastic": errors.plastic.mean(), "val/size": errors.size.mean()}
+        values |= {"val/modulus_error": error.median().exp() - 1, "val/modulus_order": _spearman(found, true)}
         if bool(elastic.any()):  # what flows does not show its stiffness
-            own = _rank_correlation(found[elastic], true[elastic])
+            own = _spearman(found[elastic], true[elastic])
             values |= {"val/modulus_error_elastic": error[elastic].median().exp() - 1, "val/modulus_order_elastic": own}
         self.log_dict(values, prog_bar=True, sync_dist=True)
 
     def on_train_end(self) -> None:
-        publish(self, self.encoder.save, {"stage": "warm-up", "steps": self.global_step})
+        report_and_save(self, self.encoder.save, {"stage": "warm-up", "steps": self.global_step})
 
 
-def _rank_correlation(a: Tensor, b: Tensor) -> Tensor:
+def _spearman(a: Tensor, b: Tensor) -> Tensor:
     """Spearman's, of two vectors; NaN of fewer than three."""
     if len(a) < 3:
         return a.new_tensor(float("nan"))

@@ -1,0 +1,1 @@
+"""From video to latents: optical flow, flow VAE and encoder."""

@@ -25,7 +25,7 @@ from neuido.data.scenes.clips import FORMAT, complete
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
 from neuido.models.render.splatting import render
-from neuido.models.video.flow import PRESETS, measure
+from neuido.models.video.flow import PRESETS, measure_velocities
 from neuido.physics.mpm.simulator import COURANT_LIMIT, Simulator
 from neuido.physics.runtime.device import choose_device
 from neuido.types import Body, Cameras, Gaussians, ParticleState, Scene, Walls
@@ -35,7 +35,7 @@ FLOORS = (0.0, 0.5, math.inf)
 
 
 @dataclass(frozen=True)
-class Plan:
+class ClipPlan:
     """What decides the content of the files; `neuido film` documents each figure."""
 
     count: int
@@ -70,7 +70,7 @@ HALVINGS = 2
 """Of the step of a clip that is unstable."""
 
 
-class Clip(NamedTuple):
+class ClipSetup(NamedTuple):
     """One clip before it is simulated."""
 
     name: str
@@ -82,8 +82,8 @@ class Clip(NamedTuple):
     cameras: Cameras
 
 
-def make(
-    plan: Plan, out: str | os.PathLike, *, device: str = "auto", batch: int = 0, shard: int = 0, shards: int = 1, progress: bool = True
+def generate_clips(
+    plan: ClipPlan, out: str | os.PathLike, *, device: str = "auto", batch: int = 0, shard: int = 0, shards: int = 1, progress: bool = True
 ) -> None:
     """Make what is missing of a shard's clips; whoever finds none missing any more writes the index."""
     folder, chosen = Path(out), choose_device(device)
@@ -103,9 +103,9 @@ def make(
             wanted = [i for i in missing if i % len(kinds) == k]
             for start in range(0, len(wanted), size):
                 with ThreadPoolExecutor(workers if size > 1 else 1) as pool:
-                    group = list(pool.map(lambda i: draw(plan, i), wanted[start : start + size]))
-                    shots = shoot(plan, group, chosen)
-                    list(pool.map(lambda pair: _finish(plan, folder, *pair), zip(group, shots)))
+                    group = list(pool.map(lambda i: sample_clip(plan, i), wanted[start : start + size]))
+                    filmed = film_clips(plan, group, chosen)
+                    list(pool.map(lambda pair: _write_clip(plan, folder, *pair), zip(group, filmed)))
                 bar.update(len(group))
     if (missing or not (folder / "index.json").exists()) and all(complete(folder / f"{name}.npz") for name in names):
         entries = []
@@ -115,7 +115,7 @@ def make(
         write(folder / "index.json", json.dumps({"format": FORMAT, "plan": asdict(plan), "clips": entries}, indent=1) + "\n")
 
 
-def draw(plan: Plan, number: int) -> Clip:
+def sample_clip(plan: ClipPlan, number: int) -> ClipSetup:
     """The clip of a number: material, floor, body, texture and cameras, all at random."""
     random = np.random.default_rng([plan.seed, number])
     family, parameters = _material(plan, random, number)
@@ -133,14 +133,20 @@ def draw(plan: Plan, number: int) -> Clip:
     velocity = (random.uniform(-0.5, 0.5), random.uniform(-3.0, -0.5), random.uniform(-0.5, 0.5))
     v = rigid_velocity(x, centre=centre, velocity=velocity, angular_velocity=tuple(random.uniform(-3, 3, 3).tolist()))
     body = Body(x.float(), v.float(), torch.full((len(x),), volume / len(x)))
-    return Clip(
-        f"clip-{number:05d}", family, parameters, scene, body, _texture(random, body, volume), _cameras(random, plan, (0.5, 0.35, 0.5))
+    return ClipSetup(
+        f"clip-{number:05d}",
+        family,
+        parameters,
+        scene,
+        body,
+        _textured_gaussians(random, body, volume),
+        _cameras(random, plan, (0.5, 0.35, 0.5)),
     )
 
 
-def shoot(plan: Plan, group: list[Clip], device: torch.device) -> Iterator[dict[str, Tensor]]:
+def film_clips(plan: ClipPlan, group: list[ClipSetup], device: torch.device) -> Iterator[dict[str, Tensor]]:
     """Simulate and render clips of one family: images, masks, and samples of the law of each, on the CPU."""
-    for clip, motion in zip(group, _roll(plan, group, device), strict=True):
+    for clip, motion in zip(group, _simulate(plan, group, device), strict=True):
         gaussians = Gaussians(*(None if t is None else t.to(device) for t in clip.gaussians))
         cameras = clip.cameras._replace(viewmats=clip.cameras.viewmats.to(device), Ks=clip.cameras.Ks.to(device))
         with torch.no_grad():
@@ -149,7 +155,7 @@ def shoot(plan: Plan, group: list[Clip], device: torch.device) -> Iterator[dict[
         yield seen | _samples(motion, clip, plan.samples, int(clip.name.removeprefix("clip-")))
 
 
-def _roll(plan: Plan, group: list[Clip], device: torch.device, halvings: int = 0) -> list[ParticleState]:
+def _simulate(plan: ClipPlan, group: list[ClipSetup], device: torch.device, halvings: int = 0) -> list[ParticleState]:
     """The frames of each clip. Where one is unstable the others run without it, and it again with steps of a half and a quarter."""
     share = 2**halvings
     scenes = [replace(c.scene, dt=c.scene.dt / share) for c in group]
@@ -162,27 +168,27 @@ def _roll(plan: Plan, group: list[Clip], device: torch.device, halvings: int = 0
     except UserError as error:
         if len(group) > 1:
             middle = len(group) // 2
-            return [*_roll(plan, group[:middle], device, halvings), *_roll(plan, group[middle:], device, halvings)]
+            return [*_simulate(plan, group[:middle], device, halvings), *_simulate(plan, group[middle:], device, halvings)]
         if halvings == HALVINGS:
             raise UserError(f"{group[0].name}: {error}") from error
-        return _roll(plan, group, device, halvings + 1)
+        return _simulate(plan, group, device, halvings + 1)
     parts = zip(simulator.particles.offsets[:-1], simulator.particles.offsets[1:])
     return [ParticleState(*(part[:, a:b] for part in frames)) for a, b in parts]
 
 
-def _finish(plan: Plan, folder: Path, clip: Clip, shot: dict[str, Tensor]) -> None:
+def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str, Tensor]) -> None:
     """Measure the flow of a clip and write its file."""
     times = torch.arange(plan.frames) * clip.scene.dt * plan.frame_steps
     options = {"size": plan.flow_size, "preset": plan.flow_preset}
-    seen = measure(shot.pop("images"), shot.pop("masks"), times, clip.cameras, clip.body.x.mean(0), **options)
-    content = {"flow": seen.flow.half(), "cell": seen.cell, "frame_interval": torch.tensor(seen.frame_interval), **shot}
+    seen = measure_velocities(filmed.pop("images"), filmed.pop("masks"), times, clip.cameras, clip.body.x.mean(0), **options)
+    content = {"flow": seen.flow.half(), "cell": seen.cell, "frame_interval": torch.tensor(seen.frame_interval), **filmed}
     hidden = folder / f".{clip.name}.npz.tmp"
     with hidden.open("wb") as file:
         np.savez(file, **{name: t.numpy() for name, t in content.items()})
     publish(hidden, folder / f"{clip.name}.npz")
 
 
-def _samples(motion: ParticleState, clip: Clip, count: int, seed: int) -> dict[str, Tensor]:
+def _samples(motion: ParticleState, clip: ClipSetup, count: int, seed: int) -> dict[str, Tensor]:
     """The law at deformations that the motion runs through: trial, corrected, stress (n, 3, 3)."""
     elastic, plastic = laws(clip.family, [clip.parameters])
     F, C = motion.F[1:].flatten(0, 1).double(), motion.C[1:].flatten(0, 1).double()
@@ -192,7 +198,7 @@ def _samples(motion: ParticleState, clip: Clip, count: int, seed: int) -> dict[s
     return {"trial": trial.cpu(), "corrected": corrected.cpu(), "stress": evaluate(elastic, corrected).cpu()}
 
 
-def _material(plan: Plan, random: np.random.Generator, number: int) -> tuple[str, dict[str, float]]:
+def _material(plan: ClipPlan, random: np.random.Generator, number: int) -> tuple[str, dict[str, float]]:
     family = list(plan.families)[number % len(plan.families)]
     return family, draw_parameters(family, plan.families[family], random)
 
@@ -236,7 +242,7 @@ def _limbs(random: np.random.Generator, points: np.ndarray) -> np.ndarray:
     return (distance < random.uniform(0.12, 0.3, 4)).any(1)
 
 
-def _texture(random: np.random.Generator, body: Body, volume: float) -> Gaussians:
+def _textured_gaussians(random: np.random.Generator, body: Body, volume: float) -> Gaussians:
     """A Gaussian a particle, coloured by waves through the body."""
     x = body.x.double().numpy()
     waves = random.standard_normal((3, 3, 3)) * random.uniform(12, 60, (3, 3, 1))
@@ -247,7 +253,7 @@ def _texture(random: np.random.Generator, body: Body, volume: float) -> Gaussian
     return Gaussians(body.x, covariance, torch.full((len(x),), 0.95), harmonics_of(torch.from_numpy(colour.clip(0, 0.95)).float()))
 
 
-def _cameras(random: np.random.Generator, plan: Plan, target: tuple[float, float, float]) -> Cameras:
+def _cameras(random: np.random.Generator, plan: ClipPlan, target: tuple[float, float, float]) -> Cameras:
     views = []
     for _ in range(plan.views):
         azimuth, elevation = random.uniform(0, 2 * math.pi), math.radians(random.uniform(0, 35))

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neuido.errors import UserError
-from neuido.models.video.flow import ENCODINGS, Velocities, encode_flow, measure
+from neuido.models.video.flow import ENCODINGS, Velocities, encode_flow, measure_velocities
 from neuido.models.video.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, load_state, read_weights, write_weights
 from neuido.models.video.video_vae import CogVideoXVAE, open_vae
 from neuido.types import MultiViewBatch
@@ -25,7 +25,7 @@ PRETRAINED = {
     "pretrained": Path(__file__).parents[1] / "weights" / "stage2.safetensors",
     "pretrained-small": Path(__file__).parents[1] / "weights" / "stage2_small.safetensors",
 }
-CLOCK, CELL = 5e-3, 1e-2
+REFERENCE_INTERVAL, REFERENCE_CELL = 5e-3, 1e-2
 """The frame interval [s] and the side of a cell [m] at which the projector's two conditions are zero."""
 
 
@@ -83,7 +83,7 @@ class Projector(nn.Module):
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, latent_dim))
 
     def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
-        """z of each view (V, d), of flow latents (V, channels, T', h, w) and conditions (V, 2) of `conditions_of`."""
+        """z of each view (V, d), of flow latents (V, channels, T', h, w) and conditions (V, 2) of `scale_conditions`."""
         x = self.conv(volume)
         x = (x + _positions(x)).flatten(2).transpose(1, 2)
         x = x + self.tokens(x)
@@ -92,7 +92,7 @@ class Projector(nn.Module):
         return self.head(self.pool(self.dropout(x)))
 
     @torch.no_grad()
-    def start_at(self, latents: Tensor, spread: float = 0.1) -> None:
+    def start_near(self, latents: Tensor, spread: float = 0.1) -> None:
         """Begin near the mean of latents (M, d), with outputs that vary in the directions in which they do.
 
         Args:
@@ -122,7 +122,7 @@ def _positions(x: Tensor) -> Tensor:
     return torch.cat(parts, 1).to(x)
 
 
-def conditions_of(frame_interval: Tensor | float, cell: Tensor) -> Tensor:
+def scale_conditions(frame_interval: Tensor | float, cell: Tensor) -> Tensor:
     """What the projector is told beside the video, (V, 2): logarithms of the frame interval and of a cell's side over the constants here.
 
     Args:
@@ -130,7 +130,7 @@ def conditions_of(frame_interval: Tensor | float, cell: Tensor) -> Tensor:
         cell: Side of a cell of the flow at the body [m], (V,).
     """
     interval = torch.as_tensor(frame_interval).to(cell).expand(len(cell))
-    return torch.stack([(interval / CLOCK).log(), (cell / CELL).log()], -1)
+    return torch.stack([(interval / REFERENCE_INTERVAL).log(), (cell / REFERENCE_CELL).log()], -1)
 
 
 class DynamicsEncoder(nn.Module):
@@ -174,6 +174,26 @@ class DynamicsEncoder(nn.Module):
         self.projector = Projector(opened.channels, latent_dim, width, heads, conditions, dropout)
         self.card: dict[str, Any] = {}
 
+    def __repr__(self) -> str:
+        sizes, flow = self.projector.config, self.flow
+        vae = "FlowVAE" if self.source is None else self.source
+        size = f"{flow['flow_size']} px flow, {flow['flow_encoding']}"
+        return f"{type(self).__name__}(latent_dim={sizes['latent_dim']}, width={sizes['width']}, vae={vae}, {size})"
+
+    def check_latents(self, latent_dim: int, option: str) -> None:
+        """Refuse an operator whose latents have another length.
+
+        Args:
+            latent_dim: Of the operator.
+            option: What the error names.
+
+        Raises:
+            UserError: The lengths differ.
+        """
+        given = self.projector.config["latent_dim"]
+        if given != latent_dim:
+            raise UserError(f"{option} gives latents of {given} numbers, the operator takes {latent_dim}: use an encoder made for it")
+
     def train(self, mode: bool = True) -> Self:
         """As ever, but the VAE stays as it is."""
         super().train(mode)
@@ -187,9 +207,11 @@ class DynamicsEncoder(nn.Module):
         flow, cell = seen.flow.to(like.device, torch.float32), seen.cell.to(like.device)
         options = {"encoding": self.flow["flow_encoding"], "speed_scale": self.flow["speed_scale"]}
         volume = torch.cat([self.vae.encode(encode_flow(each[None], **options)) for each in flow])
-        return volume.to(like), conditions_of(seen.frame_interval, cell).to(like)
+        return volume.to(like), scale_conditions(seen.frame_interval, cell).to(like)
 
-    def watch(self, batch: MultiViewBatch, views: Sequence[int], centre: Tensor, *, cache: str | os.PathLike | None = None) -> Velocities:
+    def measure_flow(
+        self, batch: MultiViewBatch, views: Sequence[int], centre: Tensor, *, cache: str | os.PathLike | None = None
+    ) -> Velocities:
         """The velocities that some views of a scene show.
 
         Args:
@@ -201,7 +223,7 @@ class DynamicsEncoder(nn.Module):
         views = list(views)
         cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats[views], Ks=batch.cameras.Ks[views])
         options = {"size": self.flow["flow_size"], "preset": self.flow["flow_preset"], "cache": cache}
-        return measure(batch.images[views], batch.masks[views], batch.times, cameras, centre, **options)
+        return measure_velocities(batch.images[views], batch.masks[views], batch.times, cameras, centre, **options)
 
     def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
         """z (d,): the mean over the views of the projector's, of flow latents and conditions."""
@@ -216,6 +238,15 @@ class DynamicsEncoder(nn.Module):
         if self.source is not None:
             config["vae"] = None
         write_weights(path, ENCODER_FORMAT, config, tensors, {"date": date.today().isoformat(), **(card or {})})
+
+    @classmethod
+    def from_pretrained(cls, name: str | os.PathLike = "pretrained") -> Self:
+        """Load an encoder that comes with neuido (`pretrained`, `pretrained-small`) or a file of `save`.
+
+        Raises:
+            UserError: As `load`.
+        """
+        return cls.load(name)
 
     @classmethod
     def load(cls, path: str | os.PathLike = "pretrained") -> Self:

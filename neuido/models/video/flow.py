@@ -77,7 +77,7 @@ class Velocities(NamedTuple):
     """[s]"""
 
 
-def window(masks: Tensor, margin: float = 0.1) -> tuple[int, int, int]:
+def body_window(masks: Tensor, margin: float = 0.1) -> tuple[int, int, int]:
     """Top, left and side [px] of the square, within the image, that holds a body in all frames of a video.
 
     Args:
@@ -95,7 +95,7 @@ def window(masks: Tensor, margin: float = 0.1) -> tuple[int, int, int]:
     return top, left, side
 
 
-def measure(
+def measure_velocities(
     images: Tensor,
     masks: Tensor,
     times: Tensor | Sequence[float],
@@ -128,9 +128,9 @@ def measure(
         for t in (images, masks):
             key.update(as_bytes(t).cpu().numpy())
         path = Path(cache) / f"flow-{key.hexdigest()[:24]}.npz"
-    found = _kept(path)
+    found = _read_cache(path)
     if found is None:
-        found = _cut(optical_flow(images, preset=preset), masks.cpu(), size)
+        found = _crop_flow(optical_flow(images, preset=preset), masks.cpu(), size)
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             hidden = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -150,11 +150,11 @@ def as_bytes(images: Tensor) -> Tensor:
     return out
 
 
-def _cut(flow: Tensor, masks: Tensor, size: int) -> tuple[Tensor, Tensor]:
+def _crop_flow(flow: Tensor, masks: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Masked flow (V, T - 1, S, S, 2) in pixels of the full image, and the sides of the windows [px], (V,)."""
     out, sides = [], []
     for each, mask in zip(flow, masks):
-        top, left, side = window(mask)
+        top, left, side = body_window(mask)
         cut = (slice(None), slice(top, top + side), slice(left, left + side))
         part = (each[cut] * mask[:-1][cut][..., None]).permute(0, 3, 1, 2)
         out.append(torch.nn.functional.interpolate(part, size=(size, size), mode="bilinear", antialias=True).permute(0, 2, 3, 1))
@@ -162,7 +162,7 @@ def _cut(flow: Tensor, masks: Tensor, size: int) -> tuple[Tensor, Tensor]:
     return torch.stack(out), torch.tensor(sides)
 
 
-def _kept(path: Path | None) -> tuple[Tensor, Tensor] | None:
+def _read_cache(path: Path | None) -> tuple[Tensor, Tensor] | None:
     if path is None or not path.is_file():
         return None
     try:

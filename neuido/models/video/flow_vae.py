@@ -46,8 +46,8 @@ class Residual(nn.Module):
         self.conv1, self.conv2 = CausalConv3d(channels, channels), CausalConv3d(channels, channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        h = self.conv1(functional.silu(by_frame(self.norm1, x)))
-        return x + self.conv2(functional.silu(by_frame(self.norm2, h)))
+        h = self.conv1(functional.silu(frame_by_frame(self.norm1, x)))
+        return x + self.conv2(functional.silu(frame_by_frame(self.norm2, h)))
 
 
 class Activation(nn.Module):
@@ -58,10 +58,10 @@ class Activation(nn.Module):
         self.norm = nn.GroupNorm(8, channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        return functional.silu(by_frame(self.norm, x))
+        return functional.silu(frame_by_frame(self.norm, x))
 
 
-def by_frame(layer: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+def frame_by_frame(layer: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """A layer for images applied to each frame of (B, C, T, H, W)."""
     flat = x.transpose(1, 2).flatten(0, 1)
     return layer(flat).unflatten(0, (x.shape[0], x.shape[2])).transpose(1, 2)
@@ -122,7 +122,9 @@ class FlowVAE(nn.Module):
         """
         if video.ndim != 5 or video.shape[1] != 3 or video.shape[-1] % 8 or video.shape[-2] % 8:
             raise UserError(f"a flow video must be (B, 3, T, H, W) with H and W multiples of 8, got {tuple(video.shape)}; change flow_size")
-        squares = by_frame(lambda frame: functional.pixel_unshuffle(frame, 2), video)  # full size costs the most and tells little more
+        squares = frame_by_frame(
+            lambda frame: functional.pixel_unshuffle(frame, 2), video
+        )  # full size costs the most and tells little more
         mean, variance = self.encoder(squares).chunk(2, 1)
         return mean, variance.clamp(-20, 2)
 
@@ -138,9 +140,9 @@ class FlowVAE(nn.Module):
         """`decode` before `scale`."""
         first, before, middle, after, narrow, last, active, out = self.decoder
         h = before(first(latent))
-        h = after(middle(_longer(h)))
-        h = last(narrow(_longer(h)))
-        return by_frame(lambda frame: functional.pixel_shuffle(frame, 2), out(active(h)))
+        h = after(middle(_upsample(h)))
+        h = last(narrow(_upsample(h)))
+        return frame_by_frame(lambda frame: functional.pixel_shuffle(frame, 2), out(active(h)))
 
     @torch.no_grad()
     def normalise(self, latents: Tensor) -> None:
@@ -172,7 +174,7 @@ class FlowVAE(nn.Module):
         return vae
 
 
-def _longer(x: Tensor) -> Tensor:
+def _upsample(x: Tensor) -> Tensor:
     """Twice the size and all but one frame of twice the length: T' -> 2 T' - 1, the inverse of a causal stride of two."""
     return functional.interpolate(x, scale_factor=(2, 2, 2))[:, :, 1:]
 

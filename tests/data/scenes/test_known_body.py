@@ -8,7 +8,8 @@ from neuido.data.bodies.scene_files import VARIABLE
 from neuido.data.scenes.filmed_scene_module import VisualDataModule
 from neuido.data.scenes.known_body import cropped, load_known
 from neuido.errors import UserError
-from neuido.models.inference.pipeline import draw, prepare
+from neuido.models.inference.pipeline import draw
+from neuido.models.inference.prepared_scene import prepare
 from neuido.models.scoring.motion_scores import intersection_over_union
 from neuido.types import ParticleState
 from tests.data.samples import Sample, experiment

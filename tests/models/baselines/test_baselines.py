@@ -8,10 +8,13 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 
 from neuido.errors import UserError
-from neuido.models.baselines.learned import PARTS, KnownLaw, MeanLatent, NCLaw, NeuMA, RandomLatent, UniPhy, nclaw, nclaw_weights
+from neuido.models.baselines.known_law import PARTS, KnownLaw
+from neuido.models.baselines.nclaw import NCLaw, NeuMA, load_nclaw, read_nclaw_weights
 from neuido.models.baselines.sparse_law import SparseLaw
 from neuido.models.baselines.spring_gaus import SpringMass, farthest_points, following
-from neuido.models.inference.pipeline import draw, prepare
+from neuido.models.baselines.stage_one_latents import MeanLatent, RandomLatent, UniPhy
+from neuido.models.inference.pipeline import render_motion
+from neuido.models.inference.prepared_scene import prepare
 from neuido.models.stages.adapt import AdaptModule
 from neuido.models.stages.image_module import image_losses
 from neuido.physics.effects.parameters import Effects
@@ -28,7 +31,7 @@ def deformations(count=2000):
     [("jelly", FixedCorotated(1e5, 0.2), 0.11), ("plasticine", Sigma(3e5, 0.25), 0.25), ("sand", Sigma(1e6, 0.2), 0.79)],
 )
 def test_distance_to_the_law_it_was_trained_on(data_root, name, law, error):
-    elastic, plastic = nclaw(data_root / "peers" / f"nclaw-{name}.npz")
+    elastic, plastic = load_nclaw(data_root / "peers" / f"nclaw-{name}.npz")
     F = deformations()
     want, got = law(F), elastic(F)
     assert ((got - want).norm() / want.norm()).item() == pytest.approx(error, abs=0.02)
@@ -39,7 +42,7 @@ def test_distance_to_the_law_it_was_trained_on(data_root, name, law, error):
 
 
 def test_frame_indifference_and_rest(data_root):
-    elastic, plastic = nclaw(data_root / "peers" / "nclaw-jelly.npz")
+    elastic, plastic = load_nclaw(data_root / "peers" / "nclaw-jelly.npz")
     F = deformations(50).double()
     Q = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))[0]
     Q = Q * Q.det()
@@ -51,17 +54,17 @@ def test_frame_indifference_and_rest(data_root):
 
 @pytest.mark.parametrize("part", [0, 1])
 def test_gradient_with_respect_to_F(data_root, part):
-    law = nclaw(data_root / "peers" / "nclaw-plasticine.npz")[part]
+    law = load_nclaw(data_root / "peers" / "nclaw-plasticine.npz")[part]
     F = deformations(3).double().requires_grad_(True)
     assert torch.autograd.gradcheck(law, (F,), eps=1e-6, rtol=1e-4, atol=1e-4)
 
 
 def test_missing_or_wrong_file(tmp_path):
     with pytest.raises(UserError, match="are missing"):
-        nclaw(tmp_path / "nclaw-jelly.npz")
+        load_nclaw(tmp_path / "nclaw-jelly.npz")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(UserError, match="no array elasticity"):
-        nclaw(tmp_path / "other.npz")
+        load_nclaw(tmp_path / "other.npz")
 
 
 # The methods.
@@ -95,7 +98,9 @@ def filmed(scene, method):
     """The scene as its own pipeline shows it under the law that the method starts with."""
     prepared = prepare(scene, None)
     with torch.no_grad():
-        images, alphas = draw(prepared, method.for_scene(prepared).roll(prepared, prepared.frames), list(range(len(prepared.images))))
+        images, alphas = render_motion(
+            prepared, method.for_scene(prepared).rollout(prepared, prepared.frames), list(range(len(prepared.images)))
+        )
     images = images.transpose(0, 1).clamp(0, 1).contiguous()
     return scene._replace(batch=scene.batch._replace(images=images, masks=alphas.transpose(0, 1).contiguous()))
 
@@ -111,7 +116,7 @@ def fit(method, scene, steps):
         for group, rate in zip(optimizer.param_groups, rates):
             group["lr"] = rate * own.rate(step / steps)
         optimizer.zero_grad()
-        loss, silhouette = image_losses(prepared, own.roll(prepared, prepared.frames), prepared.training)
+        loss, silhouette = image_losses(prepared, own.rollout(prepared, prepared.frames), prepared.training_views)
         (loss + 0.1 * silhouette + own.regulariser()).backward()
         torch.nn.utils.clip_grad_norm_(list(own.trainable().values()), 1.0)
         optimizer.step()
@@ -204,7 +209,7 @@ def test_neuma_begins_as_nclaw_and_changes_every_layer(tmp_path, weights):
     with torch.no_grad():
         for layer in tuned.lora["elasticity"]:
             layer.B += 0.1
-    given, _ = nclaw_weights(f"{weights}/nclaw-plasticine.npz")
+    given, _ = read_nclaw_weights(f"{weights}/nclaw-plasticine.npz")
     for W, base, layer in zip(tuned.laws(prepared)[0].tensors(), given, tuned.lora["elasticity"]):
         torch.testing.assert_close(W[0], base + 0.1 * layer.A.sum(0, keepdim=True))  # alpha / r = 1
 
@@ -269,7 +274,10 @@ def test_impossible_options_are_named(tmp_path, weights, monkeypatch):
         (lambda: UniPhy(operator="nowhere.safetensors"), "nowhere.safetensors are missing"),
         (lambda: SpringMass(anchors=1), "anchors = 1: at least 2"),
         (lambda: SpringMass(neighbours=0), "neighbours = 0: at least 1"),
-        (lambda: SpringMass(anchors=8, neighbours=4).for_scene(scene).roll(scene, 2, effects=Effects(drag_linear=1.0)), "takes no effects"),
+        (
+            lambda: SpringMass(anchors=8, neighbours=4).for_scene(scene).rollout(scene, 2, effects=Effects(drag_linear=1.0)),
+            "takes no effects",
+        ),
         (lambda: SparseLaw(threshold=1.5), "threshold = 1.5"),
         (lambda: SparseLaw(interval=0), "interval = 0"),
     ):

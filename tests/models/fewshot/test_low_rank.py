@@ -10,8 +10,8 @@ from safetensors.torch import load_file
 
 from neuido.errors import UserError
 from neuido.models.fewshot.low_rank import PEFT_FILES, LowRankAdaptation
-from neuido.models.inference.outputs import load_law
-from neuido.models.inference.pipeline import prepare
+from neuido.models.inference.law_file import load_law
+from neuido.models.inference.prepared_scene import prepare
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from tests.models.visual_samples import tiny_scene
 
@@ -67,7 +67,7 @@ def test_the_merged_law_equals_the_unmerged_one(prepared):
 
 def test_gradients_reach_every_parameter(prepared):
     fit = disturbed(prepared, start="plasticine")  # what does not yield has no gradient for its yielding
-    motion = fit.roll(prepared, prepared.frames)
+    motion = fit.rollout(prepared, prepared.frames)
     (motion.x[-1].sum() + motion.F[-1].square().sum() + fit.regulariser()).backward()
     assert all(p.grad is not None and float(p.grad.abs().max()) > 0 for p in fit.trainable().values())
 
@@ -114,12 +114,12 @@ def test_starts(prepared, tmp_path):
 
 def test_retreat_leads_to_the_mean_law(prepared):
     fit = disturbed(prepared)
-    before = fit.retreat()
+    before = fit.recovery_loss()
     gradients = torch.autograd.grad(before, list(fit.trainable().values()), allow_unused=True)
     with torch.no_grad():
         for p, g in zip(fit.trainable().values(), gradients):
             p -= 0.0 if g is None else 10 * g
-    assert 0 < float(fit.retreat().detach()) < float(before.detach())
+    assert 0 < float(fit.recovery_loss().detach()) < float(before.detach())
 
 
 @pytest.mark.parametrize(

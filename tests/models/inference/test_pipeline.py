@@ -11,9 +11,12 @@ from lightning.pytorch import Trainer, seed_everything
 from plyfile import PlyData
 
 import neuido
+from neuido.data.files.score_tables import folder_of
 from neuido.errors import UserError
-from neuido.models.inference.outputs import load_law, save_law, write_plys
-from neuido.models.inference.pipeline import draw, folder_of, infer, prepare, roll, track
+from neuido.models.inference.law_file import load_law, save_law
+from neuido.models.inference.outputs import write_plys
+from neuido.models.inference.pipeline import carry_points, infer_latent, render_motion, rollout_latent
+from neuido.models.inference.prepared_scene import prepare
 from neuido.models.inference.transfer import read_conditions, simulate_condition
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.scoring.lpips import Absent
@@ -41,7 +44,7 @@ def tools(tmp_path_factory):
     torch.manual_seed(0)
     operator = IntrinsicDynamicsOperator.load()
     encoder = DynamicsEncoder(FlowVAE(8), flow_size=32, width=48)
-    encoder.projector.start_at(operator.latents)
+    encoder.projector.start_near(operator.latents)
     folder = tmp_path_factory.mktemp("scenes")
     scenes = [tiny_scene(folder, f"tiny-{i}", young=young) for i, young in enumerate((5e4, 2e5))]
     return operator, encoder, [prepare(scene, encoder) for scene in scenes]
@@ -55,7 +58,7 @@ def test_the_true_law_scores_nearly_perfectly(tools):
     with torch.no_grad():
         steps = (prepared.frames - 1) * prepared.every
         motion = prepared.simulator.rollout(steps, *material(law["elasticity"], law["plasticity"]), every=prepared.every)
-        other = roll(prepared, operator, operator.latents.mean(0))
+        other = rollout_latent(prepared, operator, operator.latents.mean(0))
     absent = Absent("a test")
     for rows, worse in ((score_motion(prepared, motion), score_motion(prepared, other)),):
         assert len(rows) == 5
@@ -71,14 +74,14 @@ def test_track_carries_points_with_a_motion():
     torch.manual_seed(0)
     rest, points = torch.rand(200, 3), torch.rand(20, 3)
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    assert torch.allclose(track(rest, points, (rest + 0.3)[None])[0], points + 0.3, atol=1e-5)
-    assert torch.equal(track(rest, rest[:5], (rest @ turn.T)[None])[0].round(decimals=4), (rest[:5] @ turn.T).round(decimals=4))
-    assert (track(rest, points, (rest @ turn.T)[None])[0] - points @ turn.T).norm(dim=1).median() < 0.1
+    assert torch.allclose(carry_points(rest, points, (rest + 0.3)[None])[0], points + 0.3, atol=1e-5)
+    assert torch.equal(carry_points(rest, rest[:5], (rest @ turn.T)[None])[0].round(decimals=4), (rest[:5] @ turn.T).round(decimals=4))
+    assert (carry_points(rest, points, (rest @ turn.T)[None])[0] - points @ turn.T).norm(dim=1).median() < 0.1
 
 
 def test_law_file(tools, tmp_path):
     operator, encoder, (prepared, _) = tools
-    found = infer(encoder, operator, prepared)
+    found = infer_latent(encoder, operator, prepared)
     assert 0 < found.seconds < 5
     save_law(tmp_path / "law.safetensors", operator, found.z, {"scene": "tiny-0"})
     with torch.no_grad():
@@ -127,7 +130,7 @@ def test_two_bodies_meet(tools, tmp_path):
     pressed = motion.x[-1, -count:, 1].max() - lower_alone.x[-1, :, 1].max()
     assert pressed < -0.005  # the ball pushes the lower body's top down
     with torch.no_grad():
-        images, _ = draw(prepared[0], roll(prepared[0], operator, operator.latent("jelly")), [0])
+        images, _ = render_motion(prepared[0], rollout_latent(prepared[0], operator, operator.latent("jelly")), [0])
     assert images.shape == (6, 1, 32, 32, 3) and first is prepared[0]
 
 
@@ -163,6 +166,6 @@ def test_names_stay_inside(tmp_path):
 def test_a_shorter_sequence_replaces_a_longer_one(tools, tmp_path):
     operator, _, (prepared, _) = tools
     with torch.no_grad():
-        write_plys(tmp_path, roll(prepared, operator, operator.latent("jelly")))
-        write_plys(tmp_path, roll(prepared, operator, operator.latent("jelly"), 3))
+        write_plys(tmp_path, rollout_latent(prepared, operator, operator.latent("jelly")))
+        write_plys(tmp_path, rollout_latent(prepared, operator, operator.latent("jelly"), 3))
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["000.ply", "001.ply", "002.ply"]

@@ -92,7 +92,7 @@ def test_wrapped_linear_layers_are_merged():
 
 def test_file_round_trip(tmp_path):
     operator = IntrinsicDynamicsOperator("raw", **SMALL)
-    operator.name_latents(torch.randn(2, 6), ["jelly", "sand"], ["elastic", "sand"])
+    operator.set_latents(torch.randn(2, 6), ["jelly", "sand"], ["elastic", "sand"])
     operator.save(tmp_path / "weights.safetensors", {"stress_error": 0.01})
     loaded = IntrinsicDynamicsOperator.load(tmp_path / "weights.safetensors")
     assert loaded.config == operator.config
@@ -106,7 +106,7 @@ def test_file_round_trip(tmp_path):
 def test_random_latents_lie_as_the_trained_ones_do():
     operator = IntrinsicDynamicsOperator("raw", **SMALL)
     mean, deviation = torch.tensor([0.0, 5.0, -3.0, 0.1, 0.0, 2.0]), torch.tensor([1.0, 0.01, 2.0, 0.1, 3.0, 0.5])
-    operator.name_latents(mean + deviation * torch.randn(500, 6), [f"m{i}" for i in range(500)], ["elastic"] * 500)
+    operator.set_latents(mean + deviation * torch.randn(500, 6), [f"m{i}" for i in range(500)], ["elastic"] * 500)
     drawn = operator.random_latents(4000, torch.Generator().manual_seed(1))
     assert torch.allclose(drawn.mean(0), operator.latents.mean(0), atol=0.15)
     assert torch.allclose(drawn.std(0), operator.latents.std(0), rtol=0.05)

@@ -9,9 +9,10 @@ import torch
 from neuido.commands.main import main
 from neuido.data.files.score_tables import read_rows
 from neuido.errors import UserError
+from neuido.models.operator import interpolation
 from neuido.models.operator import latent_space as latents
-from neuido.models.operator.branch import small_strain_modulus
 from neuido.models.operator.dynamics_operator import PRETRAINED, IntrinsicDynamicsOperator
+from neuido.models.operator.law_properties import p_wave_modulus
 
 
 @pytest.fixture(scope="module", params=PRETRAINED)
@@ -24,7 +25,7 @@ def grouped(spread: float) -> IntrinsicDynamicsOperator:
     torch.manual_seed(0)
     made = IntrinsicDynamicsOperator(latent_dim=4, basis_dim=4, hidden_dim=8, head_dim=8)
     centres = torch.tensor([[4.0, 0, 0, 0], [0, 0, 0, 0]]).repeat_interleave(6, 0)
-    made.name_latents(centres + spread * torch.randn(12, 4), [f"m{i}" for i in range(12)], ["a"] * 6 + ["b"] * 6)
+    made.set_latents(centres + spread * torch.randn(12, 4), [f"m{i}" for i in range(12)], ["a"] * 6 + ["b"] * 6)
     return made
 
 
@@ -67,7 +68,7 @@ def test_silhouettes_of_the_package(operator):
 def test_few_directions_are_felt(name, most):
     """Along most of the latents' variance nothing happens to the laws; the prior takes a part of what is idle."""
     pytest.importorskip("sklearn")
-    two, forty = latents.idle(IntrinsicDynamicsOperator.load(name), kept=(2, 40))
+    two, forty = latents.active_directions(IntrinsicDynamicsOperator.load(name), kept=(2, 40))
     assert forty["law changes"] < 0.02 < two["law changes"]
     assert two["variance"] < 0.2 < forty["variance"] < most
 
@@ -77,7 +78,7 @@ def test_felt_directions_are_found():
     made = grouped(0.5)
     for head in (made.elastic_head, made.plastic_head):
         head[0].weight.data[:, 1:] = 0.0
-    V = latents._felt(made, made.latents)
+    V = latents._sensitive_directions(made, made.latents)
     assert torch.allclose(V.T @ V, torch.eye(4), atol=1e-5)
     assert V[0, 0].abs() > 0.999
 
@@ -85,43 +86,43 @@ def test_felt_directions_are_found():
 def test_embedding(operator):
     pytest.importorskip("sklearn")
     made = grouped(0.1)
-    rows = latents.embed(made, perplexity=3.0)
+    rows = latents.tsne(made, perplexity=3.0)
     x = np.array([(row["x"], row["y"]) for row in rows])
     gap = np.linalg.norm(x[:6].mean(0) - x[6:].mean(0))
     assert gap > 2 * max(x[:6].std(0).max(), x[6:].std(0).max())
-    assert rows == latents.embed(made, perplexity=3.0)
+    assert rows == latents.tsne(made, perplexity=3.0)
     with pytest.raises(UserError, match="perplexity = 12"):
-        latents.embed(made, perplexity=12)
+        latents.tsne(made, perplexity=12)
 
 
 def test_monotonicity():
-    up = latents.monotonicity([1, 2, 3, 4, 9])
+    up = interpolation.monotonicity([1, 2, 3, 4, 9])
     assert up == {"steps": 1.0, "spearman": pytest.approx(1.0), "back": 0.0}
-    assert latents.monotonicity([9, 4, 3, 2, 1]) == up
-    bent = latents.monotonicity([0, 2, 1, 4])
+    assert interpolation.monotonicity([9, 4, 3, 2, 1]) == up
+    bent = interpolation.monotonicity([0, 2, 1, 4])
     assert bent["steps"] == pytest.approx(2 / 3)
     assert bent["spearman"] == pytest.approx(0.8)
     assert bent["back"] == pytest.approx(0.25)
-    assert latents.monotonicity([1, 1, 1])["spearman"] == 0.0
+    assert interpolation.monotonicity([1, 1, 1])["spearman"] == 0.0
 
 
 def test_interpolation_is_softer_to_stiffer(operator):
     """The drop test of the package's weights: apparent stiffness is monotone between the softest and the stiffest elastic latent."""
-    ends = latents.softest_and_stiffest(operator)
+    ends = interpolation.softest_and_stiffest(operator)
     assert ends == ("elastic-022", "elastic-004")
-    found = latents.interpolate(operator, ends, count=4)
-    assert found.motion.shape[:2] == (latents.FRAMES, 4)
+    found = interpolation.interpolate(operator, ends, count=4)
+    assert found.motion.shape[:2] == (interpolation.FRAMES, 4)
     assert found.motion.isfinite().all()
     for name, sign in (("modulus", 1), ("compression", -1), ("contact", -1)):
         values = sign * np.array([row[name] for row in found.rows])
         assert (np.diff(values) > 0).all(), name
     assert found.rows[0]["compression"] > 0.2 > 0.1 > found.rows[-1]["compression"] > 0
-    end = small_strain_modulus(operator, operator.latent(ends[1])[None])
+    end = p_wave_modulus(operator, operator.latent(ends[1])[None])
     assert found.rows[-1]["modulus"] == pytest.approx(float(end.detach()), rel=1e-4)
 
 
 def test_all_pairs(operator):
-    found = latents.all_pairs(operator, "sand", count=5)
+    found = interpolation.pairwise_monotonicity(operator, "sand", count=5)
     assert found["pairs"] > 300
     assert found["spearman"] > 0.9
     assert 0.5 < found["monotone"] <= 1.0
@@ -161,7 +162,7 @@ def test_without_scikit_learn(operator, monkeypatch):
 
 def test_command_writes_all(tmp_path, monkeypatch):
     pytest.importorskip("sklearn")
-    monkeypatch.setattr(latents, "FRAMES", 31)
+    monkeypatch.setattr(interpolation, "FRAMES", 31)
     with pytest.raises(SystemExit) as stop:
         main(["latents", "--out", str(tmp_path), "--count", "3", "--ends", "[jelly, elastic-004]"])
     assert stop.value.code == 0

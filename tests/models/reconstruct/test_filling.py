@@ -42,7 +42,7 @@ def test_hull_of_a_ball():
         x = hull.centres()[hull.values > 0.5]
         distance = (x - CENTRE).norm(dim=1)
         assert bool((hull.at(CENTRE[None] + torch.tensor([[0, 0, 0], [0.15, 0, 0], [0, -0.15, 0]])) > 0.99).all())
-        sizes.append(hull.measure() / BALL)
+        sizes.append(hull.measure_volume() / BALL)
     assert sizes[0] > sizes[1] > 0.97 and sizes[1] < 1.06
     assert float(distance.max()) < RADIUS + 0.03
 
@@ -60,14 +60,14 @@ def test_hull_needs_masks_that_meet():
 @pytest.mark.parametrize("hole", [0.0, 0.12])
 def test_shell_is_filled(hole):
     volume = opacity_volume(shell(hole=hole), spacing=0.008)
-    assert volume.measure() / BALL == pytest.approx(1.0, abs=0.08)
+    assert volume.measure_volume() / BALL == pytest.approx(1.0, abs=0.08)
     assert float(volume.at(CENTRE[None])) == 1.0
 
 
 def test_open_bowl_is_not_filled():
     bowl = shell(hole=math.pi / 2)
     volume = opacity_volume(bowl, spacing=0.008)
-    assert volume.measure() < 0.35 * BALL
+    assert volume.measure_volume() < 0.35 * BALL
     assert float(volume.at(CENTRE[None])) < 0.5
 
 
@@ -85,7 +85,7 @@ def test_particles_fill_the_body(method):
     hull = visual_hull(*silhouettes(16), (0, 0, 0), (1, 1, 1), resolution=48)
     x, volume = fill(hull, count=4000, method=method)
     assert len(x) == pytest.approx(4000, rel=0.05)
-    assert float(volume.sum()) == pytest.approx(hull.measure(), rel=1e-4)
+    assert float(volume.sum()) == pytest.approx(hull.measure_volume(), rel=1e-4)
     edge = float(volume[0]) ** (1 / 3)
     assert bool((hull.at(x) > 0.5).all())
     nearest = cKDTree(x.numpy()).query(x.numpy(), k=2)[0][:, 1] / edge

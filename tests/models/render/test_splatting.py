@@ -95,9 +95,9 @@ def test_kernels_agree_with_the_twin_in_float64(name, device):
 @pytest.mark.parametrize("name", SCENES)
 def test_the_kernels_of_cuda_agree_on_the_cpu(name, monkeypatch):
     """One thread a pixel, tiles of 16, keys and a sort."""
-    monkeypatch.setattr(splatting, "by_tile", lambda device: False)
+    monkeypatch.setattr(splatting, "one_thread_per_tile", lambda device: False)
     monkeypatch.setitem(splatting.TILE, "cpu", 16)
-    monkeypatch.setattr(splatting, "_counted", lambda *found: splatting._keyed(*found, None))
+    monkeypatch.setattr(splatting, "_lists_by_counting", lambda *found: splatting._lists_by_key(*found, None))
     compare(*SCENES[name])
 
 
@@ -290,16 +290,16 @@ def test_both_ways_to_list_the_tiles_agree():
     kernels = splatting.build(splatting.real_of(torch.float32), 8)
     splat, depth, status = project(kernels, scene, view)
     columns, tiles = 7, 28
-    counted = splatting._counted(kernels, splat, depth, status, columns, tiles)
-    keyed = splatting._keyed(kernels, splat, depth, status, columns, tiles, None)
+    counted = splatting._lists_by_counting(kernels, splat, depth, status, columns, tiles)
+    keyed = splatting._lists_by_key(kernels, splat, depth, status, columns, tiles, None)
     assert 0.7 * len(counted.splats) < len(keyed.splats) < len(counted.splats)
     for (i, j), (k, l) in zip(counted.ranges.tolist(), keyed.ranges.tolist(), strict=True):
         few = keyed.splats[k:l].tolist()
         assert [g for g in counted.splats[i:j].tolist() if g in set(few)] == few
-    roomy = splatting._keyed(kernels, splat, depth, status, columns, tiles, 2 * len(keyed.splats))
+    roomy = splatting._lists_by_key(kernels, splat, depth, status, columns, tiles, 2 * len(keyed.splats))
     assert torch.equal(roomy.ranges, keyed.ranges)
     assert not roomy.broken
-    assert splatting._keyed(kernels, splat, depth, status, columns, tiles, len(keyed.splats) - 1).broken
+    assert splatting._lists_by_key(kernels, splat, depth, status, columns, tiles, len(keyed.splats) - 1).broken
 
 
 def project(kernels, scene, view):

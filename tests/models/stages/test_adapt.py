@@ -17,13 +17,13 @@ from lightning.pytorch.callbacks import LambdaCallback
 from safetensors.torch import load_file
 
 from neuido.errors import UserError
-from neuido.models.baselines.learned import KnownLaw
-from neuido.models.fewshot.fit_progress import RECOVERY, Progress
+from neuido.models.baselines.known_law import KnownLaw
+from neuido.models.fewshot.fit_progress import RATE_RECOVERY, Progress
 from neuido.models.fewshot.low_rank import LowRankAdaptation
 from neuido.models.fewshot.method import Method
 from neuido.models.fewshot.relative_density import RelativeDensity, lattice
 from neuido.models.fewshot.scene_fit import EffectSource, SceneFit
-from neuido.models.inference.pipeline import prepare
+from neuido.models.inference.prepared_scene import prepare
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.stages.adapt import AdaptModule
 from neuido.models.stages.image_module import image_losses
@@ -86,7 +86,7 @@ def test_scenes_one_after_the_other(tmp_path):
 def test_curriculum_and_frames_of_the_fit(tmp_path):
     model = module(tmp_path, steps=10, curriculum=[0.5, 0.75], curriculum_share=0.4, fit_frames=4)
     prepared = prepare(tiny_scene(tmp_path), None)
-    assert [model.frames_now(prepared, step) for step in range(6)] == [2, 2, 3, 3, 4, 4]
+    assert [model.rollout_frames(prepared, step) for step in range(6)] == [2, 2, 3, 3, 4, 4]
     fit = SceneFit(LowRankAdaptation(start="jelly").for_scene(prepared), False)
     with torch.no_grad():
         scored = model.score(prepared, fit, "before")
@@ -196,10 +196,10 @@ def test_effects_act_on_top_of_the_law(tmp_path):
     model = module(tmp_path, start="jelly", effects=Drag())
     prepared, fit = model.load_fit(scene)
     with torch.no_grad():
-        moved = fit.roll(prepared, prepared.frames)
+        moved = fit.rollout(prepared, prepared.frames)
         steps = prepared.substeps(prepared.frames)
         expected = prepared.simulator.rollout(steps, *fit.method.laws(prepared), every=prepared.every, effects=Effects(drag_linear=3.0))
-        free = fit.method.roll(prepared, prepared.frames)
+        free = fit.method.rollout(prepared, prepared.frames)
     assert torch.equal(moved.x, expected.x) and not torch.allclose(moved.x, free.x, atol=1e-3)
 
 
@@ -220,12 +220,12 @@ def test_early_stop_keeps_the_best(tmp_path, monkeypatch):
     model = module(tmp_path, stop_on="view", check_every=2, patience=4, steps=20)
     kept = []
 
-    def see(self, value, fit, patience):
-        Progress.seen(self, next(values), fit, patience)
+    def record_loss(self, value, fit, patience):
+        Progress.original(self, next(values), fit, patience)
         kept.append(fit.method.z.detach().clone())
 
-    monkeypatch.setattr(Progress, "seen", Progress.see, raising=False)
-    monkeypatch.setattr(Progress, "see", see)
+    monkeypatch.setattr(Progress, "original", Progress.record_loss, raising=False)
+    monkeypatch.setattr(Progress, "record_loss", record_loss)
     trainer(tmp_path).fit(model, TinyScenes(str(tmp_path), youngs=(5e4, 6e4)))
     assert model._progress["tiny-0"].steps == 8  # the lowest at step 4, and none lower until step 8
     assert torch.equal(model.fit_of("tiny-0").method.z, kept[1])
@@ -245,7 +245,7 @@ def test_a_step_into_a_law_that_cannot_run_is_undone(tmp_path, capsys):
     model.optimizer_step = thrown
     trainer(tmp_path).fit(model, TinyScenes(str(tmp_path), youngs=(5e4,)))
     assert "tiny-0:" in capsys.readouterr().err
-    assert model._progress["tiny-0"].damping == 0.5 * RECOVERY**2
+    assert model._progress["tiny-0"].damping == 0.5 * RATE_RECOVERY**2
     after = rows_of(tmp_path / "out" / "scores.csv")[-1]
     assert after["stage"] == "after" and float(after["psnr"]) > 20
 
@@ -257,13 +257,13 @@ def test_parameters_at_the_edge_of_what_runs_are_left():
     def put(value, runs):
         fit.weight.data.fill_(value)
         if runs:
-            progress.ran(fit)
+            progress.record_success(fit)
         else:
-            assert progress.undo(fit)
+            assert progress.restore_last_good(fit)
         progress.steps += 1
         return float(fit.weight.detach())
 
-    assert not progress.undo(fit)  # nothing has run yet
+    assert not progress.restore_last_good(fit)  # nothing has run yet
     progress = Progress()
     put(0.0, True)
     put(1.0, True)
@@ -272,7 +272,7 @@ def test_parameters_at_the_edge_of_what_runs_are_left():
     assert put(1.001, False) == 1.0
     assert put(1.001, False) == 0.5
     assert put(0.6, False) == 0.25
-    assert progress.damping == pytest.approx(0.0625 * RECOVERY)
+    assert progress.damping == pytest.approx(0.0625 * RATE_RECOVERY)
     for _ in range(50):
         put(0.9, True)
     assert progress.damping == 1.0
@@ -281,9 +281,9 @@ def test_parameters_at_the_edge_of_what_runs_are_left():
     progress.steps += 20
     put(0.8, True)
     before = progress.damping
-    assert progress.undo(fit, ran=True) and float(fit.weight.detach()) == pytest.approx(0.8)
-    assert progress.undo(fit, ran=True) and progress.damping == before
-    assert progress.undo(fit, ran=True) and float(fit.weight.detach()) == pytest.approx(0.4)
+    assert progress.restore_last_good(fit, ran=True) and float(fit.weight.detach()) == pytest.approx(0.8)
+    assert progress.restore_last_good(fit, ran=True) and progress.damping == before
+    assert progress.restore_last_good(fit, ran=True) and float(fit.weight.detach()) == pytest.approx(0.4)
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path):
@@ -312,7 +312,7 @@ class Still(Method):
     def build(self, scene):
         self.pull = torch.nn.Parameter(torch.tensor(0.0))
 
-    def roll(self, scene, frames, *, state=None, effects=None, segment=0):
+    def rollout(self, scene, frames, *, state=None, effects=None, segment=0):
         start = scene.simulator.state
         t = torch.arange(frames) * (scene.every * scene.source.scene.dt)
         x = start.x + t[:, None, None] * start.v + 0.5 * t.square()[:, None, None] * self.pull * start.x.new_tensor([0.0, -1.0, 0.0])
@@ -344,9 +344,9 @@ def test_uneven_frames_and_segments(tmp_path, segment):
     scene = tiny_scene(tmp_path, frames=4)
     times = scene.batch.times + torch.tensor([0.0, 4e-3, -3e-3, 0.0])
     prepared = prepare(scene._replace(batch=scene.batch._replace(times=times)), None)
-    assert prepared.every == 1 and prepared.picks == (0, 17, 28, 45)
+    assert prepared.every == 1 and prepared.recorded_frames == (0, 17, 28, 45)
     method = LowRankAdaptation(start="jelly").for_scene(prepared)
-    motion = method.roll(prepared, 4, segment=segment)
+    motion = method.rollout(prepared, 4, segment=segment)
     with torch.no_grad():
         whole = prepared.simulator.rollout(45, *method.laws(prepared))
     assert torch.allclose(motion.x, whole.x[[0, 17, 28, 45]], atol=1e-6)

@@ -13,9 +13,9 @@ import torch
 from lightning.pytorch import Trainer, seed_everything
 
 from neuido.errors import UserError
-from neuido.models.operator.branch import small_strain_modulus
+from neuido.models.operator.law_properties import p_wave_modulus
 from neuido.models.stages.align import AlignModule
-from neuido.models.stages.image_module import some_views
+from neuido.models.stages.image_module import sample_views
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import FlowVAE
 from tests.models.visual_samples import TinyScenes, tiny_scene
@@ -54,7 +54,7 @@ def test_training_lowers_the_loss_and_finds_the_stiffness(vae, tmp_path):
     assert all(torch.equal(p, dict(model.named_parameters())[name]) for name, p in frozen.items())
     assert len(list((tmp_path / "flow").glob("*.npz"))) == 1
     with torch.no_grad():
-        found = small_strain_modulus(model.operator, model.encoder(prepared.volume, prepared.conditions)[None])
+        found = p_wave_modulus(model.operator, model.encoder(prepared.volume, prepared.conditions)[None])
     assert float(found) == pytest.approx(6e4, rel=0.25)  # the P-wave modulus of 5e4 Pa, 0.25
     assert DynamicsEncoder.load(tmp_path / "encoder.safetensors").card["scenes"] == ["tiny-0"]
 
@@ -81,11 +81,11 @@ def test_curriculum_and_views(vae, tmp_path):
     frames = []
     for step in range(8):
         type(model).global_step = property(lambda self, step=step: step)
-        frames.append(model.frames_now(prepared))
+        frames.append(model.rollout_frames(prepared))
     del type(model).global_step
     assert frames == [3, 3, 5, 5, 6, 6, 6, 6]
-    drawn = [some_views(prepared.training, 1, step) for step in range(8)]
-    assert all(len(views) == 1 for views in drawn) and {view for views in drawn for view in views} == set(prepared.training)
+    drawn = [sample_views(prepared.training_views, 1, step) for step in range(8)]
+    assert all(len(views) == 1 for views in drawn) and {view for views in drawn for view in views} == set(prepared.training_views)
 
 
 def test_a_law_that_cannot_run_is_drawn_back(vae, tmp_path, capsys):

@@ -14,7 +14,8 @@ from neuido.data.trajectories.options import simulate
 from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.stages.pretrain import ConstitutiveMetrics, PretrainModule, answer, fit_latents
+from neuido.models.stages.constitutive import ConstitutiveMetrics, evaluate_operator, fit_latents
+from neuido.models.stages.pretrain import PretrainModule
 from neuido.physics.laws.classical import FixedCorotated, Sigma, VonMises
 from neuido.types import TrajectoryBatch
 
@@ -60,7 +61,7 @@ def test_training_learns_and_an_unseen_material_needs_only_its_latent():
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 600)
     for _ in range(600):
         optimizer.zero_grad()
-        answers = answer(operator, z, batch, stress_epsilon, residual_epsilon)
+        answers = evaluate_operator(operator, z, batch, stress_epsilon, residual_epsilon)
         (answers.stress_error.mean() + answers.plastic_error.mean()).backward()
         optimizer.step()
         schedule.step()
@@ -73,9 +74,9 @@ def test_training_learns_and_an_unseen_material_needs_only_its_latent():
     F = batch.trial[:64]
     new = TrajectoryBatch(F, F, FixedCorotated(5e4, 0.3)(F), torch.zeros(64, dtype=torch.long))
     epsilons = 0.01 * new.stress.flatten(1).norm(dim=1).mean()[None], torch.tensor([1e-5])
-    before = min(answer(operator, row[None], new, *epsilons).stress_error.mean() for row in z.detach())
+    before = min(evaluate_operator(operator, row[None], new, *epsilons).stress_error.mean() for row in z.detach())
     fitted = fit_latents(operator, new, z.detach(), *epsilons, steps=150)
-    after = answer(operator, fitted, new, *epsilons)
+    after = evaluate_operator(operator, fitted, new, *epsilons)
     assert before > 0.05 and after.stress_error.mean() < 0.025
     assert after.plastic_error.max() == 0
     assert all(torch.equal(p, q) and p.requires_grad for p, q in zip(operator.parameters(), frozen))
@@ -84,7 +85,7 @@ def test_training_learns_and_an_unseen_material_needs_only_its_latent():
 def test_metrics_by_hand():
     batch, stress_epsilon, residual_epsilon = synthetic(materials=2, samples=64)
     operator = IntrinsicDynamicsOperator(**SMALL)
-    answers = answer(operator, torch.randn(2, 8), batch, stress_epsilon, residual_epsilon)
+    answers = evaluate_operator(operator, torch.randn(2, 8), batch, stress_epsilon, residual_epsilon)
     answers = answers._replace(stress=1.25 * batch.stress.view_as(answers.stress), corrected=batch.corrected.view_as(answers.corrected))
     answers = answers._replace(stress_error=torch.full((2, 64), 0.25), plastic_error=torch.arange(128.0).view(2, 64))
     metrics = ConstitutiveMetrics("val/", ["elastic", "plasticine"])

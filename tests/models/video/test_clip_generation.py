@@ -13,7 +13,7 @@ from neuido.data.bodies.families import laws
 from neuido.data.scenes.clips import FilmDataModule, read_clip
 from neuido.errors import UserError
 from neuido.models.stages.pretrain_vae import FlowVAEModule
-from neuido.models.stages.warmup import WarmupModule, judge
+from neuido.models.stages.warmup import WarmupModule, compare_laws
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import FlowVAE
 
@@ -127,7 +127,7 @@ def test_judgement_is_the_same_for_twice_and_half():
 
     F = torch.eye(3) + 0.1 * torch.randn(1, 16, 3, 3)
     stress = 1e6 * torch.randn(1, 16, 3, 3)
-    twice, half, same = (judge(Fake(factor, stress), torch.zeros(1, 2), F, F, stress) for factor in (2.0, 0.5, 1.0))
+    twice, half, same = (compare_laws(Fake(factor, stress), torch.zeros(1, 2), F, F, stress) for factor in (2.0, 0.5, 1.0))
     assert twice.size.item() == pytest.approx(np.log(2), rel=1e-3) == half.size.item()
     assert twice.stress.item() == pytest.approx(1 / 3, rel=0.02) and half.stress.item() == pytest.approx(1 / 3, rel=0.02)
     assert same.stress == 0 and same.plastic == 0 and same.size < 1e-5

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.models.video.encoder import DynamicsEncoder, Projector, conditions_of
+from neuido.models.video.encoder import DynamicsEncoder, Projector, scale_conditions
 from neuido.models.video.flow import Velocities
 from neuido.models.video.flow_vae import FlowVAE
 
@@ -44,7 +44,7 @@ def test_it_starts_near_the_mean_latent():
     torch.manual_seed(0)
     latents = torch.randn(40, 12) @ torch.diag(torch.linspace(2, 0, 12)) + 3
     projector = Projector(latent_dim=12, width=96)
-    projector.start_at(latents, spread=0.1)
+    projector.start_near(latents, spread=0.1)
     z = projector(torch.randn(64, 16, 3, 4, 4), torch.zeros(64, 2)).detach()
     distance = ((z - latents.mean(0)) / latents.std(0).clamp(min=0.1)).abs()
     assert 1e-4 < distance.mean() < 0.5
@@ -64,7 +64,7 @@ def test_gradients_reach_the_projector_alone(encoder):
 
 
 def test_conditions_are_logarithms():
-    a, b = conditions_of(5e-3, torch.tensor([0.01])), conditions_of(1e-2, torch.tensor([0.04]))
+    a, b = scale_conditions(5e-3, torch.tensor([0.01])), scale_conditions(1e-2, torch.tensor([0.04]))
     assert torch.allclose(b - a, torch.tensor([[2.0, 4.0]]).log())
 
 

@@ -9,14 +9,14 @@ from neuido.data.cameras import orbit
 from neuido.errors import UserError
 from neuido.models.video import flow as module
 from neuido.models.video.flow import (
+    body_window,
     colour_wheel,
     encode_flow,
     flow_image,
     frame_interval_of,
-    measure,
+    measure_velocities,
     optical_flow,
     pixel_length,
-    window,
 )
 
 
@@ -87,10 +87,10 @@ def test_window_holds_the_body_in_all_frames():
     masks = torch.zeros(2, 60, 80)
     masks[0, 10:20, 30:35] = 1
     masks[1, 30:38, 40:45] = 1
-    top, left, side = window(masks)
+    top, left, side = body_window(masks)
     assert top <= 10 and top + side >= 38 and left <= 30 and left + side >= 45
     assert 28 < side < 40 and 0 <= top and top + side <= 60 and left + side <= 80
-    assert window(torch.zeros(2, 60, 80)) == (0, 0, 60)
+    assert body_window(torch.zeros(2, 60, 80)) == (0, 0, 60)
 
 
 def test_pixel_length_and_velocity():
@@ -104,7 +104,7 @@ def test_pixel_length_and_velocity():
     masks = torch.zeros(2, 4, 96, 96)
     masks[:, :, 20:70, 20:70] = 1
     small = orbit(2, radius=2.0, angle=40.0, width=96, height=96)
-    seen = measure(video, masks, torch.arange(4) * 0.01, small, torch.tensor([0.5, 0.4, 0.5]), size=16)
+    seen = measure_velocities(video, masks, torch.arange(4) * 0.01, small, torch.tensor([0.5, 0.4, 0.5]), size=16)
     speed = 2.0 * pixel_length(small, torch.tensor([0.5, 0.4, 0.5]))[0] / 0.01
     assert seen.flow.shape == (2, 3, 16, 16, 2)
     assert float(seen.flow[:, :, 5:11, 5:11, 0].mean()) == pytest.approx(float(speed), rel=0.05)
@@ -115,16 +115,16 @@ def test_pixel_length_and_velocity():
 def test_cache_is_used_and_mended(tmp_path, monkeypatch):
     video = shifted((1.0, 0.0))[None]
     arguments = (video, torch.ones(1, 4, 96, 96), torch.arange(4) * 0.01, orbit(1, width=96, height=96), torch.tensor([0.5, 0.4, 0.5]))
-    first = measure(*arguments, size=16, cache=tmp_path)
+    first = measure_velocities(*arguments, size=16, cache=tmp_path)
     (file,) = tmp_path.glob("flow-*.npz")
     measured = []
     monkeypatch.setattr(module, "optical_flow", lambda images, **_: measured.append(1) or optical_flow(images))
-    assert torch.equal(measure(*arguments, size=16, cache=tmp_path).flow, first.flow)
+    assert torch.equal(measure_velocities(*arguments, size=16, cache=tmp_path).flow, first.flow)
     assert not measured
     file.write_bytes(file.read_bytes()[:200])
-    assert torch.equal(measure(*arguments, size=16, cache=tmp_path).flow, first.flow)
+    assert torch.equal(measure_velocities(*arguments, size=16, cache=tmp_path).flow, first.flow)
     assert measured
-    measure(*arguments, size=24, cache=tmp_path)
+    measure_velocities(*arguments, size=24, cache=tmp_path)
     assert len(list(tmp_path.glob("flow-*.npz"))) == 2
 
 

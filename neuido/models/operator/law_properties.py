@@ -1,44 +1,51 @@
-"""The frozen operator and the encoder that is trained, as the modules of warm-up and Stage II begin with them."""
+"""Properties of a learned law: its small-strain moduli, and how far it is from a law that a rollout survives."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.video.encoder import DynamicsEncoder
 from neuido.physics.laws.neural.networks import hencky_strain
 
 
-def open_branch(operator: str, init_from: str | None, vae: str, **sizes) -> tuple[IntrinsicDynamicsOperator, DynamicsEncoder]:
-    """A frozen operator, and an encoder that reads latents for it.
+class Moduli(NamedTuple):
+    """Elastic constants at small strains."""
 
-    Args:
-        operator: File of `IntrinsicDynamicsOperator.save`, or `pretrained`.
-        init_from: File of `DynamicsEncoder.save`, or `pretrained`, whose own VAE and sizes then count; none: a new projector, near
-            the mean latent of Stage I.
-        vae: Of a new projector, see `video_vae.open_vae`.
-        sizes: Options of a new `DynamicsEncoder`.
+    young: float
+    """Young's modulus E [Pa]."""
+    poisson: float
+    """Poisson's ratio [-]."""
 
-    Raises:
-        UserError: A file that is missing, or latents of different lengths.
+    def __str__(self) -> str:
+        return f"E = {with_prefix(self.young, 'Pa')}, nu = {self.poisson:.3f} (small strain)"
+
+
+def with_prefix(value: float, unit: str) -> str:
+    """Return a number with three digits and the prefix of its unit, such as `98.3 kPa`."""
+    size = abs(value)
+    factor, prefix = next(((f, p) for f, p in ((1e9, "G"), (1e6, "M"), (1e3, "k")) if size >= f), (1.0, ""))
+    return f"{value / factor:.3g} {prefix}{unit}"
+
+
+def small_strain_moduli(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = 3e-3) -> tuple[Tensor, Tensor]:
+    """Return Young's modulus [Pa] (S,) and Poisson's ratio [-] (S,) of the elastic laws of z (S, d).
+
+    The Lame parameters are secants over F = I +- strain e_a e_a^T, averaged over the three axes a, so that they are those of an isotropic
+    law exactly and a mean for a law that is not isotropic (the trunk `raw`).
     """
-    frozen = IntrinsicDynamicsOperator.load(operator)
-    frozen.eval().requires_grad_(False)
-    if init_from is not None:
-        encoder = DynamicsEncoder.load(init_from)
-    else:
-        encoder = DynamicsEncoder(vae, latent_dim=frozen.latent_dim, **sizes)
-        if len(frozen.latents) > 1:
-            encoder.projector.start_at(frozen.latents)
-    if encoder.projector.config["latent_dim"] != frozen.latent_dim:
-        given = encoder.projector.config["latent_dim"]
-        raise UserError(f"model.init_from = {init_from} gives latents of {given} numbers, operator = {operator} takes {frozen.latent_dim}")
-    return frozen, encoder
+    axes = strain * torch.diag_embed(torch.eye(3, dtype=z.dtype, device=z.device))
+    F = torch.eye(3, dtype=z.dtype, device=z.device) + torch.cat([axes, -axes])
+    tau = operator.elastic(z, F.expand(len(z), 6, 3, 3).contiguous()).diagonal(dim1=-2, dim2=-1)
+    response = (tau[:, :3] - tau[:, 3:]) / (2 * strain)
+    along = response.diagonal(dim1=-2, dim2=-1).mean(-1)
+    lam = (response.sum((-2, -1)) - 3 * along) / 6
+    mu = (along - lam) / 2
+    return mu * (3 * lam + 2 * mu) / (lam + mu), lam / (2 * (lam + mu))
 
 
-def small_strain_modulus(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = 3e-3) -> Tensor:
+def p_wave_modulus(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = 3e-3) -> Tensor:
     """P-wave modulus [Pa] (S,) of the laws of z (S, d), as a secant over F_11 = 1 +- strain; differentiable."""
     F = torch.eye(3, dtype=z.dtype, device=z.device).expand(len(z), 2, 3, 3).clone()
     F[:, 0, 0, 0] += strain
@@ -49,7 +56,7 @@ def small_strain_modulus(operator: IntrinsicDynamicsOperator, z: Tensor, strain:
 
 def implausibility(operator: IntrinsicDynamicsOperator, z: Tensor) -> Tensor:
     """`implausible_stress` of the elastic law of z (d,); zero for all laws of Stage I's kind."""
-    modulus = small_strain_modulus(operator, z[None])[0]
+    modulus = p_wave_modulus(operator, z[None])[0]
     return implausible_stress(lambda F: operator.elastic(z[None], F[None])[0], modulus)
 
 

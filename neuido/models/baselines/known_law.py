@@ -1,0 +1,117 @@
+"""The parameters of a law whose family is known, fitted by gradient (PAC-NeRF, Li et al. 2023; GIC, Cai et al. 2024)."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from neuido.errors import UserError
+from neuido.models.fewshot.method import Method, require_positive
+from neuido.models.inference.prepared_scene import Laws, PreparedScene
+from neuido.physics.effects.parameters import Effects
+from neuido.physics.laws.classical import material
+from neuido.types import ParticleState
+
+PARTS = ("elasticity", "plasticity")
+
+
+class KnownLaw(Method):
+    """The parameters of a law whose family is given, by gradient through simulator and renderer (PAC-NeRF; GIC).
+
+    The family is that of the truth where a scene knows it, else that of the believed model. Young's modulus, yield stress and viscosity are
+    fitted as decimal logarithms, Poisson's ratio and the friction angle within bounds.
+
+    Args:
+        young: Start of Young's modulus [Pa] (PAC-NeRF: 316228).
+        poisson: Start of Poisson's ratio, between 0 and 0.49 (PAC-NeRF: 0.25).
+        yield_stress: Start of the yield stress [Pa] (GIC: 1000).
+        friction_angle: Start of the friction angle [degrees], between 1 and 60 (GIC: 10).
+        viscosity: Start of a Kelvin-Voigt shear viscosity [Pa s], fitted too; none: the body has none.
+        free: Which of these are fitted, of those that the family has; all where absent.
+        rates: Rates of some, in decades, Poisson's ratio, degrees; the others as `RATES`.
+
+    Raises:
+        UserError: A start outside its range, an unknown name.
+    """
+
+    RATES = {"young": 0.1, "poisson": 0.01, "yield_stress": 0.1, "friction_angle": 1.0, "viscosity": 0.05}
+    """PAC-NeRF's and GIC's."""
+    BOUNDS = {"poisson": (0.0, 0.49), "friction_angle": (1.0, 60.0)}
+
+    steps = 100
+
+    def __init__(
+        self,
+        young: float = 316228.0,
+        poisson: float = 0.25,
+        yield_stress: float = 1e3,
+        friction_angle: float = 10.0,
+        viscosity: float | None = None,
+        free: list[str] | None = None,
+        rates: dict[str, float] | None = None,
+    ):
+        super().__init__()
+        require_positive(young=young, yield_stress=yield_stress, **({} if viscosity is None else {"viscosity": viscosity}))
+        self.start = {"young": young, "poisson": poisson, "yield_stress": yield_stress, "friction_angle": friction_angle}
+        if viscosity is not None:
+            self.start["viscosity"] = viscosity
+        for name, (low, high) in self.BOUNDS.items():
+            if not low < self.start[name] < high:
+                raise UserError(f"model.method.{name} = {self.start[name]}: it must lie between {low:g} and {high:g}")
+        for option, names in (("free", free or []), ("rates", rates or {})):
+            for name in names:
+                if name not in self.RATES or (option == "free" and name not in self.start):
+                    raise UserError(f"model.method.{option}: there is no parameter {name!r}; they are {', '.join(self.start)}")
+        require_positive(**{f"rates.{name}": rate for name, rate in (rates or {}).items()})
+        self.free, self.rates = free, {**self.RATES, **(rates or {})}
+
+    def build(self, scene: PreparedScene) -> None:
+        truth = scene.source.truth
+        law = scene.source.model if truth is None else truth.law
+        self.families = {part: law[part]["law"] for part in PARTS}
+        own = [name for part in PARTS for name in law[part] if name != "law"] + ["viscosity"]
+        names = [name for name in self.start if name in own]
+        self.raw = nn.ParameterDict({name: nn.Parameter(torch.tensor(self._inverse(name)), self._is_free(name)) for name in names})
+
+    def _is_free(self, name: str) -> bool:
+        return self.free is None or name in self.free
+
+    def _inverse(self, name: str) -> float:
+        value = self.start[name]
+        if name not in self.BOUNDS:
+            return math.log10(value)
+        low, high = self.BOUNDS[name]
+        half = (high - low) / 2
+        return half * math.atanh((value - low) / half - 1)
+
+    def values(self) -> dict[str, Tensor]:
+        """The parameters in SI units and degrees, differentiable, () each."""
+        values = {}
+        for name, raw in self.raw.items():
+            if name in self.BOUNDS:  # of slope one in the middle, so that a rate has the parameter's own unit (PAC-NeRF)
+                low, high = self.BOUNDS[name]
+                half = (high - low) / 2
+                values[name] = low + half * (1 + (raw / half).tanh())
+            else:
+                values[name] = 10**raw
+        return values
+
+    def laws(self, scene: PreparedScene) -> Laws:
+        values = self.values()
+        elastic = {"law": self.families["elasticity"], "young": values["young"], "poisson": values["poisson"]}
+        plastic = {name: values[name] for name in ("yield_stress", "friction_angle") if name in values}
+        return material(elastic, {"law": self.families["plasticity"], **plastic})
+
+    def rollout(self, scene: PreparedScene, frames: int, *, effects: Effects | None = None, **options) -> ParticleState:
+        if "viscosity" in self.raw:
+            effects = Effects() if effects is None else effects
+            known = 0.0 if effects.viscosity_shear is None else effects.viscosity_shear
+            effects = effects._replace(viscosity_shear=self.values()["viscosity"] + known)
+        return super().rollout(scene, frames, effects=effects, **options)
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        return [{"params": [raw], "lr": self.rates[name]} for name, raw in self.raw.items() if raw.requires_grad]
+
+    def describe(self) -> dict[str, Any]:
+        return {**self.families, **{name: float(value.detach()) for name, value in self.values().items()}}

@@ -1,0 +1,87 @@
+"""Latents of the frozen operator without an encoder: the mean of Stage I, a random one, and one fitted to the images (UniPhy)."""
+
+from typing import Any, Literal
+
+import torch
+from torch import nn
+
+from neuido.errors import UserError
+from neuido.models.fewshot.method import Method, require_positive
+from neuido.models.inference.prepared_scene import Laws, PreparedScene
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.operator.law_properties import p_wave_modulus
+
+
+class LatentMethod(Method):
+    """A latent z of the frozen operator; not a method by itself.
+
+    Args:
+        operator: File of the operator, or `pretrained`.
+    """
+
+    def __init__(self, operator: str = "pretrained"):
+        super().__init__()
+        self.operator = IntrinsicDynamicsOperator.load(operator).eval().requires_grad_(False)
+        if not len(self.operator.latents):
+            raise UserError(f"model.method.operator = {operator} holds no latents of Stage I to start from")
+
+    def laws(self, scene: PreparedScene) -> Laws:
+        return self.operator.laws(self.z)
+
+    def describe(self) -> dict[str, Any]:
+        with torch.no_grad():
+            modulus = float(p_wave_modulus(self.operator, self.z[None])[0])
+        return {"modulus": modulus, "z": self.z.detach().cpu().tolist()}
+
+
+class MeanLatent(LatentMethod):
+    """The mean of Stage I's latents for every scene; nothing is learned."""
+
+    steps = 0
+
+    def build(self, scene: PreparedScene) -> None:
+        self.register_buffer("z", self.operator.latents.mean(0))
+
+
+class RandomLatent(LatentMethod):
+    """A random latent; nothing is learned.
+
+    Args:
+        operator: File of the operator, or `pretrained`.
+        of: `normal`: of the mean and deviation of Stage I's latents; `trained`: one of Stage I's at random.
+        seed: Which.
+    """
+
+    steps = 0
+
+    def __init__(self, operator: str = "pretrained", of: Literal["normal", "trained"] = "normal", seed: int = 0):
+        super().__init__(operator)
+        self.of, self.seed = of, seed
+
+    def build(self, scene: PreparedScene) -> None:
+        generator, latents = torch.Generator().manual_seed(self.seed), self.operator.latents
+        z = self.operator.random_latents(1, generator)[0]
+        if self.of == "trained":
+            z = latents[int(torch.randint(len(latents), (), generator=generator))].clone()
+        self.register_buffer("z", z)
+
+
+class UniPhy(LatentMethod):
+    """The latent alone, from the mean latent, by gradient through simulator and renderer; trunks and heads are frozen (Mittal et al. 2025).
+
+    UniPhy's own operator is published without weights, so that ours, which is trained in the same way, takes its place.
+
+    Args:
+        operator: File of the operator, or `pretrained`.
+        lr: Rate of the latent.
+    """
+
+    steps = 100
+
+    def __init__(self, operator: str = "pretrained", lr: float = 0.05):
+        super().__init__(operator)
+        require_positive(lr=lr)
+        self.lr = lr
+
+    def build(self, scene: PreparedScene) -> None:
+        self.z = nn.Parameter(self.operator.latents.mean(0).clone())

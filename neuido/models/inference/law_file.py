@@ -1,0 +1,59 @@
+"""Law files: the effective networks of one material as safetensors, with its description beside it as JSON."""
+
+import json
+import os
+from collections.abc import Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.models.operator.dynamics_operator import LAWS, IntrinsicDynamicsOperator
+from neuido.models.video.flow_vae import read_weights, write_weights
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+
+FORMAT = "neuido-law/1"
+WEIGHTS = ("W1", "b1", "W2", "b2", "W3", "b3")
+
+
+def save_law(path: str | os.PathLike, operator: IntrinsicDynamicsOperator, z: Tensor, card: Mapping[str, Any] | None = None) -> None:
+    """Write the law of z (d,): the effective networks, z and lambda, as safetensors, and what a person wants to know beside it as JSON.
+
+    Args:
+        path: File to write, ending in .safetensors; the JSON gets the same name.
+        operator: The operator.
+        z: Latent.
+        card: Further entries of the JSON: where the law comes from.
+    """
+    with torch.no_grad():
+        elastic, plastic = operator.laws(z)
+        tensors = {f"elastic.{name}": t for name, t in zip(WEIGHTS, elastic.tensors())}
+        tensors |= {f"plastic.{name}": t for name, t in zip(WEIGHTS, plastic.tensors())}
+        lambdas = operator.coefficients(z[None])
+        tensors |= {"z": z, "lambda_elastic": lambdas[0][0], "lambda_plastic": lambdas[1][0]}
+        modulus = float(elastic.modulus()[0])
+    config = {"trunk": operator.trunk, "elastic_scale": elastic.scale, "plastic_scale": plastic.scale}
+    card = {"date": date.today().isoformat(), "modulus": modulus, **(card or {})}
+    write_weights(path, FORMAT, config, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, card)
+    text = json.dumps({"format": FORMAT, **config, "unit": "Kirchhoff stress in Pa", **card}, indent=1)
+    Path(path).with_suffix(".json").write_text(text + "\n")
+
+
+def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
+    """The laws of a file of `save_law`, for a rollout; the operator is not needed.
+
+    Raises:
+        UserError: No such file, or not one of this kind.
+    """
+    config, tensors, _ = read_weights(path, (FORMAT,), "law")
+    if config.get("trunk") not in LAWS:
+        raise UserError(f"law: {path} has the trunk {config.get('trunk')!r}; one of {', '.join(LAWS)}")
+    elastic, plastic = LAWS[config["trunk"]]
+    try:
+        parts = [[tensors[f"{kind}.{name}"] for name in WEIGHTS] for kind in ("elastic", "plastic")]
+    except KeyError as error:
+        raise UserError(f"law: {path} lacks the tensor {error}") from error
+    return elastic(*parts[0], scale=config["elastic_scale"]), plastic(*parts[1], scale=config["plastic_scale"])

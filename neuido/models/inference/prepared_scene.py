@@ -1,0 +1,166 @@
+"""A recorded scene with all that stays constant while a law is read from it or fitted to it, on one device."""
+
+import os
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuido.data.scenes.filmed_scene import VisualScene
+from neuido.errors import UserError
+from neuido.models.render.gaussians import Binding, attach_gaussians, bind, load_ply
+from neuido.models.video.encoder import DynamicsEncoder
+from neuido.models.video.flow import as_bytes, frame_interval_of
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.device import choose_device
+from neuido.types import Cameras, Gaussians
+
+STEPS_PER_INTERVAL = 50
+"""Frames of a rollout between two of a recording at uneven times."""
+
+Laws = tuple[ElasticLaw, PlasticLaw | None]
+
+
+class PreparedScene(NamedTuple):
+    """A scene with everything that does not change while the projector learns, on one device."""
+
+    source: VisualScene
+    simulator: Simulator
+    gaussians: Gaussians
+    binding: Binding | None
+    """None: Gaussian i is particle i."""
+    every: int
+    """Substeps from one frame of a rollout to the next."""
+    images: Tensor
+    """(V, T, H, W, 3) uint8."""
+    masks: Tensor
+    """(V, T, H, W) uint8."""
+    cameras: Cameras
+    background: Tensor
+    training_views: list[int]
+    """Views that are not held out."""
+    volume: Tensor | None
+    """Flow latents of the views that the encoder sees, (V', channels, T', h, w); none without an encoder."""
+    conditions: Tensor | None
+    """(V', 2)"""
+    recorded_frames: tuple[int, ...] | None = None
+    """Which frames of a rollout are the recording's, of T recorded at uneven times; none: all."""
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return self.images.shape[1]
+
+    @property
+    def stride(self) -> int:
+        """Substeps of the recording's mean frame interval, about."""
+        return self.every if self.recorded_frames is None else self.every * STEPS_PER_INTERVAL
+
+    def substeps(self, frames: int) -> int:
+        """Substeps of a rollout from the first to the last of so many frames."""
+        return self.every * (frames - 1 if self.recorded_frames is None else self.recorded_frames[frames - 1])
+
+    @property
+    def scoring_views(self) -> list[int]:
+        """The held-out views; all views of a scene that holds none out."""
+        held = self.source.batch.held_out.nonzero()[:, 0].tolist()
+        return held or list(range(len(self.images)))
+
+    def views(self, views: list[int]) -> Cameras:
+        """The cameras of some views."""
+        return self.cameras._replace(viewmats=self.cameras.viewmats[views], Ks=self.cameras.Ks[views])
+
+    def recorded(self, views: list[int], frames: int | None = None) -> Tensor:
+        """Recorded images in [0, 1], (T, V, H, W, 3)."""
+        return self.images[views, :frames].transpose(0, 1).float().div_(255)
+
+    def silhouettes(self, views: list[int], frames: int | None = None) -> Tensor:
+        """Recorded masks in [0, 1], (T, V, H, W)."""
+        return self.masks[views, :frames].transpose(0, 1).float().div_(255)
+
+
+def as_device(device: str | torch.device) -> torch.device:
+    """Return a device from its name, `auto` included (CUDA where there is one).
+
+    Raises:
+        UserError: `cuda` where there is none.
+    """
+    return choose_device(device) if isinstance(device, str) and device in ("auto", "cpu", "cuda") else torch.device(device)
+
+
+def prepare(
+    scene: VisualScene,
+    encoder: DynamicsEncoder | None,
+    *,
+    device: str | torch.device = "auto",
+    encoder_views: int = 0,
+    cache: str | os.PathLike | None = None,
+) -> PreparedScene:
+    """Bring a scene to a device, bind its Gaussians and embed its flow.
+
+    Args:
+        scene: The scene.
+        encoder: Its frozen VAE makes the flow latents; none: they are not needed.
+        device: `auto` (CUDA where there is one), `cpu`, `cuda`, or a torch device.
+        encoder_views: How many of the training views the encoder sees, the first ones; 0: all.
+        cache: Folder in which flows are kept.
+
+    Raises:
+        UserError: Frames that are no whole number of substeps apart, no training view, and as `Simulator` and
+            `DynamicsEncoder.measure_flow`.
+    """
+    batch, device = scene.batch, as_device(device)
+    every, recorded_frames = frame_substeps(batch.times, scene.scene.dt, scene.name)
+    training = (~batch.held_out).nonzero()[:, 0].tolist()
+    if not training:
+        raise UserError(f"{scene.name} has no training view: all {len(batch.held_out)} are held out")
+    volume = conditions = None
+    if encoder is not None:
+        with torch.no_grad():
+            velocities = encoder.measure_flow(batch, training[: encoder_views or None], scene.body.x.mean(0), cache=cache)
+            volume, conditions = (t.to(device) for t in encoder.embed(velocities))
+    simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device)
+    if scene.gaussians is None:
+        rest = simulator.volume / torch.linalg.det(simulator.state.F)  # a body may start deformed
+        gaussians, binding = attach_gaussians(simulator.state.x, rest), None
+    else:
+        gaussians = load_ply(scene.gaussians, device=device)
+        binding = bind(gaussians, simulator.state.x)
+    return PreparedScene(
+        source=scene,
+        simulator=simulator,
+        gaussians=gaussians,
+        binding=binding,
+        every=every,
+        images=as_bytes(batch.images).to(device),
+        masks=as_bytes(batch.masks).to(device),
+        cameras=batch.cameras._replace(viewmats=batch.cameras.viewmats.to(device), Ks=batch.cameras.Ks.to(device)),
+        background=batch.background.to(device),
+        training_views=training,
+        volume=volume,
+        conditions=conditions,
+        recorded_frames=recorded_frames,
+    )
+
+
+def frame_substeps(times: Tensor, dt: float, name: str) -> tuple[int, tuple[int, ...] | None]:
+    """Substeps from one frame of a rollout to the next, and which frames are the recording's, none where its times are even (to 1 %).
+
+    Uneven times are rounded to a fiftieth of the mean interval.
+
+    Raises:
+        UserError: Even times that are no whole number of substeps apart, two frames at one time.
+    """
+    steps = torch.as_tensor(times, dtype=torch.float64).diff()
+    if len(steps) and float((steps - steps.mean()).abs().max()) > 0.01 * float(steps.mean()) > 0:
+        every = max(1, int(float(steps.mean()) / (STEPS_PER_INTERVAL * dt)))
+        recorded_frames = tuple(((times - times[0]) / (every * dt)).round().long().tolist())
+        if any(b <= a for a, b in zip(recorded_frames, recorded_frames[1:])):
+            raise UserError(f"{name}: two frames are {float(steps.min()):g} s apart; leave one out (frame_step, frame_count)")
+        return every, recorded_frames
+    interval = frame_interval_of(times)
+    every = round(interval / dt)
+    if every < 1 or abs(every * dt - interval) > 1e-3 * interval:
+        raise UserError(f"{name}: frames are {interval:g} s apart, no whole number of substeps of {dt:g} s; change dt or frame_step")
+    return every, None

@@ -1,0 +1,154 @@
+"""The law that a video shows, read in one pass of the encoder (zero-shot): what `read_law` and `neuido predict` return."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuido.data.scenes.filmed_scene import VisualScene, load_visual
+from neuido.models.inference.law_file import save_law
+from neuido.models.inference.pipeline import infer_latent, rollout_latent, rollout_with_retries
+from neuido.models.inference.prepared_scene import Laws, PreparedScene, as_device, prepare
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.operator.law_properties import Moduli, small_strain_moduli
+from neuido.models.video.encoder import DynamicsEncoder
+from neuido.types import ParticleState
+
+
+class VideoLaw:
+    """The law of one recorded body: a latent, and the elastic and plastic laws that the operator makes of it.
+
+    Args:
+        operator: The operator.
+        latent: z, (d,).
+        scene: Name of the recorded scene.
+        views: Number of views that the encoder saw.
+        frames: Number of frames of the recording.
+        seconds: Time from the flow latents to the law [s], where it was measured.
+        prepared: The scene, for `rollout`; none: the law alone.
+    """
+
+    def __init__(
+        self,
+        operator: IntrinsicDynamicsOperator,
+        latent: Tensor,
+        *,
+        scene: str = "",
+        views: int = 0,
+        frames: int = 0,
+        seconds: float | None = None,
+        prepared: PreparedScene | None = None,
+    ):
+        self.operator, self.latent, self.prepared = operator, latent.detach(), prepared
+        self.scene, self.views, self.frames, self.seconds = scene, views, frames, seconds
+        with torch.no_grad():
+            young, poisson = small_strain_moduli(operator, self.latent[None])
+        self.moduli = Moduli(float(young[0]), float(poisson[0]))
+        """Young's modulus [Pa] and Poisson's ratio [-] at small strains."""
+
+    @classmethod
+    def infer(
+        cls, encoder: DynamicsEncoder, operator: IntrinsicDynamicsOperator, prepared: PreparedScene, *, repeat: int = 5
+    ) -> "VideoLaw":
+        """Read the law of a prepared scene.
+
+        Args:
+            encoder: On the scene's device.
+            operator: On the scene's device.
+            prepared: Of `prepare` with this encoder.
+            repeat: Passes whose median time is `seconds`.
+        """
+        found = infer_latent(encoder, operator, prepared, repeat=repeat)
+        views = 0 if prepared.volume is None else len(prepared.volume)
+        name = prepared.source.name
+        return cls(operator, found.z, scene=name, views=views, frames=prepared.frames, seconds=found.seconds, prepared=prepared)
+
+    def law(self) -> Laws:
+        """Return the elastic and the plastic law, as `Simulator.rollout` takes them."""
+        return self.operator.laws(self.latent)
+
+    def rollout(self, frames: int | None = None) -> tuple[ParticleState, int]:
+        """Simulate the recorded body under this law.
+
+        Args:
+            frames: Number of frames K, the start included; all of the recording where absent.
+
+        Returns:
+            The motion, (K, P, ...), and how often the time step was halved because the law is too stiff for the scene's own.
+
+        Raises:
+            UserError: The law does not run, with a quarter of the scene's time step either.
+            ValueError: The law was made without a scene.
+        """
+        if self.prepared is None:
+            raise ValueError("this law was made without a scene: roll it out with Simulator(scene, body).rollout(steps, *law.law())")
+        with torch.no_grad():
+            return rollout_with_retries(self.prepared, lambda scene: rollout_latent(scene, self.operator, self.latent, frames))
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the law to a .safetensors file, and what a person wants to know to a .json file beside it.
+
+        `neuido.models.load_law` reads the file back without the operator.
+        """
+        card: dict[str, Any] = {"scene": self.scene, "views": self.views, "frames": self.frames, "seconds": self.seconds}
+        save_law(Path(path), self.operator, self.latent, card | {"young": self.moduli.young, "poisson": self.moduli.poisson})
+
+    def summary(self) -> str:
+        """Return one line: the moduli with their units, and the time of the inference."""
+        return f"{self.moduli}" + ("" if self.seconds is None else f"; law read in {1e3 * self.seconds:.1f} ms")
+
+    def __repr__(self) -> str:
+        name = f"{self.scene!r}, " if self.scene else ""
+        return f"VideoLaw({name}{self.moduli}, latent of {len(self.latent)}, {self.views} views, {self.frames} frames)"
+
+
+def read_law(
+    recording: str | os.PathLike | VisualScene,
+    *,
+    operator: str | os.PathLike | IntrinsicDynamicsOperator = "pretrained",
+    encoder: str | os.PathLike | DynamicsEncoder = "pretrained",
+    reconstruction: str | os.PathLike | None = None,
+    recording_name: str | None = None,
+    views: Sequence[str] | None = None,
+    frame_step: int = 1,
+    frame_count: int | None = None,
+    encoder_views: int = 0,
+    cache: str | os.PathLike | None = None,
+    device: str | torch.device = "auto",
+) -> VideoLaw:
+    """Read a material law from the video of a moving body, zero-shot, as `neuido predict` does.
+
+    Args:
+        recording: Folder of a multi-view recording that `neuido reconstruct` has prepared, or a scene of `load_visual`.
+        operator: File of the operator, `pretrained`, or an operator.
+        encoder: File of the encoder, `pretrained`, `pretrained-small` (few, coarse frames), or an encoder.
+        reconstruction: Folder that `neuido reconstruct` wrote; `<recording>/reconstruction` where absent.
+        recording_name: Which recording of an experiment with several.
+        views: Names of the views to read; all where absent.
+        frame_step: Take each n-th frame.
+        frame_count: Number of frames; all where absent.
+        encoder_views: Number of training views that the encoder sees, the first ones; 0: all.
+        cache: Folder in which optical flow is kept; none: nowhere.
+        device: `auto` (CUDA where there is one), `cpu`, or `cuda`.
+
+    Returns:
+        The law: `.law()` for `Simulator.rollout`, `.moduli`, `.latent`, `.save(path)`, `.rollout()`.
+
+    Raises:
+        UserError: A file that is missing or malformed, uneven frames, no training view, or latents of different lengths.
+    """
+    chosen = as_device(device)
+    if isinstance(recording, VisualScene):
+        scene = recording
+    else:
+        options: dict[str, Any] = {"recording": recording_name, "views": views, "frame_step": frame_step, "frame_count": frame_count}
+        scene = load_visual(recording, reconstruction=reconstruction, **options)
+    own_operator = operator if isinstance(operator, IntrinsicDynamicsOperator) else IntrinsicDynamicsOperator.load(operator)
+    own_encoder = encoder if isinstance(encoder, DynamicsEncoder) else DynamicsEncoder.load(encoder)
+    own_encoder.check_latents(own_operator.latent_dim, f"encoder = {encoder}" if isinstance(encoder, str) else "encoder")
+    own_operator, own_encoder = own_operator.to(chosen).eval(), own_encoder.to(chosen).eval()
+    prepared = prepare(scene, own_encoder, device=chosen, encoder_views=encoder_views, cache=cache)
+    return VideoLaw.infer(own_encoder, own_operator, prepared, repeat=1)

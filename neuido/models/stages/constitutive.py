@@ -1,0 +1,182 @@
+"""Scores of the operator on constitutive data: responses with their errors, latents of unseen materials, and metrics (Stage I)."""
+
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torchmetrics import MeanSquaredError, MetricCollection
+
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.scoring.losses import relative_errors
+from neuido.models.scoring.metrics import MedianRelativeError
+from neuido.types import TrajectoryBatch
+
+RESIDUAL_FLOOR = 1e-5
+"""Least epsilon of a relative plastic error [-]: an elastic trajectory has no residual at all."""
+
+
+class OperatorResponse(NamedTuple):
+    """What an operator says about a batch of M trajectories with n samples each."""
+
+    stress: Tensor
+    """Predicted Kirchhoff stress [Pa], (M, n, 3, 3)."""
+    corrected: Tensor
+    """Predicted corrected deformation gradient [-], (M, n, 3, 3)."""
+    stress_error: Tensor
+    """Relative error of the stress, (M, n)."""
+    plastic_error: Tensor
+    """Relative error of the plastic residual F_hat - F_tr (or of F_hat), (M, n)."""
+    residual_epsilon: Tensor
+    """Floor of the residual norm for each trajectory [-], (M,)."""
+
+
+def evaluate_operator(
+    operator: IntrinsicDynamicsOperator,
+    z: Tensor,
+    batch: TrajectoryBatch,
+    stress_epsilon: Tensor,
+    residual_epsilon: Tensor,
+    plastic_target: str = "residual",
+) -> OperatorResponse:
+    """Evaluate the operator and its relative errors.
+
+    Args:
+        operator: The operator.
+        z: Latents (M, d).
+        batch: M n samples sorted by trajectory, n of each.
+        stress_epsilon: Floor of the stress norm for each trajectory [Pa], (M,).
+        residual_epsilon: Floor of the residual norm for each trajectory [-], (M,).
+        plastic_target: `residual` compares F_hat - F_tr; `full` compares F_hat (the paper, to the letter), whose norm is about
+            sqrt(3), so that the error is nearly absolute.
+    """
+    trial, corrected, stress = (t.view(len(z), -1, 3, 3) for t in batch[:3])
+    predicted, returned = operator.elastic(z, corrected), operator.plastic(z, trial)
+    stress_error = relative_errors(predicted, stress, stress_epsilon[:, None])
+    if plastic_target == "residual":
+        plastic_error = relative_errors(returned - trial, corrected - trial, residual_epsilon[:, None])
+    else:
+        plastic_error = relative_errors(returned, corrected)
+    return OperatorResponse(predicted, returned, stress_error, plastic_error, residual_epsilon)
+
+
+def fit_latents(
+    operator: IntrinsicDynamicsOperator,
+    batch: TrajectoryBatch,
+    candidates: Tensor,
+    stress_epsilon: Tensor,
+    residual_epsilon: Tensor,
+    *,
+    steps: int = 300,
+    lr: float = 0.1,
+    samples: int = 128,
+    progress: bool = False,
+) -> Tensor:
+    """Fit only the latents of materials that the operator has not seen; its weights stay as they are.
+
+    Each latent starts at the candidate with the least error and takes AdamW steps with a cosine schedule.
+
+    Args:
+        operator: The operator.
+        batch: Samples to fit, sorted by material, the same number of each of M.
+        candidates: Latents to start from, (K, d), such as those of the training trajectories.
+        stress_epsilon: As for `evaluate_operator`, (M,).
+        residual_epsilon: As for `evaluate_operator`, (M,).
+        steps: Number of steps.
+        lr: Learning rate at the start.
+        samples: Samples of each material in a step, taken in turn.
+        progress: Write the error to stderr ten times.
+
+    Returns:
+        Latents (M, d), without gradient.
+    """
+    count = len(stress_epsilon)
+    trial, corrected, stress = (t.view(count, -1, 3, 3) for t in batch[:3])
+    total = trial.shape[1]
+    generator = torch.Generator().manual_seed(0)
+    order = torch.randperm(total, generator=generator).to(trial.device)
+
+    def errors(z: Tensor, step: int) -> Tensor:
+        rows = order[(torch.arange(min(samples, total), device=order.device) + step * samples) % total]
+        part = TrajectoryBatch(*(t[:, rows].contiguous() for t in (trial, corrected, stress)), batch.trajectory)
+        answers = evaluate_operator(operator, z, part, stress_epsilon, residual_epsilon)
+        return (answers.stress_error + answers.plastic_error).mean(1)
+
+    trainable = [p for p in operator.parameters() if p.requires_grad]
+    for parameter in trainable:
+        parameter.requires_grad_(False)
+    try:
+        with torch.no_grad():
+            scores = torch.stack([errors(z.expand(count, -1), 0) for z in candidates])
+        z = candidates.detach()[scores.argmin(0)].clone().requires_grad_(True)
+        optimizer = torch.optim.AdamW([z], lr=lr, weight_decay=0.0)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+        for step in range(steps):
+            optimizer.zero_grad()
+            error = errors(z, step)
+            error.sum().backward()
+            optimizer.step()
+            schedule.step()
+            if progress and (step + 1) % max(1, steps // 10) == 0:
+                print(f"held-out instances: latent step {step + 1}/{steps}, error {error.mean().item():.4f}", file=sys.stderr)
+    finally:
+        for parameter in trainable:
+            parameter.requires_grad_(True)
+    return z.detach()
+
+
+class ConstitutiveMetrics(nn.Module):
+    """Stress MSE [Pa^2], plastic MSE (both as in the paper's Table 3, mean over components), and median relative errors.
+
+    `stress_error` and `plastic_error` are medians over all samples, `plastic_error_yielding` over those that flow, and
+    `stress_error/<family>` and `plastic_error/<family>` over the samples of a family. Beside them stand the scores of predictors that
+    learned nothing: `stress_mse_zero` of zero stress, `plastic_mse_identity` and `plastic_error_yielding_identity` of no correction.
+    Memory does not grow with the samples.
+
+    Args:
+        prefix: Prepended to the names, e.g. `val/`.
+        families: Family of each trajectory.
+    """
+
+    def __init__(self, prefix: str, families: Sequence[str]):
+        super().__init__()
+        self.prefix, self.families = prefix, list(families)
+        self.names = sorted(set(families))
+        response = MetricCollection({"mse": MeanSquaredError(), "error": MedianRelativeError()}, compute_groups=False)
+        self.stress = response.clone(prefix=f"{prefix}stress_")
+        self.plastic = response.clone(prefix=f"{prefix}plastic_")
+        errors = MetricCollection({"yielding": MedianRelativeError()}, compute_groups=False)
+        self.yielding = errors.clone(prefix=f"{prefix}plastic_error_")
+        zero = MetricCollection({"stress_mse_zero": MeanSquaredError(), "plastic_mse_identity": MeanSquaredError()}, compute_groups=False)
+        self.zero = zero.clone(prefix=prefix)
+        self.unchanged = errors.clone(prefix=f"{prefix}plastic_error_", postfix="_identity")
+        by_family = MetricCollection({name: MedianRelativeError() for name in self.names}, compute_groups=False)
+        self.stress_by_family = by_family.clone(prefix=f"{prefix}stress_error/")
+        self.plastic_by_family = by_family.clone(prefix=f"{prefix}plastic_error/")
+
+    def update(self, answers: OperatorResponse, batch: TrajectoryBatch) -> None:
+        """Add a batch of all trajectories."""
+        trial, corrected, stress = (t.view_as(answers.stress) for t in batch[:3])
+        self.stress.update(preds=answers.stress.flatten(), target=stress.flatten(), errors=answers.stress_error)
+        self.plastic.update(preds=answers.corrected.flatten(), target=corrected.flatten(), errors=answers.plastic_error)
+        self.zero["stress_mse_zero"].update(torch.zeros_like(stress).flatten(), stress.flatten())
+        self.zero["plastic_mse_identity"].update(trial.flatten(), corrected.flatten())
+        residual = (corrected - trial).flatten(-2).norm(dim=-1)
+        flows = residual > RESIDUAL_FLOOR
+        self.yielding.update(errors=answers.plastic_error[flows])
+        self.unchanged.update(errors=(residual / (residual + answers.residual_epsilon[:, None]))[flows])
+        for name in self.names:
+            rows = [i for i, family in enumerate(self.families) if family == name]
+            self.stress_by_family[name].update(answers.stress_error[rows])
+            self.plastic_by_family[name].update(answers.plastic_error[rows])
+
+    def compute(self) -> dict[str, Tensor]:
+        return {k: v for m in self._all() for k, v in m.compute().items()}
+
+    def reset(self) -> None:
+        for collection in self._all():
+            collection.reset()
+
+    def _all(self) -> tuple[MetricCollection, ...]:
+        return self.stress, self.plastic, self.zero, self.yielding, self.unchanged, self.stress_by_family, self.plastic_by_family
