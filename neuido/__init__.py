@@ -1,15 +1,117 @@
-"""neuido: a neural operator that reads a material's law of motion from video.
+"""neuido: differentiable mechanics, material laws from video, and the effects that a model lacks.
 
-Importing this package imports neither torch nor lightning; the submodules do.
+Importing the package imports neither torch nor lightning: every public name is imported at its first use.
 """
 
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neuido.data.bodies import shapes as shapes
+    from neuido.data.bodies.scene_files import load_scene as load_scene
+    from neuido.data.measured.experiment import read_experiment as read_experiment
+    from neuido.data.measured.material_test import read_material_tests as read_material_tests
+    from neuido.data.measured.track import read_tracks as read_tracks
+    from neuido.data.scenes.readers import read as read_recording
+    from neuido.discrepancy.diagnosis import Diagnosis as Diagnosis
+    from neuido.discrepancy.workflow import diagnose as diagnose
+    from neuido.errors import UserError as UserError
+    from neuido.export.particles import export as export
+    from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator as Operator
+    from neuido.models.render.splatting import rasterize as rasterize
+    from neuido.models.render.splatting import render as render
+    from neuido.models.video.encoder import DynamicsEncoder as Encoder
+    from neuido.physics import effects as effects
+    from neuido.physics import laws as laws
+    from neuido.physics.fem.finite_elements import FiniteElements as FiniteElements
+    from neuido.physics.mpm.simulator import Simulator as Simulator
+    from neuido.types import AttachedMass as AttachedMass
+    from neuido.types import Body as Body
+    from neuido.types import Box as Box
+    from neuido.types import Cameras as Cameras
+    from neuido.types import Gaussians as Gaussians
+    from neuido.types import ParticleState as ParticleState
+    from neuido.types import Plane as Plane
+    from neuido.types import Scene as Scene
+    from neuido.types import Walls as Walls
 
 __version__ = "0.1.0"
 
+_PLACES = {  # name: its module, and after a colon its name there; a module alone: the module itself
+    **{
+        name: f"types:{name}"
+        for name in ("AttachedMass", "Body", "Box", "Cameras", "Gaussians", "ParticleState", "Plane", "Scene", "Walls")
+    },
+    "Diagnosis": "discrepancy.diagnosis:Diagnosis",
+    "Encoder": "models.video.encoder:DynamicsEncoder",
+    "FiniteElements": "physics.fem.finite_elements:FiniteElements",
+    "Operator": "models.operator.dynamics_operator:IntrinsicDynamicsOperator",
+    "Simulator": "physics.mpm.simulator:Simulator",
+    "UserError": "errors:UserError",
+    "diagnose": "discrepancy.workflow:diagnose",
+    "effects": "physics.effects",
+    "export": "export",
+    "laws": "physics.laws",
+    "load_scene": "data.bodies.scene_files:load_scene",
+    "rasterize": "models.render.splatting:rasterize",
+    "read_experiment": "data.measured.experiment:read_experiment",
+    "read_material_tests": "data.measured.material_test:read_material_tests",
+    "read_recording": "data.scenes.readers:read",
+    "read_tracks": "data.measured.track:read_tracks",
+    "render": "models.render.splatting:render",
+    "shapes": "data.bodies.shapes",
+}
+
+__all__ = [
+    "AttachedMass",
+    "Body",
+    "Box",
+    "Cameras",
+    "Diagnosis",
+    "Encoder",
+    "FiniteElements",
+    "Gaussians",
+    "Operator",
+    "ParticleState",
+    "Plane",
+    "Scene",
+    "Simulator",
+    "UserError",
+    "Walls",
+    "__version__",
+    "configs_root",
+    "diagnose",
+    "effects",
+    "export",
+    "laws",
+    "load_scene",
+    "rasterize",
+    "read_experiment",
+    "read_material_tests",
+    "read_recording",
+    "read_tracks",
+    "render",
+    "shapes",
+]
+
 
 def configs_root() -> Path:
-    """The folder of the configurations: beside the package in a checkout, inside it in a wheel."""
+    """Return the folder of the configurations: beside the package in a checkout, inside it in a wheel."""
     package = Path(__file__).resolve().parent
     checkout = package.parent
     return checkout / "configs" if (checkout / "pyproject.toml").is_file() else package / "configs"
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name at its first use."""
+    if name not in _PLACES:
+        raise AttributeError(f"module 'neuido' has no attribute {name!r}")
+    module, _, own = _PLACES[name].partition(":")
+    found = import_module(f"neuido.{module}")
+    value = globals()[name] = getattr(found, own) if own else found
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from neuido.data.bodies.scene_files import SceneSetup, load_scene, scene_names
     from neuido.data.formats.layout import MultiView
     from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
-    from neuido.data.measured.material_test import read_material_tests
-    from neuido.data.measured.track import read_tracks
+    from neuido.data.measured.material_test import MaterialTest, MaterialTests, read_material_tests
+    from neuido.data.measured.track import Track, Tracks, read_tracks
     from neuido.data.scenes.clips import FilmDataModule
     from neuido.data.scenes.filmed_scene_module import VisualDataModule
     from neuido.data.scenes.multiview import MultiViewDataModule
@@ -23,10 +23,14 @@ if TYPE_CHECKING:
 __all__ = [
     "Experiment",
     "FilmDataModule",
+    "MaterialTest",
+    "MaterialTests",
     "MultiView",
     "MultiViewDataModule",
     "Recording",
     "SceneSetup",
+    "Track",
+    "Tracks",
     "TrajectoryDataModule",
     "VisualDataModule",
     "cameras",
@@ -43,10 +47,14 @@ __all__ = [
 _PLACES = {
     "Experiment": "measured.experiment",
     "FilmDataModule": "scenes.clips",
+    "MaterialTest": "measured.material_test",
+    "MaterialTests": "measured.material_test",
     "MultiView": "formats.layout",
     "MultiViewDataModule": "scenes.multiview",
     "Recording": "measured.experiment",
     "SceneSetup": "bodies.scene_files",
+    "Track": "measured.track",
+    "Tracks": "measured.track",
     "TrajectoryDataModule": "trajectories.trajectory_module",
     "VisualDataModule": "scenes.filmed_scene_module",
     "cameras": "cameras",

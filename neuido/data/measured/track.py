@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -59,17 +59,17 @@ class Tracks:
 
     name: str
     folder: Path
-    gravity: Vector
+    gravity: Vector = (0.0, -9.81, 0.0)
     """[m/s^2]"""
-    effects: dict[str, float]
+    effects: dict[str, float] = field(default_factory=dict)
     """Effects that the model has already, as flat figures, for example {"drag_quadratic.k": 0.01}."""
-    free: tuple[str, ...]
+    free: tuple[str, ...] = ()
     """The figures of the model that are to be fitted: `gravity` (its size) or one of `effects`."""
-    nuisances: dict[str, float]
+    nuisances: dict[str, float] = field(default_factory=lambda: dict.fromkeys(NUISANCES, 0.0))
     """Standard deviation of what may be off in every recording: release_time [s], length_scale and time_base (relative)."""
-    bodies: dict[str, dict[str, float]]
+    bodies: dict[str, dict[str, float]] = field(default_factory=dict)
     """mass [kg] and diameter [m] of each body, where known."""
-    recordings: tuple[Track, ...]
+    recordings: tuple[Track, ...] = ()
 
     def of(self, role: str, body: str | None = None) -> tuple[Track, ...]:
         """The recordings of a role, of one body or of all."""

@@ -21,7 +21,7 @@ class Parameter(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """One effect."""
+    """One effect of the vocabulary: its equation, parameters and ranges, where it shows, and what it is mistaken for."""
 
     name: str
     equation: str

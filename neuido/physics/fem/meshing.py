@@ -26,7 +26,7 @@ EVEN = ((0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1))
 
 
 class Mesh(NamedTuple):
-    """Linear tetrahedra."""
+    """Linear tetrahedra: nodes, elements and volumes."""
 
     nodes: Tensor
     """Positions in the body at t = 0 [m], (N, 3) float64."""

@@ -1,0 +1,157 @@
+"""The public surface: which names there are, that each is documented, and that what users read imports nothing deeper."""
+
+import ast
+import inspect
+import os
+import re
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import neuido
+
+ROOT = Path(__file__).parents[1]
+PUBLIC = {
+    "neuido": """
+        AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Gaussians Operator ParticleState Plane Scene Simulator UserError
+        Walls __version__ configs_root diagnose effects export laws load_scene rasterize read_experiment read_material_tests
+        read_recording read_tracks render shapes
+    """,
+    "neuido.data": """
+        Experiment FilmDataModule MaterialTest MaterialTests MultiView MultiViewDataModule Recording SceneSetup Track Tracks
+        TrajectoryDataModule VisualDataModule cameras load_scene read_experiment read_material_tests read_recording read_tracks
+        scene_names shapes write_experiment
+    """,
+    "neuido.physics": "FiniteElements MassSpring Mesh Simulator effects laws mesh_body",
+    "neuido.physics.effects": "Effects Entry LIBRARY Parameter ball_inclusion linear_gradient",
+    "neuido.physics.laws": """
+        AutogradElastic AutogradPlastic DruckerPrager ElasticLaw FixedCorotated Identity InvariantElastic InvariantPlastic NeoHookean
+        ObjectiveElastic ObjectivePlastic PlasticLaw RawElastic RawPlastic Sigma SymbolicElastic SymbolicPlastic VonMises by_body
+        material stack
+    """,
+    "neuido.discrepancy": "DiagnosedEffects Diagnosis Effect ErrorChange Quantity diagnose",
+}
+NAMES = [(room, name) for room, text in PUBLIC.items() for name in text.split()]
+ROOMS = ("neuido", "neuido.physics", "neuido.data", "neuido.models", "neuido.discrepancy")
+
+
+@pytest.mark.parametrize("room", PUBLIC)
+def test_the_list_is_whole(room):
+    package = import_module(room)
+    assert sorted(package.__all__) == sorted(PUBLIC[room].split())
+    assert set(package.__all__) <= set(dir(package))
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = package.no_such_name
+
+
+@pytest.mark.parametrize(("room", "name"), NAMES)
+def test_every_name_is_there_and_documented(room, name):
+    value = getattr(import_module(room), name)
+    if isinstance(value, tuple):  # LIBRARY, which the effects' own page documents
+        assert value
+    elif name == "__version__":
+        assert re.fullmatch(r"\d+\.\d+\.\d+\S*", value)
+    else:
+        words = inspect.getdoc(value)
+        assert words and len(words.split()) > 2, f"{room}.{name} has no docstring"
+        assert isinstance(value, ModuleType) or not words.startswith(f"{name}("), f"{room}.{name} has the docstring that Python made"
+
+
+def test_type_checkers_see_every_name():
+    """What is imported lazily is imported for type checkers too; an editor then completes and documents it."""
+    for room in PUBLIC:
+        path = Path(import_module(room).__file__)
+        found = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+                found |= {alias.asname or alias.name for part in node.body if isinstance(part, ast.ImportFrom) for alias in part.names}
+        own = {"__version__", "configs_root"} if room == "neuido" else set()
+        assert set(PUBLIC[room].split()) - own <= found, room
+    assert (Path(neuido.__file__).parent / "py.typed").is_file()
+
+
+def test_import_and_listing_load_no_torch():
+    code = "import sys, neuido; dir(neuido); neuido.Scene; neuido.UserError; print(neuido.__version__, 'torch' in sys.modules)"
+    light = code.replace("neuido.Scene; ", "")  # a scene is made of tensors
+    answer = subprocess.run([sys.executable, "-c", light], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert answer.stdout.split() == [neuido.__version__, "False"]
+
+
+def test_export_is_a_function_whatever_was_imported_first():
+    code = "import neuido.export.particles, neuido; from neuido import export; print(callable(neuido.export), callable(export))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert answer.stdout.split() == ["True", "True"]
+
+
+def sources() -> list[tuple[str, str]]:
+    """Return name and Python of each piece of code that a user copies."""
+    found = [(p.relative_to(ROOT).as_posix(), p.read_text()) for p in (ROOT / "examples").rglob("*.py")]
+    for page in (ROOT / "docs").rglob("*.md"):
+        blocks = re.findall(r"^```(?:python|\{code-cell\}.*?)\n(.*?)^```", page.read_text(), re.M | re.S)
+        found += [(f"{page.relative_to(ROOT).as_posix()}[{i}]", block) for i, block in enumerate(blocks)]
+    return found
+
+
+def deep_imports(source: str) -> set[str]:
+    """Return the modules of neuido below its public packages that a source imports from."""
+    deep = set()
+    for node in ast.walk(ast.parse(source)):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module]
+        deep |= {name for name in names if name.split(".")[0] == "neuido" and name not in ROOMS}
+    return deep
+
+
+def test_deep_imports_are_seen():
+    assert deep_imports("import neuido\nfrom neuido.data import a\nfrom neuido.data.b import c\nimport neuido.x") == {
+        "neuido.data.b",
+        "neuido.x",
+    }
+
+
+@pytest.mark.parametrize(("name", "source"), sources())
+def test_what_users_copy_imports_public_names_alone(name, source):
+    deep = deep_imports(source)
+    assert not deep, f"{name} imports from {sorted(deep)}; users import from {', '.join(ROOMS)} alone"
+
+
+EXAMPLES = ("simulate_a_drop", "diagnose_a_throw")
+
+
+def code_lines(source: str) -> list[str]:
+    """Return the lines of a source without its docstring, comments and blank lines."""
+    words = ast.get_docstring(ast.parse(source), clean=False) or ""
+    lines = source.replace(f'"""{words}"""', "", 1).splitlines()
+    return [line for line in lines if line.strip() and not line.strip().startswith("#")]
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_each_job_takes_fifteen_lines(name):
+    assert 5 <= len(code_lines((ROOT / "examples" / f"{name}.py").read_text())) <= 15
+
+
+def run_example(name: str, folder: Path) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
+    command = [sys.executable, str(ROOT / "examples" / f"{name}.py")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_simulate_gives_a_gradient_through_the_drop(tmp_path):
+    height, slope = map(float, re.findall(r"(-?\d\.\d+(?:e-?\d+)?) m", run_example("simulate_a_drop", tmp_path)))
+    assert 0.1 < height < 0.5
+    assert slope != 0
+    assert (tmp_path / "drop.npz").is_file()
+
+
+def test_diagnose_names_the_drag(tmp_path):
+    said = run_example("diagnose_a_throw", tmp_path)
+    assert "the declared model lacks" in said
+    assert "drag_quadratic" in said
+    assert (tmp_path / "throw.png").stat().st_size > 5000
