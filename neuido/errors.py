@@ -1,6 +1,7 @@
 """The one error that a user can mend: raised with a single line that names what was wrong, the value, and the option to change."""
 
 import argparse
+import errno
 import pickle
 import re
 
@@ -16,23 +17,50 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, RuntimeError) and any(words in str(error) for words in ("out of memory", "Failed to allocate"))
 
 
+LONGEST = 300
+"""Characters of an error's line at the most; of a longer one the middle goes."""
+
+_NO_MEMORY = re.compile(r"can't allocate memory|bad_alloc|bad allocation|Unable to allocate|not enough memory", re.IGNORECASE)
+_NOT_WRITTEN = re.compile(r"No space left on device|os error 28|PytorchStreamWriter failed|file write failed")
+
+
 def one_line(error: BaseException) -> str | None:
-    """What a command prints of an error: one line, or None for an error that only a programmer can mend."""
+    """What a command prints of an error: one line of at most `LONGEST` characters, or None for an error that only a programmer can mend."""
+    line = _line_of(error)
+    return None if line is None else shortened(line)
+
+
+def shortened(text: str) -> str:
+    """A text as one line that a terminal may show: no control characters, at most `LONGEST` characters."""
+    text = " ".join(text.split())
+    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 103]} ... {text[-98:]}"
+
+
+def _line_of(error: BaseException) -> str | None:
     cause: BaseException | None = error
     while cause is not None:  # jsonargparse wraps what a constructor raises
         if isinstance(cause, UserError):
-            return " ".join(str(cause).split())
+            return str(cause)
         cause = cause.__cause__
     if isinstance(error, argparse.ArgumentError):
         return _condense(str(error))
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.strerror}: '{error.filename}'"
+    if isinstance(error, OSError) and error.strerror is not None:
+        own = [f"'{name}'" for name in (error.filename, error.filename2) if name is not None]
+        what = f"{error.strerror}: {', '.join(own)}" if own else error.strerror
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        return f"{what}: what was being written is not there under its name; free some space, or give another out" if full else what
     if is_out_of_memory(error):
         return f"the device has no memory left ({str(error).splitlines()[0]}): end what else runs there, ask for less, or use the CPU"
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))):
+        detail = f" ({str(error).splitlines()[0][:120]})" if str(error) else ""
+        return f"there is not enough memory{detail}: end what else runs here, or ask for less (fewer particles, cells, views or draws)"
+    if _NOT_WRITTEN.search(str(error)):
+        return "No space left on device: what was being written is not there under its name; free some space, or give another out"
     if isinstance(error, pickle.UnpicklingError):
         return "the checkpoint cannot be read weights-only: it is damaged, or holds objects that reading would execute"
     if isinstance(error, FileNotFoundError) or type(error).__name__ == "MisconfigurationException":
-        return " ".join(str(error).split())
+        return str(error)
     return None
 
 

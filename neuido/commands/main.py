@@ -4,9 +4,11 @@ Light commands are plain functions, imported by name and offered through jsonarg
 commands of the Lightning trainer (`fit`, `validate`, `test`, `predict`) build a LightningCLI in subclass mode: YAML gives `class_path` and
 `init_args` of the model and the data module.
 
-Whatever the user can mend ends in one line on stderr and exit status 2. `NEUIDO_TRACEBACK=1` shows the traceback instead.
+Whatever the user can mend ends in one line on stderr and exit status 2. A fault of neuido itself is one line too, which names the file of
+its traceback, and exit status 70. `NEUIDO_TRACEBACK=1` shows the traceback instead.
 """
 
+import contextlib
 import importlib
 import inspect
 import itertools
@@ -14,16 +16,19 @@ import json
 import os
 import signal
 import sys
+import tempfile
+import traceback
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, get_origin
+from typing import TYPE_CHECKING, Any, get_origin
 
 import neuido
+from neuido.commands import interruption
 from neuido.commands.config_files import find_config
 from neuido.commands.console import quiet_lightning
 from neuido.data.files.sweep_run import own_folder, redirect
-from neuido.errors import UserError, one_line
+from neuido.errors import UserError, one_line, shortened
 
 if TYPE_CHECKING:
     from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -57,22 +62,56 @@ MODULES = (  # so that their class names resolve without a path
 )
 
 
+FAULT = 70
+"""Exit status of a fault of neuido itself; EX_SOFTWARE of sysexits.h."""
+
+
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the command line; exits with 0 (done), 1 (a check failed), 2 (the user can mend it) or 130 (interrupted).
+    """Run the command line.
+
+    Exits with 0 (done), 1 (a check failed), 2 (the user can mend it), 70 (a fault of neuido), or 128 + n (interrupted by signal n).
 
     Args:
         args: Arguments without the program's name; those of the process where absent.
     """
-    try:
-        status = _dispatch(list(sys.argv[1:] if args is None else args))
-    except KeyboardInterrupt:
-        _fail("interrupted", 128 + signal.SIGINT)
-    except Exception as error:
-        line = None if os.environ.get("NEUIDO_TRACEBACK") else one_line(error)
-        if line is None:
-            raise
-        _fail(line, 2)
+    status: Any = FAULT
+    with interruption.watched():
+        try:
+            status = _dispatch(list(sys.argv[1:] if args is None else args))
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            status = 128 + (interruption.received() or signal.SIGINT)
+        except BrokenPipeError:  # as of `neuido ... | head`
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            status = 128 + signal.SIGPIPE
+        except SystemExit as stop:
+            status = stop.code
+            if not interruption.received():
+                raise
+        except Exception as error:
+            if os.environ.get("NEUIDO_TRACEBACK"):
+                raise
+            line = one_line(error)
+            _fail(*(_fault(error), FAULT) if line is None else (line, 2))
+        number = interruption.received()
+    if number or status == 128 + signal.SIGINT:
+        number = number or signal.SIGINT
+        _fail("interrupted" + (f" by {signal.Signals(number).name}" if number != signal.SIGINT else ""), 128 + number)
     sys.exit(status)
+
+
+def _fault(error: Exception) -> str:
+    """The line of an error that nobody foresaw; its traceback goes to a file."""
+    text = "".join(traceback.format_exception(error))
+    words = f"{sys.argv[0]} {' '.join(sys.argv[1:])}\nneuido {neuido.__version__}, Python {sys.version}\n"
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="neuido-", suffix=".log", delete=False, errors="backslashreplace") as file:
+            file.write(words + text)
+        where = f"the traceback is in {file.name}, which belongs in a report of this fault"
+    except OSError:
+        where = "NEUIDO_TRACEBACK=1 shows the traceback"
+    return f"a fault of neuido itself: {shortened(f'{type(error).__name__}: {error}')[:160]}; {where}"
 
 
 def _dispatch(args: list[str]) -> int:
@@ -130,8 +169,13 @@ def run_lightning(args: list[str]) -> "LightningCLI":
             options = self.config[self.subcommand]
             if options.get("weights_only") is None:
                 options["weights_only"] = True
-            if folder := own_folder(os.environ):
+            folder = own_folder(os.environ)
+            if folder:
                 redirect(options, folder)
+                kept = folder / interruption.STATE
+                if self.subcommand == "fit" and options.get("ckpt_path") is None and kept.is_file():  # a run of a sweep is taken up again
+                    options["ckpt_path"] = str(kept)
+            self.trainer_defaults["callbacks"] = [interruption.stop_at_step(folder and folder / interruption.STATE)]
 
     class BesideTheLog(SaveConfigCallback):
         def setup(self, trainer, pl_module, stage):  # without a log it would write into the current folder, and refuse to a second time
@@ -181,5 +225,5 @@ def _help() -> str:
 
 
 def _fail(line: str, status: int) -> None:
-    print(f"neuido: {line}", file=sys.stderr)
+    print(f"neuido: {shortened(line)}", file=sys.stderr)
     sys.exit(status)

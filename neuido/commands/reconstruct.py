@@ -145,6 +145,7 @@ def _optimise(batch: "MultiViewBatch", around: "Setting", target: Path, device: 
     from lightning.pytorch.loggers import CSVLogger
 
     from neuido.commands.console import quiet_lightning
+    from neuido.commands.interruption import stop_at_step
     from neuido.models.reconstruct.gaussian_fit import ReconstructModule
 
     class Views(LightningDataModule):
@@ -174,7 +175,7 @@ def _optimise(batch: "MultiViewBatch", around: "Setting", target: Path, device: 
         devices=1,
         max_steps=steps,
         max_epochs=-1,
-        callbacks=[saved, *([TQDMProgressBar(refresh_rate=20)] if options["progress"] else [])],
+        callbacks=[stop_at_step(target / RESUME), saved, *([TQDMProgressBar(refresh_rate=20)] if options["progress"] else [])],
         logger=CSVLogger(target, name="log"),
         log_every_n_steps=max(1, min(20, steps // 20)),
         enable_progress_bar=options["progress"],

@@ -4,6 +4,7 @@ import contextlib
 import math
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from neuido.commands.config_files import find_config
+from neuido.commands.interruption import SIGNALS, STATE
 from neuido.commands.sweep_file import Metric, Run, SweepFile, command_of, read_sweep, runs_of
 from neuido.data.files.lock import Held, OwnedLock
 from neuido.data.files.score_tables import read_rows, write_rows
@@ -25,7 +27,8 @@ def sweep(
     """Run a wandb sweep file (grid or random) without a server; wandb logs offline, and the results come into one CSV.
 
     Each run has a folder of its own, <out>/<its parameters>: what it prints (log.txt), its logs and its results. Runs that are finished
-    are skipped when the same command is given again; one that failed or was killed starts anew. Several processes, or machines
+    are skipped when the same command is given again; one that was interrupted goes on from its checkpoint, and starts anew where it left
+    none, as one that failed does. Several processes, or machines
     with one file system, may share a sweep: each takes its shard, and a run that another process holds is left to it.
     The same file runs under `wandb sweep` and `wandb agent`.
 
@@ -39,7 +42,7 @@ def sweep(
         report: Write <out>/report.html (`neuido report`) where runs have scores.
 
     Returns:
-        Exit status: 1 where a run failed.
+        Exit status: 1 where a run failed or was interrupted.
 
     Raises:
         UserError: A malformed file, a shard that there is not.
@@ -64,7 +67,7 @@ def sweep(
     _summarise(rows, plan.metric, folder)
     if report and any(name.startswith("scores/") for row in rows for name in row):
         _report(folder, path)
-    return int(any(row["status"] == "failed" for row in rows if row["run"] in {run.name for run in own}))
+    return int(any(row["status"] in ("failed", "interrupted") for row in rows if row["run"] in {run.name for run in own}))
 
 
 def _one(plan: SweepFile, run: Run, folder: Path) -> str:
@@ -80,16 +83,33 @@ def _one(plan: SweepFile, run: Run, folder: Path) -> str:
         before = status_of(folder)
         if before.get("status") == "done" and before.get("command") == words:
             return "done before"
-        _empty(folder)
+        if not (_interrupted(before) and before.get("command") == words and (folder / STATE).is_file()):  # else it is taken up again
+            _empty(folder)
         state: dict[str, Any] = {"format": FORMAT, "run": run.name, "parameters": run.parameters, "command": words}
         note(folder, {**state, "status": "started"})
         start = time.monotonic()
-        code = _execute(words, environment, folder / "log.txt", lock)
-        state |= {"status": "done" if code == 0 else "failed", "seconds": round(time.monotonic() - start, 1)}
+        try:
+            code = _execute(words, environment, folder / "log.txt", lock)
+        except BaseException:
+            note(folder, {**state, "status": "interrupted", "seconds": round(time.monotonic() - start, 1)})
+            raise
+        state |= {"status": _status(code), "seconds": round(time.monotonic() - start, 1)}
         if code != 0:
             state["error"] = _last_line(folder / "log.txt") or f"exit status {code}"
         note(folder, state)
     return f"{state['status']} in {state['seconds']:.0f} s{': ' + state['error'] if code else ''}"
+
+
+def _status(code: int) -> str:
+    """What an exit status says: a run that a signal ended, itself (-n) or by its own handler (128 + n), is neither done nor failed."""
+    if code == 0:
+        return "done"
+    return "interrupted" if code < 0 or code - 128 in (*SIGNALS, signal.SIGKILL) else "failed"
+
+
+def _interrupted(state: Mapping[str, Any]) -> bool:
+    """Whether a run was ended by a signal, or with the machine, before its sweep could note how it ended."""
+    return state.get("status") in ("interrupted", "started")
 
 
 def _environment(plan: SweepFile, run: Run, folder: Path) -> dict[str, str]:
@@ -185,7 +205,7 @@ def _summarise(rows: list[dict[str, Any]], metric: Metric | None, folder: Path) 
             print(f"best {metric.name}: {value:.6g} ({name})")
         elif any(row["status"] == "done" for row in rows):
             print(f"no run logged the metric {metric.name} into a metrics.csv below {folder}", file=sys.stderr)
-    counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "started")}
+    counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "interrupted", "started")}
     print(f"{', '.join(f'{n} {status}' for status, n in counts.items() if n) or 'no run'}; results: {folder / 'results.csv'}")
 
 

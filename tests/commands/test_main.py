@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import tempfile
+
 import pytest
 import torch
 
@@ -150,13 +152,16 @@ def test_interrupt(capsys, monkeypatch):
     assert run(capsys, "doctor") == (130, "", "neuido: interrupted\n")
 
 
-def test_fault_of_the_program_keeps_its_traceback(monkeypatch):
+def test_fault_of_the_program_keeps_its_traceback(capsys, monkeypatch, tmp_path):
     def broken(args):
-        raise ZeroDivisionError
+        return [][3] + len("x" * 400)
 
     monkeypatch.setattr(cli, "_dispatch", broken)
-    with pytest.raises(ZeroDivisionError):
-        main(["doctor"])
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    status, out, err = run(capsys, "doctor")
+    assert (status, out) == (70, "") and err.count("\n") == 1 and len(err) <= 320 and "IndexError" in err
+    (log,) = tmp_path.iterdir()
+    assert str(log) in err and "in broken" in log.read_text() and "IndexError" in log.read_text()
 
 
 def test_traceback_on_demand(monkeypatch):

@@ -1,0 +1,107 @@
+"""Signals that end a command: it stops where its state is whole, says how to go on, and exits with 128 + n."""
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lightning.pytorch import Callback
+
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+STATE = "interrupted.ckpt"
+"""What a trainer leaves that was interrupted, in the folder of its checkpoints."""
+
+_received: list[int] = []
+_patient: list[object] = []
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal came that ends the command."""
+
+
+def received() -> int | None:
+    """The first signal of this command that ends it, or None."""
+    return _received[0] if _received else None
+
+
+@contextlib.contextmanager
+def watched() -> Iterator[None]:
+    """Turn SIGINT, SIGTERM and SIGHUP into `Interrupted` while this is open; one that was ignored before (nohup) still is.
+
+    A trainer that is `stop_at_step` ends by itself after its batch; a second signal ends it at once.
+    """
+    owner = os.getpid()
+
+    def handle(number: int, frame: Any) -> None:
+        if os.getpid() != owner:  # a worker, forked from this process
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        again = bool(_received)
+        _received.append(number)
+        if not _patient or again:
+            raise Interrupted(signal.Signals(number).name)
+
+    before = {}
+    _received.clear()
+    _patient.clear()
+    with contextlib.suppress(ValueError):  # not the main thread: whoever runs this has signals of its own
+        for number in SIGNALS:
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                before[number] = signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def stop_at_step(path: Path | None = None) -> "Callback":
+    """A callback that lets a trainer end after the batch in which a signal came, with its state in a file.
+
+    Args:
+        path: The file; `interrupted.ckpt` beside the trainer's other checkpoints where absent.
+    """
+    from lightning.pytorch import Callback, LightningModule, Trainer
+
+    class StopAtStep(Callback):
+        def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+            _patient.append(self)
+
+        def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+            _patient.clear()
+
+        def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+            _patient.clear()
+
+        def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
+            if _received:
+                self._stop(trainer, save=True)
+
+        def on_validation_end(self, trainer: Trainer, *_: Any) -> None:
+            if _received:
+                self._stop(trainer, save=trainer.state.fn == "fit" and not trainer.sanity_checking)
+
+        def on_test_batch_end(self, trainer: Trainer, *_: Any) -> None:
+            if _received:
+                self._stop(trainer, save=False)
+
+        on_predict_batch_end = on_test_batch_end
+
+        def _stop(self, trainer: Trainer, *, save: bool) -> None:
+            if save:
+                file = path or _place(trainer) / STATE
+                trainer.save_checkpoint(file)
+                print(f"neuido: the state after step {trainer.global_step} is in {file}: --ckpt_path goes on from it", file=sys.stderr)
+            raise Interrupted(signal.Signals(_received[0]).name)
+
+    return StopAtStep()
+
+
+def _place(trainer: Any) -> Path:
+    folder = getattr(trainer.checkpoint_callback, "dirpath", None)
+    return Path(folder or trainer.log_dir or trainer.default_root_dir)

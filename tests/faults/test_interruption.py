@@ -1,0 +1,174 @@
+"""Interruption is no success: a signal ends every command with 128 + n, its state is saved, and it is taken up again."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file
+
+from neuido.commands.main import main
+from neuido.commands.sweep import sweep
+
+FIT = {
+    "model": {"class_path": "PretrainModule", "init_args": {"latent_dim": 4, "instance_steps": 1}},
+    "data": {"class_path": "TrajectoryDataModule", "init_args": {"root": "trajectories", "batch_size": 30}},
+    "trainer": {
+        "max_epochs": 1_000_000,
+        "max_steps": -1,
+        "accelerator": "cpu",
+        "num_sanity_val_steps": 0,
+        "limit_val_batches": 0,
+        "enable_progress_bar": False,
+        "log_every_n_steps": 1,
+        "logger": {"class_path": "lightning.pytorch.loggers.CSVLogger", "init_args": {"save_dir": "log", "flush_logs_every_n_steps": 1}},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A folder with small trajectories and the configuration of a fit that has no end by itself."""
+    folder = tmp_path_factory.mktemp("fit")
+    with pytest.raises(SystemExit) as stop:
+        main(["simulate", "--out", str(folder / "trajectories"), "--instances=1", "--held_out=0", "--particles_per_side=3", "--steps=40",
+              "--device=cpu", "--progress=false"])  # fmt: skip
+    assert stop.value.code == 0
+    (folder / "fit.yaml").write_text(yaml.safe_dump(FIT))
+    return folder
+
+
+def begin(folder: Path, *args: str) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, "-m", "neuido", *args], cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def wait_for(condition, process: subprocess.Popen, seconds: float = 120.0) -> None:
+    until = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until, "nothing happened"
+        time.sleep(0.02)
+
+
+def logged(folder: Path) -> bool:
+    return any(path.read_text().count("\n") > 2 for path in folder.rglob("metrics.csv"))
+
+
+def fit(folder: Path, *more: str) -> tuple[str, ...]:
+    return ("fit", "--config", str(folder / "fit.yaml"), "--data.root", str(folder / "trajectories"), *more)
+
+
+def interrupted(folder: Path, number: signal.Signals, *args: str) -> Path:
+    """The state that a fit leaves which gets a signal once it is at work."""
+    process = begin(folder, *args)
+    wait_for(lambda: logged(folder), process)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, err
+    assert err.splitlines()[-1] == f"neuido: interrupted by {number.name}" and "Traceback" not in err
+    (state,) = folder.rglob("interrupted.ckpt")
+    assert f"{state.relative_to(folder)}: --ckpt_path" in err
+    return state
+
+
+def test_a_fit_ends_after_its_step_with_its_state(made, tmp_path):
+    state = interrupted(tmp_path, signal.SIGTERM, *fit(made))
+    assert torch.load(state, weights_only=True)["global_step"] >= 2
+
+
+@pytest.mark.slow
+def test_an_interrupted_fit_goes_on_to_the_same_bits(made, tmp_path):
+    end = ["--trainer.max_steps=1500", "--trainer.max_epochs=-1"]
+    state = interrupted(tmp_path, signal.SIGHUP, *fit(made, *end))
+    assert torch.load(state, weights_only=True)["global_step"] < 1500
+    for name, more in (("resumed", [f"--ckpt_path={state}"]), ("whole", [])):
+        done = begin(tmp_path, *fit(made, *end, f"--model.save_to={name}.safetensors", *more))
+        assert done.communicate(timeout=300) and done.returncode == 0
+    resumed, whole = (load_file(tmp_path / f"{name}.safetensors") for name in ("resumed", "whole"))
+    assert resumed.keys() == whole.keys() and all(torch.equal(resumed[name], whole[name]) for name in whole)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_light_command_ends_with_the_signal_and_leaves_nothing_half_written(tmp_path, number):
+    args = ["simulate", "--out", "out", "--instances=1", "--held_out=0", "--steps=200000", "--device=cpu", "--progress=false"]
+    process = begin(tmp_path, *args)
+    wait_for(lambda: (tmp_path / "out" / "plan.json").exists(), process)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + number and err.startswith("neuido: interrupted") and err.count("\n") == 1
+    assert [path.name for path in (tmp_path / "out").iterdir() if not path.name.startswith(".")] == ["plan.json"]
+
+
+def test_a_signal_that_was_ignored_stays_so(tmp_path):
+    code = (
+        "import signal, os, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "import neuido.commands.main as m\n"
+        "m._dispatch = lambda args: os.kill(os.getpid(), signal.SIGHUP)\n"
+        "m.main(['doctor'])"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def sweep_file(folder: Path, command: list[str], **parameters) -> str:
+    path = folder / "plan.yaml"
+    content = {"method": "grid", "program": "neuido", "command": command, "parameters": {k: {"values": v} for k, v in parameters.items()}}
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+def status(folder: Path) -> list[str]:
+    return [json.loads(path.read_text())["status"] for path in sorted(folder.glob("*/run.json"))]
+
+
+@pytest.mark.slow
+def test_a_sweep_takes_an_interrupted_fit_up_again(made, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = [sys.executable, "-m", "neuido", *fit(made, "--trainer.max_epochs=1000000"), "${args}"]
+    file = sweep_file(tmp_path, command, **{"model.lr": [1e-3]})
+    process = begin(tmp_path, "sweep", file, "--out", "out", "--report=false")
+    wait_for(lambda: logged(tmp_path / "out"), process)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=120)
+    assert process.returncode == 128 + signal.SIGTERM and status(tmp_path / "out") == ["interrupted"]
+    (state,) = (tmp_path / "out").rglob("interrupted.ckpt")
+    step = torch.load(state, weights_only=True)["global_step"]
+    before = set((tmp_path / "out").rglob("metrics.csv"))
+    process = begin(tmp_path, "sweep", file, "--out", "out", "--report=false")
+    wait_for(lambda: any(p.read_text().count("\n") > 2 for p in set((tmp_path / "out").rglob("metrics.csv")) - before), process)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=120)
+    assert torch.load(state, weights_only=True)["global_step"] > step
+
+
+def test_a_run_that_a_signal_ended_is_not_done_and_starts_again(tmp_path, monkeypatch):
+    """The signal reaches the run alone, which ends by its own handler or by none."""
+    script = "import os, signal, sys; os.path.exists('again') or (open('again', 'w'), %s)"
+    for i, end in enumerate(("os.kill(os.getpid(), signal.SIGTERM)", "sys.exit(143)")):
+        folder = tmp_path / str(i)
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        file = sweep_file(folder, [sys.executable, "-c", script % end], a=[1])
+        assert sweep(file, out=str(folder / "out")) == 1 and status(folder / "out") == ["interrupted"]
+        assert sweep(file, out=str(folder / "out")) == 0 and status(folder / "out") == ["done"]
+        assert "interrupted" not in (folder / "out" / "results.csv").read_text()
+
+
+def test_a_worker_that_was_forked_dies_of_its_signal():
+    from neuido.commands.interruption import watched
+
+    with watched():
+        child = os.fork()
+        if child == 0:
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(5)
+            finally:
+                os._exit(3)
+        _, ended = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(ended) and os.WTERMSIG(ended) == signal.SIGTERM
