@@ -21,7 +21,7 @@ LONGEST = 300
 """Characters of an error's line at the most; of a longer one the middle goes."""
 
 _NO_MEMORY = re.compile(r"can't allocate memory|bad_alloc|bad allocation|Unable to allocate|not enough memory", re.IGNORECASE)
-_NOT_WRITTEN = re.compile(r"No space left on device|os error 28|PytorchStreamWriter failed|file write failed")
+_NOT_WRITTEN = re.compile(r"No space left on device|os error 28|PytorchStreamWriter failed|file write failed|\d+ requested and \d+ written")
 
 
 def one_line(error: BaseException) -> str | None:
@@ -59,7 +59,7 @@ def _line_of(error: BaseException) -> str | None:
         return "No space left on device: what was being written is not there under its name; free some space, or give another out"
     if isinstance(error, pickle.UnpicklingError):
         return "the checkpoint cannot be read weights-only: it is damaged, or holds objects that reading would execute"
-    if isinstance(error, FileNotFoundError) or type(error).__name__ == "MisconfigurationException":
+    if isinstance(error, OSError) or type(error).__name__ == "MisconfigurationException":
         return str(error)
     return None
 

@@ -282,15 +282,13 @@ def _compare(body: "Body", found: "Gaussians", truth: "Truth | None") -> dict[st
 def _write(target: Path, found: "Gaussians", body: "Body") -> None:
     import numpy as np
 
-    from neuido.data.files.storage import publish
+    from neuido.data.files.writing import replacing
     from neuido.models.render.gaussians import save_ply
 
-    hidden = target / ".gaussians.ply.tmp"
-    save_ply(hidden, found)
-    publish(hidden, target / "gaussians.ply")
-    hidden = target / ".body.tmp.npz"
-    np.savez(hidden, x0=body.x.numpy(), v0=body.v.numpy(), volume=body.volume.numpy())
-    publish(hidden, target / "body.npz")
+    with replacing(target / "gaussians.ply") as hidden:
+        save_ply(hidden, found)
+    with replacing(target / "body.npz") as hidden:
+        np.savez(hidden, x0=body.x.numpy(), v0=body.v.numpy(), volume=body.volume.numpy())
 
 
 def _draw(path: Path, module: "ReconstructModule", batch: "MultiViewBatch", body: "Body", side: int = 320) -> None:

@@ -90,7 +90,7 @@ def _one(plan: SweepFile, run: Run, folder: Path) -> str:
         start = time.monotonic()
         try:
             code = _execute(words, environment, folder / "log.txt", lock)
-        except BaseException:
+        except KeyboardInterrupt:
             note(folder, {**state, "status": "interrupted", "seconds": round(time.monotonic() - start, 1)})
             raise
         state |= {"status": _status(code), "seconds": round(time.monotonic() - start, 1)}

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,8 @@ import yaml
 
 import neuido
 from neuido.data.files.storage import write as write_text
+from neuido.data.files.values import file_name
+from neuido.data.files.writing import real_folder, replacing
 from neuido.discrepancy import ceiling, next_experiment, report, residual
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.believed import beside
@@ -56,10 +57,10 @@ def write(
         made.content["seconds"] = round(spent + time.monotonic() - begun, 1) if seconds is None else seconds
         details.append(made)
     tell("writing")
-    (out / "predicted").mkdir(parents=True, exist_ok=True)
+    predicted = real_folder(out / "predicted", "the folder")
     for made in details:
         for name, arrays in made.motion.items():
-            _save(out / "predicted" / f"{name}.npz", arrays)
+            _save(predicted / f"{file_name(name, 'the name of a recording')}.npz", arrays)
     models = {_body(d): beside(out, d.problem.model_after(d.after, [t.candidate.name for t in d.effects])) for d, _ in found}
     model = {"bodies": models} if len(found) > 1 else next(iter(models.values()))
     write_text(out / "model_after.yaml", yaml.safe_dump(_plain(model), sort_keys=False, default_flow_style=None))
@@ -357,10 +358,8 @@ def _body(d: Diagnosis) -> str:
 
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    hidden = path.with_name(f".{path.name}.tmp")
-    with hidden.open("wb") as stream:
+    with replacing(path) as hidden, hidden.open("wb") as stream:
         np.savez_compressed(stream, **arrays)
-    os.replace(hidden, path)
 
 
 def _plain(value: Any) -> Any:

@@ -1,13 +1,12 @@
 """Recordings as a model has them: an experiment rolled out under its declared model and effects, written as another experiment."""
 
 import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 from tqdm import tqdm
 
-from neuido.data.files.storage import publish_folder
+from neuido.data.files.writing import new_folder
 from neuido.data.measured.experiment import read_experiment, write_experiment
 from neuido.discrepancy.believed import beside, read_model_file
 from neuido.discrepancy.workflow import choose_device, experiment_problem
@@ -37,9 +36,6 @@ def replay(folder: str, out: str | os.PathLike, *, model: str | None = None, dev
     names = tqdm(range(len(problem.measured)), unit="recording", disable=not progress)
     recordings = tuple(problem.simulated(n) for n in names)
 
-    hidden = target.with_name(f".{target.name}.tmp")
-    shutil.rmtree(hidden, ignore_errors=True)
-    hidden.mkdir(parents=True)
-    write_experiment(replace(experiment, model=beside(hidden, experiment.model), recordings=recordings), hidden)
-    read_experiment(hidden)  # what cannot be read again is not published
-    publish_folder(hidden, target)
+    with new_folder(target) as hidden:
+        write_experiment(replace(experiment, model=beside(hidden, experiment.model), recordings=recordings), hidden)
+        read_experiment(hidden)  # what cannot be read again is not published

@@ -4,7 +4,6 @@ import contextlib
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from neuido.data.files.writing import real_folder, remove, replacing
 from neuido.discrepancy.problem import Ask, Point, Problem, Rows
 
 CHUNK = 32
@@ -126,10 +126,8 @@ class CachedProblem(Problem):
         stored = short if np.array_equal(short.astype(np.float64), values, equal_nan=True) else values  # the simulators work in float32
         if self.used + stored.nbytes > self.limit:
             return
-        hidden = path.with_name(f".{path.name}.tmp")
-        with hidden.open("wb") as stream:
+        with replacing(path) as hidden, hidden.open("wb") as stream:
             np.save(stream, stored)
-        os.replace(hidden, path)
         self.used += stored.nbytes
 
 
@@ -163,17 +161,13 @@ def plan_of(folder: str | os.PathLike, options: dict[str, Any], *, out: Path) ->
 
 def workplace(out: Path, plan: str, *, resume: bool) -> Path:
     """The folder of a plan's predictions in `out`; those of other plans go, and its own too where nothing is to be resumed."""
-    root = out / ".work"
-    if root.is_dir():
-        for other in root.iterdir():
-            if other.name != plan or not resume:
-                shutil.rmtree(other) if other.is_dir() else other.unlink()
-    own = root / plan
-    own.mkdir(parents=True, exist_ok=True)
-    return own
+    root = real_folder(out / ".work", "the folder of predictions")
+    for other in root.iterdir():
+        if other.name != plan or not resume:
+            remove(other)
+    return real_folder(root / plan, "the folder of predictions")
 
 
 def clear(out: Path) -> None:
     """Remove what only a resumed run would need."""
-    with contextlib.suppress(FileNotFoundError):
-        shutil.rmtree(out / ".work")
+    remove(out / ".work")

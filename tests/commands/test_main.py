@@ -3,9 +3,8 @@
 import functools
 import subprocess
 import sys
-from pathlib import Path
-
 import tempfile
+from pathlib import Path
 
 import pytest
 import torch

@@ -48,7 +48,7 @@ def begin(folder: Path, *args: str) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, "-m", "neuido", *args], cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
-def wait_for(condition, process: subprocess.Popen, seconds: float = 120.0) -> None:
+def wait_for(condition, process: subprocess.Popen, seconds: float = 400.0) -> None:
     until = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.communicate()
@@ -69,7 +69,7 @@ def interrupted(folder: Path, number: signal.Signals, *args: str) -> Path:
     process = begin(folder, *args)
     wait_for(lambda: logged(folder), process)
     process.send_signal(number)
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=400)
     assert process.returncode == 128 + number, err
     assert err.splitlines()[-1] == f"neuido: interrupted by {number.name}" and "Traceback" not in err
     (state,) = folder.rglob("interrupted.ckpt")
@@ -134,7 +134,7 @@ def test_a_sweep_takes_an_interrupted_fit_up_again(made, tmp_path, monkeypatch):
     process = begin(tmp_path, "sweep", file, "--out", "out", "--report=false")
     wait_for(lambda: logged(tmp_path / "out"), process)
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=120)
+    process.communicate(timeout=400)
     assert process.returncode == 128 + signal.SIGTERM and status(tmp_path / "out") == ["interrupted"]
     (state,) = (tmp_path / "out").rglob("interrupted.ckpt")
     step = torch.load(state, weights_only=True)["global_step"]
@@ -142,7 +142,7 @@ def test_a_sweep_takes_an_interrupted_fit_up_again(made, tmp_path, monkeypatch):
     process = begin(tmp_path, "sweep", file, "--out", "out", "--report=false")
     wait_for(lambda: any(p.read_text().count("\n") > 2 for p in set((tmp_path / "out").rglob("metrics.csv")) - before), process)
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=120)
+    process.communicate(timeout=400)
     assert torch.load(state, weights_only=True)["global_step"] > step
 
 

@@ -7,7 +7,6 @@ the corrected one and the Kirchhoff stress [Pa], nine numbers each. A file appea
 
 import json
 import os
-import uuid
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.data.files.writing import replacing
 from neuido.errors import UserError
 from neuido.types import TrajectoryBatch
 
@@ -36,9 +36,8 @@ def complete(path: Path, shape: tuple[int, ...]) -> bool:
 
 def write(path: Path, text: str) -> None:
     """Write a small file all at once; several processes may write the same one."""
-    hidden = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-    hidden.write_text(text)
-    publish(hidden, path)
+    with replacing(path) as hidden:
+        hidden.write_text(text)
 
 
 def claim(folder: Path, text: str, held: str, *, compared: str | None = None) -> None:

@@ -72,6 +72,26 @@ def take(entry: dict[str, Any], key: str, where: str) -> Any:
     return entry[key]
 
 
+def file_name(value: Any, where: str) -> str:
+    """Return a name that becomes the name of a file or folder: one part of a path, so that it stays where it is put.
+
+    Raises:
+        UserError: Not text, empty, longer than 120 bytes, hidden, or with a slash, a colon or a character that does not print.
+    """
+    if not isinstance(value, str) or not value.strip():
+        raise UserError(f"{where} must be text, got {value!r}")
+    wrong = any(c in '/\\:*?"<>|' or not c.isprintable() for c in value) or value[0] == "." or value != value.strip()
+    try:
+        wrong = wrong or len(value.encode()) > 120
+    except UnicodeEncodeError:  # half of a character
+        wrong = True
+    if wrong:
+        raise UserError(
+            f"{where} = {value[:80]!r} cannot name a file: use letters, digits, spaces, - and _, at most 120 bytes, and no dot in front"
+        )
+    return value
+
+
 def inside(folder: Path, relative: Any, where: str, *, kind: str = "folder") -> Path:
     r"""Return the path that a file names, which must stay in the folder; `\` separates folders as `/` does.
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.files.parsing import read_arrays
-from neuido.data.files.values import check_keys, inside, mapping, number
+from neuido.data.files.values import check_keys, file_name, inside, mapping, number
 from neuido.data.formats import nerfstudio
 from neuido.data.formats.layout import MultiView
 from neuido.data.measured.columns import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
@@ -207,7 +207,7 @@ def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
 
 def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path) -> Recording:
     check_keys(entry, where, ("name", "role", "frame_interval", "noise", *OVERRIDES), ("noise", *OVERRIDES))
-    name = read_text(entry["name"], f"{where}.name")
+    name = file_name(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     role = read_role(entry["role"], where)
     interval = number(entry["frame_interval"], f"{where}.frame_interval", above=0.0)

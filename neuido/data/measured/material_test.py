@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.data.files.values import check_keys, mapping, number, vector
+from neuido.data.files.values import check_keys, file_name, mapping, number, vector
 from neuido.data.measured.columns import errors_of, read_columns, read_effects, read_entries, read_header, read_role, read_text, rising
 from neuido.data.measured.experiment import read_model
 from neuido.errors import UserError
@@ -132,7 +132,7 @@ def read_material_tests(path: str | os.PathLike, *, model: Mapping[str, Any] | N
 def _test(entry: Any, where: str, folder: Path) -> MaterialTest:
     optional = ("scale", "rows", "direction")
     check_keys(entry, where, ("name", "file", "mode", "columns", "role", *optional), optional)
-    name = read_text(entry["name"], f"{where}.name")
+    name = file_name(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     if not isinstance(entry["mode"], str) or entry["mode"] not in MODES:
         raise UserError(f"{where}.mode = {entry['mode']!r} is not known; one of {', '.join(MODES)}")

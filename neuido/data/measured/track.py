@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.data.files.values import check_keys, mapping, number, vector
+from neuido.data.files.values import check_keys, file_name, mapping, number, vector
 from neuido.data.measured.columns import (
     errors_of,
     read_columns,
@@ -115,7 +115,7 @@ def _bodies(given: Any) -> dict[str, dict[str, float]]:
         raise UserError("bodies names no body")
     out = {}
     for name, figures in bodies.items():
-        read_text(name, "the name of a body")
+        file_name(name, "the name of a body")
         figures = mapping(figures or {}, f"bodies.{name}")
         check_keys(figures, f"bodies.{name}", FIGURES, FIGURES)
         out[name] = {key: number(value, f"bodies.{name}.{key}", above=0.0) for key, value in figures.items()}
@@ -125,7 +125,7 @@ def _bodies(given: Any) -> dict[str, dict[str, float]]:
 def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) -> Track:
     optional = ("rows", "spin", "noise")
     check_keys(entry, where, ("name", "body", "file", "columns", "role", *optional), optional)
-    name = read_text(entry["name"], f"{where}.name")
+    name = file_name(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     if not isinstance(entry["body"], str) or entry["body"] not in bodies:
         raise UserError(f"{where}.body = {entry['body']!r} is not known; one of {', '.join(bodies)}")

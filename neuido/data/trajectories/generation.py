@@ -18,7 +18,8 @@ from tqdm import tqdm
 
 from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import cube
-from neuido.data.files.storage import COLUMNS, FORMAT, claim, complete, publish, write
+from neuido.data.files.storage import COLUMNS, FORMAT, claim, complete, write
+from neuido.data.files.writing import replacing
 from neuido.errors import UserError
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm.simulator import Simulator
@@ -159,12 +160,12 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
     exact = [laws(instance.family, [instance.parameters]) for instance in group]
     segment = max(setup.record_every, SEGMENT // setup.record_every * setup.record_every)
     names = group[0].name if len(group) == 1 else f"{group[0].name} .. {group[-1].name}"
-    hidden = [path.with_name(f".{path.name}.tmp") for path in paths]
     header = {"descr": "<f4", "fortran_order": False, "shape": setup.shape}
     try:
         simulator = Simulator([setup.scene] * len(group), [body] * len(group), density=setup.density, device=device)
         state = simulator.state
         with torch.no_grad(), contextlib.ExitStack() as stack:
+            hidden = [stack.enter_context(replacing(path)) for path in paths]
             files = [stack.enter_context(path.open("wb")) for path in hidden]
             for file in files:
                 np.lib.format.write_array_header_1_0(file, header)
@@ -179,8 +180,6 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
         raise UserError(f"{names}: {error}") from error
     except OSError as error:
         raise UserError(f"{names}: cannot write to {paths[0].parent}: {error.strerror}; give another out") from error
-    for part, path in zip(hidden, paths, strict=True):
-        publish(part, path)
 
 
 def _samples(setup: Setup, F: Tensor, C: Tensor, elastic: ElasticLaw, plastic: PlasticLaw) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neuido.data.files.parsing import read_json
 from neuido.data.files.storage import COLUMNS, FORMAT, Files, complete, split
-from neuido.data.files.values import inside, listed, take
+from neuido.data.files.values import file_name, listed, take
 from neuido.data.trajectories.options import simulate
 from neuido.data.trajectories.sampling import Batches, Order, Step, Steps
 from neuido.errors import UserError
@@ -104,7 +104,7 @@ class TrajectoryDataModule(LightningDataModule):
         for i, entry in enumerate(listed(take(content, "trajectories", str(path)), f"{path}: trajectories")):
             for key in ("name", "family", "split", "parameters", "stress_rms", "residual_rms"):
                 take(entry, key, f"{path}: trajectories[{i}]")
-            inside(self.root, entry["name"], f"{path}: trajectories[{i}].name")
+            file_name(entry["name"], f"{path}: trajectories[{i}].name")
             if not complete(self.root / f"{entry['name']}.npy", self._shape(content)):
                 raise UserError(f"{self.root / entry['name']}.npy is missing or cut short: repair it with `{command}`")
         return content

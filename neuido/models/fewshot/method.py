@@ -14,7 +14,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from neuido.data.files.storage import publish, write
+from neuido.data.files.storage import write
+from neuido.data.files.writing import replacing
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import rollout_laws
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
@@ -161,10 +162,8 @@ class Method(nn.Module):
 
 def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
     """Write a safetensors file, all at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    hidden = path.with_name(f".{path.name}.tmp")
-    save_file(tensors, hidden)
-    publish(hidden, path)
+    with replacing(path) as hidden:
+        save_file(tensors, hidden)
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.data.files.writing import replacing
 from neuido.errors import UserError
 from neuido.types import ParticleState
 
@@ -43,17 +44,15 @@ def write_video(path: str | os.PathLike, images: Tensor, *, rate: float = 20.0) 
         UserError: OpenCV cannot write there.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    hidden = path.with_name(f".{path.stem}.tmp.mp4")
     frames = (255 * images.detach().clamp(0, 1)).round().to(torch.uint8).cpu().numpy()
     height, width = (n - n % 2 for n in frames.shape[1:3])  # the codec wants even sides
-    writer = cv2.VideoWriter(str(hidden), cv2.VideoWriter_fourcc(*"mp4v"), rate, (width, height))
-    if not writer.isOpened():
-        raise UserError(f"OpenCV cannot write the video {path}")
-    for frame in frames:
-        writer.write(cv2.cvtColor(np.ascontiguousarray(frame[:height, :width]), cv2.COLOR_RGB2BGR))
-    writer.release()
-    os.replace(hidden, path)
+    with replacing(path) as hidden:
+        writer = cv2.VideoWriter(str(hidden), cv2.VideoWriter_fourcc(*"mp4v"), rate, (width, height))
+        if not writer.isOpened():
+            raise UserError(f"OpenCV cannot write the video {path}")
+        for frame in frames:
+            writer.write(cv2.cvtColor(np.ascontiguousarray(frame[:height, :width]), cv2.COLOR_RGB2BGR))
+        writer.release()
 
 
 def contact_sheet(path: str | os.PathLike, rows: Sequence[Tensor], *, columns: int = 8) -> None:

@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
+from neuido.data.files.writing import replacing
 from neuido.errors import UserError
 from neuido.physics.laws.neural import networks
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
@@ -211,11 +212,8 @@ class IntrinsicDynamicsOperator(nn.Module):
             "latents": json.dumps({"names": self.latent_names, "families": self.latent_families}),
             "card": json.dumps({"date": date.today().isoformat(), **(card or {})}),
         }
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        hidden = path.with_name(f".{path.name}.tmp")
-        save_file(tensors, hidden, metadata=metadata)
-        hidden.replace(path)
+        with replacing(path) as hidden:
+            save_file(tensors, hidden, metadata=metadata)
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "pretrained") -> Self:

@@ -7,7 +7,6 @@ from a video.
 
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -18,6 +17,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from neuido.data.bodies.families import laws
+from neuido.data.files.writing import replacing
 from neuido.data.scenes.clips import Clip, FilmDataModule
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
@@ -160,10 +160,8 @@ class WarmupModule(LightningModule):
         pairs = [self.encoder.embed(Velocities(flow, clip.cell, clip.frame_interval)) for flow in seen]
         volume, conditions = torch.stack([volume for volume, _ in pairs]).cpu(), pairs[0][1].cpu()
         if kept is not None:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            hidden = kept.with_name(f".{kept.name}.{os.getpid()}.tmp")
-            save_file({"volume": volume, "conditions": conditions}, hidden)
-            os.replace(hidden, kept)
+            with replacing(kept) as hidden:
+                save_file({"volume": volume, "conditions": conditions}, hidden)
         return volume, conditions
 
     def training_step(self, numbers: Tensor, batch_idx: int) -> Tensor:

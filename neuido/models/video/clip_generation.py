@@ -20,7 +20,8 @@ from tqdm import tqdm
 from neuido.data.bodies.families import PARAMETERS, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
-from neuido.data.files.storage import claim, publish, write
+from neuido.data.files.storage import claim, write
+from neuido.data.files.writing import replacing
 from neuido.data.scenes.clips import FORMAT, complete
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
@@ -182,10 +183,8 @@ def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str,
     options = {"size": plan.flow_size, "preset": plan.flow_preset}
     seen = measure_velocities(filmed.pop("images"), filmed.pop("masks"), times, clip.cameras, clip.body.x.mean(0), **options)
     content = {"flow": seen.flow.half(), "cell": seen.cell, "frame_interval": torch.tensor(seen.frame_interval), **filmed}
-    hidden = folder / f".{clip.name}.npz.tmp"
-    with hidden.open("wb") as file:
+    with replacing(folder / f"{clip.name}.npz") as hidden, hidden.open("wb") as file:
         np.savez(file, **{name: t.numpy() for name, t in content.items()})
-    publish(hidden, folder / f"{clip.name}.npz")
 
 
 def _samples(motion: ParticleState, clip: ClipSetup, count: int, seed: int) -> dict[str, Tensor]:

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.data.files.writing import replacing
 from neuido.errors import UserError
 from neuido.types import Cameras
 
@@ -132,11 +133,8 @@ def measure_velocities(
     if found is None:
         found = _crop_flow(optical_flow(images, preset=preset), masks.cpu(), size)
         if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            hidden = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-            with hidden.open("wb") as file:
+            with replacing(path) as hidden, hidden.open("wb") as file:
                 np.savez(file, flow=found[0].numpy(), side=found[1].numpy())
-            os.replace(hidden, path)
     flow, side = found
     return Velocities(flow * (pixel / interval)[:, None, None, None, None], pixel * side / size, interval)
 
