@@ -12,12 +12,13 @@ pin := $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
 bin := $(VENV)/bin
 installed := $(VENV)/.installed
 
-.PHONY: help venv demo test test-slow test-gpu lint format types clean
+.PHONY: help venv demo test test-all test-slow test-gpu lint format types clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make demo      install, then learn laws from bodies and video and close one loop: CPU, minutes'
-	@echo 'make test      run the tests'
+	@echo 'make test      run the fast tests: minutes on two cores'
+	@echo 'make test-all  run every test that needs no GPU'
 	@echo 'make test-slow, test-gpu, lint, format, types, venv, clean'
 
 venv: $(installed)
@@ -36,13 +37,19 @@ $(installed): $(VENV)/.torch pyproject.toml $(CONSTRAINTS)
 demo: $(installed)
 	$(bin)/neuido demo
 
-test: export OMP_NUM_THREADS = 1
-test: $(installed)
-	$(bin)/python -m pytest -m 'not slow and not gpu'
+# One process a core, one thread a process; the tests of a file share their fixtures, so they stay together.
+WORKERS ?= auto
+pytest := $(bin)/python -m pytest -n $(WORKERS) --dist loadfile
 
-test-slow: export OMP_NUM_THREADS = 1
+test test-all test-slow: export OMP_NUM_THREADS = 1
+test: $(installed)
+	$(pytest) -m 'not slow and not gpu'
+
+test-all: $(installed)
+	$(pytest) -m 'not gpu'
+
 test-slow: $(installed)
-	$(bin)/python -m pytest -m slow
+	$(pytest) -m 'slow and not gpu'
 
 # The rollout's tests with every array on the GPU, then the tests that need one (fused laws, graphs, splatting).
 test-gpu: $(installed)
