@@ -86,7 +86,7 @@ class KnownLaw(Method):
         return half * math.atanh((value - low) / half - 1)
 
     def values(self) -> dict[str, Tensor]:
-        """The parameters in SI units and degrees, differentiable, () each."""
+        """Return the parameters in SI units and degrees, differentiable, () each."""
         values = {}
         for name, raw in self.raw.items():
             if name in self.BOUNDS:  # of slope one in the middle, so that a rate has the parameter's own unit (PAC-NeRF)

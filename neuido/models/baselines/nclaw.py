@@ -21,7 +21,7 @@ MATERIALS = {"identity": "jelly", "von_mises": "plasticine", "drucker_prager": "
 
 
 def load_nclaw(path: str | Path) -> tuple[InvariantElastic, InvariantPlastic]:
-    """NCLaw's trained laws (Ma et al. 2023, `InvariantFullMeta`); see `physics.invariants`.
+    """Read NCLaw's trained laws (Ma et al. 2023, `InvariantFullMeta`; see `neuido.physics.laws.neural.invariants`).
 
     Args:
         path: npz file with `elasticity.*` and `plasticity.*`, each `layers.0`, `layers.1` and `final_layer`.
@@ -37,7 +37,7 @@ def load_nclaw(path: str | Path) -> tuple[InvariantElastic, InvariantPlastic]:
 
 
 def read_nclaw_weights(path: str | Path) -> tuple[list[Tensor], list[Tensor]]:
-    """The three layers of the elastic and of the plastic network, (64, 13), (64, 64) and (9, 64) each.
+    """Read the three layers of the elastic and of the plastic network, (64, 13), (64, 64) and (9, 64) each.
 
     Raises:
         UserError: As `load_nclaw`.

@@ -1,8 +1,8 @@
 """A sparse symbolic law found by regression, as a `Method`.
 
 It stands where VisionLaw's search would (Lin et al. 2025), which needs a language model: no text is generated here. A stress is a
-combination of generators times monomials of the strain's invariants (`physics.symbolic`), fitted through simulator and renderer; terms that
-add little are dropped in rounds, and the rest is fitted again (sequential thresholding, Brunton et al. 2016).
+combination of generators times monomials of the strain invariants (`laws.neural.symbolic`), fitted through simulator and renderer; terms
+that add little are dropped in rounds, and the rest is fitted again (sequential thresholding, Brunton et al. 2016).
 """
 
 import math
@@ -51,7 +51,7 @@ class SparseLaw(Method):
         interval: Steps before the first round, and between two.
         rounds: Rounds of dropping; after the last one what is left is fitted to the end.
         sparsity: Weight of the sum of the sizes of all terms but the two linear ones.
-        plausibility_weight: Keeps the stress where it can run (`branch.implausible_stress`).
+        plausibility_weight: Keeps the stress where it can run (`law_properties.implausible_stress`).
         stiffness_rate, shape_rate, yield_rate: Rates of the stress's decimal logarithm, of its terms, and of the logarithms of the radii.
 
     Raises:
@@ -108,14 +108,16 @@ class SparseLaw(Method):
         self.register_buffer("becomes", torch.full((3,), math.nan))
 
     def coefficients(self) -> Tensor:
-        """Of the stress, (4, 7); zero where a term was dropped."""
+        """Return the coefficients of the stress terms, (4, 7); zero where a term was dropped."""
         return 10**self.level * self.active * self.shape * self.gain
 
     def laws(self, scene: PreparedScene) -> Laws:
         return SymbolicElastic(self.coefficients()[None]), SymbolicPlastic(10 ** self.surface[None, :, None])
 
     def rollout(self, scene: PreparedScene, frames: int, **options) -> ParticleState:
-        """As `Method.rollout`. After `interval` more runs with gradients the terms are weighed, and before the next run some dropped."""
+        """Simulate as `Method.rollout`; after each `interval` rollouts with gradients, select terms and drop the others before the next
+        rollout.
+        """
         fitting = torch.is_grad_enabled()
         if fitting:
             if self._due():
@@ -133,7 +135,7 @@ class SparseLaw(Method):
 
     @torch.no_grad()
     def weigh(self, F: Tensor) -> None:
-        """Note which terms count at deformation gradients (n, 3, 3) of a motion under the present law."""
+        """Select the terms that matter at deformation gradients (n, 3, 3) of a motion under the present law."""
         parts = torch.einsum("nk,ngij,gk->ngkij", polynomial(F), generators(F), self.coefficients())
         total = parts.sum((1, 2)).square().mean().sqrt()
         shares = parts.square().mean((0, 3, 4)).sqrt() / total.clamp(min=1e-30)
@@ -153,7 +155,7 @@ class SparseLaw(Method):
 
     @torch.no_grad()
     def drop(self) -> None:
-        """Drop what `weigh` found not to count."""
+        """Drop the terms that `weigh` did not select."""
         self.active.mul_(self.keep)
         self.shape.mul_(self.active)
         self.surface.copy_(torch.where(self.becomes.isnan(), self.surface, self.becomes))
@@ -167,7 +169,7 @@ class SparseLaw(Method):
         return self.sparsity * (size.sum() - size[:2, 0].sum()) + self.plausibility_weight * implausible_stress(law, law.modulus()[0])
 
     def recovery_loss(self) -> Tensor:
-        """The way from the start, of what was not dropped."""
+        """Return the absolute distance of the remaining parameters from their start."""
         alive = (torch.ones_like(self.level), self.active, (self.surface.abs() < UNREACHABLE - 1).detach())
         ways = [(p - start.to(p)).mul(part).abs().sum() for p, start, part in zip(self.trainable().values(), self._start, alive)]
         return torch.stack(ways).sum()

@@ -86,7 +86,7 @@ class SpringMass(Method):
             self.stiffness += math.log10(self.young / float(self.modulus(self.springs()[0])))
 
     def springs(self) -> tuple[Tensor, Tensor]:
-        """Stiffness [N/m] and damping [N s/m] of each spring, (N,)."""
+        """Return stiffness [N/m] and damping [N s/m] of each spring, (N,)."""
         level = self.stiffness
         if self.per == "anchor":
             level = level[self.network.pairs].mean(1)
@@ -97,11 +97,11 @@ class SpringMass(Method):
         return 10**level * weak / rest, damping
 
     def modulus(self, stiffness: Tensor) -> Tensor:
-        """Young's modulus [Pa] of springs in all directions alike, E = sum k L^2 / (6 V), with Poisson's ratio 1/4 (Cauchy), ()."""
+        """Return Young's modulus [Pa] of springs in all directions alike, E = sum k L^2 / (6 V), with Poisson's ratio 1/4 (Cauchy), ()."""
         return (stiffness * self.body.rest.square()).sum() / (6 * self.volume)
 
     def grip(self) -> Tensor:
-        """Share of the tangential velocity that a step on the ground leaves (Spring-Gaus, `fric_k`), (1,)."""
+        """Return share of the tangential velocity that a step on the ground leaves (Spring-Gaus, `fric_k`), (1,)."""
         return (1.2 * self.slide.sigmoid() - 0.1).clamp(0, 1)
 
     def laws(self, scene: PreparedScene) -> Laws:
@@ -116,7 +116,7 @@ class SpringMass(Method):
         effects: Effects | None = None,
         segment: int = 0,
     ) -> ParticleState:
-        """As `Method.rollout`; F stays the identity, and `segment` has no use, since a state here is small.
+        """Simulate as `Method.rollout`; F stays the identity, and `segment` is ignored because a state is small.
 
         Raises:
             UserError: Effects are given; the motion is not finite.
@@ -150,7 +150,7 @@ class SpringMass(Method):
 
 
 def farthest_points(x: Tensor, count: int) -> Tensor:
-    """Indices of points (P, 3) of which each is the farthest from those before; the first is nearest to their mean. (min(count, P),)."""
+    """Pick points (P, 3) by farthest-point sampling, from the one nearest to their mean; return indices (min(count, P),)."""
     count = min(count, len(x))
     distance = (x - x.mean(0)).square().sum(1)
     found = torch.empty(count, dtype=torch.int64, device=x.device)
@@ -164,7 +164,7 @@ def farthest_points(x: Tensor, count: int) -> Tensor:
 
 
 def following(x: Tensor, anchors: Tensor, nearest: int) -> Tensor:
-    """How points (P, 3) follow anchors (A, 3): sparse weights (P, A), one over the square root of the distance (Spring-Gaus)."""
+    """Return the sparse weights (P, A) by which points (P, 3) follow anchors (A, 3): inverse square root of the distance (Spring-Gaus)."""
     from scipy.spatial import cKDTree
 
     nearest = min(nearest, len(anchors))

@@ -47,13 +47,14 @@ class Progress:
     """The first ones that did."""
 
     def record_success(self, fit: nn.Module) -> None:
-        """The parameters have run."""
+        """Record that the present parameters ran, and let the learning rates recover."""
         self.good = snapshot(fit)
         self.first = self.first or self.good
         self.damping = min(1.0, self.damping * RATE_RECOVERY)
 
     def restore_last_good(self, fit: nn.Module, *, ran: bool = False) -> bool:
-        """Go back to the last parameters that ran, halfway to the first ones where those lead nowhere; whether there were any.
+        """Restore the last parameters that ran, or move them halfway to the first ones after repeated failures; return whether there were
+        any.
 
         Args:
             fit: What to bring back.
@@ -69,19 +70,19 @@ class Progress:
         return restore(fit, self.good)
 
     def record_loss(self, value: float, fit: nn.Module, patience: int) -> None:
-        """Take the loss of a fit; `over` becomes true after `patience` steps without a lower one."""
+        """Record the loss of a fit; set `over` after `patience` steps without a lower one."""
         if value < (1 - MIN_IMPROVEMENT) * self.lowest:
             self.lowest, self.lowest_at, self.best = value, self.steps, snapshot(fit)
         elif self.steps - self.lowest_at >= patience:
             self.over = True
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint: `Progress(**state)` is this again."""
+        """Return the content of a checkpoint, from which `Progress(**state)` is made again."""
         return dict(vars(self))
 
 
 def snapshot(fit: nn.Module) -> dict[str, Tensor]:
-    """Copies of a module's trainable parameters."""
+    """Copy a module's trainable parameters."""
     return {name: p.detach().clone() for name, p in fit.named_parameters() if p.requires_grad}
 
 

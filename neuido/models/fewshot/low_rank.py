@@ -43,7 +43,7 @@ class LowRankAdaptation(Method):
         lr: Rate of the adapter.
         latent_lr: Rate of z.
         prior_weight: Pulls z to its start, per squared unit: the mean over z's components.
-        plausibility_weight: Keeps the elastic law where it can run (`branch.implausibility`); paper: 0.
+        plausibility_weight: Keeps the elastic law where it can run (`law_properties.implausibility`); paper: 0.
         seed: Of the adapter's random half; the other half is zero, so that fitting starts at the law of the start.
     """
 
@@ -88,7 +88,7 @@ class LowRankAdaptation(Method):
         return self.tuned if isinstance(self.tuned, IntrinsicDynamicsOperator) else self.tuned.get_base_model()
 
     def _named_start(self) -> Tensor:
-        """The latent of `mean`, of a family, of a Stage I trajectory, or of a law file."""
+        """Return the latent of `mean`, of a family, of a Stage I trajectory, or of a law file."""
         latents = self.operator.latents
         own = [i for i, family in enumerate(self.operator.latent_families) if self.start in ("mean", family)]
         if own:
@@ -104,7 +104,7 @@ class LowRankAdaptation(Method):
         return tensors["z"]
 
     def build(self, scene: PreparedScene) -> None:
-        """z at its start, and the adapter, whose product is zero."""
+        """Create z at its start, and an adapter whose product is zero."""
         device = scene.images.device
         self.tuned.to(device)
         if self.encoder is not None:
@@ -136,13 +136,13 @@ class LowRankAdaptation(Method):
         return total
 
     def recovery_loss(self) -> Tensor:
-        """Towards the mean latent of Stage I, whose law runs, and an adapter of zero."""
-        haven = self.operator.latents.mean(0).to(self.z) if len(self.operator.latents) else torch.zeros_like(self.z)
+        """Return the distance of z from the mean latent of Stage I, whose law runs, and of the adapter from zero."""
+        stable = self.operator.latents.mean(0).to(self.z) if len(self.operator.latents) else torch.zeros_like(self.z)
         adapter = [p.square().mean() for name, p in self.trainable().items() if "lora_B" in name]
-        return (self.z - haven).square().mean() + sum(adapter)
+        return (self.z - stable).square().mean() + sum(adapter)
 
     def merged(self) -> IntrinsicDynamicsOperator:
-        """A plain operator with the adapter added to its weights, by PEFT."""
+        """Return a plain operator with the adapter merged into its weights by PEFT."""
         tuned = copy.deepcopy(self.tuned)
         return tuned if isinstance(tuned, IntrinsicDynamicsOperator) else tuned.merge_and_unload()
 
@@ -153,7 +153,7 @@ class LowRankAdaptation(Method):
         return {"modulus": float(modulus[1]), "latent_moved": moved, "rank": self.rank, "latent": self.z.tolist()}
 
     def save(self, folder: Path) -> None:
-        """Write PEFT's two files, z, the law (`results.save_law`), and `method.json`."""
+        """Write PEFT's two files, z, the law (`law_file.save_law`), and `method.json`."""
         folder.mkdir(parents=True, exist_ok=True)
         if self.rank:
             hidden = folder / f".{uuid.uuid4().hex}.tmp"
@@ -199,7 +199,7 @@ class LowRankAdaptation(Method):
 
 
 def load_adapter(operator: IntrinsicDynamicsOperator, folder: Path) -> nn.Module:
-    """The operator with an adapter in PEFT's format.
+    """Wrap the operator with an adapter in PEFT's format.
 
     Raises:
         UserError: A file that is missing, damaged, or for other layers.
@@ -220,7 +220,7 @@ def load_adapter(operator: IntrinsicDynamicsOperator, folder: Path) -> nn.Module
 
 
 def fingerprint(operator: nn.Module) -> str:
-    """Twelve hexadecimal digits of the weights' SHA-256: an adapter is of use with the weights that it was fitted on alone."""
+    """Return twelve hexadecimal digits of the weights' SHA-256: an adapter fits only the weights that it was trained on."""
     digest = hashlib.sha256()
     for name, tensor in sorted(operator.state_dict().items()):
         digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())

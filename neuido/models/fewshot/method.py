@@ -1,4 +1,4 @@
-"""Ways to fit the law of one scene to its images, behind one interface: ours (`adapter`) and those of the peers (`baselines`).
+"""Ways to fit the law of one scene to its images, behind one interface: ours (`low_rank`) and those of the peers (`baselines`).
 
 `AdaptModule` trains any of them: it draws the motion of `Method.rollout`, compares images, and steps over the method's parameters.
 """
@@ -44,7 +44,7 @@ class Method(nn.Module):
     encoder: DynamicsEncoder | None = None
 
     def for_scene(self, scene: PreparedScene) -> Self:
-        """A copy with the parameters of a scene, on its device; the encoder is shared."""
+        """Copy the method with parameters for one scene, on its device; the encoder is shared."""
         own = copy.deepcopy(self, {id(self.encoder): self.encoder})
         own.build(scene)
         own.to(scene.images.device)
@@ -52,10 +52,10 @@ class Method(nn.Module):
         return own
 
     def build(self, scene: PreparedScene) -> None:
-        """Make the scene's parameters, with the values from which they start; the same ones each time (seed what is random)."""
+        """Create the scene's parameters at their start values, the same ones at each call (seed what is random)."""
 
     def laws(self, scene: PreparedScene) -> Laws:
-        """The elastic and the plastic law for a rollout of the scene; their tensors are graph nodes of the parameters."""
+        """Return the elastic and the plastic law of the scene; their tensors are graph nodes of the parameters."""
         raise NotImplementedError
 
     def rollout(
@@ -67,7 +67,7 @@ class Method(nn.Module):
         effects: Effects | None = None,
         segment: int = 0,
     ) -> ParticleState:
-        """The motion over the first `frames` frames, differentiable in parameters and `state`; another kind of simulation overrides it.
+        """Simulate the first `frames` frames, differentiably in parameters and `state`; other kinds of simulation override this.
 
         Args:
             scene: The scene; its step may be finer than that of `build` (`pipeline.rollout_with_retries`).
@@ -85,32 +85,32 @@ class Method(nn.Module):
         return rollout_laws(scene, self.laws(scene), frames, segment=segment, state=state, effects=effects)
 
     def trainable(self) -> dict[str, nn.Parameter]:
-        """The parameters that are fitted, by name."""
+        """Return the parameters that are fitted, by name."""
         return {name: p for name, p in self.named_parameters() if p.requires_grad}
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Groups for the optimiser, each with `params` and its rate `lr`."""
+        """Return groups for the optimiser, each with `params` and its rate `lr`."""
         return [{"params": list(self.trainable().values()), "lr": self.lr}] if self.trainable() else []
 
     def optimizer(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-        """The optimiser over the groups of all scenes."""
+        """Return the optimiser over the groups of all scenes."""
         return torch.optim.AdamW(groups, weight_decay=0.0)
 
     def rate(self, done: float) -> float:
-        """Factor on the rates when the share `done` of a scene's steps is done: a cosine to zero."""
+        """Return the factor on the learning rates after the share `done` of a scene's steps: a cosine to zero."""
         return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
 
     def regulariser(self) -> Tensor | float:
-        """What is added to the loss of the images."""
+        """Return the regularisation term of the loss."""
         return 0.0
 
     def recovery_loss(self) -> Tensor:
-        """The loss of a step whose law could not run: the mean square of the way from the start."""
+        """Return the loss of a step whose law could not run: the mean squared distance from the start."""
         parts = [(p - start.to(p)).square().sum() for p, start in zip(self.trainable().values(), self._start)]
         return torch.stack(parts).sum() / max(1, sum(start.numel() for start in self._start))
 
     def describe(self) -> dict[str, Any]:
-        """What was identified, as numbers, words and lists of numbers: parameters in SI units, moduli, the latent."""
+        """Return what was identified, as numbers, words and lists of numbers: parameters in SI units, moduli, the latent."""
         return {}
 
     def save(self, folder: Path) -> None:
@@ -120,7 +120,7 @@ class Method(nn.Module):
         self.write_card(folder)
 
     def card(self) -> dict[str, Any]:
-        """What `method.json` says: the method's name and `describe`."""
+        """Return the content of `method.json`: the method's name and `describe`."""
         return {"format": FORMAT, "method": type(self).__name__, "found": self.describe()}
 
     def write_card(self, folder: Path) -> None:
@@ -144,7 +144,7 @@ class Method(nn.Module):
                 p.copy_(given[name])
 
     def check_card(self, folder: Path) -> dict[str, Any]:
-        """The content of `method.json`.
+        """Read `method.json` and check that it belongs to this method.
 
         Raises:
             UserError: It is missing, or another method wrote it.
@@ -181,7 +181,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def scalars(found: dict[str, Any]) -> dict[str, Any]:
-    """Those entries of `describe` that fit into a table: numbers and words."""
+    """Select the entries of `describe` that fit into a table: numbers and words."""
     return {name: value for name, value in found.items() if isinstance(value, int | float | str)}
 
 

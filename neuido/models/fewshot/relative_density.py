@@ -41,7 +41,7 @@ class RelativeDensity(nn.Module):
             self.fields.append(nn.Parameter(x.new_zeros(size)))
 
     def forward(self) -> Tensor:
-        """The factor of each particle [-], (P,), of mean one over the volume."""
+        """Return the relative density of each particle [-], (P,), with mean one over the volume."""
         total = self.fields[0].new_zeros(())
         for level, field in enumerate(self.fields):
             total = total + (field[getattr(self, f"index_{level}")] * getattr(self, f"weight_{level}")).sum(1)
@@ -49,7 +49,7 @@ class RelativeDensity(nn.Module):
         return factor * (self.volume.sum() / (self.volume * factor).sum())
 
     def prior(self) -> Tensor:
-        """Mean square of the logarithm over the volume, (): zero where the body is filled evenly."""
+        """Return mean square of the logarithm over the volume, (): zero where the body is filled evenly."""
         return (self.volume * self().log().square()).sum() / self.volume.sum()
 
     def save(self, path: Path) -> None:
@@ -73,7 +73,7 @@ class RelativeDensity(nn.Module):
 
 
 def lattice(x: Tensor, h: float) -> tuple[Tensor, Tensor, int]:
-    """Trilinear weights of points on a lattice of spacing h that holds them.
+    """Return trilinear weights of points on a lattice of spacing h that holds them.
 
     Args:
         x: Points [m], (P, 3).

@@ -21,7 +21,7 @@ class EffectSource:
     """Where effects come from that act on top of a scene's law, known and not fitted; YAML gives a subclass by `class_path`."""
 
     def of(self, scene: PreparedScene) -> Effects:
-        """The effects for a rollout of the scene, whose step may be finer than the recording's."""
+        """Return the effects for a rollout of the scene, whose step may be finer than the recording's."""
         raise NotImplementedError
 
 
@@ -49,7 +49,7 @@ class SceneFit(nn.Module):
         """Velocity of the centre [m/s] and angular velocity about it [rad/s]."""
 
     def rollout(self, scene: PreparedScene, frames: int, segment: int = 0) -> ParticleState:
-        """`Method.rollout` from the start of this fit."""
+        """Simulate with `Method.rollout` from the start state of this fit."""
         effects = None if self.effects is None else self.effects.of(scene)
         if self.density is not None:
             effects, own = Effects() if effects is None else effects, self.density()
@@ -58,7 +58,7 @@ class SceneFit(nn.Module):
         return self.method.rollout(scene, frames, state=self.start(scene.simulator), effects=effects, segment=segment)
 
     def start(self, simulator: Simulator) -> ParticleState | None:
-        """The state at t = 0; none: the body's own."""
+        """Return the state at t = 0; None where it is the body's own."""
         if self.twist is None:
             return None
         linear, angular = self.twist.to(simulator.dtype)
@@ -70,12 +70,12 @@ class SceneFit(nn.Module):
         return ParticleState(x, v + linear + (x - centre) @ spin.T, C + spin, F)
 
     def regulariser(self, density_weight: float = 0.0) -> Tensor | float:
-        """`Method.regulariser`, and so many times the relative density's prior."""
+        """Return `Method.regulariser` plus the relative density's prior times `density_weight`."""
         total = self.method.regulariser()
         return total if self.density is None else total + density_weight * self.density.prior()
 
     def save(self, folder: Path) -> None:
-        """`Method.save`, the correction of the velocity, and the relative density."""
+        """Write the method, the correction of the velocity, and the relative density."""
         self.method.save(folder)
         if self.density is not None:
             self.density.save(folder / DENSITY)
@@ -98,7 +98,7 @@ class SceneFit(nn.Module):
             self.twist = nn.Parameter(found.to(next(self.buffers(), found).device))
 
     def describe(self) -> dict[str, Any]:
-        """What was found, the correction of the velocity and the spread of the density's logarithm included."""
+        """Return what was identified, with the correction of the velocity and the spread of the density's logarithm."""
         found = self.method.describe()
         if self.density is not None:
             found = found | {"density_spread": float(self.density.prior().detach().sqrt())}

@@ -43,7 +43,7 @@ def save_law(path: str | os.PathLike, operator: IntrinsicDynamicsOperator, z: Te
 
 
 def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
-    """The laws of a file of `save_law`, for a rollout; the operator is not needed.
+    """Read the laws of a file of `save_law`, for a rollout; the operator is not needed.
 
     Raises:
         UserError: No such file, or not one of this kind.

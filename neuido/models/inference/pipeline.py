@@ -22,7 +22,7 @@ from neuido.types import ParticleState
 
 
 def rollout_laws(prepared: PreparedScene, laws: Laws, frames: int, *, segment: int = 0, **options: Any) -> ParticleState:
-    """The motion under an elastic and a plastic law: the first `frames` frames of the recording's.
+    """Simulate the first `frames` frames of a recording under an elastic and a plastic law.
 
     Args:
         prepared: The scene.
@@ -45,14 +45,14 @@ def rollout_laws(prepared: PreparedScene, laws: Laws, frames: int, *, segment: i
 def rollout_latent(
     prepared: PreparedScene, operator: IntrinsicDynamicsOperator, z: Tensor, frames: int | None = None, *, segment: int = 0
 ) -> ParticleState:
-    """`rollout_laws` of the laws of z (d,), over the first `frames` frames or all."""
+    """Simulate the first `frames` frames, or all, under the laws of z (d,)."""
     return rollout_laws(prepared, operator.laws(z), frames or prepared.frames, segment=segment)
 
 
 def rollout_with_retries(
     prepared: PreparedScene, run: Callable[[PreparedScene], ParticleState], halvings: int = 2
 ) -> tuple[ParticleState, int]:
-    """The frames of `run`, and how often the substep was halved, at most `halvings` times, because it had failed.
+    """Return the motion of `run` and the number of halvings of the time step, at most `halvings`, that it took to run.
 
     Raises:
         UserError: As `run`, with the smallest substep too.
@@ -67,7 +67,7 @@ def rollout_with_retries(
 
 
 def with_finer_steps(prepared: PreparedScene, times: int) -> PreparedScene:
-    """The same scene with a substep that is so many times smaller; its rollouts are not captured as graphs."""
+    """Return the scene with a time step `times` times smaller; its rollouts are not captured as graphs."""
     source = prepared.source
     finer = replace(source.scene, dt=source.scene.dt / times)
     simulator = Simulator(finer, source.body, density=source.density, device=prepared.simulator.device, graphs=False)
@@ -75,7 +75,7 @@ def with_finer_steps(prepared: PreparedScene, times: int) -> PreparedScene:
 
 
 def render_motion(prepared: PreparedScene, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:
-    """Images (K, V, H, W, 3) and alphas (K, V, H, W) of a motion of K frames."""
+    """Render a motion of K frames: images (K, V, H, W, 3) and alphas (K, V, H, W)."""
     moved = deform(prepared.gaussians, motion.F, motion.x, prepared.binding)
     return render(moved, prepared.views(views), background=prepared.background)
 
@@ -91,7 +91,7 @@ class Inference(NamedTuple):
 
 @torch.no_grad()
 def infer_latent(encoder: DynamicsEncoder, operator: IntrinsicDynamicsOperator, prepared: PreparedScene, *, repeat: int = 5) -> Inference:
-    """One pass of the encoder, and the time it takes to a law that can run."""
+    """Infer the latent of a scene in one pass of the encoder, and measure the time until its law can run."""
     was_training = encoder.training
     encoder.eval()
     times = []
@@ -113,7 +113,7 @@ def _wait(t: Tensor) -> None:
 
 
 def carry_points(rest: Tensor, points: Tensor, x: Tensor, nearest: int = 8) -> Tensor:
-    """Where material points go that are no particles: each with the weighted mean displacement of the particles about it.
+    """Carry points that are no particles with a motion: each moves with the weighted mean displacement of nearby particles.
 
     Args:
         rest: Particles at t = 0 [m], (P, 3).

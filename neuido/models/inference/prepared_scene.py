@@ -58,7 +58,7 @@ class PreparedScene(NamedTuple):
         return self.every if self.recorded_frames is None else self.every * STEPS_PER_INTERVAL
 
     def substeps(self, frames: int) -> int:
-        """Substeps of a rollout from the first to the last of so many frames."""
+        """Return substeps of a rollout from the first to the last of so many frames."""
         return self.every * (frames - 1 if self.recorded_frames is None else self.recorded_frames[frames - 1])
 
     @property
@@ -68,15 +68,15 @@ class PreparedScene(NamedTuple):
         return held or list(range(len(self.images)))
 
     def views(self, views: list[int]) -> Cameras:
-        """The cameras of some views."""
+        """Return the cameras of some views."""
         return self.cameras._replace(viewmats=self.cameras.viewmats[views], Ks=self.cameras.Ks[views])
 
     def recorded(self, views: list[int], frames: int | None = None) -> Tensor:
-        """Recorded images in [0, 1], (T, V, H, W, 3)."""
+        """Return recorded images in [0, 1], (T, V, H, W, 3)."""
         return self.images[views, :frames].transpose(0, 1).float().div_(255)
 
     def silhouettes(self, views: list[int], frames: int | None = None) -> Tensor:
-        """Recorded masks in [0, 1], (T, V, H, W)."""
+        """Return recorded masks in [0, 1], (T, V, H, W)."""
         return self.masks[views, :frames].transpose(0, 1).float().div_(255)
 
 
@@ -145,7 +145,7 @@ def prepare(
 
 
 def frame_substeps(times: Tensor, dt: float, name: str) -> tuple[int, tuple[int, ...] | None]:
-    """Substeps from one frame of a rollout to the next, and which frames are the recording's, none where its times are even (to 1 %).
+    """Return the substeps between frames of a rollout, and the indices of the recorded frames (None where times are even to 1 %).
 
     Uneven times are rounded to a fiftieth of the mean interval.
 

@@ -143,7 +143,7 @@ def simulate_condition(condition: Condition, known: list[tuple[PreparedScene, La
 
 
 def run_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]], out: str | os.PathLike) -> Path:
-    """`simulate_condition`, and write its particles, video and picture; the folder."""
+    """Simulate a condition, write its particles, video and picture, and return the folder."""
     motion, gaussians, first = simulate_condition(condition, known)
     with torch.no_grad():
         images = render(gaussians, first.views([first.scoring_views[0]]), background=first.background)[0][:, 0]
@@ -166,7 +166,7 @@ def _find(known: list[tuple[PreparedScene, Laws]], of: int | str) -> tuple[Prepa
 
 
 def _place(body: BodyCondition, prepared: PreparedScene) -> tuple[Body, Gaussians]:
-    """The body and its Gaussians at t = 0."""
+    """Place the body and its Gaussians at t = 0."""
     own, gaussians = prepared.source.body, prepared.gaussians
     if body.shape is not None:
         shape = body.shape

@@ -47,15 +47,15 @@ class Trunk(nn.Module):
         self.out = nn.Linear(hidden_dim, basis_dim * outputs)
 
     def hidden(self, features: Tensor) -> Tensor:
-        """(..., 9) -> (..., hidden_dim)."""
+        """Return the last hidden layer, (..., 9) -> (..., hidden_dim)."""
         return functional.silu(self.fc2(functional.silu(self.fc1(features))))
 
     def forward(self, features: Tensor) -> Tensor:
-        """The basis functions, (..., 9) -> (..., D, n)."""
+        """Evaluate the basis functions, (..., 9) -> (..., D, n)."""
         return self.out(self.hidden(features)).unflatten(-1, (self.basis_dim, self.outputs))
 
     def contract(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        """The last layer of the effective networks of S materials: lambda (S, D) -> W3 (S, n, hidden_dim), b3 (S, n)."""
+        """Contract the last layer with the coefficients of S materials: lambda (S, D) -> W3 (S, n, hidden_dim), b3 (S, n)."""
         weight, bias = affine(self.out)
         weight = weight.reshape(self.basis_dim, -1)
         return (coefficients @ weight).view(-1, self.outputs, self.out.in_features), coefficients @ bias.view(self.basis_dim, -1)
@@ -69,7 +69,7 @@ class Head(nn.Sequential):
 
 
 def affine(layer: nn.Module) -> tuple[Tensor, Tensor]:
-    """Weight and bias of a linear layer, also of one that an adapter wraps (found by applying it to the unit vectors)."""
+    """Return weight and bias of a linear layer, also of one that an adapter wraps (found by applying it to the unit vectors)."""
     if type(layer) is nn.Linear:
         return layer.weight, layer.bias
     like = next(layer.parameters())
@@ -139,7 +139,7 @@ class IntrinsicDynamicsOperator(nn.Module):
         self.latents, self.latent_names, self.latent_families = latents.detach().clone(), list(names), list(families)
 
     def latent(self, name: str) -> Tensor:
-        """The latent (d,) of a training trajectory.
+        """Return the latent (d,) of a training trajectory.
 
         Raises:
             UserError: no trajectory has this name.
@@ -149,16 +149,16 @@ class IntrinsicDynamicsOperator(nn.Module):
         return self.latents[self.latent_names.index(name)].to(self.elastic_trunk.fc1.weight)
 
     def random_latents(self, count: int, generator: torch.Generator) -> Tensor:
-        """Latents (count, d) from a normal distribution with the mean and, component by component, the deviation of the trained ones."""
+        """Draw latents (count, d) from a normal distribution with the mean and componentwise deviation of the trained ones."""
         mean, deviation = self.latents.mean(0), self.latents.std(0)
         return mean + deviation * torch.randn(count, self.latent_dim, generator=generator).to(mean)
 
     def coefficients(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """lambda^E and lambda^P, (S, D) each, of z (S, d)."""
+        """Return lambda^E and lambda^P, (S, D) each, of z (S, d)."""
         return self.elastic_head(z), self.plastic_head(z)
 
     def features(self, F: Tensor) -> Tensor:
-        """What the trunks see of F (..., 3, 3): (..., 9)."""
+        """Return the input of the trunks, (..., 9), of F (..., 3, 3)."""
         if self.trunk == "raw":
             return networks.raw_features(F)
         if F.requires_grad:
@@ -166,12 +166,12 @@ class IntrinsicDynamicsOperator(nn.Module):
         return networks.compute_strain_features(F.reshape(-1, 3, 3)).view(*F.shape[:-2], 9)
 
     def basis(self, F: Tensor) -> tuple[Tensor, Tensor]:
-        """The elastic and the plastic basis functions at F (..., 3, 3), (..., D, n) each."""
+        """Evaluate the elastic and the plastic basis functions at F (..., 3, 3), (..., D, n) each."""
         features = self.features(F)
         return self.elastic_trunk(features), self.plastic_trunk(features)
 
     def elastic(self, z: Tensor, F: Tensor) -> Tensor:
-        """Kirchhoff stress [Pa] (S, n, 3, 3) of n deformation gradients F (S, n, 3, 3) for each of S latents z (S, d)."""
+        """Evaluate the Kirchhoff stress [Pa] (S, n, 3, 3) at deformation gradients F (S, n, 3, 3) for S latents z (S, d)."""
         y = self._outputs(self.elastic_trunk, self.elastic_head(z), F)
         if self.trunk == "raw":
             return networks.RAW_STRESS_SCALE * y.unflatten(-1, (3, 3))
@@ -180,7 +180,7 @@ class IntrinsicDynamicsOperator(nn.Module):
         return networks.StressReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRESS_SCALE).view(F.shape)
 
     def plastic(self, z: Tensor, F: Tensor) -> Tensor:
-        """Corrected deformation gradient (S, n, 3, 3) of trial ones F (S, n, 3, 3) for each of S latents z (S, d)."""
+        """Correct trial deformation gradients F (S, n, 3, 3) for S latents z (S, d); returns (S, n, 3, 3)."""
         y = self._outputs(self.plastic_trunk, self.plastic_head(z), F)
         if self.trunk == "raw":
             return F + networks.STRAIN_SCALE * y.unflatten(-1, (3, 3))
@@ -193,7 +193,7 @@ class IntrinsicDynamicsOperator(nn.Module):
         return torch.baddbmm(bias.unsqueeze(1), trunk.hidden(self.features(F)), weight.mT)
 
     def laws(self, z: Tensor) -> tuple[RawElastic | ObjectiveElastic, RawPlastic | ObjectivePlastic]:
-        """The laws of S scenes for a rollout, from z (S, d) or (d,); their tensors are graph nodes of z and of all weights."""
+        """Return the laws of S scenes for a rollout, from z (S, d) or (d,); their tensors are graph nodes of z and of all weights."""
         elastic, plastic = self.coefficients(z.reshape(-1, self.latent_dim))
         return self._elastic_law(*_effective(self.elastic_trunk, elastic)), self._plastic_law(*_effective(self.plastic_trunk, plastic))
 

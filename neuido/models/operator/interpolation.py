@@ -70,7 +70,7 @@ def interpolate(
 
 
 def softest_and_stiffest(operator: IntrinsicDynamicsOperator, family: str = "elastic") -> tuple[str, str]:
-    """The names of a family's latents with the smallest and the largest small-strain modulus.
+    """Return the names of a family's latents with the smallest and the largest small-strain modulus.
 
     Raises:
         UserError: A family of fewer than two latents.
@@ -85,7 +85,7 @@ def softest_and_stiffest(operator: IntrinsicDynamicsOperator, family: str = "ela
 
 
 def monotonicity(values: Sequence[float]) -> dict[str, float]:
-    """How steadily values go from the first to the last one.
+    """Measure how steadily values go from the first to the last one.
 
     Returns:
         `steps`: the share of steps that go the way of the ends; `spearman`: the rank correlation with the order, its sign that of the ends
@@ -103,7 +103,7 @@ def monotonicity(values: Sequence[float]) -> dict[str, float]:
 
 @torch.no_grad()
 def pairwise_monotonicity(operator: IntrinsicDynamicsOperator, family: str, *, count: int = 9) -> dict[str, float]:
-    """Monotonicity of the small-strain modulus between any two latents of a family.
+    """Measure the monotonicity of the small-strain modulus between any two latents of a family.
 
     Returns:
         `pairs`; `monotone`: the share of pairs that are monotone in every step; `steps` and `spearman`: means over the pairs. Pairs whose

@@ -27,7 +27,7 @@ SPACES = {
 
 
 def require_sklearn(what: str) -> Any:
-    """scikit-learn.
+    """Import scikit-learn.
 
     Raises:
         UserError: It is not installed.
@@ -40,7 +40,7 @@ def require_sklearn(what: str) -> Any:
 
 
 def strains(count: int = 48, *, seed: int = 0) -> Tensor:
-    """Deformation gradients (n, 3, 3) on which laws are compared: I plus normal noise of 0.02 to 0.2, those with a sound volume."""
+    """Return deformation gradients (n, 3, 3) on which laws are compared: I plus normal noise of 0.02 to 0.2, those with a sound volume."""
     generator = torch.Generator().manual_seed(seed)
     spread = torch.tensor([0.02, 0.05, 0.1, 0.2]).repeat_interleave(-(-count // 4))[:, None, None]
     F = torch.eye(3) + spread * torch.randn(len(spread), 3, 3, generator=generator)
@@ -49,8 +49,8 @@ def strains(count: int = 48, *, seed: int = 0) -> Tensor:
 
 @torch.no_grad()
 def law_responses(operator: IntrinsicDynamicsOperator, z: Tensor) -> Tensor:
-    """What the laws of z (S, d) say on `strains`, (S, 18 n): stress over its norm, and plastic correction over the largest norm of a
-    training trajectory's.
+    """Return the response of the laws of z (S, d) on `strains`, (S, 18 n): normalised stress, and plastic correction over the largest
+    norm of a training trajectory's.
     """
     stress, plastic = _evaluate_laws(operator, z)
     scale = _evaluate_laws(operator, operator.latents.to(z))[1].norm(dim=1).max().clamp(min=1e-12)
@@ -65,7 +65,7 @@ def _evaluate_laws(operator: IntrinsicDynamicsOperator, z: Tensor) -> tuple[Tens
 
 @torch.no_grad()
 def latent_spaces(operator: IntrinsicDynamicsOperator) -> dict[str, np.ndarray]:
-    """The latents of an operator in each of `SPACES`, (M, ...)."""
+    """Return the latents of an operator in each of `SPACES`, (M, ...)."""
     from sklearn.decomposition import PCA
 
     z = operator.latents.to(operator.elastic_trunk.fc1.weight)
@@ -83,7 +83,7 @@ def latent_spaces(operator: IntrinsicDynamicsOperator) -> dict[str, np.ndarray]:
 
 
 def silhouettes(operator: IntrinsicDynamicsOperator, plane: np.ndarray | None = None) -> list[dict[str, Any]]:
-    """The mean silhouette by family in each space, over all latents and over each family's own; the first row is the latents' own.
+    """Compute the mean silhouette by family in each space, over all latents and over each family's own; the first row is of z itself.
 
     `neighbours` is the share of the latents whose nearest other one is of their family.
 
@@ -118,7 +118,7 @@ def _families(operator: IntrinsicDynamicsOperator) -> np.ndarray:
 
 
 def tsne(operator: IntrinsicDynamicsOperator, *, perplexity: float = 10.0, seed: int = 0) -> list[dict[str, Any]]:
-    """t-SNE of the latents as they are, a row a latent: name, family, x, y, and the small-strain modulus [Pa] of its law.
+    """Embed the latents in the plane by t-SNE: a row each with name, family, x, y, and the small-strain P-wave modulus [Pa].
 
     Raises:
         UserError: No scikit-learn, or a perplexity that is not below the number of latents.
@@ -137,7 +137,7 @@ def tsne(operator: IntrinsicDynamicsOperator, *, perplexity: float = 10.0, seed:
 
 
 def active_directions(operator: IntrinsicDynamicsOperator, *, kept: Sequence[int] = (2, 5, 10, 20, 40)) -> list[dict[str, Any]]:
-    """How few directions of the latents the laws feel: the rest is what the start of Stage I left, and widens the families.
+    """Measure how few directions of the latent space the laws depend on; the others keep the random start of Stage I.
 
     The directions are those along which the answers of the laws change most: the leading eigenvectors of the mean of J^T J, J the
     derivative of `law_responses` by z, by central differences at each latent.
@@ -172,7 +172,7 @@ def active_directions(operator: IntrinsicDynamicsOperator, *, kept: Sequence[int
 
 
 def _sensitive_directions(operator: IntrinsicDynamicsOperator, z: Tensor, step: float = 0.05) -> Tensor:
-    """Orthonormal directions (d, d), those that the laws feel most first."""
+    """Return orthonormal directions (d, d), ordered by how much the laws depend on them, most first."""
     steps = step * torch.eye(z.shape[1]).to(z)
     gram = torch.zeros(z.shape[1], z.shape[1], dtype=torch.float64)
     for own in z:

@@ -46,7 +46,7 @@ def small_strain_moduli(operator: IntrinsicDynamicsOperator, z: Tensor, strain: 
 
 
 def p_wave_modulus(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = 3e-3) -> Tensor:
-    """P-wave modulus [Pa] (S,) of the laws of z (S, d), as a secant over F_11 = 1 +- strain; differentiable."""
+    """Return the P-wave modulus [Pa] (S,) of the laws of z (S, d), as a secant over F_11 = 1 +- strain; differentiable."""
     F = torch.eye(3, dtype=z.dtype, device=z.device).expand(len(z), 2, 3, 3).clone()
     F[:, 0, 0, 0] += strain
     F[:, 1, 0, 0] -= strain
@@ -55,13 +55,13 @@ def p_wave_modulus(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float
 
 
 def implausibility(operator: IntrinsicDynamicsOperator, z: Tensor) -> Tensor:
-    """`implausible_stress` of the elastic law of z (d,); zero for all laws of Stage I's kind."""
+    """Return `implausible_stress` of the elastic law of z (d,); zero for all laws of Stage I's kind."""
     modulus = p_wave_modulus(operator, z[None])[0]
     return implausible_stress(lambda F: operator.elastic(z[None], F[None])[0], modulus)
 
 
 def implausible_stress(stress: Callable[[Tensor], Tensor], modulus: Tensor, samples: int = 48) -> Tensor:
-    """How far an elastic law is from one that a rollout survives, at strains up to 0.4.
+    """Penalise an elastic law that a rollout would not survive, at strains up to 0.4.
 
     A stress that points against its strain, or one more than three times the small-strain modulus times the strain, makes a body explode
     in some later contact, and images say so too late.

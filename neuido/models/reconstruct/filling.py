@@ -39,19 +39,19 @@ class Volume(NamedTuple):
     """Edge of a cell [m]."""
 
     def centres(self) -> Tensor:
-        """Centres of the cells [m], (X, Y, Z, 3)."""
+        """Return centres of the cells [m], (X, Y, Z, 3)."""
         axes = [torch.arange(n, device=self.lower.device) + 0.5 for n in self.values.shape]
         return self.lower + self.spacing * torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
 
     def at(self, x: Tensor) -> Tensor:
-        """The field at points x [m] (N, 3), linear between centres and zero outside, (N,)."""
+        """Interpolate the field at points x [m] (N, 3), linearly between centres and zero outside, (N,)."""
         size = torch.tensor(self.values.shape, device=x.device) * self.spacing
         unit = 2 * (x - self.lower) / size - 1
         grid = unit[:, [2, 1, 0]].view(1, -1, 1, 1, 3).to(self.values)  # grid_sample wants the last axis first
         return torch.nn.functional.grid_sample(self.values[None, None], grid, align_corners=False).view(-1)
 
     def measure_volume(self, level: float = LEVEL, finer: int = 3) -> float:
-        """Volume where the field exceeds the level [m^3], counted on a grid `finer` times finer."""
+        """Measure the volume where the field exceeds the level [m^3], on a grid `finer` times finer."""
         step = self.spacing / finer
         offsets = (torch.arange(finer, device=self.lower.device) + 0.5) * step - 0.5 * self.spacing
         centres, total = self.centres().reshape(-1, 3), 0
@@ -63,7 +63,7 @@ class Volume(NamedTuple):
 
 
 def visual_hull(masks: Tensor, cameras: Cameras, lower: Vector, upper: Vector, *, resolution: int = 96) -> Volume:
-    """The largest body that the masks allow.
+    """Carve the visual hull: the largest body that all masks allow.
 
     A point counts as the least of what the masks say where it is seen; a camera that does not see it says nothing.
 
@@ -92,7 +92,7 @@ def visual_hull(masks: Tensor, cameras: Cameras, lower: Vector, upper: Vector, *
 
 
 def opacity_volume(gaussians: Gaussians, *, spacing: float, hull: Volume | None = None) -> Volume:
-    """The opacity of Gaussians, 1 - prod(1 - o exp(-d^2 / 2)), one in all enclosed cells, and not outside the hull.
+    """Return the opacity of Gaussians, 1 - prod(1 - o exp(-d^2 / 2)), one in all enclosed cells, and at most that of the hull.
 
     Args:
         gaussians: At t = 0.
@@ -120,7 +120,7 @@ def opacity_volume(gaussians: Gaussians, *, spacing: float, hull: Volume | None 
 def fill(
     volume: Volume, *, count: int | None = None, spacing: float | None = None, method: str = "voxel", level: float = LEVEL, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Particles inside a volume.
+    """Fill a volume with particles.
 
     Args:
         volume: Where the body is.
@@ -178,7 +178,7 @@ def _carve(masks: Tensor, cameras: Cameras, lower: Tensor, upper: Tensor, resolu
 
 
 def _transmittance(gaussians: Gaussians, lower: Tensor, spacing: float, shape: list[int]) -> Tensor:
-    """prod(1 - o exp(-d^2 / 2)) at the cells' centres, (X, Y, Z).
+    """Return prod(1 - o exp(-d^2 / 2)) at the cells' centres, (X, Y, Z).
 
     Gaussians are at least a third of a cell wide, so that none slips through.
     """
@@ -201,7 +201,7 @@ def _transmittance(gaussians: Gaussians, lower: Tensor, spacing: float, shape: l
 
 
 def _fill_enclosed(solid: np.ndarray, share: int = 24) -> np.ndarray:
-    """Cells from which at least `share` of the 26 rays to the sides, edges and corners of a cube meet another that is solid."""
+    """Return cells from which at least `share` of the 26 rays to the sides, edges and corners of a cube meet another that is solid."""
     hits = np.zeros(solid.shape, dtype=np.int8)
     for direction in itertools.product((-1, 0, 1), repeat=3):
         axis = next((a for a, step in enumerate(direction) if step), None)
@@ -218,13 +218,13 @@ def _fill_enclosed(solid: np.ndarray, share: int = 24) -> np.ndarray:
 
 
 def _shift(plane: np.ndarray, by: list[int]) -> np.ndarray:
-    """plane[i + by[0], j + by[1]], and False from outside."""
+    """Return plane[i + by[0], j + by[1]], False outside."""
     padded = np.pad(plane, 1)
     return padded[1 + by[0] : 1 + by[0] + plane.shape[0], 1 + by[1] : 1 + by[1] + plane.shape[1]]
 
 
 def _lattice(volume: Volume, edge: float, level: float, generator: np.random.Generator) -> Tensor:
-    """One jittered point in each cube of a lattice whose middle lies in the volume."""
+    """Return One jittered point in each cube of a lattice whose middle lies in the volume."""
     counts = [math.ceil(n * volume.spacing / edge) for n in volume.values.shape]
     axes = [torch.arange(n, dtype=torch.float32) + 0.5 for n in counts]
     cell = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -234,7 +234,7 @@ def _lattice(volume: Volume, edge: float, level: float, generator: np.random.Gen
 
 
 def _poisson(volume: Volume, edge: float, level: float, generator: np.random.Generator) -> Tensor:
-    """Poisson disks: candidates in random order, each taken unless one that was taken lies closer than the distance.
+    """Sample Poisson disks: candidates in random order, each taken unless a taken one lies closer than the distance.
 
     All candidates that come first among their neighbours are taken at once, which gives the same as one by one.
     """

@@ -80,12 +80,12 @@ class ReconstructModule(LightningModule):
         self.hull: Volume | None = None
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians, differentiable in the parameters."""
+        """Return the Gaussians, differentiable in the parameters."""
         covariances = covariances_of(self.log_scales.exp(), self.quaternions)
         return Gaussians(self.means, covariances, self.logits.sigmoid(), self.harmonics)
 
     def render(self, cameras: Cameras, background: Tensor) -> tuple[Tensor, Tensor]:
-        """Images (V, H, W, 3) over the background (3,), and alphas (V, H, W)."""
+        """Render images (V, H, W, 3) over the background (3,), and alphas (V, H, W)."""
         g = self.gaussians()
         return rasterize(g.means, g.covariances, g.opacities, g.harmonics, *cameras, sh_degree=0, background=background)
 
@@ -123,7 +123,7 @@ class ReconstructModule(LightningModule):
         self.gradient = torch.zeros(len(x), device=x.device)
 
     def _seen(self, x: Tensor, hull: Volume) -> Tensor:
-        """Colours of points on the hull (N, 3), from the views that look at their side of it."""
+        """Return colours of points on the hull (N, 3), from the views that look at their side of it."""
         step = hull.spacing
         normal = torch.stack([hull.at(x - step * e) - hull.at(x + step * e) for e in torch.eye(3, device=x.device)], 1)
         total, weights = torch.full_like(x, 1e-6), torch.full_like(x[:, :1], 2e-6)
@@ -162,7 +162,7 @@ class ReconstructModule(LightningModule):
         return loss
 
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
-        """A step and what follows it; Lightning saves checkpoints before `on_train_batch_end`, which would come too late."""
+        """Take a step and densify; Lightning saves checkpoints before `on_train_batch_end`, which would be too late for this."""
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         self._after(self.global_step + 1)
 
@@ -178,7 +178,7 @@ class ReconstructModule(LightningModule):
                 group["lr"] = RATES["means"] * self.hparams.lr * float(self.size) * 0.01 ** min(1.0, done / self.hparams.steps)
 
     def _accumulate_gradient(self) -> None:
-        """Add to each Gaussian's record how the loss moves its projected centre, per half image."""
+        """Accumulate the gradient of the loss by the projected centre of each Gaussian, per half image."""
         cameras = self.batch.cameras
         depth = (self.means @ cameras.viewmats[:, 2, :3].T + cameras.viewmats[:, 2, 3]).mean(1).abs()
         scale = 0.5 * cameras.width / float(cameras.Ks[:, 0, 0].mean())

@@ -21,7 +21,7 @@ REACH = 7.815
 
 
 def degree_of(harmonics: Tensor) -> int:
-    """Degree of harmonics (N, K, 3)."""
+    """Return degree of harmonics (N, K, 3)."""
     degree = {1: 0, 4: 1, 9: 2, 16: 3}.get(harmonics.shape[-2])
     if degree is None:
         raise UserError(f"harmonics have {harmonics.shape[-2]} coefficients; needed 1, 4, 9 or 16")
@@ -29,7 +29,7 @@ def degree_of(harmonics: Tensor) -> int:
 
 
 def harmonic_basis(directions: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics with the signs of 3DGS: unit vectors (..., 3) -> (..., (degree + 1)^2)."""
+    """Evaluate real spherical harmonics with the signs of 3DGS: unit vectors (..., 3) -> (..., (degree + 1)^2)."""
     if degree not in (0, 1, 2, 3):
         raise UserError(f"sh_degree is {degree}; needed 0 to 3")
     x, y, z = directions.unbind(-1)
@@ -50,7 +50,7 @@ def harmonic_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colours_of(harmonics: Tensor, directions: Tensor | None, *, degree: int) -> Tensor:
-    """RGB of Gaussians seen from a direction, max(0, 1/2 + harmonics).
+    """Evaluate the RGB of Gaussians seen from a direction, max(0, 1/2 + harmonics).
 
     Args:
         harmonics: (N, K, 3), of which the first (degree + 1)^2 count.
@@ -70,12 +70,12 @@ def colours_of(harmonics: Tensor, directions: Tensor | None, *, degree: int) -> 
 
 
 def harmonics_of(colours: Tensor) -> Tensor:
-    """Harmonics of degree 0, (N, 1, 3), of RGB (N, 3)."""
+    """Return harmonics of degree 0, (N, 1, 3), of RGB (N, 3)."""
     return ((colours - 0.5) / C0).unsqueeze(-2)
 
 
 def attach_gaussians(x: Tensor, volume: Tensor, colours: Tensor | None = None, *, spread: float = 0.3, opacity: float = 0.95) -> Gaussians:
-    """A body's particles as Gaussians, one each.
+    """Attach one Gaussian to each particle of a body.
 
     Args:
         x: Positions [m], (P, 3).
@@ -102,7 +102,7 @@ class Binding(NamedTuple):
     """Weighted mean of their positions at t = 0 [m], (N, 3)."""
 
     def average(self, values: Tensor) -> Tensor:
-        """Weighted mean over the particles of each Gaussian: (..., P, m) -> (..., N, m)."""
+        """Return weighted mean over the particles of each Gaussian: (..., P, m) -> (..., N, m)."""
         index = self.index.to(values.device)
         parts = (values.index_select(-2, index[:, j]) * w[:, None] for j, w in enumerate(self.weight.to(values).unbind(1)))
         return functools.reduce(torch.add, parts)
@@ -139,7 +139,7 @@ def bind(gaussians: Gaussians, x: Tensor, *, nearest: int = 10, reach: float = R
 
 
 def deform(gaussians: Gaussians, F: Tensor, x: Tensor, binding: Binding | None = None) -> Gaussians:
-    """Gaussians carried by particles: means with x, covariance F A F^T with the first frame's A, harmonics with the polar part of F.
+    """Move Gaussians with particles: means with x, covariance F A F^T with the first frame's A, harmonics with the polar part of F.
 
     The gradient reaches F and x through means, covariances and the direction of view. Colours turn as in PhysGaussian: not the
     harmonics but the direction of view is rotated, by R^T.
@@ -166,7 +166,7 @@ def deform(gaussians: Gaussians, F: Tensor, x: Tensor, binding: Binding | None =
 
 
 def covariances_of(scales: Tensor, quaternions: Tensor) -> Tensor:
-    """R diag(s^2) R^T [m^2] (..., 3, 3) from standard deviations [m] (..., 3) and quaternions w, x, y, z (..., 4) of any length."""
+    """Return R diag(s^2) R^T [m^2] (..., 3, 3) from standard deviations [m] (..., 3) and quaternions w, x, y, z (..., 4) of any length."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
     entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
     entries += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
@@ -176,7 +176,7 @@ def covariances_of(scales: Tensor, quaternions: Tensor) -> Tensor:
 
 
 def scales_and_quaternions(covariances: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse of `covariances_of`: standard deviations (N, 3), smallest first, and unit quaternions (N, 4)."""
+    """Invert `covariances_of`: standard deviations (N, 3), smallest first, and unit quaternions (N, 4)."""
     from scipy.spatial.transform import Rotation
 
     values, vectors = torch.linalg.eigh(covariances.detach().double().cpu())
@@ -244,6 +244,6 @@ def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device
 
 
 def _names(rest: int) -> list[str]:
-    """Columns of a 3DGS file with `rest` harmonics above degree 0."""
+    """Return columns of a 3DGS file with `rest` harmonics above degree 0."""
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity"]
     return [*names, *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]

@@ -58,7 +58,7 @@ def build(real: type, tile: int) -> SimpleNamespace:
 
     @func
     def rows_of(view: mat44, K: mat33, p: vec3, width: int, height: int):
-        """The two rows of the Jacobian of the projection times the rotation, and the clamped x/z and y/z (gsplat: 1.3 x the image)."""
+        """Return the two rows of the projection's Jacobian times the rotation, and the clamped x/z and y/z (gsplat: 1.3 x the image)."""
         fx = K[0, 0]
         fy = K[1, 1]
         w = real(width)
@@ -102,7 +102,7 @@ def build(real: type, tile: int) -> SimpleNamespace:
         depth: wp.array(dtype=real),
         status: wp.array(dtype=wp.int32),
     ):
-        """Writes every row; status[0] counts the Gaussians whose numbers are not finite."""
+        """Write every row; status[0] counts the Gaussians whose numbers are not finite."""
         i = wp.tid()
         views = viewmats.shape[0]
         image = i // gaussians
@@ -257,7 +257,7 @@ def build(real: type, tile: int) -> SimpleNamespace:
         slot: wp.array(dtype=wp.int32),
         splats: wp.array(dtype=wp.int32),
     ):
-        """The lists themselves, one thread an image in the order of depth (2 N entries an image, of which the first N count); `slot`
+        """Fill the lists, one thread an image in the order of depth (2 N entries an image, of which the first N count); `slot`
         goes from the first entry of each tile to its end.
         """
         image = wp.tid()
@@ -295,7 +295,7 @@ def build(real: type, tile: int) -> SimpleNamespace:
         a_means: wp.array(dtype=vec3),
         a_covariances: wp.array(dtype=mat33),
     ):
-        """Writes both gradients; that of a covariance is symmetric."""
+        """Write both gradients; that of a covariance is symmetric."""
         i = wp.tid()
         views = viewmats.shape[0]
         f = i // gaussians

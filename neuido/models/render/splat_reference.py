@@ -8,7 +8,7 @@ from neuido.models.render.splat_kernels import CUT
 
 
 def project(means: Tensor, covariances: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, eps2d: float):
-    """Gaussians in the image of one camera.
+    """Project Gaussians into the image of one camera.
 
     Returns:
         Centre [pixels] (N, 2), covariance [pixels^2] (N, 2, 2) with `eps2d` added, depth [m] (N,). The Jacobian is taken with x/z and y/z
@@ -28,7 +28,7 @@ def project(means: Tensor, covariances: Tensor, viewmat: Tensor, K: Tensor, widt
 
 
 def compose(centre: Tensor, spread: Tensor, depth: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int):
-    """Colour (H, W, 3) and alpha (H, W) of drawn Gaussians, front to back."""
+    """Blend Gaussians front to back: colour (H, W, 3) and alpha (H, W)."""
     order = depth.argsort(stable=True)
     centre, conic, opacities, colours = centre[order], torch.linalg.inv(spread[order]), opacities[order], colours[order]
     like = {"dtype": centre.dtype, "device": centre.device}
@@ -48,7 +48,7 @@ def compose(centre: Tensor, spread: Tensor, depth: Tensor, opacities: Tensor, co
 
 
 def rasterize(means, covariances, opacities, colours, viewmats, Ks, width, height, near, far, eps2d) -> tuple[Tensor, Tensor]:
-    """Images (F, V, H, W, 3) and alphas (F, V, H, W); shapes of the arguments as in `splatting._Splat`."""
+    """Render images (F, V, H, W, 3) and alphas (F, V, H, W); shapes of the arguments as in `splatting._Splat`."""
     images, alphas = [], []
     for f in range(len(means)):
         for v in range(len(viewmats)):

@@ -30,7 +30,7 @@ INDEX_LIMIT = 2**31 - 1
 
 
 def one_thread_per_tile(device: torch.device) -> bool:
-    """Whether a thread does a whole tile, splat by splat (CPU), or one pixel (CUDA)."""
+    """Say whether a thread does a whole tile, splat by splat (CPU), or one pixel (CUDA)."""
     return device.type == "cpu"
 
 
@@ -53,7 +53,7 @@ def rasterize(
     backend: str = "auto",
     capacity: int | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Images of Gaussians, for all frames (the leading dimensions) and all views at once.
+    """Render Gaussians for all frames (the leading dimensions) and all views at once.
 
     Differentiable with respect to means, covariances, opacities, colours, rotations and background; not to cameras. Gradients of
     opacities and colours are computed where they are wanted, those of means and covariances always.
@@ -104,7 +104,7 @@ def rasterize(
 
 
 def render(gaussians: Gaussians, cameras: Cameras, **options) -> tuple[Tensor, Tensor]:
-    """`rasterize` of the two tuples; options are its keywords."""
+    """Render Gaussians with cameras by `rasterize`, whose keywords `options` are."""
     degree = degree_of(gaussians.harmonics)
     means, covariances, opacities, harmonics, rotations = gaussians
     return rasterize(means, covariances, opacities, harmonics, *cameras, sh_degree=degree, rotations=rotations, **options)
@@ -127,12 +127,12 @@ class Splatting(nn.Module):
         self.options = {"near": near, "far": far, "eps2d": eps2d, "backend": backend, "capacity": capacity}
 
     def forward(self, gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
-        """Images (..., V, H, W, 3) and alphas (..., V, H, W)."""
+        """Render images (..., V, H, W, 3) and alphas (..., V, H, W)."""
         return render(gaussians, cameras, background=self.background, **self.options)
 
 
 def _frames(means: Tensor, covariances: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor):
-    """Leading dimensions, and means (F, N, 3), covariances (F, N, 3, 3), opacities (1 or F, N)."""
+    """Return leading dimensions, and means (F, N, 3), covariances (F, N, 3, 3), opacities (1 or F, N)."""
     if means.dim() < 2 or means.shape[-1] != 3:
         raise UserError(f"means have shape {tuple(means.shape)}; needed (..., N, 3)")
     if means.dtype not in (torch.float32, torch.float64):
@@ -156,7 +156,7 @@ def _frames(means: Tensor, covariances: Tensor, opacities: Tensor, viewmats: Ten
 
 
 def _view_colours(colours: Tensor, means: Tensor, viewmats: Tensor, sh_degree: int | None, rotations: Tensor | None, frames) -> Tensor:
-    """RGB of each Gaussian, (1 or F, 1 or V, N, 3)."""
+    """Return RGB of each Gaussian, (1 or F, 1 or V, N, 3)."""
     count = means.shape[1]
     if colours.device != means.device:
         raise UserError(f"colours are on {colours.device} and means on {means.device}; needed on one device")
@@ -214,7 +214,7 @@ class _TileLists:
 
 
 def _lists_by_counting(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int) -> _TileLists:
-    """Lists on the CPU: Gaussians in the order of depth, then a counting sort by tile."""
+    """Build the tile lists on the CPU: Gaussians in the order of depth, then a counting sort by tile."""
     images, count = depth.shape
     lists = _TileLists()
     length = torch.zeros(images * tiles, dtype=torch.int32)
@@ -233,7 +233,7 @@ def _lists_by_counting(kernels, splat, depth: Tensor, status: Tensor, columns: i
 
 
 def _lists_by_key(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int, capacity: int | None) -> _TileLists:
-    """Lists on CUDA: one sort of keys of tile and depth."""
+    """Build the tile lists on CUDA: one sort of keys of tile and depth."""
     images, count = depth.shape
     device = depth.device
     lists = _TileLists()

@@ -4,7 +4,7 @@ from torch import Tensor
 
 
 def relative_errors(prediction: Tensor, target: Tensor, epsilon: Tensor | float = 0.0) -> Tensor:
-    """||y^ - y|| / (||y|| + epsilon) of each sample, (..., n, 3, 3) or (..., n, 9) -> (..., n).
+    """Return ||y^ - y|| / (||y|| + epsilon) of each sample, (..., n, 3, 3) or (..., n, 9) -> (..., n).
 
     Args:
         prediction: y^, (..., 3, 3).
@@ -15,7 +15,7 @@ def relative_errors(prediction: Tensor, target: Tensor, epsilon: Tensor | float 
 
 
 def relative_lp(prediction: Tensor, target: Tensor, epsilon: Tensor | float = 0.0) -> Tensor:
-    """The mean over samples of the relative L2 error, the paper's L_r (neuraloperator's `LpLoss` with a floor).
+    """Return the mean over samples of the relative L2 error, the paper's L_r (neuraloperator's `LpLoss` with a floor).
 
     A particle in free fall has F ~ I and a stress near zero, and its relative error would be float noise; epsilon is about one
     percent of the trajectory's root mean square.

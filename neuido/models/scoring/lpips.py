@@ -100,7 +100,7 @@ class LPIPS(nn.Module):
                 own.data.copy_(given)
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Distance of each pair of images (B, 3, H, W) in [0, 1], (B,)."""
+        """Return distance of each pair of images (B, 3, H, W) in [0, 1], (B,)."""
         total = a.new_zeros(len(a))
         x, y = (((2 * image - 1) - self.shift) / self.spread for image in (a, b))
         for group, head in zip(self.groups, self.heads):
@@ -111,7 +111,7 @@ class LPIPS(nn.Module):
 
 
 def open_lpips(backbone: str | None = None, net: str = "vgg", device: str | torch.device = "cpu") -> LPIPS | Absent:
-    """LPIPS with the weights of a local file.
+    """Open LPIPS with the weights of a local file.
 
     Args:
         backbone: The file; none: what torch's hub has kept of torchvision, if anything.

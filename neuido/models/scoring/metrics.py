@@ -37,7 +37,7 @@ class MedianRelativeError(Metric):
         self.histogram.index_add_(0, index, torch.ones_like(index))
 
     def compute(self) -> Tensor:
-        """The median [-], NaN without samples."""
+        """Return the median [-], NaN without samples."""
         total = self.histogram.sum()
         if total == 0:
             return torch.tensor(float("nan"), device=self.histogram.device)
@@ -47,7 +47,7 @@ class MedianRelativeError(Metric):
 
 
 def nearest_squared(a: Tensor, b: Tensor) -> Tensor:
-    """Squared distance of each point to its nearest in the other set [unit of a, squared].
+    """Return squared distance of each point to its nearest in the other set [unit of a, squared].
 
     On the CPU by a k-d tree a frame, on a GPU by all pairs of all frames in one launch (`physics.nearest`).
 
@@ -73,12 +73,12 @@ def nearest_squared(a: Tensor, b: Tensor) -> Tensor:
 
 
 def chamfer_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Mean squared nearest distance from a (..., P, 3) to b (..., Q, 3) plus that from b to a, (...) [unit of a, squared]."""
+    """Return mean squared nearest distance from a (..., P, 3) to b (..., Q, 3) plus that from b to a, (...) [unit of a, squared]."""
     return nearest_squared(a, b).mean(-1) + nearest_squared(b, a).mean(-1)
 
 
 def resampling_floor(points: Tensor, seed: int = 0) -> Tensor:
-    """The Chamfer distance between two random halves of a point set (..., P, 3): what a perfect law drawn anew would score, (...).
+    """Return the Chamfer distance between two random halves of a point set (..., P, 3): what a perfect law drawn anew would score, (...).
 
     Halves are sparser than the set; nearest distances in three dimensions go with P^(-1/3), so the value is multiplied by 2^(-2/3).
     All frames are halved alike.
@@ -89,7 +89,7 @@ def resampling_floor(points: Tensor, seed: int = 0) -> Tensor:
 
 
 def matched_rmse(a: Tensor, b: Tensor) -> Tensor:
-    """Root mean square distance of particles that correspond, (..., P, 3) -> (); over frames and particles."""
+    """Return root mean square distance of particles that correspond, (..., P, 3) -> (); over frames and particles."""
     return (a - b).square().sum(-1).mean().sqrt()
 
 
@@ -117,7 +117,7 @@ class ChamferDistance(Metric):
         self.frames += distances.numel()
 
     def compute(self) -> Tensor:
-        """Mean over frames times `scale`."""
+        """Return mean over frames times `scale`."""
         return self.scale * self.total / self.frames
 
 

@@ -20,18 +20,18 @@ CD_SCALE = 1e4
 
 
 def chamfer_per_frame(prepared: PreparedScene, motion: ParticleState) -> Tensor:
-    """Chamfer distance times 1e4 to the true particles in each frame after the first, (K - 1,); the truth must be known."""
+    """Return Chamfer distance times 1e4 to the true particles in each frame after the first, (K - 1,); the truth must be known."""
     target = prepared.source.truth.x[1 : len(motion.x)].to(motion.x)
     return CD_SCALE * chamfer_distance(motion.x[1 : len(target) + 1], target)
 
 
 def floor_per_frame(prepared: PreparedScene) -> Tensor:
-    """`resampling_floor` times 1e4 of the truth in each frame after the first, (T - 1,): the same whatever is predicted."""
+    """Return `resampling_floor` times 1e4 of the truth in each frame after the first, (T - 1,): the same whatever is predicted."""
     return CD_SCALE * resampling_floor(prepared.source.truth.x[1:].to(prepared.simulator.state.x))
 
 
 def score_motion(prepared: PreparedScene, motion: ParticleState, floor: Tensor | None = None) -> list[dict[str, float]]:
-    """Distances to the true particles of each frame after the first; none where the truth is not known.
+    """Score a motion against the true particles in each frame after the first; no rows where the truth is not known.
 
     `cd` is the Chamfer distance times 1e4, `floor` what a perfect law with other particles would score (`resampling_floor`), `rmse` [m]
     the root mean square distance of the true particles from where the prediction carries them (`pipeline.carry_points`).
@@ -54,7 +54,7 @@ def score_motion(prepared: PreparedScene, motion: ParticleState, floor: Tensor |
 
 @torch.no_grad()
 def score_images(prepared: PreparedScene, motion: ParticleState, views: Sequence[int], lpips: LPIPS | Absent) -> list[dict[str, Any]]:
-    """PSNR [dB], SSIM, LPIPS and the silhouettes' intersection over union of each frame after the first and each view.
+    """Return PSNR [dB], SSIM, LPIPS and the silhouettes' intersection over union of each frame after the first and each view.
 
     The image measures are of the full frame, and of the crop around the body (`crop_`).
 
@@ -76,14 +76,14 @@ def score_images(prepared: PreparedScene, motion: ParticleState, views: Sequence
 
 
 def intersection_over_union(alphas: Tensor, masks: Tensor) -> Tensor:
-    """Of silhouettes (K, H, W), the pixels of which more than half is covered; (K,), one where both are empty."""
+    """Return the intersection over union (K,) of silhouettes (K, H, W) at half coverage; one where both are empty."""
     a, b = alphas > 0.5, masks > 0.5
     either = (a | b).sum((1, 2))
     return torch.where(either > 0, (a & b).sum((1, 2)) / either.clamp(min=1), 1.0)
 
 
 def _image_rows(images: Tensor, recorded: Tensor, lpips: LPIPS | Absent) -> list[dict[str, float]]:
-    """Of K images (K, H, W, 3) each."""
+    """Score K images (K, H, W, 3) against the recorded ones."""
     psnr = -10 * (images - recorded).square().mean((1, 2, 3)).clamp(min=1e-10).log10()
     columns = {"psnr": psnr}
     a, b = images.permute(0, 3, 1, 2).contiguous(), recorded.permute(0, 3, 1, 2).contiguous()
@@ -97,7 +97,7 @@ def _image_rows(images: Tensor, recorded: Tensor, lpips: LPIPS | Absent) -> list
 
 
 def mean_of(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, float]:
-    """Means over the rows of those of the names that they have."""
+    """Average the named columns over the rows that have them."""
     out = {}
     for name in names:
         values = [row[name] for row in rows if name in row and math.isfinite(row[name])]
@@ -109,6 +109,6 @@ def mean_of(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, f
 def mean_from_frame(
     particles: Sequence[dict[str, Any]], pictures: Sequence[dict[str, Any]], first: int, names: Sequence[str]
 ) -> dict[str, float]:
-    """`mean_of` the frames from `first` on, of the rows of particles and of images."""
+    """Average the named columns over the frames from `first` on, of the rows of particles and of images."""
     parts = [mean_of([row for row in rows if row["frame"] >= first], names) for rows in (particles, pictures)]
     return parts[0] | parts[1]

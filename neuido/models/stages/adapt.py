@@ -44,7 +44,7 @@ class AdaptModule(ImageModule):
     is a `VisualDataModule`. `out/scores.csv` has two rows a scene, of `stage` before and after; `out/<scene>/fit` is of `SceneFit.save`.
 
     Args:
-        method: What is fitted (`models.methods`).
+        method: What is fitted (`fewshot.method`).
         steps: Optimiser steps of each scene; none: the method's own number (ours: 100, the paper's).
         views_per_step: Training views in a step, drawn anew for each; 0: all.
         encoder_views: Training views that the encoder sees; 0: all.
@@ -57,7 +57,7 @@ class AdaptModule(ImageModule):
         velocity_lr: Its rate, in m/s and rad/s a step.
         velocity_steps: Steps before the others in which it is fitted alone, with a cosine of their own.
         velocity_frames: Frames that these steps see.
-        estimate_density: Estimate how densely the body is filled, which no first frame shows (`models.relative_density`); paper: no.
+        estimate_density: Estimate how densely the body is filled, which no first frame shows (`fewshot.relative_density`); paper: no.
         density_lr: Its rate, of the logarithm a step.
         density_from: Share of the steps before it joins the law, which then has the large part of the motion to itself.
         density_weight: Of its mean square logarithm: pulls it to an even filling.
@@ -72,7 +72,7 @@ class AdaptModule(ImageModule):
         out: Folder for results.
         lpips_backbone: Local file of VGG16's or AlexNet's weights; none: LPIPS is absent.
         lpips_net: `vgg` or `alex`.
-        condition_files: In a prediction, files of `models.conditions` to run with the laws that were fitted.
+        condition_files: In a prediction, files of `inference.transfer` to run with the laws that were fitted.
     """
 
     def __init__(
@@ -134,12 +134,12 @@ class AdaptModule(ImageModule):
     # What there is of a scene.
 
     def open_scene(self, scene: VisualScene, device: torch.device, *, watched: bool) -> PreparedScene:
-        """The scene on the device; `watched`: with the flow that the method's encoder wants."""
+        """Prepare the scene on the device; `watched`: with the flow that the method's encoder needs."""
         encoder = self.plan.encoder.to(device) if watched and self.plan.encoder is not None else None
         return prepare(scene, encoder, device=device, encoder_views=self.hparams.encoder_views, cache=self.hparams.cache)
 
     def new_fit(self, prepared: PreparedScene, uneven: bool = False) -> SceneFit:
-        """A fit that has not begun; `uneven`: with a density, whatever the option says."""
+        """Create a fit at its start; `uneven`: with a relative density even if the option is off."""
         density = None
         if self.hparams.estimate_density or uneven:
             simulator = prepared.simulator
@@ -162,11 +162,11 @@ class AdaptModule(ImageModule):
             self._names.append(scene.name)
 
     def fit_of(self, name: str) -> SceneFit:
-        """The fit of a scene of this run."""
+        """Return the fit of a scene of this run."""
         return cast(SceneFit, self.fits[self._names.index(name)])
 
     def _training_views(self, prepared: PreparedScene) -> list[int]:
-        """The views that are trained on."""
+        """Return the views that are trained on."""
         if self.hparams.stop_on != "view":
             return prepared.training_views
         if len(prepared.training_views) < 2:
@@ -174,7 +174,7 @@ class AdaptModule(ImageModule):
         return prepared.training_views[:-1]
 
     def _frames(self, prepared: PreparedScene) -> int:
-        """Frames that fitting sees."""
+        """Return frames that fitting sees."""
         return min(prepared.frames, self.hparams.fit_frames or prepared.frames)
 
     # Fitting.
@@ -232,7 +232,7 @@ class AdaptModule(ImageModule):
         return self._weighted(loss, silhouette) + regular
 
     def _rollout_or_restore(self, prepared: PreparedScene, fit: SceneFit, frames: int) -> ParticleState | None:
-        """The motion; where it fails that of parameters that ran, to which the fit returns with half the rates; or none."""
+        """Simulate; after a failure restore parameters that ran, halve the rates, and simulate those; None where there are none."""
         name = prepared.source.name
         progress = self._progress[name]
         for _ in range(2):
@@ -251,14 +251,14 @@ class AdaptModule(ImageModule):
         return self.hparams.image_weight * loss + self.hparams.silhouette_weight * silhouette
 
     def rollout_frames(self, prepared: PreparedScene, step: int) -> int:
-        """Frames of a rollout at this step of a scene."""
+        """Return frames of a rollout at this step of a scene."""
         frames = self._frames(prepared)
         if step < self.ahead:
             return min(frames, self.hparams.velocity_frames)
         return curriculum_frames((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """A step whose gradient is not finite is left out; where that comes again the fit goes back as from a law that does not run."""
+        """Skip a step whose gradient is not finite; after repeated ones restore the last parameters that ran."""
         gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
         if gradients and not bool(torch.stack([g.isfinite().all() for g in gradients]).all()):
             self._log({"train/not_finite": 1.0})
@@ -294,7 +294,7 @@ class AdaptModule(ImageModule):
 
     @without_gradients
     def _check_early_stop(self, prepared: PreparedScene, progress: Progress) -> None:
-        """The loss of all frames on all training views, or on the one that is kept from training."""
+        """Evaluate the loss of all frames on all training views, or on the view that is kept from training."""
         fit = self.fit_of(prepared.source.name)
         motion = self._try(prepared, fit)
         if motion is None:
@@ -328,7 +328,7 @@ class AdaptModule(ImageModule):
 
     @without_gradients
     def _try(self, prepared: PreparedScene, fit: SceneFit) -> ParticleState | None:
-        """The motion over all frames that fitting sees, none where it fails."""
+        """Simulate all frames that fitting sees; None where the law does not run."""
         try:
             return fit.rollout(prepared, self._frames(prepared))
         except UserError:
@@ -347,7 +347,7 @@ class AdaptModule(ImageModule):
         self._show(self._rows[-1])
 
     def score(self, prepared: PreparedScene, fit: SceneFit, stage: str) -> dict[str, Any]:
-        """Means of the scores and what was found; the rows by time step go to files in `out/<scene>/<stage>`."""
+        """Score a fit: means and what was found; rows by frame go to files in `out/<scene>/<stage>`."""
         found = {f"found_{key}": value for key, value in scalars(fit.describe()).items()}
         try:
             motion, halvings = rollout_with_retries(prepared, lambda scene: fit.rollout(scene, prepared.frames))
@@ -380,7 +380,7 @@ class AdaptModule(ImageModule):
     # Test and prediction, with what a fit wrote.
 
     def load_fit(self, scene: VisualScene) -> tuple[PreparedScene, SceneFit]:
-        """The scene, and its fit: the one of this run, of `adapter`, or one that has not begun."""
+        """Return the scene and its fit: that of this run, of `adapter`, or one at its start."""
         if scene.name in self._names:
             return self.open_scene(scene, self.device, watched=False), self.fit_of(scene.name)
         prepared = self.open_scene(scene, self.device, watched=True)

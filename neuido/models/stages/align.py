@@ -54,7 +54,7 @@ class AlignModule(ImageModule):
         curriculum_share: Share of the run.
         silhouette_weight: Of the squared error of the silhouettes, normalised as the images'; it pulls where colours mislead.
         prior_weight: Pulls z to where training began, per squared unit: the mean over z's components. 0: not at all.
-        plausibility_weight: Keeps z where elastic laws can run (`branch.implausibility`); paper: 0.
+        plausibility_weight: Keeps z where elastic laws can run (`law_properties.implausibility`); paper: 0.
         segment: Keep the state of a rollout every so many frames only (`Simulator.rollout`); 0: of all. Saves memory.
         cache: Folder in which optical flow is kept.
         save_to: File to write the encoder to at the end of a fit.
@@ -62,7 +62,7 @@ class AlignModule(ImageModule):
         lpips_backbone: Local file of VGG16's or AlexNet's weights; none: LPIPS is absent.
         lpips_net: `vgg` or `alex`.
         baselines: In a test, random latents to score each unseen scene with, beside the mean latent.
-        condition_files: In a prediction, files of `models.conditions` to run with the laws that were found.
+        condition_files: In a prediction, files of `inference.transfer` to run with the laws that were found.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class AlignModule(ImageModule):
     # What there is of a scene.
 
     def prepared(self, scene: VisualScene) -> PreparedScene:
-        """The scene, prepared when it is first seen."""
+        """Prepare a scene when it is first seen."""
         if scene.name not in self._prepared:
             options = {"encoder_views": self.hparams.encoder_views, "cache": self.hparams.cache}
             self._prepared[scene.name] = prepare(scene, self.encoder, device=self.device, **options)
@@ -130,7 +130,7 @@ class AlignModule(ImageModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def rollout_frames(self, prepared: PreparedScene) -> int:
-        """Frames of a rollout at this point of the run."""
+        """Return frames of a rollout at this point of the run."""
         done = self.global_step / max(1, self._total)
         return curriculum_frames(done, prepared.frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
@@ -156,13 +156,13 @@ class AlignModule(ImageModule):
         return total
 
     def _mean_latent(self, z: Tensor) -> Tensor:
-        """The mean latent of Stage I, whose law runs."""
+        """Return the mean latent of Stage I, whose law runs."""
         return self.operator.latents.mean(0).to(z) if len(self.operator.latents) else torch.zeros_like(z)
 
     # Scores.
 
     def score(self, scene: VisualScene, *, images: bool = True) -> tuple[dict[str, Any], list[dict[str, Any]], list[dict[str, Any]]]:
-        """Zero-shot scores of a scene: their means, and the rows by time step, of particles and of images."""
+        """Score zero-shot inference of a scene: means, and the rows by frame, of particles and of images."""
         prepared = self.prepared(scene)
         found = infer_latent(self.encoder, self.operator, prepared)
         summary: dict[str, Any] = {"scene": scene.name, "seconds": found.seconds}
@@ -189,7 +189,7 @@ class AlignModule(ImageModule):
         self.log_dict(values)
 
     def _gather(self) -> list[dict[str, Any]]:
-        """The rows of all processes, one a scene, in order of name; empties them here."""
+        """Gather the rows of all processes, one a scene, ordered by name, and clear them here."""
         rows, self._rows = self._rows, []
         if self.trainer.world_size > 1:
             everyone: list[Any] = [None] * self.trainer.world_size
@@ -210,7 +210,7 @@ class AlignModule(ImageModule):
         self._rows.append(summary)
 
     def score_baselines(self, prepared: PreparedScene) -> dict[str, float]:
-        """CD of Stage I's mean latent, of random ones (`random_latents`), and of its own at random (medians over those that run)."""
+        """Score baselines by CD: Stage I's mean latent, random latents, and trained latents at random (medians over those that run)."""
         generator = torch.Generator().manual_seed(0)
         latents, count = self.operator.latents, self.hparams.baselines
         drawn = self.operator.random_latents(count, generator)

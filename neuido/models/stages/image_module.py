@@ -25,7 +25,7 @@ STILL_IMAGE, STILL_MASK = 1e-6, 1e-5
 
 
 def without_gradients(method: Callable) -> Callable:
-    """Without gradients, but outside Lightning's inference mode: rollouts keep buffers, and training could not write to them afterwards."""
+    """Run a method without gradients, but outside Lightning's inference mode, whose tensors training could not write to afterwards."""
 
     @functools.wraps(method)
     def run(*arguments, **options):
@@ -52,7 +52,7 @@ def check_options(counts: dict[str, int], weights: dict[str, float], shares: dic
 
 
 def curriculum_frames(done: float, frames: int, curriculum: Sequence[float], curriculum_share: float) -> int:
-    """Frames of a rollout when the share `done` of a run is done: shares of `frames`, one after the other, and then all."""
+    """Return the rollout length after the share `done` of a run: each share of the curriculum in turn, then all frames."""
     if not curriculum or done >= curriculum_share:
         return frames
     share = curriculum[min(int(done / curriculum_share * len(curriculum)), len(curriculum) - 1)]
@@ -60,7 +60,7 @@ def curriculum_frames(done: float, frames: int, curriculum: Sequence[float], cur
 
 
 def sample_views(views: list[int], count: int, step: int) -> list[int]:
-    """So many of the views (0: all), drawn anew in each step, by the step alone: a resumed run draws as the interrupted one would have."""
+    """Sample `count` views (0: all) with the step as the seed, so that a resumed run samples the same ones."""
     if not 0 < count < len(views):
         return views
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(step))
@@ -68,7 +68,7 @@ def sample_views(views: list[int], count: int, step: int) -> list[int]:
 
 
 def image_losses(prepared: PreparedScene, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:
-    """Squared errors of the images and of the silhouettes, over those of a still first frame."""
+    """Return the squared errors of images and silhouettes, relative to those of a still first frame."""
     frames = len(motion.x)
     images, alphas = render_motion(prepared, motion, views)
     recorded, masks = prepared.recorded(views, frames), prepared.silhouettes(views, frames)
@@ -89,13 +89,13 @@ class ImageModule(LightningModule):
     def score_motion(
         self, prepared: PreparedScene, motion: ParticleState, *, images: bool = True
     ) -> tuple[dict[str, float], list[dict[str, Any]], list[dict[str, Any]]]:
-        """Scores of a motion: their means, and the rows by time step, of particles and of images on the views that were held out."""
+        """Score a motion: means, and the rows by frame, of particles and of images on the held-out views."""
         particles = scores.score_motion(prepared, motion, self._floor(prepared))
         pictures = scores.score_images(prepared, motion, prepared.scoring_views, self._lpips()) if images else []
         return scores.mean_of(particles, SCORES) | scores.mean_of(pictures, SCORES), particles, pictures
 
     def _floor(self, prepared: PreparedScene) -> Tensor | None:
-        """Measured once a scene: it depends on the truth alone."""
+        """Return the resampling floor of a scene, measured once: it depends on the truth alone."""
         name = prepared.source.name
         if prepared.source.truth is not None and name not in self._floors:
             self._floors[name] = scores.floor_per_frame(prepared)

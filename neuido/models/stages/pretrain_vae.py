@@ -61,11 +61,11 @@ class FlowVAEModule(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def video(self, batch: FlowBatch) -> Tensor:
-        """(B, 3, t + 1, S, S) in [-1, 1]."""
+        """Encode the flow of a batch as videos (B, 3, t + 1, S, S) in [-1, 1]."""
         return encode_flow(batch.flow, encoding=self.hparams.flow_encoding, speed_scale=self.hparams.speed_scale)
 
     def losses(self, video: Tensor, *, sample: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Weighted squared error, divergence for each latent number, and the mean latents."""
+        """Return weighted squared error, divergence for each latent number, and the mean latents."""
         mean, variance = self.vae.posterior(video)
         latent = mean + (0.5 * variance).exp() * torch.randn_like(mean) if sample else mean
         error = (self.vae.reconstruct(latent) - video).square()
@@ -95,7 +95,7 @@ class FlowVAEModule(LightningModule):
         self.latent_sum.zero_()
 
     def on_validation_epoch_end(self) -> None:
-        """The scale of the latents follows the held-out clips."""
+        """Set the scale of the latents from the held-out clips."""
         count, total, squares = self.latent_sum.tolist()
         self.vae.scale.fill_(max(squares / count - (total / count) ** 2, 1e-12) ** -0.5)
 

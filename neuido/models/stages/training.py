@@ -13,7 +13,7 @@ from neuido.models.video.encoder import DynamicsEncoder
 
 
 def optimiser_steps(trainer: Trainer) -> int:
-    """Optimiser steps of a whole run.
+    """Return optimiser steps of a whole run.
 
     `trainer.estimated_stepping_batches` would do, but it sets up the loaders before Lightning restores their state, and a run
     resumed in the middle of an epoch would then start that epoch anew.
@@ -29,7 +29,7 @@ def optimiser_steps(trainer: Trainer) -> int:
 
 
 def validation_scores(module: LightningModule) -> dict[str, float]:
-    """What the last validation logged, by names that begin with `val/`."""
+    """Return what the last validation logged, by names that begin with `val/`."""
     return {name: float(value) for name, value in module.trainer.callback_metrics.items() if name.startswith("val/")}
 
 
@@ -57,7 +57,7 @@ def report_and_save(
 
 
 def open_operator_and_encoder(operator: str, init_from: str | None, vae: str, **sizes) -> tuple[IntrinsicDynamicsOperator, DynamicsEncoder]:
-    """A frozen operator, and an encoder that reads latents for it.
+    """Open a frozen operator, and an encoder that infers latents for it.
 
     Args:
         operator: File of `IntrinsicDynamicsOperator.save`, or `pretrained`.

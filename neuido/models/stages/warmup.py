@@ -40,7 +40,7 @@ class LawErrors(NamedTuple):
     """|log| of the ratio of the stresses' root mean squares, which does not saturate."""
 
     def total(self, size_weight: float) -> Tensor:
-        """What is minimised, (B,)."""
+        """Return the training loss, (B,)."""
         return self.stress + self.plastic + size_weight * self.size
 
 
@@ -150,7 +150,7 @@ class WarmupModule(LightningModule):
         return key.hexdigest()[:24]
 
     def _embed(self, clip: Clip, kept: Path | None) -> tuple[Tensor, Tensor]:
-        """Flow latents (1 or 2 with the mirrored, V, channels, T', h, w) and conditions (V, 2)."""
+        """Return flow latents (1 or 2 with the mirrored, V, channels, T', h, w) and conditions (V, 2)."""
         if kept is not None and kept.is_file():
             found = load_file(kept)
             return found["volume"], found["conditions"]
@@ -178,7 +178,7 @@ class WarmupModule(LightningModule):
         return errors.total(self.hparams.size_weight).mean()
 
     def validation_step(self, numbers: Tensor, batch_idx: int) -> None:
-        """All views of a clip give one z, as in Stage II."""
+        """Infer one z from all views of a clip, as in Stage II, and score its law."""
         clips = self._clips
         volume, conditions = clips["volume"][numbers, 0], clips["conditions"][numbers]
         views = volume.shape[1]
@@ -204,7 +204,7 @@ class WarmupModule(LightningModule):
 
 
 def _spearman(a: Tensor, b: Tensor) -> Tensor:
-    """Spearman's, of two vectors; NaN of fewer than three."""
+    """Return Spearman's rank correlation of two vectors; NaN for fewer than three numbers."""
     if len(a) < 3:
         return a.new_tensor(float("nan"))
     ranks = torch.stack([v.argsort().argsort().to(torch.float32) for v in (a, b)])

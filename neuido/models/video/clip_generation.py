@@ -86,7 +86,7 @@ class ClipSetup(NamedTuple):
 def generate_clips(
     plan: ClipPlan, out: str | os.PathLike, *, device: str = "auto", batch: int = 0, shard: int = 0, shards: int = 1, progress: bool = True
 ) -> None:
-    """Make what is missing of a shard's clips; whoever finds none missing any more writes the index."""
+    """Generate the missing clips of a shard; the process that completes the set writes the index."""
     folder, chosen = Path(out), choose_device(device)
     if not 0 <= shard < shards:
         raise UserError(f"shard = {shard} must be from 0 to shards - 1 = {shards - 1}")
@@ -117,7 +117,7 @@ def generate_clips(
 
 
 def sample_clip(plan: ClipPlan, number: int) -> ClipSetup:
-    """The clip of a number: material, floor, body, texture and cameras, all at random."""
+    """Sample the set-up of a clip by its number: material, floor, body, texture and cameras."""
     random = np.random.default_rng([plan.seed, number])
     family, parameters = _material(plan, random, number)
     dt = float(random.choice(plan.dts))
@@ -157,7 +157,7 @@ def film_clips(plan: ClipPlan, group: list[ClipSetup], device: torch.device) -> 
 
 
 def _simulate(plan: ClipPlan, group: list[ClipSetup], device: torch.device, halvings: int = 0) -> list[ParticleState]:
-    """The frames of each clip. Where one is unstable the others run without it, and it again with steps of a half and a quarter."""
+    """Simulate each clip; retry an unstable one alone with half and a quarter of the time step."""
     share = 2**halvings
     scenes = [replace(c.scene, dt=c.scene.dt / share) for c in group]
     try:
@@ -188,7 +188,7 @@ def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str,
 
 
 def _samples(motion: ParticleState, clip: ClipSetup, count: int, seed: int) -> dict[str, Tensor]:
-    """The law at deformations that the motion runs through: trial, corrected, stress (n, 3, 3)."""
+    """Sample the law at deformations that the motion reaches: trial, corrected, stress (n, 3, 3)."""
     elastic, plastic = laws(clip.family, [clip.parameters])
     F, C = motion.F[1:].flatten(0, 1).double(), motion.C[1:].flatten(0, 1).double()
     pick = torch.randint(len(F), (count,), generator=torch.Generator().manual_seed(seed)).to(F.device)
@@ -203,7 +203,7 @@ def _material(plan: ClipPlan, random: np.random.Generator, number: int) -> tuple
 
 
 def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, float]:
-    """Points (P, 3) of a ball, box, cylinder or a union of ellipsoids about the origin, turned at random, and their volume [m^3].
+    """Sample points (P, 3) of a ball, box, cylinder or a union of ellipsoids about the origin, turned at random, and their volume [m^3].
 
     Half of all bodies are unions: three thick ellipsoids, or a trunk with four thin limbs, since those bend long before the trunk yields.
     """
@@ -233,7 +233,7 @@ def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, flo
 
 
 def _limbs(random: np.random.Generator, points: np.ndarray) -> np.ndarray:
-    """Which points lie in one of four capsules that stick out of the origin."""
+    """Return which points lie in one of four capsules that stick out of the origin."""
     tips = random.standard_normal((4, 3))
     tips *= random.uniform(0.5, 0.95, (4, 1)) / np.linalg.norm(tips, axis=1, keepdims=True)
     along = np.clip(points @ tips.T / (tips**2).sum(1), 0, 1)
@@ -242,7 +242,7 @@ def _limbs(random: np.random.Generator, points: np.ndarray) -> np.ndarray:
 
 
 def _textured_gaussians(random: np.random.Generator, body: Body, volume: float) -> Gaussians:
-    """A Gaussian a particle, coloured by waves through the body."""
+    """Attach a Gaussian to each particle, coloured by waves through the body."""
     x = body.x.double().numpy()
     waves = random.standard_normal((3, 3, 3)) * random.uniform(12, 60, (3, 3, 1))
     phases = random.uniform(0, 2 * math.pi, (3, 3))

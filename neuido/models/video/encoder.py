@@ -83,7 +83,7 @@ class Projector(nn.Module):
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, latent_dim))
 
     def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
-        """z of each view (V, d), of flow latents (V, channels, T', h, w) and conditions (V, 2) of `scale_conditions`."""
+        """Return z of each view (V, d), of flow latents (V, channels, T', h, w) and conditions (V, 2) of `scale_conditions`."""
         x = self.conv(volume)
         x = (x + _positions(x)).flatten(2).transpose(1, 2)
         x = x + self.tokens(x)
@@ -93,7 +93,7 @@ class Projector(nn.Module):
 
     @torch.no_grad()
     def start_near(self, latents: Tensor, spread: float = 0.1) -> None:
-        """Begin near the mean of latents (M, d), with outputs that vary in the directions in which they do.
+        """Initialise the output near the mean of latents (M, d), varying in the directions in which they vary.
 
         Args:
             latents: Those of Stage I.
@@ -107,7 +107,7 @@ class Projector(nn.Module):
 
 
 def _positions(x: Tensor) -> Tensor:
-    """Sines and cosines of place and time, (1, C, T, H, W): place in parts of the image, time in latent frames."""
+    """Return sines and cosines of place and time, (1, C, T, H, W): place in parts of the image, time in latent frames."""
     _, channels, T, H, W = x.shape
     axes = (torch.arange(T) / 8.0, (torch.arange(H) + 0.5) / H, (torch.arange(W) + 0.5) / W)
     share = channels // 6
@@ -123,7 +123,7 @@ def _positions(x: Tensor) -> Tensor:
 
 
 def scale_conditions(frame_interval: Tensor | float, cell: Tensor) -> Tensor:
-    """What the projector is told beside the video, (V, 2): logarithms of the frame interval and of a cell's side over the constants here.
+    """Return the conditions of the projector, (V, 2): logarithms of frame interval and cell size over their reference values.
 
     Args:
         frame_interval: [s], a number or (V,).
@@ -195,14 +195,14 @@ class DynamicsEncoder(nn.Module):
             raise UserError(f"{option} gives latents of {given} numbers, the operator takes {latent_dim}: use an encoder made for it")
 
     def train(self, mode: bool = True) -> Self:
-        """As ever, but the VAE stays as it is."""
+        """Set the training mode of all but the frozen VAE."""
         super().train(mode)
         self.vae.eval()
         return self
 
     @torch.no_grad()
     def embed(self, seen: Velocities) -> tuple[Tensor, Tensor]:
-        """What stays constant while the projector learns: flow latents (V, channels, T', S/8, S/8) and conditions (V, 2)."""
+        """Compute what stays constant while the projector learns: flow latents (V, channels, T', S/8, S/8) and conditions (V, 2)."""
         like = next(self.projector.parameters())
         flow, cell = seen.flow.to(like.device, torch.float32), seen.cell.to(like.device)
         options = {"encoding": self.flow["flow_encoding"], "speed_scale": self.flow["speed_scale"]}
@@ -212,7 +212,7 @@ class DynamicsEncoder(nn.Module):
     def measure_flow(
         self, batch: MultiViewBatch, views: Sequence[int], centre: Tensor, *, cache: str | os.PathLike | None = None
     ) -> Velocities:
-        """The velocities that some views of a scene show.
+        """Measure the velocities in some views of a scene.
 
         Args:
             batch: The scene.
@@ -226,7 +226,7 @@ class DynamicsEncoder(nn.Module):
         return measure_velocities(batch.images[views], batch.masks[views], batch.times, cameras, centre, **options)
 
     def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
-        """z (d,): the mean over the views of the projector's, of flow latents and conditions."""
+        """Return z (d,): the mean over the views of the projector's, of flow latents and conditions."""
         return self.projector(volume, conditions).mean(0)
 
     def save(self, path: str | os.PathLike, card: Mapping[str, Any] | None = None) -> None:

@@ -35,7 +35,7 @@ SECTORS = (15, 6, 4, 11, 13, 6)
 
 
 def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None = None) -> Tensor:
-    """Dense flow from each frame to the next [px per frame], by DIS.
+    """Compute dense flow from each frame to the next [px per frame], by DIS.
 
     Args:
         images: RGB in [0, 1], (..., T, H, W, 3), T >= 2.
@@ -79,7 +79,7 @@ class Velocities(NamedTuple):
 
 
 def body_window(masks: Tensor, margin: float = 0.1) -> tuple[int, int, int]:
-    """Top, left and side [px] of the square, within the image, that holds a body in all frames of a video.
+    """Return top, left and side [px] of the square, within the image, that holds a body in all frames of a video.
 
     Args:
         masks: (T, H, W); a body is where they exceed one half.
@@ -107,7 +107,7 @@ def measure_velocities(
     preset: str = "medium",
     cache: str | os.PathLike | None = None,
 ) -> Velocities:
-    """The velocities that videos show, in a square around the body, masked by its silhouette.
+    """Measure velocities in videos, in a square around the body, masked by its silhouette.
 
     Args:
         images: RGB in [0, 1], (V, T, H, W, 3).
@@ -140,7 +140,7 @@ def measure_velocities(
 
 
 def as_bytes(images: Tensor) -> Tensor:
-    """Images or masks in [0, 1] as bytes, (V, T, ...) uint8; frame by frame, since whole videos as floats fill gigabytes."""
+    """Convert images or masks in [0, 1] to bytes, (V, T, ...) uint8, frame by frame to save memory."""
     out = torch.empty(images.shape, dtype=torch.uint8, device=images.device)
     for view, own in zip(images.detach(), out):
         for frame, part in zip(view, own):
@@ -149,7 +149,7 @@ def as_bytes(images: Tensor) -> Tensor:
 
 
 def _crop_flow(flow: Tensor, masks: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Masked flow (V, T - 1, S, S, 2) in pixels of the full image, and the sides of the windows [px], (V,)."""
+    """Return masked flow (V, T - 1, S, S, 2) in pixels of the full image, and the sides of the windows [px], (V,)."""
     out, sides = [], []
     for each, mask in zip(flow, masks):
         top, left, side = body_window(mask)
@@ -172,7 +172,7 @@ def _read_cache(path: Path | None) -> tuple[Tensor, Tensor] | None:
 
 
 def pixel_length(cameras: Cameras, centre: Tensor) -> Tensor:
-    """What a pixel of each camera measures at the depth of a point [m], (V,).
+    """Return the size of a pixel of each camera at the depth of a point [m], (V,).
 
     Args:
         cameras: V cameras.
@@ -186,7 +186,7 @@ def pixel_length(cameras: Cameras, centre: Tensor) -> Tensor:
 
 
 def flow_image(flow: Tensor, scale: float) -> Tensor:
-    """Velocity as three channels in [-1, 1]: its two components and its magnitude, over a fixed scale.
+    """Encode velocity as three channels in [-1, 1]: its two components and its magnitude, over a fixed scale.
 
     Args:
         flow: (..., H, W, 2) [m/s].
@@ -200,7 +200,7 @@ def flow_image(flow: Tensor, scale: float) -> Tensor:
 
 
 def colour_wheel(flow: Tensor) -> Tensor:
-    """The flow as a Middlebury colour image in [-1, 1], each frame over its own largest magnitude (the paper's input, after Tora).
+    """Encode flow as a Middlebury colour image in [-1, 1], normalised frame by frame (the paper's input, after Tora).
 
     Args:
         flow: (..., H, W, 2).
@@ -220,7 +220,7 @@ def colour_wheel(flow: Tensor) -> Tensor:
 
 
 def _wheel() -> Tensor:
-    """RGB of the wheel, (55, 3)."""
+    """Return RGB of the wheel, (55, 3)."""
     rows = []
     for sector, steps in enumerate(SECTORS):
         rise = torch.arange(steps) / steps
@@ -233,7 +233,7 @@ def _wheel() -> Tensor:
 
 
 def encode_flow(flow: Tensor, *, encoding: str = "velocity", speed_scale: float = 2.0) -> Tensor:
-    """The flow as videos for a 3D VAE, with an empty first frame so that there is one for each image (Tora).
+    """Encode flow as videos for a 3D VAE, with an empty first frame so that there is one for each image (Tora).
 
     Args:
         flow: V videos (V, T - 1, H, W, 2) [m/s].
@@ -256,7 +256,7 @@ def encode_flow(flow: Tensor, *, encoding: str = "velocity", speed_scale: float 
 
 
 def frame_interval_of(times: Tensor | Sequence[float]) -> float:
-    """The time between the frames [s], which must be even to 1 %.
+    """Return the time between the frames [s], which must be even to 1 %.
 
     Raises:
         UserError: One frame alone, or uneven times.

@@ -22,7 +22,7 @@ from neuido.errors import UserError
 
 FORMAT = "neuido-flow-vae/1"
 ENCODER_FORMAT = "neuido-encoder/1"
-"""Of `models.encoder`, whose files hold a VAE beside the projector."""
+"""Of `encoder.DynamicsEncoder`, whose files hold a VAE beside the projector."""
 CHANNELS = 16
 """Latent channels, as CogVideoX's."""
 
@@ -63,7 +63,7 @@ class Activation(nn.Module):
 
 
 def frame_by_frame(layer: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """A layer for images applied to each frame of (B, C, T, H, W)."""
+    """Apply a layer for images to each frame of (B, C, T, H, W)."""
     flat = x.transpose(1, 2).flatten(0, 1)
     return layer(flat).unflatten(0, (x.shape[0], x.shape[2])).transpose(1, 2)
 
@@ -116,7 +116,7 @@ class FlowVAE(nn.Module):
         self.card: dict[str, Any] = {}
 
     def posterior(self, video: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and log variance of the latent, before `scale`, (B, 16, T', H/8, W/8) each, of (B, 3, T, H, W) in [-1, 1].
+        """Return mean and log variance of the latent, before `scale`, (B, 16, T', H/8, W/8) each, of (B, 3, T, H, W) in [-1, 1].
 
         Raises:
             UserError: A shape of another kind, or height and width that 8 does not divide.
@@ -130,15 +130,15 @@ class FlowVAE(nn.Module):
         return mean, variance.clamp(-20, 2)
 
     def encode(self, video: Tensor) -> Tensor:
-        """Mean latents times `scale`, (B, 16, T', H/8, W/8), of videos (B, 3, T, H, W) in [-1, 1]; T' = floor((T - 1) / 4) + 1."""
+        """Encode videos (B, 3, T, H, W) in [-1, 1] to mean latents times `scale`, (B, 16, T', H/8, W/8); T' = floor((T - 1) / 4) + 1."""
         return self.scale * self.posterior(video)[0]
 
     def decode(self, latent: Tensor) -> Tensor:
-        """Videos (B, 3, 4 T' - 3, H, W) of latents times `scale`."""
+        """Decode latents times `scale` to videos (B, 3, 4 T' - 3, H, W)."""
         return self.reconstruct(latent / self.scale)
 
     def reconstruct(self, latent: Tensor) -> Tensor:
-        """`decode` before `scale`."""
+        """Decode latents before `scale`."""
         first, before, middle, after, narrow, last, active, out = self.decoder
         h = before(first(latent))
         h = after(middle(_upsample(h)))
@@ -176,20 +176,20 @@ class FlowVAE(nn.Module):
 
 
 def _upsample(x: Tensor) -> Tensor:
-    """Twice the size and all but one frame of twice the length: T' -> 2 T' - 1, the inverse of a causal stride of two."""
+    """Double the size and the length but for one frame: T' -> 2 T' - 1, the inverse of a causal stride of two."""
     return functional.interpolate(x, scale_factor=(2, 2, 2))[:, :, 1:]
 
 
 def write_weights(
     path: str | os.PathLike, kind: str, config: Mapping[str, Any], tensors: dict[str, Tensor], card: Mapping[str, Any]
 ) -> None:
-    """A safetensors file with its format, configuration and card, written all at once."""
+    """Write a safetensors file with its format, configuration and card, all at once."""
     with replacing(path) as hidden:
         save_file(tensors, hidden, metadata={"format": kind, "config": json.dumps(dict(config)), "card": json.dumps(dict(card))})
 
 
 def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
-    """Configuration, tensors and card of a file of `write_weights`.
+    """Read configuration, tensors and card of a file of `write_weights`.
 
     Raises:
         UserError: No such file, or one of a format that is not in `kinds`; it names `option`.
@@ -209,7 +209,7 @@ def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -
 
 
 def load_state(module: nn.Module, tensors: dict[str, Tensor], path: str | os.PathLike) -> None:
-    """`load_state_dict` whose failure is one line."""
+    """Load a state dict; a mismatch is a one-line error."""
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:

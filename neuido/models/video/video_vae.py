@@ -21,7 +21,7 @@ class VideoVAE(Protocol):
     """Latent channels."""
 
     def encode(self, video: Tensor) -> Tensor:
-        """(B, 3, T, H, W) in [-1, 1] -> (B, channels, T', H/8, W/8), T' = floor((T - 1) / 4) + 1."""
+        """Encode videos, (B, 3, T, H, W) in [-1, 1] -> (B, channels, T', H/8, W/8), T' = floor((T - 1) / 4) + 1."""
         ...
 
 
@@ -57,14 +57,14 @@ class CogVideoXVAE(nn.Module):
 
     @torch.no_grad()
     def encode(self, video: Tensor) -> Tensor:
-        """Mean latents times the file's scaling factor, one video at a time."""
+        """Return mean latents times the file's scaling factor, one video at a time."""
         like = next(self.inner.parameters())
         rows = [self.inner.encode(clip[None].to(like)).latent_dist.mean for clip in video]
         return self.factor * torch.cat(rows).to(video.dtype)
 
 
 def open_vae(source: str | os.PathLike) -> FlowVAE | CogVideoXVAE:
-    """A VAE, frozen.
+    """Open a VAE, frozen.
 
     Args:
         source: A file of `FlowVAE.save`; `pretrained`, the one that comes with neuido; or `cogvideox:` and a folder or the name of
