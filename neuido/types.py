@@ -9,6 +9,20 @@ from torch import Tensor
 Vector = tuple[float, float, float]
 
 
+def brief(value: object) -> str:
+    """Return a value in a few words: a tensor of one element as its number, a larger one as its shape and type."""
+    if isinstance(value, Tensor):
+        kind = str(value.dtype).removeprefix("torch.")
+        return f"{value.item():.6g}" if value.numel() == 1 else f"{tuple(value.shape)} {kind} on {value.device}"
+    return f"{value:.6g}" if isinstance(value, float) else repr(value)
+
+
+def brief_fields(value: NamedTuple) -> str:
+    """Return a named tuple with its fields in a few words each, those that are None left out."""
+    fields = zip(value._fields, value)
+    return f"{type(value).__name__}({', '.join(f'{name}: {brief(part)}' for name, part in fields if part is not None)})"
+
+
 class ParticleState(NamedTuple):
     """The state of P particles, or of K frames of them with a leading K."""
 
@@ -21,6 +35,9 @@ class ParticleState(NamedTuple):
     F: Tensor
     """Elastic deformation gradient [-], (P, 3, 3)."""
 
+    def __repr__(self) -> str:
+        return brief_fields(self)
+
 
 class Particles(NamedTuple):
     """Which scene each of the concatenated particles belongs to; scene s owns offsets[s]:offsets[s+1]."""
@@ -29,6 +46,9 @@ class Particles(NamedTuple):
     """Scene index, (P,) int32."""
     offsets: tuple[int, ...]
     """First particle of each scene, and P at the end: S + 1 numbers."""
+
+    def __repr__(self) -> str:
+        return brief_fields(self)
 
 
 class Body(NamedTuple):
@@ -43,6 +63,9 @@ class Body(NamedTuple):
     F: Tensor | None = None
     """Deformation gradient [-], (P, 3, 3); the identity where absent."""
 
+    def __repr__(self) -> str:
+        return brief_fields(self)
+
 
 class TrajectoryBatch(NamedTuple):
     """Samples of constitutive behaviour (paper, Stage I), in the order of a substep: trial, corrected, stress."""
@@ -56,6 +79,9 @@ class TrajectoryBatch(NamedTuple):
     trajectory: Tensor
     """Index of the trajectory that a sample comes from, (B,) int64."""
 
+    def __repr__(self) -> str:
+        return brief_fields(self)
+
 
 class Cameras(NamedTuple):
     """V pinhole cameras of one image size. Pixel (i, j) covers [j, j + 1) x [i, i + 1), so its centre lies at j + 0.5, i + 0.5."""
@@ -66,6 +92,9 @@ class Cameras(NamedTuple):
     """Intrinsics [px], (V, 3, 3)."""
     width: int
     height: int
+
+    def __repr__(self) -> str:
+        return brief_fields(self)
 
 
 class MultiViewBatch(NamedTuple):
@@ -87,6 +116,9 @@ class MultiViewBatch(NamedTuple):
     """Which of the views are for scoring only, (V,) bool."""
     background: Tensor
     """Its colour, (3,) float32."""
+
+    def __repr__(self) -> str:
+        return brief_fields(self)
 
 
 @dataclass(frozen=True)
@@ -170,3 +202,6 @@ class Gaussians(NamedTuple):
     """Spherical harmonics of the colour less one half, (N, (degree + 1)^2, 3); degree 0 to 3."""
     rotations: Tensor | None = None
     """By how much each Gaussian is rotated since its harmonics were fitted, (N, 3, 3); not at all where absent."""
+
+    def __repr__(self) -> str:
+        return brief_fields(self)

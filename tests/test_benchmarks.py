@@ -25,7 +25,7 @@ import scaling  # noqa: E402
 def simulator(friction: float, dt: float = 1e-3) -> Simulator:
     """A ball that meets the floor at an angle."""
     x, v, volume, *_ = ball(centre=(0.5, 0.145, 0.5), radius=0.14, spacing=0.025, velocity=(1.0, -3.0, 0.4))
-    return Simulator(Scene(cells=24, dt=dt, walls=Walls("separate", friction)), Body(x, v, volume))
+    return Simulator(Scene(cells=24, dt=dt, walls=Walls("separate", friction)), Body(x, v, volume), device="cpu")
 
 
 @pytest.mark.parametrize("friction", [0.0, float("inf")])

@@ -26,7 +26,7 @@ PUBLIC = {
         TrajectoryDataModule VisualDataModule cameras load_scene read_experiment read_material_tests read_recording read_tracks
         scene_names shapes write_experiment
     """,
-    "neuido.physics": "FiniteElements MassSpring Mesh Simulator effects laws mesh_body",
+    "neuido.physics": "FiniteElements Frames MassSpring Mesh Simulator effects laws mesh_body",
     "neuido.physics.effects": "Effects Entry LIBRARY Parameter ball_inclusion linear_gradient",
     "neuido.physics.laws": """
         AutogradElastic AutogradPlastic DruckerPrager ElasticLaw FixedCorotated Identity InvariantElastic InvariantPlastic NeoHookean

@@ -10,10 +10,12 @@ if TYPE_CHECKING:
     from neuido.physics.fem.meshing import Mesh as Mesh
     from neuido.physics.fem.meshing import mesh_body as mesh_body
     from neuido.physics.mpm.simulator import Simulator as Simulator
+    from neuido.physics.runtime.frames import Frames as Frames
     from neuido.physics.springs.mass_spring import MassSpring as MassSpring
 
 __all__ = [
     "FiniteElements",
+    "Frames",
     "MassSpring",
     "Mesh",
     "Simulator",
@@ -24,6 +26,7 @@ __all__ = [
 
 _PLACES = {
     "FiniteElements": "fem.finite_elements:FiniteElements",
+    "Frames": "runtime.frames:Frames",
     "MassSpring": "springs.mass_spring:MassSpring",
     "Mesh": "fem.meshing:Mesh",
     "Simulator": "mpm.simulator:Simulator",

@@ -54,7 +54,7 @@ def experiment(
         ("throw", "fit", body((0.8, -1.5, 0.0), 6.0, 0.5, side)),
         ("drop", "held_out", body((-0.5, -2.0, 0.4), 4.0, 0.55, side)),
     ):
-        simulator = Simulator(scene, b, density=1000.0)
+        simulator = Simulator(scene, b, density=1000.0, device="cpu")
         with torch.no_grad():
             pair = material(MODEL["elasticity"], MODEL["plasticity"]) if laws is None else laws
             out = simulator.rollout(10 * (frames - 1), *pair, every=10, effects=Effects.of(effects))
@@ -91,7 +91,7 @@ def filmed(
         ("throw", "fit", body((0.9, 0.6, 0.2), 5.0, 0.42, side)),
         ("drop", "held_out", body((-0.4, -1.0, 0.3), -4.0, 0.6, side)),
     ):
-        simulator = Simulator(scene, b, density=1000.0)
+        simulator = Simulator(scene, b, density=1000.0, device="cpu")
         with torch.no_grad():
             out = simulator.rollout(
                 20 * (frames - 1), *material(MODEL["elasticity"], MODEL["plasticity"]), every=20, effects=Effects.of(effects)

@@ -66,7 +66,7 @@ def test_drag_on_a_neural_law_is_named_and_the_model_goes_back(law, folder, tmp_
     assert model["free"] == ["stiffness"]
 
     r = read_experiment(folder)["drop"]
-    simulator = Simulator(r.scene, r.body, density=1000.0)
+    simulator = Simulator(r.scene, r.body, density=1000.0, device="cpu")
     found = ready(out / "model_after.yaml", simulator)
     with torch.no_grad():
         moved = simulator.rollout(110, found.elasticity, found.plasticity, effects=found.effects, every=10)

@@ -62,7 +62,7 @@ def test_diagnose_of_the_repeated_recordings_answers_none(folder, after, tmp_pat
 
 def test_ready_is_what_the_problem_simulates(folder, after):
     r = read_experiment(folder)["throw"]
-    simulator = Simulator(r.scene, r.body, density=1000.0)
+    simulator = Simulator(r.scene, r.body, density=1000.0, device="cpu")
     law = ready(after, simulator)
     with torch.no_grad():
         out = simulator.rollout(90, law.elasticity, law.plasticity, effects=law.effects, every=10)
@@ -72,7 +72,7 @@ def test_ready_is_what_the_problem_simulates(folder, after):
 
 def test_ready_takes_fields_over_the_body_and_forces_in_time(folder):
     r = read_experiment(folder)["throw"]
-    simulator = Simulator([r.scene] * 2, [r.body] * 2, density=1000.0)
+    simulator = Simulator([r.scene] * 2, [r.body] * 2, density=1000.0, device="cpu")
     base = {"density": 1000.0, "elasticity": {"law": "fixed_corotated", "young": 6e4, "poisson": 0.3}, "free": ["young"]}
     for effects in ({"stiffness_gradient.x": 0.5}, {"time_force.y0": 2.0, "time_force.y4": -2.0, "time_force.interval": 0.02}):
         law = ready({**base, "effects": effects}, simulator)

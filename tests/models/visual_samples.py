@@ -48,7 +48,7 @@ def tiny_scene(
            "plasticity": plasticity or {"law": "identity"}}  # fmt: skip
     if plasticity is not None:
         law["elasticity"]["law"] = "sigma"
-    simulator = Simulator(scene, body)
+    simulator = Simulator(scene, body, device="cpu")
     with torch.no_grad():
         effects = None if density is None else Effects(relative_density=density(body.x))
         laws = material(law["elasticity"], law["plasticity"])

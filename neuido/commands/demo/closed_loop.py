@@ -187,7 +187,7 @@ def record(
     recordings = []
     for launch in launches:
         body = _block(launch, side)
-        simulator = Simulator(scene, body, density=model["density"])
+        simulator = Simulator(scene, body, density=model["density"], device="cpu")
         with torch.no_grad():
             seen = simulator.rollout(
                 every * (frames - 1), *material(model["elasticity"], model["plasticity"]), every=every, effects=Effects.of(dict(effects))

@@ -86,7 +86,7 @@ def _compare(operator: "IntrinsicDynamicsOperator", name: str, family: str, para
     from neuido.types import Scene, Walls
 
     body = ball(centre=(0.5, 0.3, 0.5), radius=0.15, spacing=0.027, velocity=(0.5, -1.0, 0.0))
-    simulator = Simulator(Scene(cells=CELLS, dt=DT, walls=Walls(inset=INSET)), body)
+    simulator = Simulator(Scene(cells=CELLS, dt=DT, walls=Walls(inset=INSET)), body, device="cpu")
     with torch.no_grad():
         true = simulator.rollout(STEPS, *laws(family, [parameters]), every=EVERY).x
         learned = simulator.rollout(STEPS, *operator.cpu().laws(operator.latent(name)), every=EVERY).x

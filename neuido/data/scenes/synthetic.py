@@ -135,7 +135,7 @@ def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.Path
             raise UserError(f"substeps must be a positive whole number, got {substeps!r}")
         if bool(((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any()):
             raise UserError("particles of the body lie outside scene.domain")
-        Simulator(scene, body, density=law["density"]).check_step(material(law["elasticity"], law["plasticity"])[0])
+        Simulator(scene, body, density=law["density"], device="cpu").check_step(material(law["elasticity"], law["plasticity"])[0])
     except UserError as error:
         raise UserError(f"scenes: {name}: {error}") from error
     return Plan(name, scene, body, motion, law, belief, split, substeps, source)

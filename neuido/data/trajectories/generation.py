@@ -144,7 +144,7 @@ def _body(setup: Setup) -> Body:
 
 def _check_steps(setup: Setup, wanted: list[Instance]) -> None:
     """Refuse an unstable step of the last instance before the first one is simulated."""
-    simulator = Simulator(setup.scene, _body(setup), density=setup.density)
+    simulator = Simulator(setup.scene, _body(setup), density=setup.density, device="cpu")
     for instance in wanted:
         try:
             simulator.check_step(laws(instance.family, [instance.parameters])[0])

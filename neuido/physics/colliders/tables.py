@@ -41,7 +41,7 @@ class ColliderTable(NamedTuple):
 
 
 def planes_of(scene: Scene) -> tuple[Plane, ...]:
-    """The colliders of a scene followed by its six walls.
+    """Return the colliders of a scene followed by its six walls.
 
     Raises:
         UserError: Unknown contact, zero normal, negative or NaN friction.
@@ -66,7 +66,7 @@ def planes_of(scene: Scene) -> tuple[Plane, ...]:
 
 
 def collider_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.device) -> ColliderTable:
-    """The planes of all scenes, padded to the largest number of them."""
+    """Return the planes of all scenes, padded to the largest number of them."""
     rows = [planes_of(scene) for scene in scenes]
     count = max(1, *(len(row) for row in rows))
     plane = torch.zeros(len(scenes), count, 4, dtype=torch.float64)

@@ -81,7 +81,7 @@ class Tables(NamedTuple):
 
 
 def shear_modulus(law: ElasticLaw) -> Tensor:
-    """The law's shear modulus at F = I [Pa], (S,) of the law.
+    """Return the law's shear modulus at F = I [Pa], (S,) of the law.
 
     That of a classical law comes from its parameters. Any other law is asked: the mean of central differences of tau_ij in three pure
     shears of 1e-4 (1e-2 in float32), differentiable in the law's tensors.
@@ -125,7 +125,7 @@ def hysteresis_spectrum(loss: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _kinds(plasticity: PlasticLaw | None, scene_count: int) -> tuple[int, ...] | None:
-    """The kind of each scene's base plasticity, or None for a law that is not a classical one."""
+    """Return the kind of each scene's base plasticity, or None for a law that is not a classical one."""
     if plasticity is None or plasticity.identity:
         return (NO_FLOW,) * scene_count
     if not hasattr(plasticity, "scene_laws"):
@@ -142,7 +142,7 @@ def _flow(
     like: Tensor,
     mu: Tensor,
 ) -> tuple[Tensor | None, tuple[int, ...]]:
-    """The table of the flow and its kinds, or None where the base law does it all."""
+    """Return the table of the flow and its kinds, or None where the base law does it all."""
     base = _kinds(plasticity, count)
     own = {name: getattr(effects, name) for name in ("hardening", "softening", "kinematic_hardening", "rate_yield")}
     given = [name for name, value in own.items() if value is not None]
@@ -192,7 +192,7 @@ def tables(
     *,
     shear: Tensor | float | None = None,
 ) -> Tables:
-    """The tables of the effects of the material, differentiable in the effects and in the parameters of the base laws.
+    """Return the tables of the effects of the material, differentiable in the effects and in the parameters of the base laws.
 
     Args:
         effects: The effects.

@@ -33,7 +33,7 @@ class History(NamedTuple):
 
 
 def spin(C: Tensor, dt: Tensor | float) -> Tensor:
-    """The rotation of a step, Cayley's (I - dt W/2)^-1 (I + dt W/2) with W = skew C, (P, 3, 3) (Hughes and Winget 1980, eq. 14)."""
+    """Return the rotation of a step, Cayley's (I - dt W/2)^-1 (I + dt W/2) with W = skew C, (P, 3, 3) (Hughes and Winget 1980, eq. 14)."""
     Q = 0.25 * dt * (C - C.mT)
     size = 0.5 * (Q * Q).sum((-2, -1), keepdim=True)
     eye = torch.eye(3, dtype=C.dtype, device=C.device)
@@ -41,7 +41,7 @@ def spin(C: Tensor, dt: Tensor | float) -> Tensor:
 
 
 def deviator(A: Tensor) -> Tensor:
-    """A - tr(A)/3 I, (..., 3, 3)."""
+    """Return a - tr(A)/3 I, (..., 3, 3)."""
     eye = torch.eye(3, dtype=A.dtype, device=A.device)
     return A - A.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] / 3 * eye
 
@@ -67,7 +67,7 @@ def expm(A: Tensor) -> Tensor:
 
 
 def hencky(F: Tensor) -> Tensor:
-    """The left Hencky strain ln V of F = V R, (P, 3, 3); stretches are bounded below by `law_kernels.FLOOR`."""
+    """Return the left Hencky strain ln V of F = V R, (P, 3, 3); stretches are bounded below by `law_kernels.FLOOR`."""
     at = linalg.frame(F)
     return linalg.isotropic_stress(F, at, at.sigma.clamp(min=FLOOR).log(), linalg.log_difference(at.sigma, FLOOR))
 
@@ -132,12 +132,12 @@ class Constitutive:
         self._stiffness = effects.particle_stiffness(count, like)
 
     def start(self) -> History:
-        """A history of zeros."""
+        """Return a history of zeros."""
         zero = self.like.new_zeros
         return History(zero(self.count, self.tables.layout.branches, 3, 3), zero(self.count), zero(self.count, 3, 3), zero(self.count))
 
     def _scale(self, time: Tensor | float) -> Tensor:
-        """The factor of the elastic stress that does not depend on the history, (P,)."""
+        """Return the factor of the elastic stress that does not depend on the history, (P,)."""
         scale = self.like.new_ones(self.count)
         if self._stiffness is not None:
             scale = scale * self._stiffness
@@ -180,7 +180,7 @@ class Constitutive:
         return tau
 
     def advance(self, trial: Tensor, C: Tensor, history: History, dt: Tensor | float, time: Tensor | float = 0.0) -> tuple[Tensor, History]:
-        """The corrected deformation gradient of a trial one, and the history after the step.
+        """Return the corrected deformation gradient of a trial one, and the history after the step.
 
         Args:
             trial: F_tr = (I + dt C) F, (P, 3, 3).

@@ -21,7 +21,7 @@ from neuido.physics.runtime.once import cached
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """The kernels for `wp.float32` or `wp.float64`."""
+    """Return the kernels for `wp.float32` or `wp.float64`."""
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
@@ -151,7 +151,7 @@ def build(real: type) -> SimpleNamespace:
         a_stiffness: wp.array(dtype=real),
         a_growth: wp.array(dtype=real),
     ):
-        """Adds to all; a_F is that of the trial gradient."""
+        """Add to all of them; a_F is that of the trial gradient."""
         p = wp.tid()
         s = scene[p]
         Fp = F[p]

@@ -59,7 +59,7 @@ def tools(real: type, module: str) -> Tools:
 
     @func
     def spread(a_history: wp.array2d(dtype=real), p: int, at: int, A: mat33):
-        """A must be symmetric."""
+        """Add the adjoint of a symmetric matrix A to those of its columns."""
         a_history[p, at] = a_history[p, at] + A[0, 0]
         a_history[p, at + 1] = a_history[p, at + 1] + A[1, 1]
         a_history[p, at + 2] = a_history[p, at + 2] + A[2, 2]
@@ -78,7 +78,7 @@ def tools(real: type, module: str) -> Tools:
 
     @func
     def gather(a_history: wp.array2d(dtype=real), p: int, at: int):
-        """The adjoint of a symmetric matrix, from those of its columns."""
+        """Return the adjoint of a symmetric matrix, from those of its columns."""
         A = load(a_history, p, at)
         return half * (A + wp.diag(wp.get_diag(A)))
 

@@ -18,7 +18,7 @@ from neuido.physics.runtime.once import cached
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """The kernels for `wp.float32` or `wp.float64`."""
+    """Return the kernels for `wp.float32` or `wp.float64`."""
     start_warp()
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
     name = f"neuido.history.{real.__name__}"
@@ -100,7 +100,7 @@ def build(real: type) -> SimpleNamespace:
         history: wp.array2d(dtype=real),
         history_next: wp.array2d(dtype=real),
     ):
-        """The largest norm of the deviatoric Hencky strain so far."""
+        """Write the largest norm of the deviatoric Hencky strain so far."""
         p = wp.tid()
         most = history[p, at]
         if bound(F[p]) > most:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics.effects.library import LIBRARY, Entry, Parameter
+from neuido.types import brief_fields
 
 __all__ = ["LIBRARY", "Effects", "Entry", "Parameter", "ball_inclusion", "linear_gradient"]
 
@@ -151,7 +152,7 @@ class Effects(NamedTuple):
         return any(getattr(self, name) is not None for name in _MATERIAL)
 
     def rows(self, name: str, scene_count: int, like: Tensor) -> Tensor:
-        """The parameter `name` as (S, 1) or (S, 3), differentiable, in the type and on the device of `like`; zero where absent.
+        """Return the parameter `name` as (S, 1) or (S, 3), differentiable, in the type and on the device of `like`; zero where absent.
 
         Raises:
             UserError: Below its range, not a number, or a shape that fits neither one scene nor all.
@@ -172,7 +173,7 @@ class Effects(NamedTuple):
         return rows.expand(scene_count, width)
 
     def particle_stiffness(self, count: int, like: Tensor) -> Tensor | None:
-        """The factor on each particle's elastic stress, (P,), of `stiffness` and `relative_density`; None: neither is given.
+        """Return the factor on each particle's elastic stress, (P,), of `stiffness` and `relative_density`; None: neither is given.
 
         Raises:
             UserError: As `particle_factor`.
@@ -228,7 +229,7 @@ class Effects(NamedTuple):
         return total + (1 - share) * knots[scene, left] + share * knots[scene, right]
 
     def force_table(self, scene_count: int, like: Tensor) -> Tensor:
-        """What `grid_kernels.update_grid` reads.
+        """Return the table of body forces that `mpm.grid.update_grid` reads.
 
         Columns linear drag, quadratic drag, pull, centre x, y, z, (S, 6); where one of them is given also magnus x, y, z, stick and
         restitution, (S, 11).
@@ -256,6 +257,9 @@ class Effects(NamedTuple):
         times = torch.arange(steps, dtype=torch.float64, device=dt.device)[:, None] * dt.double()
         return torch.exp(self.rows("stiffness_change", len(dt), dt)[:, 0] * times.to(dt))
 
+    def __repr__(self) -> str:
+        return brief_fields(self)
+
 
 def _tensor(value) -> Tensor:
     """Numbers become float64, so that they keep their digits."""
@@ -263,7 +267,7 @@ def _tensor(value) -> Tensor:
 
 
 def linear_gradient(x: Tensor, slope: Tensor, *, mean: Tensor | None = None, length: Tensor | float | None = None) -> Tensor:
-    """The factor exp(slope . (X - mean) / length), (P,): a stiffness gradient over the body.
+    """Return the factor exp(slope . (X - mean) / length), (P,): a stiffness gradient over the body.
 
     Args:
         x: Reference positions [m], (P, 3).
@@ -279,7 +283,7 @@ def linear_gradient(x: Tensor, slope: Tensor, *, mean: Tensor | None = None, len
 def ball_inclusion(
     x: Tensor, log_ratio: Tensor | float, centre: Tensor, radius: Tensor | float, *, width: Tensor | float = 0.0, mean: Tensor | None = None
 ) -> Tensor:
-    """The factor exp(log_ratio) inside a ball and one outside, (P,): a stiffer or a softer inclusion.
+    """Return the factor exp(log_ratio) inside a ball and one outside, (P,): a stiffer or a softer inclusion.
 
     Args:
         x: Reference positions [m], (P, 3).
@@ -351,7 +355,7 @@ def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tenso
 
 
 def _stiffness(part: Mapping[str, Tensor | float], x: Tensor | None, scene: Tensor | None) -> Tensor:
-    """The factor of each particle from the parameters of `stiffness_gradient`; each scene has its own mean and length."""
+    """Return the factor of each particle from the parameters of `stiffness_gradient`; each scene has its own mean and length."""
     if x is None:
         raise UserError("stiffness_gradient needs the particles' reference positions: Effects.of(values, x=...)")
     index = torch.zeros(len(x), dtype=torch.long, device=x.device) if scene is None else scene.long()

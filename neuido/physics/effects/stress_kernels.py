@@ -20,7 +20,7 @@ from neuido.physics.runtime.once import cached
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """The kernels for `wp.float32` or `wp.float64`, those of `history_kernels` included."""
+    """Return the kernels for `wp.float32` or `wp.float64`, those of `history_kernels` included."""
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
@@ -66,7 +66,7 @@ def build(real: type) -> SimpleNamespace:
 
     @func
     def extra_stress(F: mat33, material: wp.array2d(dtype=real), s: int, spectral: bool):
-        """What strain stiffening, the second invariant, fibres and the asymmetry add [Pa].
+        """Return what strain stiffening, the second invariant, fibres and the asymmetry add [Pa].
 
         One that is zero is not computed: an inverted body, which the base law may bear, has no logarithm of its stretches.
         """
@@ -102,7 +102,7 @@ def build(real: type) -> SimpleNamespace:
         idle: bool,
         history: wp.array2d(dtype=real),
     ):
-        """The stress before `worn_scale`: that of the base law, extra(F) and the branches [Pa]; `idle` as of `history_kernels.relax`."""
+        """Return the stress before `worn_scale` [Pa]: of the base law, extra(F) and the branches; `idle` as of `history_kernels.relax`."""
         out = base[p]
         if material:
             out = out + extra_stress(F[p], material, s, spectral)
@@ -168,7 +168,7 @@ def build(real: type) -> SimpleNamespace:
         a_material: wp.array2d(dtype=real),
         a_branches: wp.array3d(dtype=real),
     ):
-        """Turns a_tau into the adjoint of the base law's stress and adds to the others; `base`, that stress, is read if scaled."""
+        """Turn a_tau into the adjoint of the base law's stress and adds to the others; `base`, that stress, is read if scaled."""
         p = wp.tid()
         s = scene[p]
         A = a_tau[p]

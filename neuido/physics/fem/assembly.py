@@ -69,7 +69,7 @@ class BodyMesh(NamedTuple):
 
 
 def body_mesh(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype: torch.dtype) -> BodyMesh:
-    """The ties of a mesh to the particles x (P, 3) of the given volumes (P,)."""
+    """Return the ties of a mesh to the particles x (P, 3) of the given volumes (P,)."""
     nodes, own = mesh.nodes, mesh.volume
     element_of, weights = locate(mesh, x)
     centroid = nodes[mesh.elements].mean(dim=1)
@@ -144,7 +144,7 @@ class Assembly:
         return held
 
     def rows(self, tables: Tables) -> Tables:
-        """The rows of this assembly's scenes."""
+        """Return the rows of this assembly's scenes."""
 
         def part(t: Tensor | None) -> Tensor | None:
             return None if t is None else t[self.a : self.b].contiguous()

@@ -80,7 +80,7 @@ class AssemblyRollout:
         return [t if len(t) == 1 or not assembly.is_part else t[assembly.a : assembly.b] for t in tensors]
 
     def _fields(self, given: Inputs, count: int) -> Fields:
-        """What the first of the intervals reads."""
+        """Return what the first of the intervals reads."""
         stiffness = None
         if given.stiffness is not None:
             index, weight = self.assembly.to_elements

@@ -18,7 +18,7 @@ from neuido.physics.runtime.once import cached
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """The kernels for `wp.float32` or `wp.float64`; contact and body forces are those of `grid_kernels`."""
+    """Return the kernels for `wp.float32` or `wp.float64`; contact and body forces are those of `grid_kernels`."""
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -69,7 +69,7 @@ def build(real: type) -> SimpleNamespace:
 
     @kernel
     def reshape(trial: wp.array(dtype=mat33), F: wp.array(dtype=mat33), gradients: wp.array(dtype=mat33), shape: wp.array(dtype=mat33)):
-        """The shape without stress, G F, of elements that flowed."""
+        """Write the shape without stress, G F, of elements that flowed."""
         i = wp.tid()
         change = F[i] - trial[i]
         if wp.ddot(change, change) != zero:
@@ -104,7 +104,7 @@ def build(real: type) -> SimpleNamespace:
         friction: wp.array2d(dtype=real),
         force: wp.array2d(dtype=real),
     ):
-        """The velocity with which a node ends its step on a plane and not behind it."""
+        """Return the velocity with which a node ends its step on a plane and not behind it."""
         v = v0
         for c in range(kind.shape[1]):
             if kind[s, c] > 0:
@@ -191,7 +191,7 @@ def build(real: type) -> SimpleNamespace:
 
     @kernel
     def pressure(tau: wp.array(dtype=mat33), J_mean: wp.array(dtype=real), out: wp.array(dtype=real)):
-        """Derivative of the energy with the mean volume change [Pa]."""
+        """Write the derivative of the energy with the mean volume change [Pa]."""
         i = wp.tid()
         out[i] = wp.trace(tau[i]) / (real(3.0) * J_mean[i])
 
@@ -202,7 +202,7 @@ def build(real: type) -> SimpleNamespace:
         J: wp.array(dtype=real),
         tau: wp.array(dtype=mat33),
     ):
-        """The stress whose forces are the slope of the smoothed energy: the deviator, and the pressure of the corners."""
+        """Write the stress whose forces are the slope of the smoothed energy: the deviator, and the pressure of the corners."""
         i = wp.tid()
         e = elements[i]
         p = J[i] * real(0.25) * (nodal[e[0]] + nodal[e[1]] + nodal[e[2]] + nodal[e[3]])

@@ -132,7 +132,7 @@ class Loop:
             self.history.copy_(self.history_next)
 
     def run(self) -> None:
-        """The launches of an interval; the last history is where an odd number of swaps leaves it."""
+        """Launch an interval; the last history is where an odd number of swaps leaves it."""
         begun = self.history, self.history_next
         with torch_stream(self.assembly.solver.device):
             elastic, plastic = self._engines()
@@ -184,7 +184,7 @@ class Loop:
                      self.trial if self.changes else self.F)  # fmt: skip
 
     def _remember(self, growth: Tensor | None) -> None:
-        """The history after a step, and F where an effect makes it of the trial one."""
+        """Write the history after a step, and F where an effect makes it of the trial one."""
         f, scene, layout, k = self.fields, self.assembly.particles.scene, self.layout, self.material
         if f.branches is not None:
             self._launch(k.relax, len(self.F), scene, f.dt, f.branches, False, self.C, self.history, self.history_next)
@@ -201,7 +201,7 @@ class Loop:
 def key(
     elasticity: Law, plasticity: Law | None, tables: Tables | None, fields: Fields, laws: Sequence[Sequence[Tensor]], count: int
 ) -> Hashable | None:
-    """What decides the launches of a loop; None where they may not be captured."""
+    """Return what decides the launches of a loop; None where they may not be captured."""
     elastic = elasticity.key(laws[0])
     plastic = "none" if plasticity is None else plasticity.key(laws[1])
     if elastic is None or plastic is None:

@@ -22,6 +22,7 @@ from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm import inputs
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.device import real_of
+from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.threads import one_thread_each, scene_pool
 from neuido.types import Body, ParticleState, Scene
@@ -116,6 +117,11 @@ class FiniteElements:
         self.runs = [AssemblyRollout(assembly, self.graphs) for assembly in assemblies]
         self.pool = scene_pool() if threads and len(self.runs) > 1 else None
 
+    def __repr__(self) -> str:
+        count, elements = len(self.scenes), sum(len(mesh.elements) for mesh in self.meshes)
+        return (f"FiniteElements({count} scene{'' if count == 1 else 's'}, {len(self.mass)} particles, {elements} elements, "
+                f"smoothing {self.smoothing}, {str(self.dtype).removeprefix('torch.')} on {self.device})")  # fmt: skip
+
     @property
     def scene_count(self) -> int:
         """The number of scenes S."""
@@ -209,7 +215,7 @@ class FiniteElements:
         inner: int | None = None,
         finer: int = 1,
         lenient: bool = False,
-    ) -> ParticleState:
+    ) -> Frames:
         """Run `steps` steps of the scenes; arguments and result are those of `mpm.Simulator.rollout`, without gradients.
 
         Args:
@@ -253,7 +259,7 @@ class FiniteElements:
         inner: int | None,
         finer: int,
         lenient: bool,
-    ) -> ParticleState:
+    ) -> Frames:
         state, effects, tables, viscosity, stiffness = given.state, given.effects, given.tables, given.viscosity, given.stiffness
         refused: list[int] = []
         if inner is None:
@@ -261,7 +267,11 @@ class FiniteElements:
         else:
             inner_of = [inner] * self.scene_count
         inner_of = [n * finer for n in inner_of]
-        frames = ParticleState(*(t.new_empty(steps // every + 1, *t.shape) for t in state))
+        frames = Frames(
+            *(t.new_empty(steps // every + 1, *t.shape) for t in state),
+            dt=[scene.dt * every for scene in self.scenes],
+            particles=self.particles,
+        )
 
         def one(run: AssemblyRollout) -> None:
             assembly = run.assembly
@@ -310,6 +320,6 @@ class FiniteElements:
 
 
 def _size(mesh: Mesh) -> float:
-    """The longest edge from an element's first corner [m]."""
+    """Return the longest edge from an element's first corner [m]."""
     corners = mesh.nodes[mesh.elements]
     return float((corners[:, 1:] - corners[:, :1]).norm(dim=2).max())

@@ -46,6 +46,9 @@ class Mesh(NamedTuple):
         last = torch.linalg.inv(corners[:, 1:] - corners[:, :1]).mT
         return torch.cat([-last.sum(dim=1, keepdim=True), last], dim=1)
 
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.nodes)} nodes, {len(self.elements)} elements)"
+
 
 def tetrahedra_of(cells: np.ndarray, kind: int) -> np.ndarray:
     """Corners of the tetrahedra of lattice cells, (n, kind, 4, 3) int, from the cells' indices (n, 3).
@@ -85,7 +88,7 @@ def steepest(mesh: Mesh) -> Tensor:
 
 
 def mesh_of_cells(cells: np.ndarray, origin: np.ndarray, axes: np.ndarray, kind: int = 5) -> Mesh:
-    """The mesh of lattice cells.
+    """Return the mesh of lattice cells.
 
     Args:
         cells: Indices of the cells, (n, 3).
@@ -100,7 +103,7 @@ def mesh_of_cells(cells: np.ndarray, origin: np.ndarray, axes: np.ndarray, kind:
 
 
 def oriented(nodes: Tensor, elements: Tensor) -> Mesh:
-    """A mesh whose elements are turned where their volume is negative.
+    """Return a mesh whose elements are turned where their volume is negative.
 
     Raises:
         UserError: An element without volume, or a node that is in no element.
@@ -116,7 +119,7 @@ def oriented(nodes: Tensor, elements: Tensor) -> Mesh:
 
 
 def mesh_body(x: Tensor, volume: Tensor, *, elements: int | None = None, kind: int = 5) -> Mesh:
-    """A mesh of the body that particles fill. Its volume is theirs, unless theirs leave gaps between them (`LOOSE`).
+    """Return a mesh of the body that particles fill. Its volume is theirs, unless theirs leave gaps between them (`LOOSE`).
 
     Args:
         x: Positions [m], (P, 3).
@@ -167,7 +170,7 @@ def mesh_body(x: Tensor, volume: Tensor, *, elements: int | None = None, kind: i
 
 
 def _onto_surface(mesh: Mesh, x: Tensor, volume: Tensor, level: float, edge: float) -> Mesh:
-    """The outer nodes moved to where the density of the particles, smoothed over half a cell, is `level`: stairs become slopes."""
+    """Move the outer nodes to where the density of the particles, smoothed over half a cell, is `level`: stairs become slopes."""
     order = mesh.elements[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3).sort(dim=1).values
     face, count = torch.unique(order, dim=0, return_counts=True)
     outer = torch.unique(face[count == 1])
@@ -193,7 +196,7 @@ def _onto_surface(mesh: Mesh, x: Tensor, volume: Tensor, level: float, edge: flo
 
 
 def _scaled(mesh: Mesh, total: float) -> Mesh:
-    """The mesh about its centre, of the given volume; as it is where that is far from its own."""
+    """Scale the mesh about its centre to the given volume; as it is where that is far from its own."""
     volume = mesh.volume
     if not 1 / LOOSE <= float(volume.sum()) / total <= LOOSE:
         return mesh
@@ -202,7 +205,10 @@ def _scaled(mesh: Mesh, total: float) -> Mesh:
 
 
 def lattice_of(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """The rectangular lattice on which points lie to 2 % of its spacing: origin (3,), axes as rows (3, 3), indices (P, 3); or None."""
+    """Return the rectangular lattice on which points lie to 2 % of its spacing, or None.
+
+    Its origin (3,), its axes as rows (3, 3), and the indices of the points (P, 3).
+    """
     if len(x) < 8:
         return None
     middle = x[np.argmin(((x - x.mean(axis=0)) ** 2).sum(axis=1))]
@@ -321,7 +327,7 @@ def _without_holes(full: np.ndarray) -> np.ndarray:
 
 
 def locate(mesh: Mesh, points: Tensor, *, near: int = 24, chunk: int = 1024) -> tuple[Tensor, Tensor]:
-    """The element of each point and its barycentric weights: (n,), (n, 4); a point outside is extrapolated from the nearest element.
+    """Return the element of each point and its barycentric weights: (n,), (n, 4); a point outside is extrapolated from the nearest element.
 
     Args:
         mesh: The mesh.

@@ -21,7 +21,7 @@ class Law:
     """One elastic or one plastic law for S scenes."""
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """The differentiable inputs in the form that `forward` takes, each with leading S; graph nodes of the law's parameters."""
+        """Return the differentiable inputs in the form that `forward` takes, each with leading S; graph nodes of the law's parameters."""
         raise NotImplementedError
 
     def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
@@ -44,7 +44,7 @@ class Law:
         raise NotImplementedError
 
     def engine(self, tensors: Sequence[Tensor], particles: Particles) -> "Engine":
-        """What runs this law in one rollout; a law with faster kernels for a device overrides it."""
+        """Return what runs this law in one rollout; a law with faster kernels for a device overrides it."""
         return Engine(self, tensors, particles)
 
     def single_scene(self, s: int) -> "Law":
@@ -52,11 +52,11 @@ class Law:
         return self
 
     def key(self, tensors: Sequence[Tensor]) -> Hashable | None:
-        """What, beside the shapes of its tensors, decides its launches with them; None: they may not be captured in a graph."""
+        """Return what, beside the shapes of its tensors, decides its launches with them; None: they may not be captured in a graph."""
         return None
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
-        """The slow twin, differentiable by autograd. F (..., 3, 3) where S = 1, else (P, 3, 3) with its `particles`."""
+        """Return the law of F in plain torch, for autograd. F (..., 3, 3) where S = 1, else (P, 3, 3) with its `particles`."""
         raise NotImplementedError
 
 
@@ -79,7 +79,7 @@ class Engine:
         self.law.adjoint(self.tensors, F, grad_out, grad_F, self.grads, self.particles)
 
     def gradients(self) -> list[Tensor | None]:
-        """The gradients of the tensors, after the last `adjoint`."""
+        """Return the gradients of the tensors, after the last `adjoint`."""
         return self.grads
 
 
@@ -185,6 +185,9 @@ class AutogradLaw(Law):
         if particles is None:
             raise UserError(f"{type(self).__name__} holds {self._scenes} scenes: give `particles` to say which scene each F belongs to")
         return torch.cat([self.function(F[a:b], *(t[s] for t in self._tensors)) for s, a, b in self._ranges(particles)])
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({getattr(self.function, '__qualname__', self.function)}, {len(self._tensors)} tensors)"
 
 
 class AutogradElastic(AutogradLaw, ElasticLaw):

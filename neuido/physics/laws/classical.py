@@ -14,7 +14,7 @@ from neuido.physics.laws.base import AutogradElastic, AutogradLaw, AutogradPlast
 from neuido.physics.linalg import decompositions as linalg
 from neuido.physics.linalg.warp_functions import FLOOR
 from neuido.physics.runtime.device import launch, real_of, torch_stream
-from neuido.types import Particles
+from neuido.types import Particles, brief
 
 __all__ = [
     "AutogradElastic",
@@ -89,12 +89,12 @@ class _Classical(Law):
     """True for plastic laws."""
 
     def scene_laws(self) -> tuple[type["_Classical"], ...]:
-        """The class of each scene's law, S of them."""
+        """Return the class of each scene's law, S of them."""
         return (type(self),) * self.tensors()[0].shape[0]
 
     @staticmethod
     def twin(F: Tensor, parameters: Tensor) -> Tensor:
-        """The law in plain torch; F (..., 3, 3), parameters (..., n) that broadcast against its leading axes."""
+        """Return the law in plain torch; F (..., 3, 3), parameters (..., n) that broadcast against its leading axes."""
         raise NotImplementedError
 
     def _kinds(self, device: torch.device) -> Tensor:
@@ -156,6 +156,19 @@ class _Classical(Law):
             (index,) = torch.nonzero(kinds == law.kind, as_tuple=True)
             out = out.index_copy(0, index, law.twin(F[index], parameters[scene[index]]))
         return out
+
+    def __repr__(self) -> str:
+        parts = []
+        for name, t in self._named().items():
+            one = len(t.unique()) == 1
+            parts.append(f"{name} {brief(t[0]) if one else f'{t.min():.4g} to {t.max():.4g}'}{_RANGES[name][2]}")
+        scenes = len(self.scene_laws())
+        values = ", ".join(parts if scenes == 1 else [*parts, f"{scenes} scenes"])
+        return f"{type(self).__name__}({values})"
+
+    def _named(self) -> dict[str, Tensor]:
+        """Return the parameters that the law was made with, by their names."""
+        return {name: t.detach() for name in _RANGES if isinstance(t := getattr(self, name, None), Tensor)}
 
 
 class _OfScene(_Classical):
@@ -353,6 +366,9 @@ class _Stacked(_Classical):
     def scene_laws(self) -> tuple[type[_Classical], ...]:
         return sum((law.scene_laws() for law in self.laws), ())
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(map(repr, self.laws))})"
+
 
 class StackedElastic(_Stacked, ElasticLaw):
     """Elastic laws of several kinds, one after the other over the scenes; see `stack`."""
@@ -409,7 +425,7 @@ def _named(section: str, given: Mapping[str, Any], laws: dict, common: tuple[str
 
 
 def material(elasticity: Mapping[str, Any], plasticity: Mapping[str, Any] | None = None) -> tuple[ElasticLaw, PlasticLaw]:
-    """The laws that an experiment file names.
+    """Return the laws that an experiment file names.
 
     Args:
         elasticity: `law` (fixed_corotated, sigma, neo_hookean), `young` [Pa], `poisson`; numbers or tensors (S,).

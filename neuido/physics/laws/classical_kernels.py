@@ -232,7 +232,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
 
     @wp.func
     def return_by_series(Fp: mat, kind: wp.int32, param: real):
-        """The same without a frame where the strain is slight: F + (exp(X) - 1) F with X the plastic increment of -ln V."""
+        """Return the same without a frame where the strain is slight: F + (exp(X) - 1) F with X the plastic increment of -ln V."""
         E = strain(Fp)
         out = Fp
         if wp.ddot(E, E) <= slight * slight:

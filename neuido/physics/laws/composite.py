@@ -64,12 +64,15 @@ class _Composite(Law):
             law.adjoint(part, F[rows].contiguous(), grad_out[rows].contiguous(), own_grad, grads, own)
             grad_F[rows] += own_grad
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(map(repr, self.laws))})"
+
 
 class CompositeElastic(_Composite, ElasticLaw):
     """Elastic laws by particle."""
 
     def modulus(self) -> Tensor:
-        """The largest of the parts' [Pa], (1,)."""
+        """Return the largest of the parts' [Pa], (1,)."""
         return torch.stack([law.modulus().max().double() for law in self.laws]).max()[None]  # type: ignore[attr-defined]
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
@@ -88,7 +91,7 @@ class CompositePlastic(CompositeElastic, PlasticLaw):
 def by_body(
     elasticity: Sequence[ElasticLaw], plasticity: Sequence[PlasticLaw], counts: Sequence[int], order: Tensor
 ) -> tuple[CompositeElastic, CompositePlastic]:
-    """The laws of bodies that were concatenated to one.
+    """Return the laws of bodies that were concatenated to one.
 
     Args:
         elasticity: An elastic law of one scene for each body.

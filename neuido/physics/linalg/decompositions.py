@@ -143,7 +143,7 @@ class _Values(torch.autograd.Function):
 
 
 def frame(F: Tensor) -> Frame:
-    """The principal frame of F, (..., 3, 3): `sigma` differentiable, the rotations constant."""
+    """Return the principal frame of F, (..., 3, 3): `sigma` differentiable, the rotations constant."""
     return Frame(*_Values.apply(F))
 
 

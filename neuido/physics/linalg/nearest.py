@@ -12,7 +12,7 @@ from neuido.physics.runtime.once import cached
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """The kernel for one scalar type.
+    """Return the kernel for one scalar type.
 
     Args:
         real: `wp.float32` or `wp.float64`.

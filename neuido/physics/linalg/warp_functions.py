@@ -315,7 +315,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
 
     @wp.func
     def inverse_stretch(excess: vec):
-        """The derivative of `hencky`."""
+        """Return the derivative of `hencky`."""
         result = vec(zero, zero, zero)
         for i in range(3):
             if one + excess[i] > floor:

@@ -17,7 +17,7 @@ from neuido.physics.runtime.device import torch_stream
 def run_backward(
     plan: Plan, inputs: Sequence[Tensor], tape: Tape, gradients: Sequence[Tensor | None], wanted: Sequence[bool], steps: int | None = None
 ) -> list[Tensor | None]:
-    """The adjoint of every input that is wanted, from the gradients of the frames of x, v, C and F (None: zero)."""
+    """Return the adjoint of every input that is wanted, from the gradients of the frames of x, v, C and F (None: zero)."""
     setup, k = plan.setup, plan.setup.kernels
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
     a_fixed = [torch.zeros_like(t) for t in inputs[STATES:FIXED]]
@@ -109,7 +109,7 @@ def update_history_adjoint(
     a_trial: Tensor,
     a_history: Tensor,
 ) -> None:
-    """Adds to the adjoints of C and F after the substep (in `a_next`), of the trial gradient and of the history before."""
+    """Add to the adjoints of C and F after the substep (in `a_next`), of the trial gradient and of the history before."""
     setup, k = plan.setup, plan.effects
     a_C, a_F, a_history_next = a_next[2:]
     if plan.layout.e_max:

@@ -45,7 +45,7 @@ def run(
 
 
 def _frames(plan: Plan, cache: RolloutCache, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """A run without a tape."""
+    """Return the frames of a run without a tape."""
     kept = cache.find(plan, inputs, keep_all=False)
     kept.forward(plan, inputs)
     check(plan, kept.tape)
@@ -126,12 +126,12 @@ class _Segments(torch.autograd.Function):
 
 
 def _kinds(inputs: Sequence[Tensor]) -> tuple[str, ...]:
-    """The kinds of the inputs after the start."""
+    """Return the kinds of the inputs after the start."""
     return (*KINDS[STATES:], *("law",) * (len(inputs) - FIXED))
 
 
 def _own(t: Tensor, kind: str, i: int, steps: int) -> Tensor:
-    """The part of an input that segment i of `steps` substeps reads."""
+    """Return the part of an input that segment i of `steps` substeps reads."""
     return t[i * steps : (i + 1) * steps] if kind == "time" and t.numel() and len(t) > 1 else t
 
 
@@ -146,7 +146,7 @@ class SingleScenes:
         self.ranges = list(zip(offsets[:-1], offsets[1:]))
 
     def part(self, inputs: Sequence[Tensor], s: int) -> tuple[Tensor, ...]:
-        """The inputs of scene s: its particles, its row of the scenes' tables, its row of a law (or the one that all share)."""
+        """Return the inputs of scene s: its particles, its row of the scenes' tables, its row of a law (or the one that all share)."""
         i, j = self.ranges[s]
         parts = []
         for n, t in enumerate(inputs):
@@ -162,7 +162,7 @@ class SingleScenes:
         return tuple(t.contiguous() for t in parts)
 
     def whole_gradient(self, inputs: Sequence[Tensor], parts: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
-        """The gradients of the whole's inputs from those of the scenes."""
+        """Return the gradients of the whole's inputs from those of the scenes."""
         out: list[Tensor | None] = []
         for n, t in enumerate(inputs):
             if parts[0][n] is None:
@@ -185,7 +185,7 @@ class SingleScenes:
         return out
 
     def each(self, function: Callable[[int], T]) -> list[T]:
-        """The function of every scene's number, as many at a time as there are cores; the first error is raised."""
+        """Return the function of every scene's number, as many at a time as there are cores; the first error is raised."""
         with one_thread_each():
             return list(self.pool.map(function, range(len(self.plans))))
 

@@ -40,7 +40,7 @@ class KeptRollout:
     def backward(
         self, plan: Plan, inputs: Sequence[Tensor], serial: int, gradients: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
-        """The adjoint of the run `serial` with these inputs."""
+        """Return the adjoint of the run `serial` with these inputs."""
         if serial != self.serial:
             self.forward(plan, inputs)
         return self._backward(plan, inputs, gradients, wanted)
@@ -88,7 +88,7 @@ class CapturedRollout(KeptRollout):
 
 
 def capture(launches: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
-    """A graph of the launches, and what they returned.
+    """Capture a CUDA graph of the launches, and return it with what they returned.
 
     No garbage collection meanwhile, for freeing another graph would break it; and none before, as `torch.cuda.graph` has it: that takes
     longer than to capture a hundred substeps.
@@ -126,7 +126,7 @@ class RolloutCache:
         return self._single.setdefault(s, RolloutCache(self.graphs))
 
     def find(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> KeptRollout:
-        """The kept rollout for a plan with inputs of these shapes; captured where graphs are on and its laws may be captured."""
+        """Return the kept rollout for a plan with inputs of these shapes; captured where graphs are on and its laws may be captured."""
         own = plan.key(inputs) if self.graphs else None
         key = (own, plan.steps, plan.every, plan.plasticity is None, keep_all, *(tuple(t.shape) for t in inputs))
         if key not in self._kept:

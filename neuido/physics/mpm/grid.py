@@ -15,7 +15,7 @@ from neuido.physics.runtime.once import cached
 
 @cached
 def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
-    """The kernels for one scalar type; arguments as in `transfers.build`.
+    """Return the kernels for one scalar type; arguments as in `transfers.build`.
 
     Body forces come as a table (S, 6): linear drag [1/s], quadratic drag [1/m], pull [1/s^2], its centre x, y, z [m]. With five
     columns more it holds Magnus' vector [1/s], stick and restitution [1/s] (`effects.Effects.force_table`).
@@ -130,7 +130,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         dt: real,
         force: wp.array2d(dtype=real),
     ):
-        """The velocity after the first `count` colliders, in their order."""
+        """Return the velocity after the first `count` colliders, in their order."""
         out = v
         for c in range(count):
             n = normal_of(plane[s, c])
@@ -201,7 +201,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         a_friction: wp.array2d(dtype=real),
         parameters: bool,
     ):
-        """Writes a_grid; adds to the adjoints of gravity, body forces and friction where `parameters` is set."""
+        """Write a_grid; add to the adjoints of gravity, body forces and friction where `parameters` is set."""
         first = wp.tid() * chunk
         for node in range(first, first + chunk):
             g = grid[node]

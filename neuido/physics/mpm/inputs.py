@@ -54,7 +54,7 @@ class RolloutInputs(NamedTuple):
     """`Effects.growth` over the solver's own steps, (T, S)."""
 
     def stiffening(self, solver: Solver) -> tuple[Tensor, Tensor] | None:
-        """What the effects add to each scene's P-wave modulus [Pa], and the factor on the sum, (S,) float64 each.
+        """Return what the effects add to each scene's P-wave modulus [Pa], and the factor on the sum, (S,) float64 each.
 
         Of particles with factors of their own that one whose waves are fastest counts, and its factor is told at the least density.
         """
@@ -89,7 +89,7 @@ def prepare(
     friction: Tensor | None = None,
     mass: Tensor | None = None,
 ) -> RolloutInputs:
-    """What `steps` steps read, differentiable in everything given; the arguments are those of `mpm.Simulator.rollout`.
+    """Return what `steps` steps read, differentiable in everything given; the arguments are those of `mpm.Simulator.rollout`.
 
     Raises:
         UserError: A shape that does not fit, an effect outside its range or without a law that it needs.
@@ -133,7 +133,7 @@ def prepare(
 def waves(
     solver: Solver, elasticity: ElasticLaw, mass: Tensor | None = None, stiffening: tuple[Tensor, Tensor] | None = None
 ) -> list[tuple[float, float]]:
-    """The P-wave modulus at rest [Pa] and the least density [kg/m^3] of each scene, which bound its step.
+    """Return the P-wave modulus at rest [Pa] and the least density [kg/m^3] of each scene, which bound its step.
 
     Args:
         solver: The scenes.

@@ -80,14 +80,14 @@ class Plan:
         return (*elastic, *(() if self.plasticity is None else self.plasticity.tensors()))
 
     def key(self, inputs: Sequence[Tensor]) -> tuple | None:
-        """What, beside the shapes of the inputs, decides the launches; None where they may not be captured."""
+        """Return what, beside the shapes of the inputs, decides the launches; None where they may not be captured."""
         elastic = self.elasticity.key(inputs[FIXED : self.split])
         plastic = "none" if self.plasticity is None else self.plasticity.key(inputs[self.split :])
         own = (self.steps, self.every, self.layout, self.spectral, self.flow_kinds)
         return None if elastic is None or plastic is None else (*own, elastic, plastic)
 
     def shortened(self, steps: int) -> "Plan":
-        """The same for fewer substeps."""
+        """Return the same plan for fewer substeps."""
         plan = copy.copy(self)
         plan.steps = steps
         return plan
@@ -98,7 +98,7 @@ class Plan:
         return self.elasticity.engine(inputs[FIXED : self.split], particles), plastic
 
     def single_scene(self, s: int) -> "Plan":
-        """The plan of one scene."""
+        """Return the plan of one scene."""
         plastic = None if self.plasticity is None else self.plasticity.single_scene(s)
         tables = None if self.tables is None else self.tables._replace(kinds=self.flow_kinds[s : s + 1])
         plan = Plan(self.setup.single_scene(s), self.elasticity.single_scene(s), plastic, self.steps, self.every, tables, self.lenient)
@@ -114,7 +114,7 @@ class Plan:
         return self.plasticity is not None or bool(self.flow_kinds)
 
     def material(self, inputs: Sequence[Tensor], n: int, *, idle: bool = True) -> Material | None:
-        """What the kernels of the effects read in substep n."""
+        """Return what the kernels of the effects read in substep n."""
         if self.tables is None:
             return None
         stiffness, growth, *tables = inputs[STATES + 5 : FIXED]
@@ -122,5 +122,5 @@ class Plan:
 
 
 def at_step(t: Tensor, n: int) -> Tensor:
-    """The row of an input over time that substep n reads."""
+    """Return the row of an input over time that substep n reads."""
     return t[n if len(t) > 1 else 0] if t.numel() else t

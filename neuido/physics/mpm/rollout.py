@@ -130,7 +130,7 @@ def gather(
     trial: Tensor,
     status: Tensor,
 ) -> None:
-    """The particles of the next substep, from the velocity of the nodes."""
+    """Write the particles of the next substep, from the velocity of the nodes."""
     setup = plan.setup
     x, _, _, F, history = now
     plan.launch(setup.kernels.grid_to_particles, len(x),
@@ -164,7 +164,7 @@ def flow_inputs(plan: Plan, material: Material) -> list:
 
 
 def update_history(plan: Plan, material: Material, trial: Tensor, C: Tensor, history: Tensor, F: Tensor, history_next: Tensor) -> None:
-    """The history of the next substep, and its F where an effect makes it of the trial one."""
+    """Write the history of the next substep, and its F where an effect makes it of the trial one."""
     setup, k = plan.setup, plan.effects
     if material.branches is not None:
         plan.launch(k.relax, len(F), [setup.particles.scene, setup.dt, material.branches, material.idle, C, history, history_next])
@@ -175,7 +175,7 @@ def update_history(plan: Plan, material: Material, trial: Tensor, C: Tensor, his
 
 
 def node_range(plan: Plan, x: Tensor | None) -> slice:
-    """The nodes that particles touch, as a range: on the CPU the planes between the first and the last one, with one to spare.
+    """Return the range of nodes that particles touch: on the CPU the planes between the first and the last one, with one to spare.
 
     The particles are at x, or, if None, where the last `gather` left them.
     """
@@ -199,7 +199,7 @@ def to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tens
 
 
 def add_to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> None:
-    """The same, added to what is there."""
+    """Add momentum and mass to the nodes."""
     setup = plan.setup
     arguments = [setup.particles.scene, setup.origin, setup.dx, setup.dt, setup.nodes, mass, setup.sorted_volume, x, v, C, tau, grid]
     plan.launch(setup.kernels.particles_to_grid, len(x), arguments, plan.block)

@@ -21,6 +21,7 @@ from neuido.physics.mpm.graphs import RolloutCache
 from neuido.physics.mpm.plan import Plan
 from neuido.physics.mpm.state import Setup
 from neuido.physics.runtime.device import as_device
+from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.threads import scene_pool
 from neuido.types import Body, ParticleState, Scene
@@ -95,6 +96,13 @@ class Simulator:
         """The number of scenes S."""
         return len(self.scenes)
 
+    def __repr__(self) -> str:
+        count = len(self.scenes)
+        cells = sorted({scene.cells for scene in self.scenes})
+        dts = sorted({scene.dt for scene in self.scenes})
+        return (f"Simulator({count} scene{'' if count == 1 else 's'}, {len(self.mass)} particles, {_span(cells)} cells, "
+                f"dt {_span(dts)} s, {str(self.dtype).removeprefix('torch.')} on {self.device})")  # fmt: skip
+
     def step_limits(
         self,
         elasticity: ElasticLaw,
@@ -102,7 +110,7 @@ class Simulator:
         mass: Tensor | None = None,
         stiffer: tuple[Tensor, Tensor] | None = None,
     ) -> list[StepLimit]:
-        """The longest stable step of each scene; arguments are those of `check_step`.
+        """Return the longest stable step of each scene; arguments are those of `check_step`.
 
         Raises:
             UserError: A negative modulus.
@@ -119,7 +127,7 @@ class Simulator:
     def step_margin(
         self, steps: int, elasticity: ElasticLaw, plasticity: PlasticLaw | None = None, *, effects: Effects | None = None
     ) -> float:
-        """The longest stable step over the one in use, of the scene that has least to spare; below 1 a `rollout` of these refuses.
+        """Return the longest stable step over the one in use, of the scene that has least to spare; below 1 a `rollout` of these refuses.
 
         Raises:
             UserError: As `rollout`, but for the step.
@@ -190,7 +198,7 @@ class Simulator:
         segment: int | None = None,
         check: bool = True,
         lenient: bool = False,
-    ) -> ParticleState:
+    ) -> Frames:
         """Run `steps` substeps.
 
         Differentiable with respect to `state`, `gravity`, `friction`, `mass`, the tensors of the laws and of the effects.
@@ -212,7 +220,8 @@ class Simulator:
             lenient: Frames of a scene whose step is too long, or whose motion fails, are NaN, in place of an error.
 
         Returns:
-            Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1; frame 0 is the start.
+            Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1; frame 0 is the start. They
+            unpack to these four, know their `times` and can be saved (`Frames`).
 
         Raises:
             UserError: Before the start: an unstable step. Afterwards: a particle lost, too fast, or not finite.
@@ -240,9 +249,15 @@ class Simulator:
         optional = [mass.new_empty(0) if t is None else t.contiguous() for t in optional]
         with self.cache.lock:
             frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, self.pool)
-            out = ParticleState(*(t[:, self.inverse] for t in frames[:4]))
+            x, v, C, F, history = (t[:, self.inverse] for t in frames)
+        out = Frames(x, v, C, F, [scene.dt * every for scene in self.scenes], self.particles, history)
         if lenient:
             refusing = torch.tensor([bool(why) for why in refused], device=self.device)
             scene = self.particles.scene.long()
             invalidate(out, refusing[scene] | ~torch.isfinite(out.x[-1]).all(dim=1), scene)
         return out
+
+
+def _span(values: list) -> str:
+    """Return the one value, or the range, of sorted values."""
+    return f"{values[0]:g}" if len(values) == 1 else f"{values[0]:g} to {values[-1]:g}"

@@ -16,7 +16,7 @@ from neuido.types import Body, Particles, ParticleState, Scene
 
 
 def affine_velocity(x: Tensor, v: Tensor, neighbours: int = 32, chunk: int = 2048) -> Tensor:
-    """The velocity gradient that belongs to a velocity field on particles, (P, 3, 3) [1/s].
+    """Return the velocity gradient that belongs to a velocity field on particles, (P, 3, 3) [1/s].
 
     A rollout starts with it (C = 0 would lose 6-8 % of a spin in the first step). One affine fit serves where it is exact
     to 1e-3 (all rigid and uniform motions), else a fit over the nearest neighbours of each particle. Differentiable in v.
@@ -163,7 +163,7 @@ class Setup:
         self.held = torch.cat(held).to(torch.uint8)
 
     def _sort(self) -> None:
-        """The order in which the kernels see the particles: scene by scene, then by cell, so that neighbours add to the same nodes."""
+        """Sort the particles as the kernels see them: scene by scene, then by cell, so that neighbours add to the same nodes."""
         scene = self.particles.scene.long()
         cell = ((self.state.x - self.origin[scene]) / self.dx[scene, None] - 0.5).floor().long()
         ny, nz = self.grid_shape[2:]

@@ -130,7 +130,7 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
 
     @func
     def first_node(cells: vec3, nodes: wp.vec3i):
-        """The lowest node of a particle's stencil, clamped into the grid (a lost particle is flagged elsewhere)."""
+        """Return the lowest node of a particle's stencil, clamped into the grid (a lost particle is flagged elsewhere)."""
         return wp.vec3i(
             wp.clamp(int(wp.floor(cells[0] - real(0.5))), 0, nodes[0] - 3),
             wp.clamp(int(wp.floor(cells[1] - real(0.5))), 0, nodes[1] - 3),

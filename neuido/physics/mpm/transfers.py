@@ -111,7 +111,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         a_C: wp.array(dtype=mat33),
         a_tau: wp.array(dtype=mat33),
     ):
-        """Adds to a_mass and a_x; writes a_v, a_C and a_tau."""
+        """Add to a_mass and a_x; write a_v, a_C and a_tau."""
         p = wp.tid()
         s = scene[p]
         h = dx[s]
@@ -272,7 +272,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         a_x: wp.array(dtype=vec3),
         a_F: wp.array(dtype=mat33),
     ):
-        """Adds to a_velocity (zero before); writes a_x and a_F."""
+        """Add to a_velocity (zero before); write a_x and a_F."""
         p = wp.tid()
         p += arrange(stencil(x[p], scene[p], origin, dx, nodes))
         s = scene[p]
@@ -333,7 +333,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         C_next: wp.array(dtype=mat33),
         F_trial: wp.array(dtype=mat33),
     ):
-        """The trial gradient again, as `grid_to_particles` wrote it."""
+        """Write the trial gradient again, as `grid_to_particles` wrote it."""
         p = wp.tid()
         F_trial[p] = F[p] + dt[scene[p]] * (C_next[p] * F[p])
 

@@ -16,7 +16,7 @@ from neuido.physics.effects.constitutive import Constitutive, History
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, StackedElastic
-from neuido.types import Particles, Vector
+from neuido.types import Particles, Vector, brief_fields
 
 MODES = ("uniaxial", "equibiaxial", "pure_shear", "biaxial", "simple_shear")
 PROBE = 1e-6
@@ -39,6 +39,9 @@ class Specimen(NamedTuple):
     incompressible: bool = False
     """The lateral stress is zero by pressure, and the volume constant."""
 
+    def __repr__(self) -> str:
+        return brief_fields(self)
+
 
 def stress_along(
     specimen: Specimen,
@@ -50,7 +53,7 @@ def stress_along(
     true_stress: bool = False,
     step: float = 0.1,
 ) -> Tensor:
-    """The stress that a machine measures, row by row.
+    """Return the stress that a machine measures, row by row.
 
     The specimen is virgin and at rest before the first row; where that is deformed already it is reached within the first interval
     of time. Without a history (no plasticity, no effect that remembers) rows do not depend on each other and run side by side.
@@ -120,7 +123,7 @@ class _Rig:
         )
 
     def material(self, each: int) -> Constitutive:
-        """The twin with `each` particles for every parameter set, point-major."""
+        """Return the twin with `each` particles for every parameter set, point-major."""
         P = self.specimen.points
         particles = Particles(torch.arange(P, dtype=torch.int32).repeat_interleave(each), tuple(range(0, P * each + 1, each)))
         s = self.specimen
@@ -146,18 +149,18 @@ class _Rig:
         return torch.diag_embed(self.log_stretches(given, u).exp())
 
     def residual(self, tau: Tensor) -> Tensor:
-        """The lateral stress that must vanish (..., k) [Pa], of tau (..., 3, 3) in the specimen's axes."""
+        """Return the lateral stress that must vanish (..., k) [Pa], of tau (..., 3, 3) in the specimen's axes."""
         t = tau.diagonal(dim1=-2, dim2=-1)
         if self.mode == "uniaxial" and not self.even:
             return t[..., 1:2] - t[..., 2:] if self.specimen.incompressible else t[..., 1:]
         return t[..., 2:][..., : self.free]
 
     def turned(self, A: Tensor) -> Tensor:
-        """A tensor of the specimen's axes in those of the material."""
+        """Return a tensor of the specimen's axes in those of the material."""
         return self.R @ A @ self.R.mT
 
     def back(self, A: Tensor) -> Tensor:
-        """The inverse of `turned`."""
+        """Return a tensor of the material's axes in those of the specimen."""
         return self.R.mT @ A @ self.R
 
     def guess(self, given: Tensor) -> Tensor:
@@ -255,7 +258,7 @@ class _Rig:
         return torch.stack(taus, 1), torch.stack(us, 1)
 
     def measured(self, tau: Tensor, u: Tensor, true_stress: bool) -> Tensor:
-        """What the machine reads (P, n, m) of tau (P, n, 3, 3) and the unknowns (P, n, k)."""
+        """Return what the machine reads (P, n, m) of tau (P, n, 3, 3) and the unknowns (P, n, k)."""
         if self.mode == "simple_shear":
             return tau[..., 0, 1:2]  # J = 1, and F^-T leaves the component as it is
         e = self.log_stretches(self.path.expand(*tau.shape[:2], -1), u)
@@ -269,14 +272,14 @@ class _Rig:
 
 
 def _log(increment: Tensor, mode: str) -> Tensor:
-    """The logarithm of an increment of F, (..., 3, 3): of a diagonal one, or of I + gamma e1 e2^T."""
+    """Return the logarithm of an increment of F, (..., 3, 3): of a diagonal one, or of I + gamma e1 e2^T."""
     if mode == "simple_shear":
         return increment - torch.eye(3, dtype=increment.dtype)
     return torch.diag_embed(increment.diagonal(dim1=-2, dim2=-1).log())
 
 
 def turn(direction: Tensor) -> Tensor:
-    """The smallest rotation that takes the first axis to `direction` (3,); half a turn about the third axis for the opposite."""
+    """Return the smallest rotation that takes the first axis to `direction` (3,); half a turn about the third axis for the opposite."""
     d = direction / direction.norm()
     if d[0] < -1 + 1e-12:
         return torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=d.dtype))

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.errors import UserError
+from neuido.types import brief_fields
 
 
 class Forces(NamedTuple):
@@ -37,6 +38,9 @@ class Forces(NamedTuple):
     """Time between those [s]."""
     added_mass: np.ndarray | float | None = None
     """c of the inertia (1 + c) [-]; the weight is unchanged."""
+
+    def __repr__(self) -> str:
+        return brief_fields(self)
 
 
 def fly(
@@ -102,7 +106,7 @@ def _hermite(X: np.ndarray, V: np.ndarray, since: np.ndarray, h: float) -> np.nd
 
 
 def _acceleration(forces: Forces, count: int, release: np.ndarray):
-    """The function (x (P, 3), v (P, 3), time since the release) -> acceleration (P, 3) [m/s^2]."""
+    """Return the function (x (P, 3), v (P, 3), time since the release) -> acceleration (P, 3) [m/s^2]."""
 
     def scalar(name: str) -> np.ndarray | None:
         value = getattr(forces, name)

@@ -15,7 +15,7 @@ from neuido.physics.runtime.once import BUILDING, cached
 
 
 def choose_device(name: str) -> torch.device:
-    """The device for `auto` (cuda where there is one), `cpu` or `cuda`.
+    """Return the device for `auto` (cuda where there is one), `cpu` or `cuda`.
 
     Raises:
         UserError: Another name, or cuda where there is none.
@@ -60,7 +60,7 @@ def start_warp() -> None:
 
 @contextlib.contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """The remark comes from Warp's C library, so the descriptor itself is turned away."""
+    """Redirect standard error while Warp's C library prints its remark."""
     kept, hole = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(hole, 2)
@@ -72,7 +72,7 @@ def _silent_stderr() -> Iterator[None]:
 
 
 def real_of(dtype: torch.dtype) -> type:
-    """The Warp scalar type of a torch float type."""
+    """Return the Warp scalar type of a torch float type."""
     return {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
 
 
@@ -102,7 +102,7 @@ def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.devic
 
 
 def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, *, block: int = 256) -> Callable[[int], None]:
-    """A launch for many steps, of a kernel whose first argument is the step; `arguments` are the others.
+    """Prepare a launch for many steps, of a kernel whose first argument is the step; `arguments` are the others.
 
     On a GPU they are packed once, which takes longer than a launch. They must outlive the last one.
     """

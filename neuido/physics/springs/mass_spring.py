@@ -14,7 +14,7 @@ from neuido.physics.colliders.contact import SLIP, STICKY
 from neuido.physics.colliders.tables import collider_table
 from neuido.physics.runtime.device import real_of, repeated, torch_stream
 from neuido.physics.springs import spring_kernels
-from neuido.types import Scene
+from neuido.types import Scene, brief_fields
 
 SAFETY = 0.5
 """Share of the largest stable step that a rollout takes at most."""
@@ -35,6 +35,9 @@ class Springs(NamedTuple):
     """Lengths at rest [m], (N,)."""
     rank: Tensor
     """Which neighbour one end is to the other, 0 the nearest; the lesser of the two, (N,) int64."""
+
+    def __repr__(self) -> str:
+        return brief_fields(self)
 
 
 def connect(x: Tensor, neighbours: int) -> Springs:
@@ -95,8 +98,12 @@ class MassSpring:
         self.others = ends[order, 1].int().contiguous()
         self.springs = torch.arange(len(self.pairs), device=self.device).repeat(2)[order].int().contiguous()
 
+    def __repr__(self) -> str:
+        kind = f"{str(self.mass.dtype).removeprefix('torch.')} on {self.device}"
+        return f"MassSpring({len(self.mass)} masses, {len(self.pairs)} springs, power {self.power:g}, {kind})"
+
     def substeps(self, stiffness: Tensor, damping: Tensor, dt: float) -> int:
-        """Steps into which dt [s] must be divided: `SAFETY` of what Gershgorin's bound on the frequencies, and damping, allow."""
+        """Return into how many steps dt [s] must be divided: `SAFETY` of what Gershgorin's bound on the frequencies and damping allow."""
         with torch.no_grad():
             both = torch.stack([stiffness, damping], 1).to(self.mass)
             sums = torch.zeros(len(self.mass), 2, dtype=both.dtype, device=self.device)

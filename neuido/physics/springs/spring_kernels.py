@@ -25,7 +25,7 @@ SHORTEST = 1e-9
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """The kernels for `wp.float32` or `wp.float64`.
+    """Return the kernels for `wp.float32` or `wp.float64`.
 
     Springs come as lists: those of mass i stand at offsets[i]:offsets[i + 1] of `others` (the mass at the other end) and `springs` (which
     spring it is); each spring stands in two lists. Thread t of `pull` and `pull_adjoint` takes every `lanes`-th spring of mass t / lanes.
@@ -72,7 +72,7 @@ def build(real: type) -> SimpleNamespace:
         n: int, power: real, offsets: ints, others: ints, springs: ints, rest: reals, stiffness: reals, damping: reals, x: frames,
         v: frames, lanes: int, parts: vecs,
     ):  # fmt: skip
-        """Writes a thread's part of the force on its mass."""
+        """Write a thread's part of the force on its mass."""
         t = wp.tid()
         i = t // lanes
         force = vec3(zero, zero, zero)
@@ -92,7 +92,7 @@ def build(real: type) -> SimpleNamespace:
         n: int, dt: real, gravity: vec3, mass: reals, planes: planes_of, kinds: ints, grip: reals, x: frames, v: frames, lanes: int,
         parts: vecs, before: frames,
     ):  # fmt: skip
-        """Writes the velocity before contact, and the next position and velocity."""
+        """Write the velocity before contact, and the next position and velocity."""
         i = wp.tid()
         force = vec3(zero, zero, zero)
         for k in range(lanes):
@@ -147,7 +147,7 @@ def build(real: type) -> SimpleNamespace:
         n: int, power: real, offsets: ints, others: ints, springs: ints, rest: reals, stiffness: reals, damping: reals, x: frames,
         v: frames, g_force: vecs, lanes: int, parts_x: vecs, parts_v: vecs, g_stiffness: reals, g_damping: reals,
     ):  # fmt: skip
-        """Writes a thread's part of the adjoints of x and v; from the end with the smaller index it adds to those of the springs."""
+        """Write a thread's part of the adjoints of x and v; from the end with the smaller index it adds to those of the springs."""
         t = wp.tid()
         i = t // lanes
         gx = vec3(zero, zero, zero)
@@ -177,7 +177,7 @@ def build(real: type) -> SimpleNamespace:
 
     @kernel
     def gather(n: int, lanes: int, parts_x: vecs, parts_v: vecs, own_x: frames, own_v: frames, g_x: vecs, g_v: vecs):
-        """Adds a mass's parts, and what reaches this frame itself, to the adjoints of x and v."""
+        """Add a mass's parts, and what reaches this frame itself, to the adjoints of x and v."""
         i = wp.tid()
         gx = g_x[i] + own_x[n, i]
         gv = g_v[i] + own_v[n, i]

@@ -74,7 +74,7 @@ def test_truth_is_the_simulation(ball):
     spin = torch.tensor(motion.angular_velocity)
     v = torch.tensor(motion.velocity) + torch.linalg.cross(spin.expand_as(body.x), body.x - torch.tensor(motion.centre))
     scene = scenes.scene_from_dict(BALL["scene"], BALL["discretisation"])
-    simulator = Simulator(scene, body._replace(v=v), density=1000.0)
+    simulator = Simulator(scene, body._replace(v=v), density=1000.0, device="cpu")
     with torch.no_grad():
         x = simulator.rollout(40, *material(truth.law["elasticity"], truth.law["plasticity"]), every=10).x
     torch.testing.assert_close(truth.x, x, rtol=0, atol=1e-5)

@@ -23,7 +23,7 @@ FREE = Scene(gravity=(0.0, 0.0, 0.0), walls=None, dt=1e-3)
 
 
 def solver(scene, body, **options):
-    return FiniteElements(scene, body, **{"density": 1000.0, "dtype": torch.float64} | options)
+    return FiniteElements(scene, body, **{"density": 1000.0, "dtype": torch.float64} | options, device="cpu")
 
 
 def joined(sim, count, graphs=False):
@@ -381,7 +381,7 @@ def test_the_margin_is_where_a_rollout_refuses(effects):
     law = FixedCorotated(torch.tensor([1e5, 1e8]), torch.full((2,), 0.3))
 
     def bodies(most):
-        return FiniteElements([FREE] * 2, [body] * 2, max_inner_steps=most)
+        return FiniteElements([FREE] * 2, [body] * 2, max_inner_steps=most, device="cpu")
 
     margin = bodies(1000).step_margin(5, law, effects=effects)
     needed = math.ceil(1000 / margin)
@@ -398,15 +398,15 @@ def test_the_margin_is_where_a_rollout_refuses(effects):
 def test_wrong_options_are_named():
     body = block((0.3, 0.3, 0.3), (0.6, 0.5, 0.5), (4, 4, 4))
     with pytest.raises(UserError, match="smoothing is 'all'"):
-        FiniteElements(FREE, body, smoothing="all")
+        FiniteElements(FREE, body, smoothing="all", device="cpu")
     mesh = mesh_body(body.x, body.volume)
     with pytest.raises(UserError, match="1 meshes for 2 bodies"):
-        FiniteElements([FREE] * 2, [body] * 2, meshes=[mesh])
+        FiniteElements([FREE] * 2, [body] * 2, meshes=[mesh], device="cpu")
     with pytest.raises(UserError, match="multiple of every"):
         solver(FREE, body).rollout(5, FixedCorotated(1e4, 0.3), every=2)
     with pytest.raises(UserError, match="friction has shape"):
         solver(FREE, body).rollout(4, FixedCorotated(1e4, 0.3), friction=torch.zeros(3, 3))
-    given = FiniteElements([FREE] * 2, [body, Body(body.x, body.v, body.volume)], meshes=mesh)
+    given = FiniteElements([FREE] * 2, [body, Body(body.x, body.v, body.volume)], meshes=mesh, device="cpu")
     assert given.meshes[1] is mesh
 
 

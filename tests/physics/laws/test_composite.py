@@ -26,11 +26,11 @@ def test_apart_each_moves_as_if_alone():
     left, right = bodies()
     scene = Scene(cells=16, dt=1e-3)
     soft, hard = (FixedCorotated(1e4, 0.2), Identity()), (Sigma(1e5, 0.3), VonMises(1e3, 1e5, 0.3))
-    simulator = Simulator(scene, join(left, right))
+    simulator = Simulator(scene, join(left, right), device="cpu")
     laws = by_body([soft[0], hard[0]], [soft[1], hard[1]], [64, 64], simulator.order)
     with torch.no_grad():
         together = simulator.rollout(100, *laws, every=100)
-        alone = [Simulator(scene, body).rollout(100, *pair, every=100) for body, pair in ((left, soft), (right, hard))]
+        alone = [Simulator(scene, body, device="cpu").rollout(100, *pair, every=100) for body, pair in ((left, soft), (right, hard))]
     assert torch.allclose(together.x[-1, :64], alone[0].x[-1], atol=1e-5)
     assert torch.allclose(together.x[-1, 64:], alone[1].x[-1], atol=1e-5)
     assert (alone[0].x[-1, :, 1].mean() - alone[1].x[-1, :, 1].mean()).abs() > 5e-3
@@ -39,7 +39,7 @@ def test_apart_each_moves_as_if_alone():
 
 def test_gradients_reach_each_law():
     left, right = bodies()
-    simulator = Simulator(Scene(cells=16, dt=1e-3), join(left, right), dtype=torch.float64)
+    simulator = Simulator(Scene(cells=16, dt=1e-3), join(left, right), dtype=torch.float64, device="cpu")
     young = [torch.tensor([value], dtype=torch.float64, requires_grad=True) for value in (1e4, 5e4)]
 
     def height(first, second):
@@ -56,6 +56,6 @@ def test_gradients_reach_each_law():
 
 def test_numbers_that_do_not_fit_are_refused():
     left, _ = bodies()
-    simulator = Simulator(Scene(cells=16, dt=1e-3), left)
+    simulator = Simulator(Scene(cells=16, dt=1e-3), left, device="cpu")
     with pytest.raises(UserError, match="64 in all"):
         by_body([FixedCorotated(1e4, 0.2)], [Identity()], [60], simulator.order)

@@ -78,7 +78,7 @@ def test_planes_beyond_the_body_do_not_matter(monkeypatch, dtype):
     body = cube(length=0.2, centre=(0.3, 0.2, 0.5), particles_per_side=6, velocity=(2.5, -2.0, 0.3))
 
     def frames():
-        simulator = Simulator(Scene(cells=16, dt=5e-4), body, dtype=dtype)
+        simulator = Simulator(Scene(cells=16, dt=5e-4), body, dtype=dtype, device="cpu")
         with torch.no_grad():
             return simulator.rollout(240, FixedCorotated(torch.tensor([2e4], dtype=dtype), 0.3), every=40)
 

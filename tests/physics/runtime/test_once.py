@@ -37,7 +37,7 @@ def work(i):
         laws = learned if i < 4 else (NeoHookean(1e4, 0.3), VonMises(300.0, 1e4, 0.3))
         scenes = 2 if i < 4 else 1
         with torch.no_grad():
-            sim = Simulator([Scene(cells=12, dt=5e-4)] * scenes, [body] * scenes, dtype=dtype if i >= 4 else torch.float32)
+            sim = Simulator([Scene(cells=12, dt=5e-4)] * scenes, [body] * scenes, dtype=dtype if i >= 4 else torch.float32, device="cpu")
             found.setdefault(i if i >= 4 else "learned", []).append(sim.rollout(4, *laws, every=4).x)
     except BaseException as error:
         errors.append(repr(error))
@@ -108,7 +108,7 @@ def test_a_function_that_fails_is_asked_again():
 
 def test_threads_that_share_a_simulator_get_their_own_motion():
     body = cube(length=0.2, centre=(0.5, 0.13, 0.5), particles_per_side=4)
-    simulator = Simulator(Scene(cells=12, dt=5e-4), body)
+    simulator = Simulator(Scene(cells=12, dt=5e-4), body, device="cpu")
     stiffness = [1e4 * (1 + i) for i in range(8)]
 
     def motion(young, simulator=simulator):
@@ -117,7 +117,7 @@ def test_threads_that_share_a_simulator_get_their_own_motion():
         x[-1].square().sum().backward()
         return x.detach()
 
-    alone = [motion(young, Simulator(Scene(cells=12, dt=5e-4), body)) for young in stiffness]
+    alone = [motion(young, Simulator(Scene(cells=12, dt=5e-4), body, device="cpu")) for young in stiffness]
     with ThreadPoolExecutor(8) as pool:
         together = list(pool.map(motion, stiffness * 2))
     assert all(torch.equal(a, b) for a, b in zip(alone * 2, together, strict=True))

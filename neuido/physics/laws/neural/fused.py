@@ -36,7 +36,7 @@ INPUTS = 16
 
 @cached
 def build(width: int) -> SimpleNamespace:
-    """The fused kernels for one hidden width."""
+    """Return the fused kernels for one hidden width."""
     start_warp()
     tiles = width // 8
     kept = 8 * tiles + 4
@@ -108,7 +108,7 @@ def build(width: int) -> SimpleNamespace:
         g_out: wp.array(dtype=mat33), g_F: wp.array(dtype=mat33),
         P3: floats, PB: floats, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
     ):  # fmt: skip
-        """Adds to g_F, and to the warp's share of the last layer's gradient where P3 is given; writes units where X is."""
+        """Add to g_F, and to the warp's share of the last layer's gradient where P3 is given; writes units where X is."""
         tid = wp.tid()
         warp = tid / 32
         last = lasts[warp]
@@ -240,7 +240,7 @@ class FusedEngine(Engine):
             self._reduce_first(len(F))
 
     def _reduce_first(self, count: int) -> None:
-        """The gradients of the first two layers, shared by all scenes or one for each."""
+        """Add the gradients of the first two layers, shared by all scenes or one for each."""
         g1, b1, g2, b2 = self.grads[:4]
         h1, d1, d2 = (t.view(count, self.width) for t in (self.H1, self.G1, self.G2))
         ranges = [(0, 0, count)] if self.rows[0] == 1 else [

@@ -31,7 +31,7 @@ EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """The kernels for `wp.float32` or `wp.float64`; features (P, 13), outputs (P, 9)."""
+    """Return the kernels for `wp.float32` or `wp.float64`; features (P, 13), outputs (P, 9)."""
     start_warp()
     mat = wp.types.matrix((3, 3), real)
     vec = wp.types.vector(3, real)
@@ -105,7 +105,7 @@ def build(real: type) -> SimpleNamespace:
     def outputs_adjoint(
         F: wp.array(dtype=mat), R: wp.array(dtype=mat), scale: real, elastic: int, g_out: wp.array(dtype=mat), g_Y: wp.array2d(dtype=real)
     ):
-        """Writes the adjoint of the outputs."""
+        """Write the adjoint of the outputs."""
         p = wp.tid()
         g = g_out[p]
         if elastic == 1:
@@ -126,7 +126,7 @@ def build(real: type) -> SimpleNamespace:
         g_X: wp.array2d(dtype=real),
         g_F: wp.array(dtype=mat),
     ):
-        """Adds to the adjoint of F what comes through the read-out, the rotation and the features, whose adjoint is g_X."""
+        """Add to the adjoint of F what comes through the read-out, the rotation and the features, whose adjoint is g_X."""
         p = wp.tid()
         Fp = F[p]
         g = g_out[p]

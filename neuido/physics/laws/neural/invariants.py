@@ -127,6 +127,9 @@ class _Invariant(EngineLaw):
         ends = zip(particles.offsets[:-1], particles.offsets[1:])
         return torch.cat([self._readout(F[i:j], self._network(F[i:j], s)) for s, (i, j) in enumerate(ends)])
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({max(len(W) for W in self.weights)} scenes, {self.weights[0].shape[1]} hidden units)"
+
 
 class InvariantElastic(_Invariant, ElasticLaw):
     """tau = R X F^T [Pa], with X the symmetric part of the network's outputs."""
@@ -166,7 +169,7 @@ def features(F: Tensor) -> Tensor:
 
 
 def _ties(sigma: Tensor) -> Tensor:
-    """The mean over equal ones of descending values (..., 3), as matrices (..., 3, 3)."""
+    """Return the mean over equal ones of descending values (..., 3), as matrices (..., 3, 3)."""
     tie = TIE * EPSILON[real_of(sigma.dtype)]
     gaps = sigma[..., :-1] - sigma[..., 1:]
     group = torch.cat([torch.zeros_like(gaps[..., :1]), (gaps > tie).to(sigma.dtype).cumsum(-1)], -1)

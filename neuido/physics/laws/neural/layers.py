@@ -28,7 +28,7 @@ def linear(x: Tensor, W: Tensor, b: Tensor | None, offsets: Sequence[int], out: 
 def linear_adjoint(
     x: Tensor, W: Tensor, gy: Tensor, offsets: Sequence[int], ones: Tensor | None, gx: Tensor | None, gW: Tensor | None, gb: Tensor | None
 ) -> None:
-    """Writes gx; adds to gW and gb. Any of them may be None: not wanted. `ones` (P,) sums the rows for gb."""
+    """Write gx; add to gW and gb. Any of them may be None: not wanted. `ones` (P,) sums the rows for gb."""
     single = gy.shape[0]
     for target, parameter in ((gx, W), (gW, gW), (gb, gb)):
         if target is None:

@@ -284,7 +284,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
 
 @cached
 def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
-    """The kernels for one scalar type, compiled on first launch; features (P, 9), coefficients (P, 4) or (P, 3).
+    """Return the kernels for one scalar type, compiled on first launch; features (P, 9), coefficients (P, 4) or (P, 3).
 
     Args:
         real: `wp.float32` or `wp.float64`.
@@ -330,7 +330,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
 
     @kernel
     def stress_coefficients_adjoint(F: wp.array(dtype=mat33), scale: real, g_tau: wp.array(dtype=mat33), g_c: wp.array2d(dtype=real)):
-        """Writes the adjoint of c."""
+        """Write the adjoint of c."""
         p = wp.tid()
         N, h, l, A, q = measure(F[p])
         g = stress_coefficients(l, A, q, scale, g_tau[p])
@@ -346,7 +346,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         g_X: wp.array2d(dtype=real),
         g_F: wp.array(dtype=mat33),
     ):
-        """Adds to the adjoint of F."""
+        """Add to the adjoint of F."""
         p = wp.tid()
         N, h, l, A, q = measure(F[p])
         g_F[p] = g_F[p] + stress_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_tau[p], row9(g_X, p))
@@ -366,7 +366,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         g_out: wp.array(dtype=mat33),
         g_c: wp.array2d(dtype=real),
     ):
-        """Writes the adjoint of c."""
+        """Write the adjoint of c."""
         p = wp.tid()
         N, h, l, A, q = measure(F[p])
         g = correction_coefficients(F[p], l, A, q, row4(c, p), scale, straight_through, g_out[p])
@@ -382,7 +382,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         g_X: wp.array2d(dtype=real),
         g_F: wp.array(dtype=mat33),
     ):
-        """Adds to the adjoint of F."""
+        """Add to the adjoint of F."""
         p = wp.tid()
         N, h, l, A, q = measure(F[p])
         g_F[p] = g_F[p] + correction_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_out[p], row9(g_X, p))

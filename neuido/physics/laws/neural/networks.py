@@ -42,13 +42,13 @@ STRAIN_SCALE = 1e-2
 
 
 def launch(kernel, like: Tensor, *arguments) -> None:
-    """Launches a kernel of `network_kernels` over the rows of `like`, on torch's device and current stream."""
+    """Launch a kernel of `network_kernels` over the rows of `like`, on torch's device and current stream."""
     with torch_stream(like.device):
         device.launch(kernel, like.shape[0], arguments, like.device)
 
 
 def kernels(like: Tensor):
-    """The kernels for the scalar type of a tensor."""
+    """Return the kernels for the scalar type of a tensor."""
     return network_kernels.build(real_of(like.dtype))
 
 
@@ -171,7 +171,7 @@ class _Network:
         return self.weights
 
     def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
-        """The fused kernels on CUDA where they exist for this network, else the engine of every law."""
+        """Return the fused kernels on CUDA where they exist for this network, else the engine of every law."""
         if self._fusable(tensors[0]):
             return fused.FusedEngine(self, tensors, particles)
         return Engine(self, tensors, particles)
@@ -187,7 +187,7 @@ class _Network:
         return _workspace(F.shape[0], hidden, self.outputs, F.dtype, F.device, threading.get_ident())
 
     def _evaluate(self, tensors: Sequence[Tensor], F: Tensor, particles: Particles | None) -> _Workspace:
-        """Runs the network; every intermediate result is in the workspace."""
+        """Run the network; every intermediate result is in the workspace."""
         W1, b1, W2, b2, W3, b3 = (t.detach() for t in tensors)
         offsets = self._offsets(F, particles)
         w = self._buffers(F, W1.shape[-2])
@@ -217,7 +217,7 @@ class _Network:
         return (0, F.shape[0]) if particles is None else particles.offsets
 
     def _twin(self, features: Tensor, particles: Particles | None) -> Tensor:
-        """The network in plain torch, (..., 9) -> (..., outputs); (P, 9) where there are several scenes."""
+        """Return the network in plain torch, (..., 9) -> (..., outputs); (P, 9) where there are several scenes."""
         rows = []
         offsets = (0, len(features)) if len(self.weights[4]) == 1 else self._offsets(features, particles)
         for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])):
@@ -240,6 +240,11 @@ class _Network:
                 values.append((tau[0] - tau[1]) / (2 * step))
         self.weights = weights
         return torch.stack(values)
+
+    def __repr__(self) -> str:
+        W1, scenes = self.weights[0], len(self.weights[4])
+        plural = "" if scenes == 1 else "s"
+        return f"{type(self).__name__}({scenes} scene{plural}, {W1.shape[1]} hidden units, scale {self.scale:g}, on {W1.device})"
 
 
 class _Raw(_Network):

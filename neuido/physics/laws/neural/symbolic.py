@@ -93,7 +93,7 @@ class _Symbolic(EngineLaw):
         return type(self).__name__
 
     def _at(self, F: Tensor, particles: Particles | None) -> Tensor:
-        """The coefficients of each F in plain torch, (..., outputs)."""
+        """Return the coefficients of each F in plain torch, (..., outputs)."""
         W = self.coefficients.to(F.dtype)
         terms = polynomial(F)[..., : self.columns]
         if len(W) == 1:
@@ -101,6 +101,11 @@ class _Symbolic(EngineLaw):
         if particles is None:
             raise UserError(f"{type(self).__name__} holds {len(W)} scenes: give `particles` to say which scene each F belongs to")
         return (W[particles.scene.long()] @ terms[..., None])[..., 0]
+
+    def __repr__(self) -> str:
+        if self.elastic and len(self.coefficients) == 1:
+            return f"{type(self).__name__}(tau/kPa = {formula(self.coefficients[0])})"
+        return f"{type(self).__name__}({len(self.coefficients)} scenes)"
 
 
 class SymbolicElastic(_Symbolic, ElasticLaw):
@@ -126,19 +131,19 @@ class SymbolicPlastic(_Symbolic, PlasticLaw):
 
 
 def polynomial(F: Tensor) -> Tensor:
-    """The terms of F (..., 3, 3) in plain torch, (..., 7), in the order of `TERMS`."""
+    """Return the terms of F (..., 3, 3) in plain torch, (..., 7), in the order of `TERMS`."""
     l, q, r = networks.strain_features(*networks.hencky_strain(F))[..., FIRST:].unbind(-1)
     return torch.stack([torch.ones_like(l), l, q, r, l * l, l * q, q * q], -1)
 
 
 def generators(F: Tensor) -> Tensor:
-    """The four generators of F (..., 3, 3) in plain torch, (..., 4, 3, 3), in the order of `GENERATORS`."""
+    """Return the four generators of F (..., 3, 3) in plain torch, (..., 4, 3, 3), in the order of `GENERATORS`."""
     units = torch.eye(4, dtype=F.dtype, device=F.device)
     return torch.stack([networks.isotropic_stress(F, unit.expand(*F.shape[:-2], 4), 1.0) for unit in units], -3)
 
 
 def formula(coefficients: Tensor) -> str:
-    """A stress as text, tau/kPa, from coefficients (4, 7) of which zeros are left out."""
+    """Return a stress as text, tau/kPa, from coefficients (4, 7) of which zeros are left out."""
     parts = []
     for row, generator in zip(coefficients.detach().cpu().tolist(), GENERATORS):
         for value, term, degree in zip(row, TERMS, DEGREE):

@@ -70,7 +70,7 @@ def test_formula_says_what_is_left():
 
 def test_gradient_of_a_rollout_against_a_finite_difference():
     body = block((0.3, 0.05, 0.3), (0.7, 0.45, 0.7), (5, 5, 5), velocity=(0.0, -2.0, 0.5))
-    simulator = Simulator(Scene(cells=12, dt=1e-3), body, dtype=torch.float64)
+    simulator = Simulator(Scene(cells=12, dt=1e-3), body, dtype=torch.float64, device="cpu")
     g = torch.Generator().manual_seed(1)
     direction = torch.randn(1, 4, 7, generator=g, dtype=torch.float64), torch.rand(1, 3, 1, generator=g, dtype=torch.float64)
 

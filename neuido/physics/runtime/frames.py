@@ -1,0 +1,135 @@
+"""What a rollout returns: the frames of its particles, with their times, to unpack, to look at and to save."""
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.errors import UserError
+from neuido.physics.runtime.atomic_files import whole_file
+from neuido.types import Particles, ParticleState
+
+
+class Frames(ParticleState):
+    """K frames of P particles: a `ParticleState` with a leading K that knows its times.
+
+    It unpacks to x, v, C and F as a `ParticleState` does.
+
+    Args:
+        x: Position [m], (K, P, 3).
+        v: Velocity [m/s], (K, P, 3).
+        C: Affine velocity [1/s], (K, P, 3, 3).
+        F: Elastic deformation gradient [-], (K, P, 3, 3).
+        dt: Time between two frames [s], a number or one for each scene, (S,).
+        particles: Scene of each particle; none: one scene.
+        history: What the effects remember, (K, P, width); width 0 where none does, None where the solver does not tell.
+
+    Attributes:
+        dt: Time between two frames [s], (S,).
+        particles: As given.
+        history: As given.
+    """
+
+    dt: Tensor
+    particles: Particles | None
+    history: Tensor | None
+
+    def __new__(
+        cls,
+        x: Tensor,
+        v: Tensor,
+        C: Tensor,
+        F: Tensor,
+        dt: Tensor | Sequence[float] | float = 1.0,
+        particles: Particles | None = None,
+        history: Tensor | None = None,
+    ) -> "Frames":
+        """Make frames; see the class."""
+        frames = super().__new__(cls, x, v, C, F)
+        frames.dt = torch.as_tensor(dt, dtype=torch.float64).detach().cpu().reshape(-1)
+        frames.particles, frames.history = particles, history
+        return frames
+
+    @classmethod
+    def _make(cls, iterable: Iterable[Any]) -> ParticleState:  # type: ignore[override]  # what `_replace` calls
+        return ParticleState._make(iterable)
+
+    @property
+    def times(self) -> Tensor:
+        """Time of each frame [s], float64, (K,), or (S, K) where the scenes have different steps."""
+        at = torch.arange(len(self.x), dtype=torch.float64)
+        each = torch.unique(self.dt)
+        return at * each if len(each) == 1 else self.dt[:, None] * at
+
+    def __repr__(self) -> str:
+        frames, count = self.x.shape[:2]
+        scenes = 1 if self.particles is None else len(self.particles.offsets) - 1
+        times = self.times[..., -1].reshape(-1)
+        end = f"{float(times[0]):.4g} s" if len(times) == 1 else f"{float(times.min()):.4g} to {float(times.max()):.4g} s"
+        failed = ~torch.isfinite(self.x[-1].detach()).all(dim=-1)
+        word = f", {int(failed.sum())} particles not finite at the end" if bool(failed.any()) else ""
+        plural = "" if scenes == 1 else "s"
+        kind = f"{str(self.x.dtype).removeprefix('torch.')} on {self.x.device}"
+        return f"Frames({frames} frames of {count} particles in {scenes} scene{plural}, the last at {end}, {kind}{word})"
+
+    def save(self, path: str | os.PathLike) -> list[Path]:
+        """Write the frames in the format that the name ends with, each file all at once.
+
+        `.npz`: arrays x, v, C, F, times and scene. `.ply`: a point cloud a frame, `NAME_0000.ply`, `NAME_0001.ply`, ..., with x, y, z [m]
+        and vx, vy, vz [m/s]; files of a longer series of that name are removed. `.csv`: a row for each frame and particle.
+
+        Args:
+            path: Where; folders on the way are made.
+
+        Returns:
+            The files that were written.
+
+        Raises:
+            UserError: Another ending, or a place where nothing can be written.
+        """
+        path = Path(path)
+        writers = {".npz": self._save_npz, ".ply": self._save_ply, ".csv": self._save_csv}
+        if path.suffix.lower() not in writers:
+            raise UserError(f"frames cannot be saved as {str(path)!r}: let the name end with {', '.join(writers)}")
+        return writers[path.suffix.lower()](path)
+
+    def _scene(self) -> np.ndarray:
+        """Return the scene of each particle, (P,)."""
+        return np.zeros(self.x.shape[1], np.int32) if self.particles is None else self.particles.scene.cpu().numpy()
+
+    def _save_npz(self, path: Path) -> list[Path]:
+        arrays = {name: t.detach().cpu().numpy() for name, t in zip(self._fields, self)}
+        with whole_file(path) as hidden, open(hidden, "wb") as file:
+            np.savez_compressed(file, times=self.times.numpy(), scene=self._scene(), **arrays)
+        return [path]
+
+    def _save_ply(self, path: Path) -> list[Path]:
+        rows = torch.cat([self.x, self.v], dim=-1).detach().cpu().numpy().astype("<f4")
+        columns = "".join(f"property float {name}\n" for name in ("x", "y", "z", "vx", "vy", "vz"))
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {rows.shape[1]}\n{columns}end_header\n".encode("ascii")
+        digits = max(4, len(str(len(rows) - 1)))
+        written = [path.with_name(f"{path.stem}_{k:0{digits}d}{path.suffix}") for k in range(len(rows))]
+        for own, row in zip(written, rows):
+            with whole_file(own) as hidden:
+                hidden.write_bytes(head + row.tobytes())
+        series = re.compile(re.escape(path.stem) + r"_\d{4,}" + re.escape(path.suffix))
+        for old in path.parent.iterdir():
+            if series.fullmatch(old.name) and old not in written:
+                old.unlink()
+        return written
+
+    def _save_csv(self, path: Path) -> list[Path]:
+        times, scene = self.times.expand(len(self.dt), -1) if self.times.ndim == 1 else self.times, self._scene()
+        rows = torch.cat([self.x, self.v], dim=-1).detach().cpu().double().numpy()
+        with whole_file(path) as hidden, open(hidden, "w") as file:
+            file.write("frame,time [s],scene,particle,x [m],y [m],z [m],vx [m/s],vy [m/s],vz [m/s]\n")
+            for k, frame in enumerate(rows):
+                for p, row in enumerate(frame):
+                    at = float(times[min(int(scene[p]), len(times) - 1), k])
+                    file.write(f"{k},{at:.9g},{scene[p]},{p}," + ",".join(f"{value:.9g}" for value in row) + "\n")
+        return [path]
