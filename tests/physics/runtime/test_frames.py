@@ -9,7 +9,8 @@ from plyfile import PlyData
 
 from neuido.data.bodies.shapes import cube
 from neuido.errors import UserError
-from neuido.physics import Effects, FiniteElements, Frames, Simulator, laws
+from neuido.physics import FiniteElements, Frames, Simulator, laws
+from neuido.physics.effects import Effects
 from neuido.types import Scene
 
 BODY = cube(length=0.2, centre=(0.5, 0.5, 0.5), particles_per_side=4)
