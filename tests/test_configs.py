@@ -10,12 +10,12 @@ import yaml
 
 import neuido
 from neuido.commands import main as cli
+from neuido.commands.cli.sweep_file import command_of as sweep_command
+from neuido.commands.cli.sweep_file import read_sweep, runs_of
 from neuido.commands.diagnose import diagnose
 from neuido.commands.film import film
 from neuido.commands.latents import latents
 from neuido.commands.simulate import simulate
-from neuido.commands.sweep_file import command_of as sweep_command
-from neuido.commands.sweep_file import read_sweep, runs_of
 from neuido.data.files.score_tables import read_rows
 from neuido.data.trajectories.options import simulate as trajectories
 

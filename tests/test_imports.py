@@ -62,7 +62,7 @@ def test_direction(module):
             assert not wrong, f"{module} imports {sorted(wrong)}; {room} may import {allowed} alone"
 
 
-SPEAK_WANDB = ("neuido.commands.main", "neuido.commands.sweep", "neuido.commands.sweep_file", "neuido.data.files.sweep_run")
+SPEAK_WANDB = ("neuido.commands.main", "neuido.commands.sweep", "neuido.commands.cli.sweep_file", "neuido.data.files.sweep_run")
 """They speak the language of its files and its environment, and import nothing of it."""
 
 
@@ -83,8 +83,9 @@ def test_third_parties(module):
 
 LIGHT = ("", ".__main__", ".errors", ".data.trajectories.options", ".data.undeclared", ".data.files.html_page",
          ".data.files.results", ".data.files.sweep_run", ".data.files.score_tables", ".commands.diagnose",
-         *(f".commands.{name}" for name in ("main", "doctor", "simulate", "reconstruct", "film", "sweep", "config_files", "report",
-                                            "latents", "demo.demo")))  # fmt: skip
+         *(f".commands.{name}" for name in ("main", "doctor", "simulate", "reconstruct", "film", "sweep", "report",
+                                            "latents", "demo.demo", "cli.config_files", "cli.suggestions",
+                                            "cli.trainer", "cli.functions")))  # fmt: skip
 
 
 @pytest.mark.parametrize("module", [f"neuido{name}" for name in LIGHT])

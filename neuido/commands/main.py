@@ -9,29 +9,21 @@ its traceback, and exit status 70. `NEUIDO_TRACEBACK=1` shows the traceback inst
 """
 
 import contextlib
-import importlib
-import inspect
-import itertools
-import json
 import os
 import signal
 import sys
 import tempfile
 import traceback
-import zipfile
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_origin
+from typing import Any
 
 import neuido
 from neuido.commands import interruption
-from neuido.commands.config_files import find_config
-from neuido.commands.console import quiet_lightning
-from neuido.data.files.sweep_run import own_folder, redirect
+from neuido.commands.cli.config_files import find_configs
+from neuido.commands.cli.functions import run_function
+from neuido.commands.cli.suggestions import refuse_abbreviations, suggest
+from neuido.commands.cli.trainer import HEAVY, run_lightning
 from neuido.errors import UserError, one_line, shortened
-
-if TYPE_CHECKING:
-    from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 LIGHT = {  # name: (module, function, one line for the list); the module must import torch only inside its functions
     "simulate": ("neuido.commands.simulate", "simulate", "Generate the trajectories of Stage I, or filmed scenes."),
@@ -44,22 +36,6 @@ LIGHT = {  # name: (module, function, one line for the list); the module must im
     "film": ("neuido.commands.film", "film", "Film simulated bodies of many materials, for the video encoder."),
     "doctor": ("neuido.commands.doctor", "doctor", "Print versions and devices, and run a small rollout on each device."),
 }
-HEAVY = {
-    "fit": "Train a model.",
-    "validate": "Run one validation epoch.",
-    "test": "Run one test epoch.",
-    "predict": "Run inference.",
-}
-
-MODULES = (  # so that their class names resolve without a path
-    *(f"neuido.models.stages.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt")),
-    *(f"neuido.models.baselines.{name}" for name in ("known_law", "nclaw", "spring_gaus", "sparse_law", "stage_one_latents")),
-    "neuido.models.fewshot.low_rank",
-    "neuido.data.trajectories.trajectory_module",
-    "neuido.data.scenes.clips",
-    "neuido.data.scenes.filmed_scene_module",
-    "neuido.discrepancy.diagnosed",
-)
 
 
 FAULT = 70
@@ -123,96 +99,16 @@ def _dispatch(args: list[str]) -> int:
         print(f"neuido {neuido.__version__}")
         return 0
     if name not in LIGHT and name not in HEAVY:
-        raise UserError(f"unknown command '{name}': use one of {', '.join([*HEAVY, *LIGHT])}")
-    args = _find_configs(args)
+        known = [*HEAVY, *LIGHT]
+        raise UserError(f"unknown command '{name}'{suggest(name, known) or ':'} The commands are {', '.join(known)}")
+    args = find_configs(args)
     os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # lightning's own calls, lightning issue 21900
+    refuse_abbreviations()
     if name in LIGHT:
-        return _run_light(name, args[1:])
+        module, function, _ = LIGHT[name]
+        return run_function(name, module, function, args[1:])
     run_lightning(args)
     return 0
-
-
-def _run_light(name: str, args: list[str]) -> int:
-    from jsonargparse import auto_cli
-
-    module, function, _ = LIGHT[name]
-    component = getattr(importlib.import_module(module), function)
-    first = next(iter(inspect.signature(component).parameters.values()))
-    alone = list(itertools.takewhile(lambda word: not word.startswith("-"), args))  # the first parameter may stand alone
-    if alone and get_origin(first.annotation) is list:
-        args = [f"--{first.name}", json.dumps(alone), *args[len(alone) :]]
-    elif alone:
-        args = [f"--{first.name}", *args]
-    status = auto_cli(component, args=args, as_positional=False, prog=f"neuido {name}", exit_on_error=False)
-    return status if isinstance(status, int) else 0
-
-
-def run_lightning(args: list[str]) -> "LightningCLI":
-    """Run a command of the trainer; the model, the data module and the trainer are attributes of what it returns."""
-    quiet_lightning()
-    from lightning.pytorch import LightningDataModule, LightningModule
-    from lightning.pytorch.cli import LightningCLI, SaveConfigCallback
-
-    for module in MODULES:
-        importlib.import_module(module)
-
-    class NeuidoCLI(LightningCLI):
-        def add_arguments_to_parser(self, parser: "LightningArgumentParser") -> None:
-            parser.link_arguments("data.trajectory_count", "model.init_args.trajectory_count", apply_on="instantiate")
-
-        def _parse_ckpt_path(self) -> None:  # Lightning reads the hyperparameters of the checkpoint here
-            _check_checkpoint(self.config[self.config.subcommand].get("ckpt_path"))
-            super()._parse_ckpt_path()
-
-        def before_instantiate_classes(self) -> None:
-            # Lightning loads a remote checkpoint with pickle unless told otherwise; here that takes an explicit `--weights_only false`.
-            options = self.config[self.subcommand]
-            if options.get("weights_only") is None:
-                options["weights_only"] = True
-            folder = own_folder(os.environ)
-            if folder:
-                redirect(options, folder)
-                kept = folder / interruption.STATE
-                if self.subcommand == "fit" and options.get("ckpt_path") is None and kept.is_file():  # a run of a sweep is taken up again
-                    options["ckpt_path"] = str(kept)
-            self.trainer_defaults["callbacks"] = [interruption.stop_at_step(folder and folder / interruption.STATE)]
-
-    class BesideTheLog(SaveConfigCallback):
-        def setup(self, trainer, pl_module, stage):  # without a log it would write into the current folder, and refuse to a second time
-            if trainer.loggers:
-                super().setup(trainer, pl_module, stage)
-
-    parser = {"exit_on_error": False}  # raise argparse.ArgumentError instead of 100 lines of usage
-    return NeuidoCLI(
-        LightningModule,
-        LightningDataModule,
-        subclass_mode_model=True,
-        subclass_mode_data=True,
-        auto_configure_optimizers=False,
-        seed_everything_default=0,
-        save_config_callback=BesideTheLog,
-        parser_kwargs={"prog": "neuido", "version": neuido.__version__, **parser, **{name: dict(parser) for name in HEAVY}},
-        args=args,
-    )
-
-
-def _check_checkpoint(given: str | None) -> None:
-    if given is None or given in ("best", "last", "hpc") or given.startswith("registry") or "://" in given:
-        return
-    if not Path(given).exists():
-        raise UserError(f"ckpt_path = {given}: there is no such file")
-    if Path(given).is_file() and not zipfile.is_zipfile(given):
-        raise UserError(f"ckpt_path = {given} is not a checkpoint, or is cut short")
-
-
-def _find_configs(args: list[str]) -> list[str]:
-    found = list(args)
-    for i, (before, argument) in enumerate(zip(["", *args], args, strict=False)):
-        if before in ("-c", "--config"):
-            found[i] = find_config(argument)
-        elif argument.startswith("--config="):
-            found[i] = "--config=" + find_config(argument.removeprefix("--config="))
-    return found
 
 
 def _help() -> str:

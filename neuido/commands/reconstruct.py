@@ -144,7 +144,7 @@ def _optimise(batch: "MultiViewBatch", around: "Setting", target: Path, device: 
     from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
     from lightning.pytorch.loggers import CSVLogger
 
-    from neuido.commands.console import quiet_lightning
+    from neuido.commands.cli.console import quiet_lightning
     from neuido.commands.interruption import stop_at_step
     from neuido.models.reconstruct.gaussian_fit import ReconstructModule
 

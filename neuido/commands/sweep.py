@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from neuido.commands.config_files import find_config
+from neuido.commands.cli.config_files import find_config
+from neuido.commands.cli.sweep_file import Metric, Run, SweepFile, command_of, read_sweep, runs_of
 from neuido.commands.interruption import SIGNALS, STATE
-from neuido.commands.sweep_file import Metric, Run, SweepFile, command_of, read_sweep, runs_of
 from neuido.data.files.lock import Held, OwnedLock
 from neuido.data.files.score_tables import read_rows, write_rows
 from neuido.data.files.sweep_run import FOLDER, FORMAT, note, status_of

@@ -11,6 +11,7 @@ import torch
 
 import neuido
 from neuido.commands import main as cli
+from neuido.commands.cli.config_files import find_configs
 from neuido.commands.main import main
 from neuido.commands.simulate import simulate
 from tests.command import run
@@ -65,7 +66,8 @@ def test_version(capsys):
 def test_module_and_script_are_one_command():
     answer = subprocess.run([sys.executable, "-m", "neuido", "simlate"], capture_output=True, text=True, cwd=ROOT)
     assert answer.returncode == 2
-    assert answer.stderr == f"neuido: unknown command 'simlate': use one of {', '.join([*cli.HEAVY, *cli.LIGHT])}\n"
+    known = ", ".join([*cli.HEAVY, *cli.LIGHT])
+    assert answer.stderr == f"neuido: unknown command 'simlate', did you mean 'simulate'? The commands are {known}\n"
 
 
 def test_a_device_without_memory_is_one_line(capsys, monkeypatch):
@@ -79,6 +81,19 @@ def test_a_device_without_memory_is_one_line(capsys, monkeypatch):
 
 def test_light_wrong_key_on_the_command_line(capsys):
     assert_one_line(capsys, ["simulate", "--out", "x", "--instancez", "3"], "instancez")
+
+
+@pytest.mark.parametrize(("wrong", "meant"), [("devic", "device"), ("particlez", "particles"), ("seedd", "seed")])
+def test_light_wrong_name_is_answered_with_the_one_that_was_meant(capsys, tmp_path, wrong, meant):
+    assert_one_line(capsys, ["film", "--out", "x", f"--{wrong}", "3"], f"--{wrong}", f"did you mean '{meant}'?")
+    path = tmp_path / "wrong.yaml"
+    path.write_text(f"out: x\n{wrong}: 3\n")
+    assert_one_line(capsys, ["film", "--config", str(path)], f"'{wrong}'", f"did you mean '{meant}'?")
+
+
+def test_light_abbreviation_is_refused(capsys, tmp_path):
+    assert_one_line(capsys, ["simulate", "--out", str(tmp_path / "x"), "--instanc", "3"], "instanc")
+    assert not (tmp_path / "x").exists()
 
 
 def test_light_wrong_key_in_yaml(capsys, tmp_path):
@@ -121,9 +136,9 @@ def test_missing_configuration_of_the_demo(capsys):
 def test_configurations_that_come_with_neuido_are_found_from_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("configs/stage1.yaml", "stage1.yaml", "stage1"):
-        assert cli._find_configs(["fit", "--config", name, f"--config={name}"]) == ["fit", "--config", STAGE1, f"--config={STAGE1}"]
+        assert find_configs(["fit", "--config", name, f"--config={name}"]) == ["fit", "--config", STAGE1, f"--config={STAGE1}"]
     Path("stage1.yaml").touch()
-    assert cli._find_configs(["-c", "stage1.yaml"]) == ["-c", "stage1.yaml"]
+    assert find_configs(["-c", "stage1.yaml"]) == ["-c", "stage1.yaml"]
 
 
 @pytest.mark.parametrize(
@@ -188,6 +203,9 @@ class TestLightning:
 
     def test_wrong_trainer_option(self, capsys):
         assert_one_line(capsys, ["fit", "--config", STAGE1, "--trainer.max_epochz", "3"], "--trainer.max_epochz")
+
+    def test_abbreviation_is_refused(self, capsys):
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--trainer.max_epoch", "3"], "--trainer.max_epoch")
 
     def test_wrong_trainer_type(self, capsys):
         assert_one_line(capsys, ["fit", "--config", STAGE1, "--trainer.max_epochs", "many"], "--trainer.max_epochs", "many")

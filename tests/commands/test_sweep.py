@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 import neuido
+from neuido.commands.cli.sweep_file import command_of, read_sweep, runs_of
 from neuido.commands.main import main
 from neuido.commands.sweep import scored, sweep
-from neuido.commands.sweep_file import command_of, read_sweep, runs_of
 from neuido.data.files.score_tables import write_rows
 from neuido.data.files.sweep_run import own_folder, redirect
 from neuido.errors import UserError

@@ -61,8 +61,8 @@ def demo_video(
     """
     import yaml
 
-    from neuido.commands.config_files import find_config
-    from neuido.commands.main import run_lightning
+    from neuido.commands.cli.config_files import find_config
+    from neuido.commands.cli.trainer import run_lightning
     from neuido.commands.reconstruct import reconstruct
     from neuido.commands.simulate import simulate
     from neuido.data.trajectories.options import Film
@@ -102,8 +102,8 @@ def demo_video(
 
 
 def _adapt(folder: Path, encoder: Path, steps: int) -> Adapted:
-    from neuido.commands.config_files import find_config
-    from neuido.commands.main import run_lightning
+    from neuido.commands.cli.config_files import find_config
+    from neuido.commands.cli.trainer import run_lightning
 
     results = folder / "adapted"
     common = ["--config", find_config("adapt_small"), "--data.root", str(folder / "scenes"), "--data.scenes", _listed(UNSEEN)]

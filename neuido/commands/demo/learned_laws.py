@@ -51,8 +51,8 @@ def demo_laws(out: str = "runs/demo", *, settings: str = "quickstart") -> LawsRe
         out: Folder for the trajectories, the run and the picture.
         settings: Configuration to train with.
     """
-    from neuido.commands.config_files import find_config
-    from neuido.commands.main import run_lightning
+    from neuido.commands.cli.config_files import find_config
+    from neuido.commands.cli.trainer import run_lightning
 
     folder, config = Path(out), find_config(settings, "--settings")
     print(f"[laws 1/2] neuido fit --config {settings} --data.root {folder / 'trajectories'}", flush=True)

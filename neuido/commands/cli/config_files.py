@@ -15,3 +15,14 @@ def find_config(name: str, option: str = "--config") -> str:
         if own.is_file():
             return str(own)
     raise UserError(f"no configuration file '{name}', neither here nor in {configs_root()}: change {option}")
+
+
+def find_configs(args: list[str]) -> list[str]:
+    """Return the arguments with each `--config` resolved by `find_config`."""
+    found = list(args)
+    for i, (before, argument) in enumerate(zip(["", *args], args, strict=False)):
+        if before in ("-c", "--config"):
+            found[i] = find_config(argument)
+        elif argument.startswith("--config="):
+            found[i] = "--config=" + find_config(argument.removeprefix("--config="))
+    return found

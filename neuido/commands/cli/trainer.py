@@ -1,0 +1,94 @@
+"""The commands of the Lightning trainer (`fit`, `validate`, `test`, `predict`): a LightningCLI in subclass mode.
+
+YAML gives `class_path` and `init_args` of the model and the data module.
+"""
+
+import importlib
+import os
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import neuido
+from neuido.commands import interruption
+from neuido.commands.cli.console import quiet_lightning
+from neuido.data.files.sweep_run import own_folder, redirect
+from neuido.errors import UserError
+
+if TYPE_CHECKING:
+    from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+
+HEAVY = {
+    "fit": "Train a model.",
+    "validate": "Run one validation epoch.",
+    "test": "Run one test epoch.",
+    "predict": "Run inference.",
+}
+
+MODULES = (  # so that their class names resolve without a path
+    *(f"neuido.models.stages.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt")),
+    *(f"neuido.models.baselines.{name}" for name in ("known_law", "nclaw", "spring_gaus", "sparse_law", "stage_one_latents")),
+    "neuido.models.fewshot.low_rank",
+    "neuido.data.trajectories.trajectory_module",
+    "neuido.data.scenes.clips",
+    "neuido.data.scenes.filmed_scene_module",
+    "neuido.discrepancy.diagnosed",
+)
+
+
+def run_lightning(args: list[str]) -> "LightningCLI":
+    """Run a command of the trainer; the model, the data module and the trainer are attributes of what it returns."""
+    quiet_lightning()
+    from lightning.pytorch import LightningDataModule, LightningModule
+    from lightning.pytorch.cli import LightningCLI, SaveConfigCallback
+
+    for module in MODULES:
+        importlib.import_module(module)
+
+    class NeuidoCLI(LightningCLI):
+        def add_arguments_to_parser(self, parser: "LightningArgumentParser") -> None:
+            parser.link_arguments("data.trajectory_count", "model.init_args.trajectory_count", apply_on="instantiate")
+
+        def _parse_ckpt_path(self) -> None:  # Lightning reads the hyperparameters of the checkpoint here
+            _check_checkpoint(self.config[self.config.subcommand].get("ckpt_path"))
+            super()._parse_ckpt_path()
+
+        def before_instantiate_classes(self) -> None:
+            # Lightning loads a remote checkpoint with pickle unless told otherwise; here that takes an explicit `--weights_only false`.
+            options = self.config[self.subcommand]
+            if options.get("weights_only") is None:
+                options["weights_only"] = True
+            folder = own_folder(os.environ)
+            if folder:
+                redirect(options, folder)
+                kept = folder / interruption.STATE
+                if self.subcommand == "fit" and options.get("ckpt_path") is None and kept.is_file():  # a run of a sweep is taken up again
+                    options["ckpt_path"] = str(kept)
+            self.trainer_defaults["callbacks"] = [interruption.stop_at_step(folder and folder / interruption.STATE)]
+
+    class BesideTheLog(SaveConfigCallback):
+        def setup(self, trainer, pl_module, stage):  # without a log it would write into the current folder, and refuse to a second time
+            if trainer.loggers:
+                super().setup(trainer, pl_module, stage)
+
+    parser = {"exit_on_error": False}  # raise argparse.ArgumentError instead of 100 lines of usage
+    return NeuidoCLI(
+        LightningModule,
+        LightningDataModule,
+        subclass_mode_model=True,
+        subclass_mode_data=True,
+        auto_configure_optimizers=False,
+        seed_everything_default=0,
+        save_config_callback=BesideTheLog,
+        parser_kwargs={"prog": "neuido", "version": neuido.__version__, **parser, **{name: dict(parser) for name in HEAVY}},
+        args=args,
+    )
+
+
+def _check_checkpoint(given: str | None) -> None:
+    if given is None or given in ("best", "last", "hpc") or given.startswith("registry") or "://" in given:
+        return
+    if not Path(given).exists():
+        raise UserError(f"ckpt_path = {given}: there is no such file")
+    if Path(given).is_file() and not zipfile.is_zipfile(given):
+        raise UserError(f"ckpt_path = {given} is not a checkpoint, or is cut short")
