@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from neuido.discrepancy.workflow import diagnose as diagnose
     from neuido.errors import UserError as UserError
     from neuido.export.particles import export as export
+    from neuido.models.inference.video_law import read_law as read_law
     from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator as Operator
     from neuido.models.render.splatting import rasterize as rasterize
     from neuido.models.render.splatting import render as render
@@ -56,6 +57,7 @@ _PLACES = {  # name: its module, and after a colon its name there; a module alon
     "load_scene": "data.bodies.scene_files:load_scene",
     "rasterize": "models.render.splatting:rasterize",
     "read_experiment": "data.measured.experiment:read_experiment",
+    "read_law": "models.inference.video_law:read_law",
     "read_material_tests": "data.measured.material_test:read_material_tests",
     "read_recording": "data.scenes.readers:read",
     "read_tracks": "data.measured.track:read_tracks",
@@ -88,6 +90,7 @@ __all__ = [
     "load_scene",
     "rasterize",
     "read_experiment",
+    "read_law",
     "read_material_tests",
     "read_recording",
     "read_tracks",

@@ -93,3 +93,102 @@ def test_light_modules_load_neither_torch_nor_lightning(module):
     code = f"import sys, {module}; print(sorted({{'torch', 'lightning', 'warp', 'jsonargparse'}} & set(sys.modules)))"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert answer.stdout.strip() == "[]"
+
+
+# The drawn structure. The front doors (`__init__.py`), which import public names lazily, are drawn with what they lead to left out.
+
+FLOORS, FOLDER_FLOORS, FILES, LINES = 9, 14, 14, 450
+COMMANDS = {path.stem for path in (PACKAGE / "commands").glob("*.py")}
+INSIDE = "neuido.discrepancy"
+"""Its files are moved by themselves, later; its folder, lengths and stems are not held yet."""
+
+
+def drawn() -> dict[str, set[str]]:
+    """Return what each file imports of the package, type-only imports included."""
+    graph = {}
+    for module in MODULES:
+        if not module.endswith("__init__"):
+            names = imports_of(module)
+            graph[module] = {other for name in names for other in (name, name.rpartition(".")[0]) if other in MODULES and other != module}
+    return graph
+
+
+def circles(graph: dict[str, set[str]]) -> list[set[str]]:
+    """Return the groups of nodes that reach one another."""
+    reached = {}
+    for start in graph:
+        seen, waiting = set(), list(graph[start])
+        while waiting:
+            node = waiting.pop()
+            if node not in seen:
+                seen.add(node)
+                waiting += graph.get(node, ())
+        reached[start] = seen
+    groups = {frozenset(other for other in reached[node] if node in reached.get(other, ())) for node in graph if node in reached[node]}
+    return [set(group) for group in groups]
+
+
+def by_folder(graph: dict[str, set[str]]) -> dict[str, set[str]]:
+    """Return the same between folders; a file of a room's top stands for itself, but for commands and the inside of a diagnosis."""
+
+    def folder(module: str) -> str:
+        whole = next((room for room in (INSIDE, "neuido.commands") if within(module, (room,))), None)
+        return whole or (module if module.count(".") < 3 else module.rpartition(".")[0])
+
+    out: dict[str, set[str]] = {}
+    for module, others in graph.items():
+        out.setdefault(folder(module), set()).update(folder(other) for other in others if folder(other) != folder(module))
+    return out
+
+
+def test_circles_are_seen():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == [{"b", "c"}]
+    assert circles({"a": {"b"}, "b": set()}) == []
+
+
+def test_no_circle_of_files():
+    assert circles(drawn()) == []
+
+
+def test_no_circle_of_folders():
+    assert circles(by_folder(drawn())) == []
+
+
+def floors(graph: dict[str, set[str]]) -> int:
+    """Return the length of the longest way down, in nodes."""
+    heights: dict[str, int] = {}
+
+    def height(node: str) -> int:
+        if node not in heights:
+            heights[node] = 1 + max((height(other) for other in graph.get(node, ())), default=0)
+        return heights[node]
+
+    return max(map(height, graph))
+
+
+def test_few_floors():
+    graph, rooms = by_folder(drawn()), {}
+    for node, others in graph.items():
+        own = ".".join(node.split(".")[:2])
+        rooms.setdefault(own, set()).update(room for other in others if (room := ".".join(other.split(".")[:2])) != own)
+    assert circles(rooms) == []
+    assert floors(rooms) <= FLOORS
+    assert floors(graph) <= FOLDER_FLOORS
+
+
+def test_folders_and_files_are_small():
+    for folder in {path.parent for path in PACKAGE.rglob("*.py")}:
+        if folder.name != "discrepancy":
+            assert len(list(folder.glob("*.py"))) <= FILES, folder
+    for module in MODULES:
+        lines = len((PACKAGE.parent / (module.replace(".", "/") + ".py")).read_text().splitlines())
+        assert lines <= LINES or within(module, (INSIDE,)), f"{module} has {lines} lines"
+
+
+def test_no_stem_twice_but_a_commands():
+    stems: dict[str, list[str]] = {}
+    for module in MODULES:
+        stem = module.rpartition(".")[2]
+        if stem not in ("__init__", "__main__") and not within(module, (INSIDE,)):
+            stems.setdefault(stem, []).append(module)
+    assert {stem: own for stem, own in stems.items() if len(own) > 1 and stem not in COMMANDS} == {}

@@ -18,13 +18,20 @@ ROOT = Path(__file__).parents[1]
 PUBLIC = {
     "neuido": """
         AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Gaussians Operator ParticleState Plane Scene Simulator UserError
-        Walls __version__ configs_root diagnose effects export laws load_scene rasterize read_experiment read_material_tests
-        read_recording read_tracks render shapes
+        Walls __version__ configs_root diagnose effects export laws load_scene rasterize read_experiment read_law
+        read_material_tests read_recording read_tracks render shapes
     """,
     "neuido.data": """
         Experiment FilmDataModule MaterialTest MaterialTests MultiView MultiViewDataModule Recording SceneSetup Track Tracks
         TrajectoryDataModule VisualDataModule cameras load_scene read_experiment read_material_tests read_recording read_tracks
         scene_names shapes write_experiment
+    """,
+    "neuido.models": """
+        AdaptModule AlignModule ChamferDistance DynamicsEncoder Encoder FlowVAE FlowVAEModule IntrinsicDynamicsOperator KnownLaw
+        LPIPS LowRankAdaptation MatchedRMSE MeanLatent MedianRelativeError Method Moduli NCLaw NeuMA Operator PreparedScene
+        PretrainModule RandomLatent ReconstructModule SparseLaw Splatting SpringMass UniPhy VideoLaw WarmupModule attach_gaussians
+        bind chamfer_distance deform fill load_gaussians load_law load_nclaw opacity_volume prepare rasterize read_law relative_lp
+        render save_gaussians save_law small_strain_moduli visual_hull write_particles write_video
     """,
     "neuido.physics": "FiniteElements Frames MassSpring Mesh Simulator effects laws mesh_body",
     "neuido.physics.effects": "Effects Entry LIBRARY Parameter ball_inclusion linear_gradient",
@@ -120,7 +127,7 @@ def test_what_users_copy_imports_public_names_alone(name, source):
     assert not deep, f"{name} imports from {sorted(deep)}; users import from {', '.join(ROOMS)} alone"
 
 
-EXAMPLES = ("simulate_a_drop", "diagnose_a_throw")
+EXAMPLES = ("simulate_a_drop", "law_from_video", "diagnose_a_throw")
 
 
 def code_lines(source: str) -> list[str]:
@@ -155,3 +162,10 @@ def test_diagnose_names_the_drag(tmp_path):
     assert "the declared model lacks" in said
     assert "drag_quadratic" in said
     assert (tmp_path / "throw.png").stat().st_size > 5000
+
+
+@pytest.mark.slow
+def test_video_gives_a_law(tmp_path):
+    young = float(re.search(r"E = ([\d.]+) kPa", run_example("law_from_video", tmp_path))[1])
+    assert 5 < young < 500  # the truth is of this order: a soft ball
+    assert (tmp_path / "law.safetensors").is_file()

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.stages.constitutive import RESIDUAL_FLOOR, ConstitutiveMetrics, OperatorResponse, evaluate_operator, fit_latents
+from neuido.models.stages.operator_scores import RESIDUAL_FLOOR, ConstitutiveMetrics, OperatorResponse, evaluate_operator, fit_latents
 from neuido.models.stages.training import optimiser_steps, validation_scores
 from neuido.types import TrajectoryBatch
 

@@ -14,7 +14,7 @@ from neuido.data.trajectories.options import simulate
 from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.stages.constitutive import ConstitutiveMetrics, evaluate_operator, fit_latents
+from neuido.models.stages.operator_scores import ConstitutiveMetrics, evaluate_operator, fit_latents
 from neuido.models.stages.pretrain import PretrainModule
 from neuido.physics.laws.classical import FixedCorotated, Sigma, VonMises
 from neuido.types import TrajectoryBatch
