@@ -287,7 +287,7 @@ def _write(target: Path, found: "Gaussians", body: "Body") -> None:
 
     with replacing(target / "gaussians.ply") as hidden:
         save_ply(hidden, found)
-    with replacing(target / "body.npz") as hidden:
+    with replacing(target / "body.npz", keep_suffix=True) as hidden:
         np.savez(hidden, x0=body.x.numpy(), v0=body.v.numpy(), volume=body.volume.numpy())
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from neuido.discrepancy.choosing import first_rounds, told_exactly
 from neuido.discrepancy.classes import drop, narrow, widen
 from neuido.discrepancy.deadline import Deadline
-from neuido.discrepancy.fit import Fit
+from neuido.discrepancy.fit import Fit, NotFinite
 from neuido.discrepancy.floors import Floor, Part, split
 from neuido.discrepancy.intervals import intervals
 from neuido.discrepancy.judging import ALPHA, WITHIN
@@ -19,6 +19,7 @@ from neuido.discrepancy.pairs import by_growing, two_effects
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import UNEXPLAINED, Inference
 from neuido.discrepancy.trials import Round, Stand, Trial
+from neuido.errors import UserError
 
 __all__ = [
     "ALPHA",
@@ -104,6 +105,9 @@ def diagnose(
         most: Effects that may be added.
         tell: Called with a line of progress.
         seconds: After which it comes to its end; see `Deadline`.
+
+    Raises:
+        UserError: No method can predict the declared model; the line of its simulator.
     """
     memo = Memo(problem)
     deadline = Deadline(seconds, pace=lambda: memo.pace)
@@ -117,7 +121,10 @@ def diagnose(
             break
         # the problem's own parameters are about the other method
         near = {name: starts[0].fit.point[name] for name in inference.as_declared} if starts else None
-        start = inference.start(near)
+        try:
+            start = inference.start(near)
+        except NotFinite as error:
+            raise UserError(problem.refusal(n)) from error
         if start is not None:
             tried.append(inference)
             starts.append(start)

@@ -7,6 +7,7 @@ import numpy as np
 
 from neuido.discrepancy.memo import Memo
 from neuido.discrepancy.problem import Parameter, Point, Problem
+from neuido.errors import UserError
 
 SMALLER = (0.5, 0.25, 0.12, 0.06)
 """Factors of sizes that are tried where a fit's start does not run: explicit steps bear only so much viscosity, say."""
@@ -30,6 +31,10 @@ KEPT_UP = 3
 """Iterations over which a fit is trusted to keep up the pace of its last step; gains get smaller."""
 
 
+class NotFinite(UserError):
+    """A prediction that is not finite where linear algebra would need it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Covariance:
     """sigma^2 I + U diag(s^2) U^T of the data of one recording, with orthonormal columns U (n, k)."""
@@ -43,6 +48,8 @@ class Covariance:
         """sigma^2 I + L L^T for columns L (n, k)."""
         if not columns.size:
             return cls(sigma, np.empty((columns.shape[0], 0)), np.empty(0))
+        if not np.isfinite(columns).all():
+            raise NotFinite("predictions under different settings are not finite")
         values, vectors = np.linalg.eigh(columns.T @ columns)
         keep = values > max(1e-12 * values.max(), 1e-300)
         spread = np.sqrt(values[keep])

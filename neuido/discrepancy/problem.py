@@ -165,6 +165,10 @@ class Problem:
         """
         return math.inf
 
+    def refusal(self, setting: int) -> str:
+        """Return why the declared model has no finite prediction under a setting, and the factor that would let it run."""
+        return f"the declared model has no finite prediction ({self.setting_name(setting)}): check its values and units"
+
     def bears(self, point: Point, setting: int) -> bool:
         """Whether a point is `SURE` to run under a setting that is to stand in for another one."""
         return self.margin(point, setting) >= math.log(SURE)

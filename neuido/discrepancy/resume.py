@@ -66,6 +66,9 @@ class CachedProblem(Problem):
     def margin(self, point: Point, setting: int = 0) -> float:
         return self.problem.margin(point, setting)
 
+    def refusal(self, setting: int) -> str:
+        return self.problem.refusal(setting)
+
     def effort(self, recording: int, setting: int = 0) -> float:
         return self.problem.effort(recording, setting)
 

@@ -12,15 +12,19 @@ from neuido.errors import UserError
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike) -> Iterator[Path]:
+def replacing(path: str | os.PathLike, *, keep_suffix: bool = False) -> Iterator[Path]:
     """Give the name of a temporary file beside a file; when the block ends it takes the file's place, for good and all at once.
 
     Several processes may write one file: each has a temporary name of its own. Where the block fails, as on a full disk, the temporary
     file goes and what was there before stays. A link is replaced, not followed.
+
+    Args:
+        path: The file; its folder is made.
+        keep_suffix: Whether the temporary name ends as the file's does, for writers that go by it.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    hidden = temporary(path)
+    hidden = temporary(path, path.suffix if keep_suffix else "")
     try:
         yield hidden
         _sync(hidden)
@@ -59,14 +63,17 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
     _sync(path.parent)
 
 
-def temporary(path: Path) -> Path:
+def temporary(path: Path, suffix: str = "") -> Path:
     """Return a name beside a file that no other process uses; what dead processes of this machine left beside it goes first."""
     host = "".join(c for c in socket.gethostname() if c.isalnum())[:20]
-    for old in path.parent.glob(f".{_literal(path.name)}.{host}-*.tmp{_literal(path.suffix)}"):
+    old_name = path.with_name(f".{path.name}.tmp")  # of earlier versions
+    if old_name.is_file():
+        remove(old_name)
+    for old in path.parent.glob(f".{_literal(path.name)}.{host}-*.tmp{_literal(suffix)}"):
         pid = old.name[len(path.name) + len(host) + 3 :].partition("-")[0]
         if pid.isdigit() and not _lives(int(pid)):
             remove(old)
-    return path.with_name(f".{path.name}.{host}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp{path.suffix}")
+    return path.with_name(f".{path.name}.{host}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp{suffix}")
 
 
 def remove(path: Path) -> None:

@@ -64,7 +64,7 @@ def test_what_a_dead_process_left_goes_and_what_a_live_one_writes_stays(tmp_path
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     host = "".join(c for c in socket.gethostname() if c.isalnum())[:20]
-    left, held = (tmp_path / f".a.txt.{host}-{pid}-00000000.tmp.txt" for pid in (dead.pid, os.getpid()))
+    left, held = (tmp_path / f".a.txt.{host}-{pid}-00000000.tmp" for pid in (dead.pid, os.getpid()))
     for path in (left, held):
         path.write_text("half")
     write(tmp_path / "a.txt", "whole")
