@@ -12,13 +12,14 @@ pin := $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
 bin := $(VENV)/bin
 installed := $(VENV)/.installed
 
-.PHONY: help venv demo test test-all test-slow test-gpu lint format types clean
+.PHONY: help venv demo docs test test-all test-slow test-gpu lint format types clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make demo      install, then learn laws from bodies and video and close one loop: CPU, minutes'
 	@echo 'make test      run the fast tests: minutes on two cores'
 	@echo 'make test-all  run every test that needs no GPU'
+	@echo 'make docs      build the documentation: docs/_build/html/index.html'
 	@echo 'make test-slow, test-gpu, lint, format, types, venv, clean'
 
 venv: $(installed)
@@ -32,6 +33,15 @@ $(VENV)/.torch:
 
 $(installed): $(VENV)/.torch pyproject.toml $(CONSTRAINTS)
 	$(bin)/python -m pip install $(pin) -e '.[dev]'
+	@touch $@
+
+# Examples are run, warnings are errors, internal links are checked. The site is docs/_build/html/index.html.
+docs: export OMP_NUM_THREADS = 1
+docs: $(VENV)/.docs
+	$(bin)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+
+$(VENV)/.docs: $(installed)
+	$(bin)/python -m pip install $(pin) -e '.[docs]'
 	@touch $@
 
 demo: $(installed)

@@ -75,6 +75,9 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         check_keys(content, "the file", ("format", "name", "source", "scene", "model", "body", "discretisation", "steps"), ("source",))
         if content["format"] != FORMAT:
             raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
+        for key in ("name", "source"):
+            if not isinstance(content.get(key, ""), str):
+                raise UserError(f"{key} must be text, got {content[key]!r}")
         steps = content["steps"]
         if not isinstance(steps, int) or steps < 1:
             raise UserError(f"steps must be a positive whole number, got {steps!r}")

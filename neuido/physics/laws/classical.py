@@ -411,7 +411,7 @@ _PLASTIC = {"identity": (Identity, ()), "von_mises": (VonMises, ("yield_stress",
 
 def _named(section: str, given: Mapping[str, Any], laws: dict, common: tuple[str, ...]) -> tuple[type, dict[str, Any]]:
     name = given.get("law")
-    if name not in laws:
+    if not isinstance(name, str) or name not in laws:
         raise UserError(f"{section}.law = {name!r} is not known; one of {', '.join(laws)}")
     law, own = laws[name]
     accepted = (*common, *own)

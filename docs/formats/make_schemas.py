@@ -1,0 +1,248 @@
+"""Write the JSON Schemas of docs/formats/schemas: `python docs/formats/make_schemas.py`.
+
+Enumerations (laws, effects, modes, roles) come from the readers themselves; tests/test_docs.py checks that schema and
+reader accept and refuse the same files.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+OUT = Path(__file__).parent / "schemas"
+Schema = dict[str, Any]
+NUMBER: Schema = {"type": "number"}
+POSITIVE: Schema = {"type": "number", "exclusiveMinimum": 0}
+NOT_NEGATIVE: Schema = {"type": "number", "minimum": 0}
+TEXT: Schema = {"type": "string", "minLength": 1}
+VECTOR: Schema = {"type": "array", "items": NUMBER, "minItems": 3, "maxItems": 3}
+BOX: Schema = {"type": "array", "items": VECTOR, "minItems": 2, "maxItems": 2, "description": "lower and upper corner [m]"}
+ROWS: Schema = {
+    "type": "array",
+    "items": {"type": "integer", "minimum": 0},
+    "minItems": 2,
+    "maxItems": 2,
+    "description": "half-open range of data rows",
+}
+
+
+def record(required: Schema, optional: Schema | None = None, **more: Any) -> Schema:
+    """Return the schema of a mapping that takes no other keys."""
+    return {"type": "object", "properties": required | (optional or {}), "required": list(required), "additionalProperties": False, **more}
+
+
+def one_of(values: Any) -> Schema:
+    """Return the schema of a choice."""
+    return {"enum": list(values)}
+
+
+def some(entry: Schema) -> Schema:
+    """Return the schema of a list that is not empty."""
+    return {"type": "array", "items": entry, "minItems": 1}
+
+
+def effects_of(names: Any) -> Schema:
+    """Return the schema of effects that a model has already: flat names with their figures."""
+    from neuido.physics.effects import LIBRARY
+
+    entries = {entry.name: entry for entry in LIBRARY}
+    pattern = "|".join(sorted(entries[name].name for name in names))
+    value: Schema = {"anyOf": [NUMBER, {"type": "object"}, {"type": "array"}]}
+    return {"type": ["object", "null"], "patternProperties": {f"^({pattern})(\\.[A-Za-z0-9_]+)?$": value}, "additionalProperties": False}
+
+
+ELASTICITY = {
+    "oneOf": [
+        record(
+            {
+                "law": one_of(["fixed_corotated", "sigma", "neo_hookean"]),
+                "young": POSITIVE,
+                "poisson": {"type": "number", "minimum": -1, "maximum": 0.5},
+            }
+        )
+    ]
+}
+PLASTICITY = {
+    "oneOf": [
+        record({"law": one_of(["identity"])}),
+        record({"law": one_of(["von_mises"]), "yield_stress": POSITIVE}),
+        record({"law": one_of(["drucker_prager"]), "friction_angle": {"type": "number", "minimum": 0, "maximum": 90}}),
+    ]
+}
+CONTACT = one_of(["sticky", "slip", "separate"])
+PLANE = record({"type": one_of(["plane"]), "point": VECTOR, "normal": VECTOR, "contact": CONTACT}, {"friction": NOT_NEGATIVE})
+COLLIDERS = {"type": ["array", "null"], "items": PLANE}
+MASSES = {"type": ["array", "null"], "items": record({"box": BOX, "mass": POSITIVE})}
+SCENE = record(
+    {"domain": BOX, "gravity": VECTOR},
+    {
+        "colliders": COLLIDERS,
+        "clamps": {"type": ["array", "null"], "items": record({"box": BOX})},
+        "attached_masses": MASSES,
+        "walls": {"oneOf": [{"type": "null"}, record({"contact": CONTACT}, {"friction": NOT_NEGATIVE, "inset": NOT_NEGATIVE})]},
+    },
+)
+GRID = record({"grid": {"type": "integer", "minimum": 4}, "dt": POSITIVE})
+FREE = {"type": "array", "items": TEXT, "uniqueItems": True}
+
+
+def schemas() -> dict[str, Schema]:
+    """Return the schema of each format by its file name."""
+    from neuido.data.measured import material_test, track
+    from neuido.data.measured.columns import ROLES
+    from neuido.physics.effects import LIBRARY
+
+    names = [entry.name for entry in LIBRARY]
+    role = one_of(ROLES)
+    material = {"elasticity": ELASTICITY}
+    extra = {"plasticity": PLASTICITY, "free": FREE}
+    law = record({"file": TEXT}, {"stiffness": POSITIVE})
+    own = record({"density": POSITIVE, **material}, {**extra, "effects": effects_of(names)})
+    neural = record({"density": POSITIVE, "law": law}, {**material, **extra, "effects": effects_of(names)})
+    columns = [
+        {keys: TEXT for keys in choice}
+        for path, stress in material_test.MODES.values()
+        for choice in [[*p, *s] for p in _choices(path, material_test.STRAINS) for s in _choices(stress, material_test.STRESSES)]
+    ]
+    columns = [c for i, c in enumerate(columns) if c not in columns[:i]]
+    formats = {
+        "neuido-experiment-1": record(
+            {
+                "format": one_of(["neuido-experiment/1"]),
+                "name": TEXT,
+                "scene": SCENE,
+                "model": {"anyOf": [own, neural]},
+                "discretisation": GRID,
+                "recordings": some(
+                    record(
+                        {"name": TEXT, "role": role, "frame_interval": POSITIVE},
+                        {"noise": NOT_NEGATIVE, "gravity": VECTOR, "attached_masses": MASSES, "colliders": COLLIDERS},
+                    )
+                ),
+            }
+        ),
+        "neuido-material-test-1": record(
+            {
+                "format": one_of(["neuido-material-test/1"]),
+                "name": TEXT,
+                "model": record(
+                    {"density": POSITIVE, **material},
+                    {**extra, "incompressible": {"type": "boolean"}, "effects": effects_of(material_test.EFFECTS)},
+                ),
+                "tests": some(
+                    record(
+                        {
+                            "name": TEXT,
+                            "file": TEXT,
+                            "mode": one_of(material_test.MODES),
+                            "columns": {"anyOf": [record(c, {"time": TEXT}) for c in columns]},
+                            "role": role,
+                        },
+                        {"scale": {"type": "object", "additionalProperties": POSITIVE}, "rows": ROWS, "direction": VECTOR},
+                    )
+                ),
+            }
+        ),
+        "neuido-track-1": record(
+            {
+                "format": one_of(["neuido-track/1"]),
+                "name": TEXT,
+                "model": record({"gravity": VECTOR}, {"effects": effects_of(track.EFFECTS), "free": FREE}),
+                "bodies": {
+                    "type": "object",
+                    "minProperties": 1,
+                    "additionalProperties": {"oneOf": [{"type": "null"}, record({}, dict.fromkeys(track.FIGURES, POSITIVE))]},
+                },
+                "recordings": some(
+                    record(
+                        {
+                            "name": TEXT,
+                            "body": TEXT,
+                            "file": TEXT,
+                            "columns": record({"t": TEXT}, dict.fromkeys(track.AXES, TEXT), minProperties=2),
+                            "role": role,
+                        },
+                        {"rows": ROWS, "spin": VECTOR, "noise": POSITIVE},
+                    )
+                ),
+            },
+            {"nuisances": {"oneOf": [{"type": "null"}, record({}, dict.fromkeys(track.NUISANCES, NOT_NEGATIVE))]}},
+        ),
+        "neuido-scene-1": record(
+            {
+                "format": one_of(["neuido-scene/1"]),
+                "name": TEXT,
+                "scene": SCENE,
+                "model": record({"density": POSITIVE, **material}, {"plasticity": PLASTICITY}),
+                "body": {
+                    "anyOf": [
+                        record({"particles": TEXT}),
+                        {"type": "object", "properties": {"shape": one_of(["cube", "box", "ball", "cylinder"])}, "required": ["shape"]},
+                    ]
+                },
+                "discretisation": GRID,
+                "steps": {"type": "integer", "minimum": 1},
+            },
+            {"source": {"type": "string"}},
+        ),
+        "neuido-diagnosis-1": _diagnosis(names),
+    }
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {f"{name}.schema.json": {"$schema": dialect, "title": name, **schema} for name, schema in formats.items()}
+
+
+def _choices(keys: tuple[str, ...], others: dict[str, str]) -> list[list[str]]:
+    """Return the ways to name quantities: all by their own names, or all by the others."""
+    renamed = [others.get(key, key) for key in keys]
+    return [list(keys)] if renamed == list(keys) else [list(keys), renamed]
+
+
+def _diagnosis(names: list[str]) -> Schema:
+    figure: Schema = {"anyOf": [NUMBER, {"type": "null"}, {"type": "array"}]}
+    quantity: Schema = {
+        "type": "object",
+        "properties": {"value": figure, "unit": TEXT, "interval90": {"type": "array"}},
+        "required": ["value", "unit", "interval90"],
+    }
+    quantities: Schema = {"type": "object", "additionalProperties": quantity}
+    effect: Schema = {
+        "type": "object",
+        "properties": {
+            "name": one_of(names),
+            "class": some(one_of(names)),
+            "parameters": quantities,
+            "p_value": {"type": "number", "minimum": 0, "maximum": 1},
+            "where": {"type": "string"},
+        },
+        "required": ["name", "class", "parameters", "p_value", "where"],
+    }
+    errors: Schema = {"type": "object", "properties": {"by_recording": {"type": "object"}}, "required": ["fit", "by_recording"]}
+    part: Schema = {
+        "type": "object",
+        "properties": {
+            "answer": one_of(["effect", "class", "none", "unknown", "insufficient"]),
+            "effects": {"type": "array", "items": effect},
+            "declared": quantities,
+            "after": quantities,
+            "error": {
+                "type": "object",
+                "properties": {"measure": TEXT, "unit": TEXT, "before": errors, "after": errors},
+                "required": ["measure", "unit", "noise_floor", "discretisation_floor", "before", "after"],
+            },
+            "rejected": {"type": "array", "items": {"type": "object", "required": ["name", "reason"]}},
+        },
+        "required": ["answer", "effects", "declared", "after", "error", "rejected"],
+    }
+    head: Schema = {"format": one_of(["neuido-diagnosis/1"])}
+    several: Schema = {"type": "object", "properties": {"bodies": some(part)}, "required": ["bodies"]}
+    return {"type": "object", "properties": head, "required": ["format"], "anyOf": [part, several]}
+
+
+def main() -> None:
+    """Write all schemas."""
+    OUT.mkdir(exist_ok=True)
+    for name, schema in schemas().items():
+        (OUT / name).write_text(json.dumps(schema, indent=1, ensure_ascii=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Each example runs, answers what it promises, and stays short."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import neuido
+
+ROOT = Path(neuido.__file__).parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("[0-9][0-9]_*.py"))
+if not EXAMPLES:
+    pytest.skip("the examples do not come with the installed package", allow_module_level=True)
+ANSWERS = {  # what each must print
+    "01": r"d height / d modulus [1-9]",
+    "02": r"found (5\.[5-9]|6\.[0-4])\d*e\+04 Pa",
+    "03": r"d height / d stiffness [1-9]",
+    "04": r"-0\.\d+ m for each 1/s of drag",
+    "05": r"d height / d modulus",
+    "06": r"the methods end \d\.\d mm apart",
+    "07": r"lacks strain_stiffening",
+    "08": r"drag_quadratic",
+    "09": r"torch\.Size\(\[6, 2, 96, 96, 3\]\)",
+    "10": r"P-wave modulus read from the video: \d+ kPa",
+    "11": r"lacks drag_linear",
+    "12": "",
+}
+
+
+def test_each_example_has_an_answer():
+    assert [path.name[:2] for path in EXAMPLES] == sorted(ANSWERS)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_shape(path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= 62
+    words = ast.get_docstring(ast.parse(text))
+    title, line = words.splitlines()[:2]
+    assert re.fullmatch(r"=+", line)
+    assert len(line) >= len(title)
+    assert f"python examples/{path.name}" in words, "it says how to run it"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_runs(path, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
+    environment.pop("NEUIDO_DATA", None)
+    done = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, cwd=tmp_path, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    assert re.search(ANSWERS[path.name[:2]], done.stdout), done.stdout
+    assert list(tmp_path.glob("*.png")), "it draws a picture for the gallery"
