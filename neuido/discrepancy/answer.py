@@ -17,7 +17,9 @@ from neuido.data.files.writing import real_folder, replacing
 from neuido.discrepancy import ceiling, next_experiment, report, residual
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.believed import beside
+from neuido.discrepancy.floors import Part
 from neuido.discrepancy.judging import ALPHA
+from neuido.discrepancy.limits import would_help
 from neuido.discrepancy.problem import Problem
 from neuido.discrepancy.rollouts import CONTACT_HEIGHT
 from neuido.discrepancy.trials import Round, Trial
@@ -25,6 +27,9 @@ from neuido.errors import UserError
 
 FORMAT = "neuido-diagnosis/1"
 VERSION = neuido.__version__
+UNSURE = ("insufficient", "unknown")
+P_VALUE = "chance of the largest gain over all effects in a linear model of the fits, without the search and the refits of its draws"
+"""What the p-value is of; a fit is not linear, and a search tries more than one start."""
 Found = Sequence[tuple[Diagnosis, float]]
 
 
@@ -89,18 +94,27 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         "format": FORMAT,
         "experiment": d.problem.name,
         "answer": d.answer,
+        "why": list(d.why),
+        "would_help": would_help(d.problem.labels.get("kind", ""), discretised=d.problem.settings > 1) if d.answer in UNSURE else [],
         "effects": [_effect(d, r, series) for r in d.rounds if r.chosen is not None],
+        "leads": [_lead(t) for t in d.leads],
+        "untried": untried(d),
         "declared": _declared(d, d.before, d.declared_intervals),
         "after": _declared(d, d.after, d.intervals),
         "error": {
             "measure": d.problem.measure,
             "unit": d.problem.unit,
             "noise_floor": d.floors["noise"],
+            "noise_from": dict(d.noise_from),
+            "left_over_floor": d.over.get("floor"),
+            "left_over_noise": d.over.get("noise"),
             "discretisation_floor": d.floors["discretisation"],
             **{when: errors(d, when) for when in ("before", "after")},
             **_settings(d),
         },
         "rejected": rejected(d),
+        "not_excluded": [{"name": h.name, "parameter": h.parameter, "unit": h.unit, "up_to": h.up_to} for h in d.hidden],
+        "settings_not_run": {name: list(own) for name, own in d.unable.items()},
         "next_experiment": next_experiment.propose(d),
         "ceiling": {when: {"held_out": c.held_out, "fit": c.fit} for when, c in ceilings.items()},
         "left_out": list(d.left_out),
@@ -136,21 +150,30 @@ def _settings(d: Diagnosis) -> dict[str, Any]:
 def errors(d: Diagnosis, when: str, *, one_setting: bool = False) -> dict[str, Any]:
     """Errors of the parts that are fitted, of those that are held out, and by recording; joined ones weigh each datum alike.
 
+    Of what is held out the `validation` part has steered the search, and the `test` part, where there is one, has not.
+
     The prediction is a simulation under the setting in use, and the differences of the others to it in the amounts that the fitted
     recordings hold; `one_setting`: the simulation alone.
     """
     own = (d.one_setting if one_setting else d.errors)[when]
 
-    def joined(fitted: bool) -> float | None:
-        parts = [p for p in d.parts if p.fitted == fitted]
+    def joined(parts: Sequence[Part]) -> float | None:
         counts = [np.count_nonzero(p.rows) for p in parts]
         return math.sqrt(sum(n * own[p.name] ** 2 for n, p in zip(counts, parts)) / sum(counts)) if parts else None
 
-    return {"fit": joined(True), "held_out": joined(False), "by_recording": dict(own)}
+    fitted, validation = ([p for p in d.parts if p.fitted == which] for which in (True, False))
+    out = {"fit": joined(fitted), "held_out": joined([*validation, *d.sealed])}
+    return out | {"validation": joined(validation), "test": joined(d.sealed), "by_recording": dict(own)}
 
 
 def rejected(d: Diagnosis) -> list[dict[str, str]]:
-    """Every candidate that is neither an effect nor in the class of one, with the reason of the round that weighed it best."""
+    """Every candidate that is neither an effect nor in the class of one, with the reason of the round that weighed it best.
+
+    A search that was cut off rejects nothing (`untried`).
+    """
+    ruled_out = [{"name": name, "reason": reason} for name, reason in d.problem.labels.get("excluded", {}).items()]
+    if d.answer == "unfinished":
+        return ruled_out
     kept = {t.candidate.name for r in d.rounds for t in (r.members if r.chosen is not None else [])}
     reasons: dict[str, str] = {}
     near = "what is left without it is noise, or so near to it that no effect could lower it enough"
@@ -158,8 +181,8 @@ def rejected(d: Diagnosis) -> list[dict[str, str]]:
     for r in d.rounds:
         for t in r.trials:
             name = t.candidate.name
-            if name not in kept and name not in reasons and t.reason:
-                reasons[name] = t.reason
+            if name not in kept and name not in reasons and (t.reason or d.why):
+                reasons[name] = t.reason or d.why[0]
         for key, reason in r.unfitted.items():
             name = key.partition(":")[0]
             if name not in kept:
@@ -167,8 +190,21 @@ def rejected(d: Diagnosis) -> list[dict[str, str]]:
     for c in d.problem.candidates:
         if c.name not in kept and c.name not in reasons:
             reasons[c.name] = behind if any(r.trials for r in d.rounds) else near
-    out = [{"name": name, "reason": reason} for name, reason in reasons.items()]
-    return out + [{"name": name, "reason": reason} for name, reason in d.problem.labels.get("excluded", {}).items()]
+    return [{"name": name, "reason": reason} for name, reason in reasons.items()] + ruled_out
+
+
+def untried(d: Diagnosis) -> list[str]:
+    """Candidates that a search which was cut off has not fitted."""
+    if d.answer != "unfinished":
+        return []
+    fitted = {t.candidate.name for r in d.rounds for t in r.trials}
+    return list(dict.fromkeys(c.name for c in d.problem.candidates if c.name not in fitted))
+
+
+def _lead(t: Trial) -> dict[str, Any]:
+    """What leads in a search that was cut off: its figures so far, without intervals, and how far it lowers the error."""
+    own = {p.name.partition(".")[2]: {"value": t.fit.point.get(p.name, p.value), "unit": p.unit} for p in t.candidate.parameters}
+    return {"name": t.candidate.name, "error_ratio": math.exp(min(t.gain, 700.0)), "parameters": own}
 
 
 def _effect(d: Diagnosis, r: Round, series: Mapping[str, list[residual.Series]]) -> dict[str, Any]:
@@ -185,6 +221,7 @@ def _effect(d: Diagnosis, r: Round, series: Mapping[str, list[residual.Series]])
         "class": names,
         "parameters": _derived(d, c.name, parameters),
         "p_value": r.p_value,
+        "p_value_of": P_VALUE,
         "where": _where(c.where, series),
     }
     if c.form:
@@ -279,15 +316,14 @@ def _stages(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> list[r
     n = [r.name for r in d.problem.recordings].index(name)
     r = d.problem.measured[n]
     mass = float(r.body.volume.double().sum()) * float(d.after.get("density", d.problem.experiment.model["density"]))
-    first = d.rounds[0].floor
-    return residual.stages(arrays["measured"], arrays["t"], arrays["before"], arrays["after"], mass=mass, sigma=first.noise[n],
+    return residual.stages(arrays["measured"], arrays["t"], arrays["before"], arrays["after"], mass=mass, sigma=d.final["before"].noise[n],
                            planes=r.scene.colliders, margin=1.5 * r.scene.dx)  # fmt: skip
 
 
 def _place(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Where on the body the force that is missing before is largest."""
     n = [r.name for r in d.problem.recordings].index(name)
-    where, excess = residual.place(arrays["measured"], arrays["t"], arrays["before"], sigma=d.rounds[0].floor.noise[n])
+    where, excess = residual.place(arrays["measured"], arrays["t"], arrays["before"], sigma=d.final["before"].noise[n])
     centre = d.problem.measured[n].body.x.double().mean(dim=0).numpy()
     return {"from_centre": list(where - centre), "unit": "m", "over_median": excess}
 

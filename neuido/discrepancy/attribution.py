@@ -1,8 +1,8 @@
 """From a residual to a name: grow the model by one effect at a time, drop what became needless, and say how sure the answer is."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,13 +12,14 @@ from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.fit import Fit, NotFinite
 from neuido.discrepancy.floors import Floor, Part, split
 from neuido.discrepancy.intervals import intervals
-from neuido.discrepancy.judging import ALPHA, WITHIN
+from neuido.discrepancy.judging import ALPHA, STANDS_OUT, WITHIN
 from neuido.discrepancy.laboratory import Tell
+from neuido.discrepancy.limits import Hidden, blind_to_settings, findings, hidden, unable
 from neuido.discrepancy.memo import Memo, Work
 from neuido.discrepancy.pairs import by_growing, two_effects
 from neuido.discrepancy.problem import Point, Problem
 from neuido.discrepancy.rounds import UNEXPLAINED, Inference
-from neuido.discrepancy.trials import Round, Stand, Trial
+from neuido.discrepancy.trials import Round, Stand, Trial, times_over
 from neuido.errors import UserError
 
 __all__ = [
@@ -69,6 +70,20 @@ class Diagnosis:
     """What each step ran."""
     deadline: Deadline = field(default_factory=Deadline)
     """When it has to come to its end."""
+    sealed: list[Part] = field(default_factory=list)
+    """Recordings that took no part in the search: theirs is a test error."""
+    leads: list[Trial] = field(default_factory=list)
+    """What leads in a search that was cut off; nothing of it is named."""
+    why: list[str] = field(default_factory=list)
+    """Why the recordings say too little, or what is wrong with them."""
+    over: dict[str, float] = field(default_factory=dict)
+    """How far what is left after is above the `floor` and above the `noise`: ratios of errors."""
+    hidden: list[Hidden] = field(default_factory=list)
+    """Sizes up to which the other effects would not have been seen."""
+    unable: Mapping[str, list[str]] = field(default_factory=dict)
+    """The other settings that did not run, by recording."""
+    noise_from: dict[str, str] = field(default_factory=dict)
+    """`stated`, `estimated` or `assumed`, by recording."""
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -158,6 +173,8 @@ def diagnose(
     # where every point costs pairs grow after what takes less, and where nothing was named last of all
     if not hurried and (not found or (len(found) == 1 and not problem.together)):
         grown = by_growing(inference, rounds[0], at, others)
+    if hurried and 0 < len(found) < MOST and not inference.is_settled(at.errors):
+        deadline.skips("two effects at once")
     if grown or (0 < len(found) < 3 and not hurried):
         by, pair = grown or two_effects(inference, rounds, found, at, others)
         if by is not inference:
@@ -179,35 +196,38 @@ def diagnose(
 
 def conclude(inference: Inference, before: Stand, after: Stand, found: list[Trial], rounds: list[Round]) -> Diagnosis:
     """The answer and its figures, each stand with the floor that its effects were weighed with."""
-    first = rounds[0]
+    first, problem = rounds[0], inference.problem
+    cut = inference.deadline.cut and (bool(found) or not inference.is_noise(before.errors))
     kept = {t.candidate.key for t in found}
     steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
-    if found:
-        classes = [len({t.candidate.name for t in r.members}) for r in steps if r.chosen is not None]
-        answer = "class" if max(classes) > 1 else "effect"
-    elif first.unsure or inference.is_unexplained(first):
-        answer = "unknown"
-    else:
-        answer = "none" if enough(inference) else "insufficient"
+    leads = leading(rounds) if cut else []
+    over = inference.over(after) if found and not cut else first.over
+    answer, why = decided(inference, before, after, found, steps, cut=cut)
+    if found and answer not in ("effect", "class"):  # nothing is named, and nothing added
+        after, found, over = before, [], first.over
+        steps = [replace(first, chosen=None, members=[])]
     stands = {"before": before, "after": after}
     alone = {when: inference.mean_squares([s.fit.point], s.floor, plain=True)[0] for when, s in stands.items()}
     own = intervals(inference, after.fit, after.floor, after.errors)
     declared = {}
-    if inference.problem.declared:
-        stated = Fit(before.fit.point, tuple(p.name for p in inference.problem.declared), 0.0, np.empty(0), 0, True)
+    if problem.declared:
+        stated = Fit(before.fit.point, tuple(p.name for p in problem.declared), 0.0, np.empty(0), 0, True)
         declared = intervals(inference, stated, before.floor, before.errors)
     scale, floor = inference.scale, after.floor
+    looked = [] if cut or not any(r.trials for r in rounds) else hidden(inference, after, rounds[-1], found)
+    amounts = {when: inference.amounts(s.fit.point, s.floor) for when, s in stands.items()}
+    final, errors, single = tested(inference, stands, amounts, alone)
     return Diagnosis(
-        inference.problem,
+        problem,
         answer,
         steps,
         before.fit.point,
         after.fit.point,
         inference.parts,
-        {when: _by_recording(inference, s.errors) for when, s in stands.items()},
-        {when: _by_recording(inference, row) for when, row in alone.items()},
-        {when: inference.amounts(s.fit.point, s.floor) for when, s in stands.items()},
-        {when: s.floor for when, s in stands.items()},
+        errors,
+        single,
+        amounts,
+        final,
         {
             "noise": scale * math.sqrt(np.mean([v**2 for v in floor.noise.values()])),
             "discretisation": scale * math.sqrt(np.mean([np.mean(v**2) for v in floor.spread.values()])),
@@ -217,7 +237,65 @@ def conclude(inference: Inference, before: Stand, after: Stand, found: list[Tria
         inference.setting,
         inference.memo.work,
         inference.deadline,
+        sealed=list(inference.sealed),
+        leads=leads,
+        why=why,
+        over={"floor": over, "noise": times_over(after.errors, inference.noise_squares)},
+        hidden=looked,
+        unable=unable(inference),
+        noise_from={r.name: inference.noise_from(n) for n, r in enumerate(problem.recordings)},
     )
+
+
+def decided(
+    inference: Inference, before: Stand, after: Stand, found: Sequence[Trial], steps: Sequence[Round], *, cut: bool
+) -> tuple[str, list[str]]:
+    """The answer, and why the recordings say too little or what is wrong with them; `cut`: the search ended for lack of time."""
+    first = steps[0]
+    if cut:
+        return "unfinished", []
+    wrong = findings(inference.problem.declared, after.fit.point)
+    if wrong:
+        return "insufficient", wrong
+    missing = bool(found) or first.unsure or inference.is_unexplained(first)
+    inference.floor(after.fit.point, like=after.floor)  # which settings run there
+    if missing and blind_to_settings(inference):
+        return "insufficient", ["no other setting of the simulation runs there, so that its own error is not known"]
+    if found:
+        several = any(len({t.candidate.name for t in r.members}) > 1 for r in steps if r.chosen is not None)
+        return "class" if several else "effect", []
+    if missing:
+        return "unknown", []
+    if not enough(inference):
+        return "insufficient", ["there are few data for the figures that are free"]
+    noisy = times_over(before.errors, inference.noise_squares)
+    if noisy > STANDS_OUT:
+        return "insufficient", [f"what is left is {noisy:.0f} times the noise, and the discretisation alone may make as much"]
+    return "none", []
+
+
+def leading(rounds: Sequence[Round]) -> list[Trial]:
+    """What leads in a search that was cut off: the effects that would be named, and else the best fit."""
+    chosen = [r.chosen for r in rounds if r.chosen is not None]
+    return chosen or [t for r in rounds[:1] for t in r.trials[:1] if t.gain > 0]
+
+
+def tested(
+    inference: Inference, stands: Mapping[str, Stand], amounts: Mapping[str, np.ndarray], alone: Mapping[str, np.ndarray]
+) -> tuple[dict[str, Floor], dict[str, dict[str, float]], dict[str, dict[str, float]]]:
+    """The floors, errors and errors under one setting, `before` and `after`, with those of the recordings that were sealed until now."""
+    floors, errors, single = {}, {}, {}
+    for when, stand in stands.items():
+        floors[when], point = stand.floor, stand.fit.point
+        errors[when], single[when] = _by_recording(inference, stand.errors), _by_recording(inference, alone[when])
+        for part in inference.sealed:
+            there = inference.floor(point, of=[part.recording])
+            floors[when] = floors[when].joined(there)
+            residual = {part.recording: inference.residual(point, part.recording)}
+            for out, own in ((errors, amounts[when]), (single, None)):
+                left = there.settle(residual[part.recording], part, own)
+                out[when][part.name] = inference.scale * math.sqrt(float(np.mean(left**2)))
+    return floors, errors, single
 
 
 def enough(inference: Inference) -> bool:

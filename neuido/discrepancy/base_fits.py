@@ -71,7 +71,7 @@ class BaseFits(Laboratory):
         ended: list[tuple[int, Fit]] = []
         live = [(i, point) for i, (_, point) in enumerate(entries)]
         for share in (*HORIZONS[1:], 1.0):
-            if not live or (ended and self.deadline.past(until)):
+            if not live or (ended and self.deadline.ends(until)):
                 break
             options = {} if share == 1.0 else {"iterations": self.stepwise}
             requests = [self.request(entries[i][0], point, until=until, sizes=sizes[i] if sizes else (), **options) for i, point in live]
@@ -135,7 +135,7 @@ class BaseFits(Laboratory):
         """
         best = min(made, key=lambda stand: self.fitted_score(stand.errors))
         free = self.problem.declared
-        if self.is_noise(best.errors[self.fitted], fitted=True) or not free or self.deadline.over:
+        if self.is_noise(best.errors[self.fitted], fitted=True) or not free or self.deadline.ends():
             return []
         with self.quickly():
             first = self.begun = self.first_part(free, dict(self.as_declared), best.floor)

@@ -57,7 +57,7 @@ def as_seen(d: Diagnosis, when: str, n: int) -> np.ndarray:
     point, floor = {"before": d.before, "after": d.after}[when], d.final[when]
     predicted, y = d.problem.predict([point], n, d.setting)[0], d.problem.recordings[n].y
     out = predicted.copy()
-    for part in d.parts:
+    for part in (*d.parts, *d.sealed):
         if part.recording == n:
             out[part.rows] = (y + floor.settle(predicted - y, part, d.amounts[when]))[part.rows]
     return out

@@ -40,7 +40,7 @@ def told_exactly(inference: Inference, start: Stand) -> bool:
     if not look.least or not inference.is_noise(look.least[0]):
         return False
     first = inference.round(start.fit, start.floor, [])
-    if first.chosen is None or inference.deadline.over:
+    if first.chosen is None or inference.deadline.ends():
         return False
     return inference.is_exact(replace(first.chosen, stand=inference.finished(first.chosen.stand)))
 

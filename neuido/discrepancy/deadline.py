@@ -22,6 +22,7 @@ class Deadline:
 
     Attributes:
         left_out: What the search has not done, in words.
+        cut: Whether a step or a fit ended early for lack of time, so that more time could change the answer.
     """
 
     def __init__(
@@ -30,6 +31,7 @@ class Deadline:
         self.clock, self.begun, self.seconds, self.pace = clock, clock(), seconds, pace
         self.concluding = False
         self.left_out: list[str] = []
+        self.cut = False
 
     @property
     def share(self) -> float:
@@ -40,16 +42,21 @@ class Deadline:
 
     @property
     def over(self) -> bool:
-        """Whether the time for the search is up, or all of it once the diagnosis concludes."""
-        return self.past(1.0)
+        """Whether the time for the search is up, or all of it once the diagnosis concludes; nothing is noted."""
+        return self._is_past(1.0)
 
-    def past(self, share: float) -> bool:
-        """Whether this share of the time that counts is over."""
+    def ends(self, share: float = 1.0) -> bool:
+        """Whether something ends here because this share of the time that counts is over; the search counts as cut off then."""
+        past = self._is_past(share)
+        self.cut = self.cut or past
+        return past
+
+    def _is_past(self, share: float) -> bool:
         return self.clock() - self.begun > share * self.share * self.seconds
 
     def skips(self, what: str, until: float = 1.0) -> bool:
         """Whether there is no time left for a step, or it is past this share of it; which is noted then."""
-        if not self.past(until):
+        if not self.ends(until):
             return False
         if what not in self.left_out:
             self.left_out.append(what)

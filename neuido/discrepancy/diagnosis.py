@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 FORMAT = "neuido-diagnosis/1"
 LEADING = ("yield_stress", "damping_ratio", "coefficient", "ratio")
 """Derived figures that say more about an effect than the fitted ones."""
+MORE = 3.0
+"""Times its floor above which what named effects leave is more than they explain."""
+MORE_LEFT = ", and something more that no effect here explains"
 BEFORE, AFTER, INK = "#c0392b", "#1f77b4", "#333333"
 MOST_PANELS = 4
 
@@ -130,7 +133,7 @@ class Diagnosis:
 
     @property
     def answer(self) -> str:
-        """`effect`, `class`, `none`, `unknown` or `insufficient`; `several` where the answers of bodies differ."""
+        """`effect`, `class`, `none`, `unknown`, `insufficient` or `unfinished`; `several` where the answers of bodies differ."""
         if "answer" in self._content:
             return self._content["answer"]
         answers = {own.answer for own in self.bodies.values()}
@@ -167,6 +170,22 @@ class Diagnosis:
         return ErrorChange(before, after, e["unit"], floor, key == "held_out")
 
     @property
+    def why(self) -> tuple[str, ...]:
+        """Why the data say too little, or what is wrong with them."""
+        return tuple(self._content.get("why", ()))
+
+    @property
+    def leads(self) -> tuple[str, ...]:
+        """Effects that lead in a search that was cut off; none of them is an answer."""
+        return tuple(lead["name"] for lead in self._content.get("leads", ()))
+
+    @property
+    def leaves_more(self) -> bool:
+        """Whether the named effects leave more than `MORE` times what noise and discretisation would."""
+        over = self._content["error"].get("left_over_floor")
+        return bool(self.effects) and over is not None and over > MORE
+
+    @property
     def left_out(self) -> tuple[str, ...]:
         """Steps for which there was no time."""
         if "bodies" in self._content:
@@ -186,6 +205,9 @@ class Diagnosis:
         error = self.error
         names = " and ".join("|".join((e.name, *e.alternatives)) for e in self.effects)
         out = f"{self.answer}: {names}" if names else self.answer
+        out += MORE_LEFT if self.leaves_more else ""
+        out += f" (in the lead so far: {' and '.join(self.leads)})" if self.leads else ""
+        out += "".join(f": {why}" for why in self.why[:1])
         scored = "held-out" if error.held_out else "fitted"
         out += f"; {scored} error {error.before:.3g} -> {error.after:.3g} {error.unit} (floor {error.floor:.2g})"
         return out + (f"; no time for {', '.join(self.left_out)}: give more minutes" if self.left_out else "")
@@ -202,6 +224,7 @@ class Diagnosis:
                 f"{e.name} ({equations.get(e.name, 'an effect')}): {e.parameter} = {figure}; p = {e.p_value:.3g}. Where: {e.where}."
             )
         scored = "recordings that no fit has seen" if error.held_out else "the fitted recordings"
+        lines += [f"In the lead so far: {name}." for name in self.leads]
         change = f"falls from {error.before:.3g} to {error.after:.3g}" if self.effects else f"is {error.after:.3g}"
         lines.append(f"The error of {scored} {change} {error.unit}; noise and discretisation leave {error.floor:.3g} {error.unit}.")
         if self.left_out:
@@ -210,13 +233,16 @@ class Diagnosis:
 
     def _sentence(self) -> str:
         names = " and ".join(" or ".join((e.name, *e.alternatives)) for e in self.effects)
-        return {
-            "effect": f"the declared model lacks {names}.",
-            "class": f"the declared model lacks an effect, {names}; these data cannot tell the alternatives apart.",
+        more = MORE_LEFT if self.leaves_more else ""
+        sentence = {
+            "effect": f"the declared model lacks {names}{more}.",
+            "class": f"the declared model lacks an effect, {names}{more}; these data cannot tell the alternatives apart.",
             "none": "nothing is missing. What remains is noise and the error of the discretisation.",
             "unknown": "something is missing that no effect of the library explains.",
-            "insufficient": "the data are too few, too short or too noisy to say.",
+            "insufficient": "these data do not say whether something is missing.",
+            "unfinished": "the time was up before every effect was tried: nothing is named yet.",
         }[self.answer]
+        return " ".join([*(f"{why}." for why in self.why), sentence])
 
     def plot(self) -> "Figure":
         """Return a matplotlib figure: the error over time before and after, or the data with both predictions, a panel a recording."""

@@ -13,6 +13,8 @@ SMALLER = (0.5, 0.25, 0.12, 0.06)
 """Factors of sizes that are tried where a fit's start does not run: explicit steps bear only so much viscosity, say."""
 STEP = 0.02
 """Difference step, in typical steps of a parameter."""
+OTHER_STEPS = (0.1, -1.0)
+"""Factors, one after another, of a difference step that does not run: a tenth of it, and that on the other side."""
 DAMPINGS = (0.1, 1.0, 10.0)
 """Tried as factors of the present damping."""
 KEPT_PROMISE = 0.7
@@ -171,7 +173,15 @@ def levenberg_marquardt(
                 ends = [margin(point_at(q + step * e)) for step, e in zip(steps, np.eye(len(q)), strict=True)]
                 steps = np.where(np.array(ends) < 0, -steps, steps)
             columns = yield from ask([q + np.eye(len(q))[i] * steps[i] for i in range(len(q))])
-            J = np.stack([np.zeros_like(r) if c is None else (c - r) / s for c, s in zip(columns, steps, strict=True)], axis=1)
+            for factor in OTHER_STEPS:  # a parameter whose step does not run is no parameter that does nothing
+                lost = [i for i, c in enumerate(columns) if c is None]
+                if lost:
+                    again = yield from ask([q + np.eye(len(q))[i] * factor * steps[i] for i in lost])
+                    for i, c in zip(lost, again, strict=True):
+                        columns[i], steps[i] = c, factor * steps[i]
+            if any(c is None for c in columns):
+                break
+            J = np.stack([(c - r) / s for c, s in zip(columns, steps, strict=True)], axis=1)
             fresh = True
         A, g = J.T @ J, J.T @ r
         tried = [np.clip(q + move, low, high) for move in _moves(A, g, damping)]

@@ -1,7 +1,7 @@
 """What is fitted, what is held out, and what noise, nuisances and discretisation do to each."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -71,6 +71,10 @@ class Floor:
                 weight[p.recording] = weight[p.recording] * (t <= t[p.rows].min() + share * np.ptp(t[p.rows]))
         return replace(self, weight=weight)
 
+    def joined(self, other: "Floor") -> "Floor":
+        """This floor and that of other recordings."""
+        return Floor(*({**getattr(self, f.name), **getattr(other, f.name)} for f in fields(Floor)))
+
     def spread_squares(self, parts: Sequence[Part]) -> np.ndarray:
         """Mean squares of what the settings differ by, without a refit, of each part, (len(parts),)."""
         return np.array([np.mean(self.spread[p.recording][p.rows] ** 2) for p in parts])
@@ -129,9 +133,19 @@ def _bounded(normal: np.ndarray, right: np.ndarray, bound: float) -> np.ndarray:
     return values
 
 
+def sealed(problem: Problem) -> tuple[int, ...]:
+    """The recordings that nothing but the test error is taken from, by number: of several that are held out the last by name.
+
+    What is held out steers the search (its ranking, what is named, what is dropped), so that its error is one of validation.
+    """
+    held = sorted(problem.roles["held_out"], key=lambda n: problem.recordings[n].name)
+    return tuple(held[-1:]) if len(held) > 1 else ()
+
+
 def split(problem: Problem) -> list[Part]:
-    """What is fitted and what is held out: whole recordings where there are some, else the last 40 % of the time."""
-    roles = problem.roles
+    """What is fitted, and what it is validated by: whole recordings where there are some, else the last 40 % of the time."""
+    roles, aside = problem.roles, sealed(problem)
+    roles = {role: [n for n in own if n not in aside] for role, own in roles.items()}
     whole = {n: np.ones(len(r.y), bool) for n, r in enumerate(problem.recordings)}
     names = {n: r.name for n, r in enumerate(problem.recordings)}
     if roles["held_out"]:

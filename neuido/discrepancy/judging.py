@@ -44,6 +44,10 @@ FORETELLS = math.log(1.3)
 """What such a one must gain in what is held out."""
 SEEN = 0.1
 """Share of the noise, mean squares, that counts as above it where less is left."""
+IMPLAUSIBLE = 30.0
+"""Ratio of a fitted figure to the declared one from which the data are not those of the declared units or material."""
+STANDS_OUT = 5.0
+"""Times the noise above which a residual within its floor is no reason to say that nothing is missing: too much could hide there."""
 WITHIN = 0.5
 """Share of the floor within which a residual that no effect explains is no reason to look further."""
 LIKE_A_GRID = 0.5, 2.5
@@ -154,6 +158,15 @@ class Judging(Instead):
         steps = [math.log(WITHIN), 0.0, math.log(1.5)]
         at_least = float(np.interp(math.log(r.over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
         return min(at_least, GAIN_TO_NOISE) if (away and r.over > 1.0) or stands_alone(r, t) else at_least
+
+    def usual_gain(self, r: Round) -> float:
+        """The gain that an effect must bring where nothing else is known of it, by the residual over the floor."""
+        if self.problem.settings == 1:
+            return max(LEAST_GAIN_EXACT, r.by_chance(ALPHA))
+        if self.is_noise(r.errors):
+            return GAIN_TO_NOISE
+        steps = [math.log(WITHIN), 0.0, math.log(1.5)]
+        return float(np.interp(math.log(r.over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
 
     def is_told_by_fit(self, r: Round, t: Trial) -> bool:
         """Whether an effect of few parameters, and no other one by far, brings the fitted recordings from far above the noise down to it.

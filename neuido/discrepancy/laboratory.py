@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from neuido.discrepancy import evidence
+from neuido.discrepancy import noise as noises
 from neuido.discrepancy.deadline import Deadline
 from neuido.discrepancy.evidence import NOISE_ALONE
 from neuido.discrepancy.fit import Fit, Request, levenberg_marquardt, residuals, run
-from neuido.discrepancy.floors import Floor, over_time, split
+from neuido.discrepancy.floors import Floor, Part, over_time, sealed, split
 from neuido.discrepancy.memo import Memo
-from neuido.discrepancy.problem import Parameter, Point, Problem
+from neuido.discrepancy.problem import Parameter, Point, Problem, Recording
 from neuido.discrepancy.trials import score
 
 LEAST_GAIN = math.log(1.7)
@@ -56,6 +57,8 @@ class Laboratory:
         self.tell = tell or (lambda line: None)
         self.memo = memo or Memo(problem)
         self.parts = split(problem)
+        self.sealed = [Part(n, np.ones(len(problem.recordings[n].y), bool), False, problem.recordings[n].name) for n in sealed(problem)]
+        """Recordings that take no part in anything but the test error."""
         self.fitted = [p.fitted for p in self.parts]
         self.scored_recordings = list(dict.fromkeys(p.recording for p in self.parts))
         self.fitted_recordings = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
@@ -65,8 +68,11 @@ class Laboratory:
         """Where the declared model fits the first part of the fitted recordings, if that was asked for."""
         self.still: Point | None = None
         """Where the declared model fits best without a parameter of the problem's own, if it was given one."""
+        self.noises = [_noise(r) for r in problem.recordings]
         self.noise_squares = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
         """Mean squares of the noise of each part."""
+        self.unable: dict[int, list[int]] = {}
+        """The other settings that do not run where the floor of a recording was last taken."""
         self.scale = problem.error(np.ones(1), 0)
         """What a root mean square of one is as an error of the problem."""
 
@@ -182,10 +188,10 @@ class Laboratory:
         amounts = self.amounts(point, floor)
         return self.problem.recentred(point, self.setting, amounts) if len(amounts) else point
 
-    def noise(self) -> Floor:
-        """The floor without any discretisation error."""
-        noise = {n: self.noise_of(n) for n in range(len(self.problem.recordings))}
-        ones = {n: np.ones(len(r.y)) for n, r in enumerate(self.problem.recordings)}
+    def noise(self, of: Sequence[int] | None = None) -> Floor:
+        """The floor without any discretisation error, of the recordings that are scored, or of those that are named."""
+        noise = {n: self.noise_of(n) for n in of or self.scored_recordings}
+        ones = {n: np.ones(len(self.problem.recordings[n].y)) for n in noise}
         return Floor(
             noise,
             {n: ones[n] / noise[n] for n in noise},
@@ -194,15 +200,26 @@ class Laboratory:
         )
 
     def noise_of(self, n: int) -> float:
-        r = self.problem.recordings[n]
-        return r.noise if r.noise else max(1e-3 * float(np.std(r.y)), 1e-12)
+        """Standard deviation of the noise of a recording: what is stated, or found in the data, or assumed (`noise_from`)."""
+        return self.noises[n][0]
 
-    def floor(self, point: Point, *, like: Floor | None = None, fitted: bool = False) -> Floor:
+    def noise_uncertainty(self, n: int) -> float:
+        """Relative standard deviation of that noise; zero for one that is stated."""
+        count = max(len(self.problem.recordings[n].y), 1)
+        return {"stated": 0.0, "estimated": math.sqrt(noises.OVERLAP / count), "assumed": noises.UNSURE}[self.noise_from(n)]
+
+    def noise_from(self, n: int) -> str:
+        """Where that comes from: `stated`, `estimated` or `assumed`."""
+        return self.noises[n][1]
+
+    def floor(self, point: Point, *, like: Floor | None = None, fitted: bool = False, of: Sequence[int] | None = None) -> Floor:
         """Noise and discretisation at a point: differences of the settings, and how large they are in the course of time.
 
         `like`: a floor whose nuisances serve here too. `fitted`: the differences of the fitted recordings alone, which is what fits read.
+        `of`: the recordings, where these are not all that are scored. A setting that does not run there has a column of zeros, and is noted
+        in `unable`.
         """
-        plain = self.noise()
+        plain = self.noise(of)
         others = self.problem.others(self.setting)
         if not others:
             return replace(plain, nuisances=self.nuisances(point, list(plain.noise)))
@@ -213,6 +230,7 @@ class Laboratory:
         for n in wanted:
             here, *there = (rows[n, s][0] for s in (self.setting, *others))
             able = [bool(np.isfinite(t).all()) for t in there]
+            self.unable[n] = [s for s, ok in zip(others, able, strict=True) if not ok]
             D = np.stack([t - here if ok else np.zeros_like(here) for t, ok in zip(there, able, strict=True)], axis=1)
             differences[n] = D
             spread[n] = over_time(np.sqrt(np.sum(D**2, axis=1) / max(sum(able), 1)), self.problem.recordings[n].times)
@@ -232,7 +250,7 @@ class Laboratory:
     def foresee(self, points: Sequence[Point], *, fitted: bool = False) -> None:
         """Run what `floor` and `stand` of several points will ask for, in one launch; the memo keeps it."""
         with self.memo.during("discretisation"):
-            wanted = self.fitted_recordings if fitted else list(range(len(self.problem.recordings)))
+            wanted = self.fitted_recordings if fitted else self.scored_recordings
             self.predicted(points, wanted, [self.setting, *self.problem.others(self.setting)])
 
     def stand(self, point: Point, *, like: Floor | None = None, fitted: bool = False) -> tuple[Floor, np.ndarray]:
@@ -246,10 +264,13 @@ class Laboratory:
         return self.sharpened(floor, errors), errors
 
     def request(self, parameters: Sequence[Parameter], start: Point, *, until: float = 1.0, **options: Any) -> Request:
-        """A fit, which ends where it is when this share of the time for the search is over; options of `levenberg_marquardt`."""
+        """A fit, which ends where it is when this share of the time for the search is over; options of `levenberg_marquardt`.
+
+        `until`: infinite for a fit that the clock never ends.
+        """
         margin = functools.partial(self.problem.margin, setting=self.setting)
         together = self.problem.together
-        return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.deadline.past(until), **options)
+        return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.deadline.ends(until), **options)
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""
@@ -303,7 +324,8 @@ class Laboratory:
 
         Each without its own difference. Most of what a grid or a step does a stiffness, or the difference of another grid, can do as well:
         how far a fit goes from `point` is the discretisation error of the parameters, and what it leaves, mean squares of the parts, the
-        one that an effect could be mistaken for.
+        one that an effect could be mistaken for. The clock ends none of them: one that stops at once leaves the whole difference
+        of the settings, and any residual lies within that.
         """
         others = self.problem.others(self.setting)
         with self.memo.during("discretisation"):
@@ -311,7 +333,7 @@ class Laboratory:
             made = {s: {n: rows[n, s][0] for n in floor.noise} for s in others}
         made = {s: y for s, y in made.items() if all(np.isfinite(row).all() for row in y.values())}
         floors = [floor.without(others.index(s)) for s in made]
-        requests = [self.request(free, point, iterations=8, tolerance=ROUGH) for _ in made]
+        requests = [self.request(free, point, until=math.inf, iterations=8, tolerance=ROUGH) for _ in made]
         fits = self.fits(requests, floors, to=list(made.values()), step="discretisation")
         with self.memo.during("discretisation"):
             rows = self.predicted([fit.point for fit in fits], list(floor.noise))
@@ -342,3 +364,13 @@ class Laboratory:
             columns = [np.where(np.isfinite(row - here).all(), row - here, 0.0) for row in rows]
             out[n] = np.stack(columns, axis=1) if columns else np.empty((len(here), 0))
         return out
+
+
+def _noise(r: Recording) -> tuple[float, str]:
+    """The noise of a recording, and where it comes from."""
+    if r.noise:
+        return r.noise, r.noise_from
+    found = noises.of_series(r.y, r.groups, r.times)
+    if found:
+        return found, "estimated"
+    return max(noises.ASSUMED * noises.moved(r.y, r.groups), 1e-12), "assumed"

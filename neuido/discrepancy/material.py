@@ -1,5 +1,6 @@
 """A material test as a `Problem`: the declared law along measured paths of the deformation gradient, and the effects it may lack."""
 
+import math
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +10,7 @@ import torch
 
 from neuido.data.measured.material_test import MaterialTest, MaterialTests, read_material_tests
 from neuido.discrepancy.declared import declared
-from neuido.discrepancy.noise import high_pass, monotone_pieces
+from neuido.discrepancy.noise import high_pass, monotone_pieces, surface
 from neuido.discrepancy.problem import Candidate, Parameter, Point, Problem, Recording
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY, Effects
@@ -227,7 +228,7 @@ def _recording(test: MaterialTest, noise: float | None) -> Recording:
     rows, channels = test.stress.shape
     at = np.arange(rows, dtype=np.float64) if test.time is None else test.time
     groups = np.tile(np.arange(channels), rows)
-    return Recording(test.name, test.role, test.stress.reshape(-1), noise, groups, np.repeat(at, channels))
+    return Recording(test.name, test.role, test.stress.reshape(-1), noise, groups, np.repeat(at, channels), "estimated")
 
 
 def _noise_in(tests: MaterialTests, chain: Sequence[int], i: int) -> float | None:
@@ -242,7 +243,9 @@ def _noise_in(tests: MaterialTests, chain: Sequence[int], i: int) -> float | Non
 def noise_of(test: MaterialTest) -> float | None:
     """Standard deviation of a test's independent noise [Pa]: what local cubics along its path leave (`noise.high_pass`), over its channels.
 
-    Not below 1e-4 of the largest stress, which is what three or four digits in a file are worth; none where the rows are too few.
+    Rows without any run that is long enough, such as a grid of biaxial states or a curve in disorder, are taken by their place instead: a
+    curve in the order of its strain, states by the smooth surface through them. Not below 1e-4 of the largest stress, which is what three
+    or four digits in a file are worth; none where the rows are too few.
     """
     e = test.path if test.mode == "simple_shear" else np.log(test.path)
     pieces = []
@@ -250,4 +253,10 @@ def noise_of(test: MaterialTest) -> float | None:
         at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(e[rows], axis=0), axis=1))])
         pieces += [(at, channel) for channel in test.stress[rows].T]
     found = high_pass(pieces)
+    if found is None and e.shape[1] == 1:
+        order = np.argsort(e[:, 0], kind="stable")
+        found = high_pass([(e[order, 0], channel) for channel in test.stress[order].T])
+    if found is None:
+        each = [one for channel in test.stress.T if (one := surface(e, channel)) is not None]
+        found = math.sqrt(np.mean(np.square(each))) if each else None
     return None if found is None else max(found, 1e-4 * float(np.abs(test.stress).max()))

@@ -130,6 +130,8 @@ class Recording:
     """(n,) whole numbers; rows of one group are samples of one quantity in the order of time."""
     times: np.ndarray
     """(n,) time [s] of each row, or its order where there is no time."""
+    noise_from: str = "stated"
+    """Where the noise comes from: it is `stated`, or `estimated` from the data."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,7 +117,7 @@ class Refining(Growing):
         ends = self.from_here(entries, floor)
         going = list(range(len(ends)))
         for _ in range(ONWARD):
-            if self.deadline.over:
+            if self.deadline.ends():
                 break
             run = self.which_run([ends[i][0].point for i in going])
             left = {i: self.mean_squares([ends[i][0].point], ends[i][1], fitted=True)[0] for i in going}
@@ -212,7 +212,7 @@ class Refining(Growing):
         the truth stays behind.
         """
         ended = [entry for entry in ended if np.isfinite(entry[1].cost)]
-        if self.problem.settings == 1 or not ended or self.deadline.over:
+        if self.problem.settings == 1 or not ended or self.deadline.ends():
             return {}
 
         def left_there(fit: Fit, there: Floor) -> float:

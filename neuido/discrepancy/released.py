@@ -72,16 +72,14 @@ class Released:
 
     @property
     def variance(self) -> float:
-        """Of the tracking error of one coordinate [m^2], its slow part included."""
-        sigma = self.error.sigma if self.track.noise is None else self.track.noise
-        return sigma**2 + self.error.amplitude**2
+        """Of the tracking error of one coordinate [m^2]: a noise that is stated, or the estimate with its slow part."""
+        return self.error.sigma**2 + self.error.amplitude**2 if self.track.noise is None else self.track.noise**2
 
     def whitener(self, t: np.ndarray) -> np.ndarray:
         """The matrix (n, n) that brings the tracking error at times t (n,) to unit variance."""
-        covariance = self.error.covariance(t)
         if self.track.noise is not None:
-            covariance += (self.track.noise**2 - self.error.sigma**2) * np.eye(len(t))
-        return np.linalg.inv(np.linalg.cholesky(covariance))
+            return np.eye(len(t)) / self.track.noise
+        return np.linalg.inv(np.linalg.cholesky(self.error.covariance(t)))
 
 
 def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from neuido.discrepancy import report_figures as draw
 from neuido.discrepancy import report_silhouettes as pictures
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.ceiling import Ceiling
+from neuido.discrepancy.diagnosis import MORE
 from neuido.discrepancy.judging import ALPHA
 from neuido.discrepancy.residual import Series
 
@@ -28,8 +29,24 @@ SENTENCES = {
     "class": "The declared model lacks an effect; these recordings cannot tell {names} apart.",
     "none": "Nothing is missing: what remains is what noise, nuisances and the discretisation bring.",
     "unknown": "Something is missing that none of the known effects explains.",
-    "insufficient": "The recordings are too few, too short or too noisy to say.",
+    "insufficient": "These recordings do not say whether something is missing.",
+    "unfinished": "The time was up before every effect was tried: nothing is named yet.",
 }
+MORE_LEFT = (
+    "The declared model lacks {names}, and something more that no effect here explains: what is left is {over:.0f} times what noise and "
+    "discretisation would leave."
+)
+STANDS = " What remains stands at {noise:.1f} times the noise: an effect that does less would not be seen (see Not excluded)."
+SIZES = "Sizes up to which an effect would not have been named here, to first order; empty: any size that it may have."
+HELD_OUT = {
+    "validation": "validation: held out of the fits, not of the choice of effects",
+    "test": "test: not looked at before the answer was there",
+}
+"""What each error of held-out recordings is of."""
+
+
+STANDS_ABOVE = 1.5
+"""Times the noise above which the answer `none` says where the residual stands."""
 
 
 @dataclass(eq=False)
@@ -73,11 +90,14 @@ def _one(made: Details, d: Diagnosis) -> list[str]:
     c = made.content
     names = " and ".join(" or ".join(e["class"]) for e in c["effects"])
     bodies = {name: arrays for name, arrays in made.motion.items() if "positions" in arrays}
-    out = [f'<p class="answer">{escaped(SENTENCES[c["answer"]].format(names=names or "it"))}</p>', _effects(c), _errors(c)]
+    out = [f'<p class="answer">{escaped(_answer(c, names))}</p>', _effects(c), _leads(c), _errors(c)]
     if c["left_out"]:
         out.append(
             f'<p class="note">{escaped("The time was up before: " + "; ".join(c["left_out"]) + ". More minutes go on from here.")}</p>'
         )
+    for place, settings in c["settings_not_run"].items():
+        lost = f"{place}: {', '.join(settings)} does not run there, and takes no part in the discretisation error."
+        out.append(f'<p class="note">{escaped(lost)}</p>')
     for place, reason in c.get("not_predicted", {}).items():
         out.append(f'<p class="note">{escaped(f"{place} is not shown: {reason}.")}</p>')
     if bodies:
@@ -103,7 +123,9 @@ def _one(made: Details, d: Diagnosis) -> list[str]:
     elif made.motion:
         out += ["<h2>Data before and after</h2>", draw.data_curves(made.motion, d.problem.unit)]
     out += _ranking(d)
-    out += ["<h2>Rejected</h2>", table(("effect", "reason"), [(r["name"], r["reason"]) for r in c["rejected"]])]
+    out += _sizes(c)
+    if c["rejected"]:
+        out += ["<h2>Rejected</h2>", table(("effect", "reason"), [(r["name"], r["reason"]) for r in c["rejected"]])]
     out += ["<h2>Fitted figures</h2>", _figures(c)]
     share = made.ceilings["after"]
     fit, held = (100 * min(max(value, 0.0), 1.0) for value in (share.fit, share.held_out))
@@ -119,6 +141,39 @@ def _one(made: Details, d: Diagnosis) -> list[str]:
     return out
 
 
+def _answer(c: dict[str, Any], names: str) -> str:
+    """The answer in a few sentences, what is wrong with the recordings first."""
+    out = SENTENCES[c["answer"]].format(names=names or "it")
+    over, noise = c["error"]["left_over_floor"], c["error"]["left_over_noise"]
+    if c["effects"] and over is not None and over > MORE:
+        out = MORE_LEFT.format(names=names, over=over)
+    if c["answer"] == "none" and noise is not None and noise > STANDS_ABOVE:
+        out += STANDS.format(noise=noise)
+    if c["why"]:
+        why = "; ".join(c["why"])
+        out = f"{why[0].upper()}{why[1:]}. {out}"
+    if c["would_help"]:
+        out += f" What would help: {'; '.join(c['would_help'])}."
+    return out
+
+
+def _leads(c: dict[str, Any]) -> str:
+    """What leads in a search that was cut off, and what it has not tried."""
+    out = ""
+    for lead in c["leads"]:
+        figures = ", ".join(f"{key} = {_said(p['value'], 3)} {p['unit']}" for key, p in lead["parameters"].items())
+        told = f"In the lead so far: {lead['name']} ({figures}), which lowers the error {lead['error_ratio']:.2f}-fold. It is no answer."
+        out += f"<p>{escaped(told)}</p>"
+    return out + (f"<p>{escaped('Not tried: ' + ', '.join(c['untried']) + '.')}</p>" if c["untried"] else "")
+
+
+def _sizes(c: dict[str, Any]) -> list[str]:
+    """How large each effect may be without having been seen."""
+    rows = [(h["name"], h["parameter"], "" if h["up_to"] is None else _said(h["up_to"], 3), h["unit"]) for h in c["not_excluded"]]
+    heads = ("effect", "parameter", "up to", "unit")
+    return ["<h2>Not excluded</h2>", f"<p>{SIZES}</p>", table(heads, rows)] if rows else []
+
+
 def _effects(c: dict[str, Any]) -> str:
     rows = []
     for e in c["effects"]:
@@ -129,17 +184,18 @@ def _effects(c: dict[str, Any]) -> str:
             else:
                 low, high = p["interval90"]
                 rows.append((e["name"], key, p["value"], p["unit"], f"{_said(low)} to {_said(high)}", f"{e['p_value']:.3g}", e["where"]))
-    return table(("effect", "parameter", "value", "unit", "90 % interval", "p (family-wise)", "where"), rows) if rows else ""
+    return table(("effect", "parameter", "value", "unit", "90 % interval", "p (linear model)", "where"), rows) if rows else ""
 
 
 def _errors(c: dict[str, Any]) -> str:
     e = c["error"]
     rows = [(name, before, e["after"]["by_recording"][name]) for name, before in e["before"]["by_recording"].items()]
-    for name, label in (("fit", "all that is fitted"), ("held_out", "all that is held out")):
-        if e["before"][name] is not None:
+    for name, label in (("fit", "all that is fitted"), *HELD_OUT.items()):
+        if e["before"].get(name) is not None:
             rows.append((label, e["before"][name], e["after"][name]))
     rows = [(label, before, after, None if None in (before, after) else before / max(after, 1e-300)) for label, before, after in rows]
-    floors = f"Floors: noise {e['noise_floor']:.3g} {e['unit']}, discretisation {e['discretisation_floor']:.3g} {e['unit']}."
+    known = ", ".join(dict.fromkeys(e["noise_from"].values()))
+    floors = f"Floors: noise {e['noise_floor']:.3g} {e['unit']} ({known}), discretisation {e['discretisation_floor']:.3g} {e['unit']}."
     out = f"<h2>Error [{escaped(e['unit'])}]</h2>" + table(("recording", "before", "after", "ratio"), rows) + f"<p>{escaped(floors)}</p>"
     return out + _settings(e)
 
@@ -190,7 +246,8 @@ def _ranking(d: Diagnosis) -> list[str]:
             rows.append((t.candidate.key, figures, f"{math.exp(t.gain):.2f}", "" if cosine is None else f"{cosine:.2f}", verdict))
         out.append(table(("effect", "parameters", "error ratio", "cosine to the best", "verdict"), rows))
         chance = f"chance brings {math.exp(threshold):.2f} at 95 %, from {len(r.null)} draws"
-        out.append(f'<p class="note">p = {r.p_value:.3g}, family-wise over all candidates; {chance}.</p>' if trials else NOTHING)
+        told = f"p = {r.p_value:.3g}, of the largest gain over all candidates in a linear model of the fits; {chance}."
+        out.append(f'<p class="note">{told}</p>' if trials else NOTHING)
     return out
 
 

@@ -1,6 +1,7 @@
 """Predictions kept on disk while a diagnosis runs, so that one that was killed goes on where it stopped, to the same answer."""
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+import neuido
 from neuido.data.files.writing import real_folder, remove, replacing
 from neuido.discrepancy.problem import Ask, Point, Problem, Rows
 
@@ -160,6 +162,28 @@ def plan_of(folder: str | os.PathLike, options: dict[str, Any], *, out: Path) ->
             while block := stream.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()[:16]
+
+
+RELEVANT = ("errors.py", "types.py", "data", "discrepancy", "models", "physics")
+"""Parts of the package that predictions come from."""
+
+
+@functools.cache
+def code_digest() -> str:
+    """Return a digest of the sources that predictions come from: those of another version, or changed by hand, are not to be reused."""
+    root = Path(neuido.__file__).parent
+    digest = hashlib.sha256(neuido.__version__.encode())
+    for name in RELEVANT:
+        place = root / name
+        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def outdated(out: Path, plan: str) -> list[str]:
+    """Return the plans whose predictions are kept in `out` and are of other data, options or code than `plan`."""
+    root = out / ".work"
+    return sorted(path.name for path in root.iterdir() if path.name != plan) if root.is_dir() else []
 
 
 def workplace(out: Path, plan: str, *, resume: bool) -> Path:

@@ -129,7 +129,8 @@ class Inference(Judging):
     @property
     def unexplained(self) -> float:
         """Times its floor above which a residual that no effect explains is called unknown."""
-        return UNEXPLAINED if self.problem.settings > 1 else UNEXPLAINED_EXACT
+        unsure = max(self.noise_uncertainty(n) for n in self.scored_recordings)  # a residual of a noise that is not known may be noise
+        return (UNEXPLAINED if self.problem.settings > 1 else UNEXPLAINED_EXACT) * (1.0 + 2.0 * unsure)
 
     def round(self, base: Fit, floor: Floor, found: Sequence[Trial], rival: Round | None = None, *, most: float = math.inf) -> Round:
         """Look for one more effect beside those that were found.
@@ -318,7 +319,7 @@ class Inference(Judging):
         ends = led.ends if led is not None else {}
         first = not found and (led is None or led.chosen is not None)
         candidates, free, slopes, ranked, columns = self.screened(base.point, floor, found, most, led)
-        hurried = self.deadline.past(until)
+        hurried = self.deadline.ends(until)
         chosen, begun = self.begin(base, floor, found, led, candidates, free, slopes, ranked, columns, hurried=hurried)
         led_here = [c for c in candidates if c.key in chosen and c.key in ends]
         starts = [(c, self.with_effect(base.point, c, ends[c.key], found), None) for c in led_here] + begun
@@ -452,7 +453,7 @@ class Inference(Judging):
         """
         held = [p.recording for p in self.parts if not p.fitted]
         by_key = {c.key: c for c in candidates}
-        best = dict(chosen) if chosen and self.deadline.over else {c.key: 0 for c in candidates} | chosen
+        best = dict(chosen) if chosen and self.deadline.ends() else {c.key: 0 for c in candidates} | chosen
         one = [replace(by_key[key], starts=(by_key[key].starts[i],)) for key, i in best.items()]
         new = [n for n in held if n not in self.fitted_recordings]
         with self.quickly(point, floor):

@@ -7,6 +7,10 @@ import numpy as np
 from neuido.discrepancy.base_fits import BaseFits
 from neuido.discrepancy.floors import Floor
 from neuido.discrepancy.problem import Candidate, Parameter, Point
+from neuido.errors import UserError
+
+LEAST_STEP = 1e-3
+"""Of a slope, in typical steps of a parameter: below it no smaller one is tried."""
 
 
 class Screening(BaseFits):
@@ -36,7 +40,10 @@ class Screening(BaseFits):
     def slopes(self, parameters: Sequence[Parameter], point: Point, recordings: Sequence[int], step: float = 0.3) -> dict[int, np.ndarray]:
         """Derivatives of the data by coordinates of parameters, one typical step each; central where the range allows.
 
-        One-sided where the model runs on one side alone, and zero where it runs on neither.
+        One-sided where the model runs on one side alone; where it runs on neither, by smaller steps.
+
+        Raises:
+            UserError: The model runs at the point, but not even a small step away from it on either side.
         """
         out = {}
         asked, spans = [], []
@@ -51,6 +58,13 @@ class Screening(BaseFits):
             columns = [np.empty((len(here), 0))]
             for i, (up, down) in enumerate(spans):
                 high, low = (bool(np.isfinite(row).all()) for row in rows[2 * i : 2 * i + 2])
+                if not (high or low) and np.isfinite(here).all():
+                    if step < LEAST_STEP:
+                        p = parameters[i]
+                        at = f"{p.name} = {point.get(p.name, p.value):.6g} {p.unit}"
+                        raise UserError(f"{self.problem.recordings[n].name} cannot be simulated on either side of {at}: give another value")
+                    columns.append(self.slopes([parameters[i]], point, [n], step / 10)[n])
+                    continue
                 change = (rows[2 * i] if high else here) - (rows[2 * i + 1] if low else here)
                 columns.append((change / max(up * high + down * low, 1e-9))[:, None])
             out[n] = np.concatenate(columns, axis=1)
@@ -73,6 +87,9 @@ class Screening(BaseFits):
                 if not c.linear:
                     amount = np.clip(amount, 0.0, 1.5)
                 for k, p in enumerate(sizes):
+                    if start[p.name] == 0:  # its direction is nothing
+                        amount[k] = 0.0
+                        continue
                     low, high = (p.lower / start[p.name], p.upper / start[p.name])
                     amount[k] = np.clip(amount[k], min(low, high), max(low, high))
                 stays = float(np.sum((left + B @ amount) ** 2) / max(np.sum(left**2), 1e-300))

@@ -124,7 +124,7 @@ class Starting(Screening):
         least: dict[str, float] = {}
         self.tell(f"{sum(len(made) for _, made in places)} starts of {len(places)} effects")
         for chunk in _in_goes(places, TRIED_AT_ONCE if self.problem.together else 1):
-            if self.deadline.past(until):
+            if self.deadline.ends(until):
                 out += [start for own, _ in chunk for start in own]
                 continue
             before, *costs = self.costs([base.point, *(point for _, made in chunk for _, point, _ in made)], floor)

@@ -31,6 +31,8 @@ IMPACT = 4.0
 """Loss of speed from frame to frame that is an impact, in standard deviations of the noise."""
 DISAGREE = 1e-3
 """Level at which the bodies of a folder disagree on an effect of their surroundings."""
+LEAST_HALF = 0.3
+"""Typical steps that the range about a common estimate has on either side at the least."""
 WITNESS = 5.0
 """Standard deviations about their common estimate in which it may lie."""
 
@@ -42,17 +44,18 @@ class TrackProblem(Problem):
     recording are nuisances that `predict` estimates anew for every point (`released.settle`), with the folder's priors and in the metric
     of the tracking error: of a `fit` recording from all frames, of a held-out one from its first 40 %, the rest of which is scored.
     So predictions are profiles, and the inference has no nuisances left. Frames after an impact at the end of a track (`flight_of`) are
-    left out.
+    left out. Times count from the first sample of each recording, whatever the origin of its clock.
     """
 
     def __init__(self, tracks: Tracks, body: str) -> None:
+        tracks = from_first_samples(tracks)
         self.tracks, self.body = tracks, body
         self._flights = [flight_of(track, tracks.gravity) for track in tracks.recordings if track.body == body]
         self.error_model = tracking_error(tracks)
         self._starts = [Released(track, tracks.nuisances, tracks.gravity, self.error_model) for track in self._flights]
         candidates = track_candidates(tracks, body, self._flights)
         self.axes = tuple(sorted({a for track in self._flights for a in track.axes}))
-        interval = max(float(track.t[-1]) for track in tracks.recordings) / (KNOTS - 1)  # one for all: it is of the surroundings
+        interval = max(float(np.ptp(track.t)) for track in tracks.recordings) / (KNOTS - 1)  # one for all: it is of the surroundings
         self._partners = {p.name: p.value for c in candidates for p in c.parameters} | {"time_force.interval": interval} | tracks.effects
         super().__init__(
             name=f"{tracks.name}: {body}",
@@ -70,8 +73,9 @@ class TrackProblem(Problem):
         early = _early(track) if track.role == "held_out" else 0
         count, axes = track.x[early:].shape
         noise = settled_error(start, self.forces([{}], track), early) if early else start.variance**0.5
-        groups = np.tile(np.arange(axes), count)
-        return Recording(track.name, track.role, track.x[early:].reshape(-1), noise, groups, np.repeat(track.t[early:], axes))
+        groups, times = np.tile(np.arange(axes), count), np.repeat(track.t[early:], axes)
+        known = "estimated" if track.noise is None else "stated"
+        return Recording(track.name, track.role, track.x[early:].reshape(-1), noise, groups, times, known)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         if not points:
@@ -221,14 +225,26 @@ def _restrict(problem: TrackProblem, name: str, agreed: tuple[np.ndarray, np.nda
             sizes = candidate.size_parameters
             made = {}
             for p, mean, deviation in zip(sizes, *agreed):  # position_force has more entries: those of its place
-                half = WITNESS * float(deviation) + 0.3 * p.scale
+                half = WITNESS * float(deviation) + LEAST_HALF * p.scale
                 made[p.name] = replace(p, lower=max(p.lower, min(mean - half, p.value)), upper=min(p.upper, max(mean + half, p.value)))
             parameters = tuple(made.get(p.name, p) for p in candidate.parameters)
             limits = {p.name: (p.lower, p.upper) for p in parameters}
-            starts = tuple({k: min(max(v, limits[k][0]), limits[k][1]) for k, v in start.items()} for start in candidate.starts)
+            own = {p.name for p in sizes}
+            starts = tuple({k: _inside(v, *limits[k], nonzero=k in own) for k, v in start.items()} for start in candidate.starts)
             candidate = replace(candidate, parameters=parameters, starts=starts)
         kept.append(candidate)
     object.__setattr__(problem, "candidates", tuple(kept))
+
+
+def _inside(value: float, lower: float, upper: float, *, nonzero: bool) -> float:
+    """The value within a range; for one that must not vanish, in a range that ends at zero, a third of the way to the other end."""
+    inside = min(max(value, lower), upper)
+    return (lower if abs(lower) > abs(upper) else upper) / 3 if nonzero and inside == 0 else inside
+
+
+def from_first_samples(tracks: Tracks) -> Tracks:
+    """Tracks whose clocks are zero at the first sample of each recording."""
+    return replace(tracks, recordings=tuple(replace(track, t=track.t - track.t[0]) for track in tracks.recordings))
 
 
 def flight_of(track: Track, gravity: Sequence[float]) -> Track:

@@ -98,14 +98,18 @@ def diagnose(
     temporary = tempfile.TemporaryDirectory(prefix="neuido-diagnosis-") if out is None else None
     target = Path(temporary.name if temporary else out or "").expanduser()
     given = {"model": _content(model), "law": _content(law)}
-    options = {"effects": names, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": answer.VERSION, "data": data}
+    options = {"effects": names, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": store.code_digest(), "data": data}
     options |= given | {"solver": solver}
     plan = "read-data" if folder is None else store.plan_of(place, options, out=target)
     target.mkdir(parents=True, exist_ok=True)
-    work = store.workplace(target, plan, resume=resume and folder is not None)
+    resumes = resume and folder is not None
+    outdated = store.outdated(target, plan) if resumes else []
+    work = store.workplace(target, plan, resume=resumes)
     if not any(work.iterdir()):  # a run that continues keeps its log
         (target / "log.csv").unlink(missing_ok=True)
     log = Log(target / "log.csv", shown=progress, begun=begun)
+    if outdated:
+        print(f"{target / '.work'}: stored predictions of other data, options or code are ignored", file=sys.stderr)
     found = []
     for i, problem in enumerate(problems):
         started = time.monotonic()
@@ -116,7 +120,7 @@ def diagnose(
         found.append((infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds), time.monotonic() - started))
     log.name = ""
     answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
-    if not any(own.left_out for own, _ in found):  # otherwise a run with more minutes continues from what is kept
+    if not any(own.left_out or own.deadline.cut for own, _ in found):  # otherwise a run with more minutes continues from what is kept
         store.clear(target)
     for own, _ in found:
         log.work(own.work)

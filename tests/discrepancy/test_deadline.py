@@ -11,6 +11,7 @@ from neuido.discrepancy import attribution, next_experiment
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.body import body_problem
 from neuido.discrepancy.deadline import AFTER, LEAST, SEARCH, Deadline
+from neuido.discrepancy.rounds import Inference
 from neuido.discrepancy.workflow import restricted
 from tests import command
 from tests.discrepancy import made
@@ -64,6 +65,19 @@ def test_what_takes_long_after_the_search_is_left_out_too(block, monkeypatch):
     assert next_experiment.propose(found) is None and found.left_out == ("the next experiment",)
 
 
+def test_the_floor_is_the_same_after_the_deadline(block):
+    """The motions under other settings are refitted whatever the clock says: left as they are, any residual would lie within them."""
+    laboratory = Inference(replace(body_problem(block), solvers=(0,)))
+    point = dict(laboratory.as_declared)
+    floor, _ = laboratory.stand(point)
+    free = laboratory.problem.declared
+    before = laboratory.floors(point, free, floor)
+    laboratory.deadline = Deadline(1.0, clock=Clock(1e6))
+    assert laboratory.deadline.ends() and laboratory.deadline.cut
+    np.testing.assert_array_equal(laboratory.floors(point, free, floor), before)
+    assert (before < laboratory.noise_squares + floor.spread_squares(laboratory.parts)).all()
+
+
 def test_without_a_limit_nothing_is_left_out():
     clock = Clock(1e9)
     assert not Deadline(clock=clock).over and not Deadline(math.inf, clock=clock).skips("this")
@@ -86,7 +100,8 @@ def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypa
         assert found.after["drag_linear.k"] == pytest.approx(3.0, rel=0.05)
     else:
         assert {"the declared model again", "refining the best fits"} <= set(found.left_out)
-        assert len(found.effects) <= 1
+        assert found.answer == "unfinished" and found.effects == [] and not any("drag" in name for name in found.after)
+        assert [t.candidate.name for t in found.leads] == ["drag_linear"]
         assert all(np.isfinite(found.intervals[name]).all() for name in found.intervals)
 
 
@@ -114,8 +129,12 @@ def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
     recordings = tuple(replace(r, noise=noise * r.noise) for r in problem.recordings)
     found = diagnose(replace(problem, recordings=recordings, solvers=(0,)), draws=39, most=2, seconds=60.0)
     assert over == [False] and not asked
-    assert found.after["drag_linear.k"] == pytest.approx(3.0, rel=0.02)
-    assert list(found.left_out) == ([] if settled else ["a further effect"])
+    if settled:
+        assert found.answer == "effect" and found.left_out == ()
+        assert found.after["drag_linear.k"] == pytest.approx(3.0, rel=0.02)
+    else:
+        assert found.answer == "unfinished" and found.left_out == ("a further effect", "two effects at once")
+        assert found.leads[0].fit.point["drag_linear.k"] == pytest.approx(3.0, rel=0.05)
 
 
 def test_more_minutes_go_on_from_there(block, tmp_path, capsys):
@@ -127,7 +146,9 @@ def test_more_minutes_go_on_from_there(block, tmp_path, capsys):
     status, told, _ = command.run(capsys, *asked, "--minutes", "0.0001")
     content = json.loads((out / "diagnosis.json").read_text())
     assert status == 0 and content["left_out"] and "give more minutes" in told
-    assert (out / ".work").is_dir() and "The time was up before" in (out / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert content["answer"] == "unfinished" and content["effects"] == content["rejected"] == [] and "unfinished" in told
+    assert (out / ".work").is_dir() and "nothing is named yet" in page and "<h2>Rejected</h2>" not in page
     status, told, _ = command.run(capsys, *asked, "--minutes", "0")
     content = json.loads((out / "diagnosis.json").read_text())
     assert status == 0 and content["left_out"] == [] and content["effects"][0]["name"] == "drag_linear" and "minutes" not in told

@@ -1,0 +1,115 @@
+"""What a diagnosis could not have seen, and what forbids an answer: figures at their bounds, and the sizes that effects may still have."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from neuido.discrepancy.judging import IMPLAUSIBLE
+from neuido.discrepancy.problem import Parameter, Point
+from neuido.discrepancy.rounds import Inference
+from neuido.discrepancy.trials import Round, Stand, Trial
+
+AT_BOUND = 1e-6
+"""Relative distance from a bound at which a figure stands on it."""
+FREE_AT = {"poisson": "upper"}
+"""Bounds that are no sign of a fault: an incompressible body is one."""
+
+
+class Hidden(NamedTuple):
+    """How large an effect may be without having been seen."""
+
+    name: str
+    parameter: str
+    unit: str
+    up_to: float | None
+    """Size; none: any within the effect's range."""
+
+
+def findings(declared: Sequence[Parameter], point: Point) -> list[str]:
+    """What is wrong with fitted figures of the declared model, in words: those at a bound, and those far from what was declared."""
+    out = []
+    for p in declared:
+        value = point.get(p.name, p.value)
+        said = f"{p.name} would be {value:.3g} {p.unit} (declared: {p.value:.3g} {p.unit})"
+        ends = [
+            side for side in ("lower", "upper") if FREE_AT.get(p.name) != side and _is_at(p, value, side) and not _is_at(p, p.value, side)
+        ]
+        ratio = max(value / p.value, p.value / value) if p.log else 1.0
+        if ends:
+            out.append(f"{said}, the {ends[0]} end of what is possible")
+        elif ratio > IMPLAUSIBLE:
+            out.append(f"{said}, {ratio:.0f} times {'more' if value > p.value else 'less'}")
+    return out
+
+
+def _is_at(p: Parameter, value: float, side: str) -> bool:
+    """Whether a value stands at the `lower` or the `upper` bound of a parameter."""
+    bound = getattr(p, side)
+    return abs(value - bound) <= AT_BOUND * max(abs(bound), 0.0 if p.log else p.scale)
+
+
+def hidden(inference: Inference, at: Stand, r: Round, found: Sequence[Trial] = ()) -> list[Hidden]:
+    """The sizes up to which effects would not have been named where a model stands.
+
+    To first order: an effect is seen where what the fitted figures do not make up for of its motion adds to the residual by as much as a
+    named one must take away. Directions are those of the screening of a round, so that next to nothing is simulated anew.
+
+    Args:
+        inference: What has looked.
+        at: Where the model stands.
+        r: The round that looked last.
+        found: The effects that the model has.
+    """
+    problem, recordings = inference.problem, inference.fitted_recordings
+    taken = {t.candidate.name for t in found}
+    candidates = [c for c in problem.candidates if c.linear]
+    if not candidates or not inference.runs(at.fit.point):
+        return []
+    own = {name.partition(".")[0] for name in r.base if "." in name}
+    free = (*problem.declared, *(p for t in found if t.candidate.name in own for p in t.candidate.parameters))
+    with inference.quickly(r.base, r.floor):
+        slopes = inference.slopes(free, r.base, recordings)
+        columns = inference.columns(r.base, candidates, recordings)
+    beside = [columns[t.candidate.key, 0] for t in found if (t.candidate.key, 0) in columns and t.candidate.name not in own]
+    past = inference.past({n: np.concatenate([slopes[n], *(c[n] for c in beside)], axis=1) for n in recordings}, at.floor)
+    left = past({n: inference.residual(at.fit.point, n) for n in recordings})
+    size = max(math.sqrt(float(np.mean(left**2))), 1.0) * math.sqrt(len(left))
+    seen = math.sqrt(math.exp(2.0 * inference.usual_gain(r)) - 1.0) * size
+    least: dict[tuple[str, str], Hidden] = {}
+    for c in candidates:
+        if c.name in taken:
+            continue
+        for i, start in enumerate(c.starts):
+            B = past(columns[c.key, i])
+            for k, p in enumerate(c.size_parameters):
+                moved = float(np.linalg.norm(B[:, k]))
+                up_to = abs(start[p.name]) * seen / moved if math.isfinite(moved) and moved > 0 else math.inf
+                one = Hidden(c.name, p.name.partition(".")[2], p.unit, up_to if up_to < max(abs(p.lower), abs(p.upper)) else None)
+                before = least.get((c.name, one.parameter))
+                if before is None or before.up_to is None or (one.up_to is not None and one.up_to < before.up_to):
+                    least[c.name, one.parameter] = one
+    return list(least.values())
+
+
+def would_help(kind: str, *, discretised: bool) -> list[str]:
+    """What would let a further diagnosis say more, in words."""
+    out = ["a longer or faster recording of the same body", "a recording of another launch, fitted beside these"]
+    if kind == "material test":
+        out = ["tests to larger strain, in another mode, or at another rate", "a repeated test, which gives the scatter of the specimens"]
+    if discretised:
+        out = ["a finer grid and a smaller time step in the scene", *out, "more views or more tracked points"]
+    return out
+
+
+def unable(inference: Inference) -> Mapping[str, list[str]]:
+    """The names of the other settings that do not run where the model stands, by recording."""
+    problem = inference.problem
+    return {problem.recordings[n].name: [problem.setting_name(s) for s in own] for n, own in inference.unable.items() if own}
+
+
+def blind_to_settings(inference: Inference) -> bool:
+    """Whether no other setting runs in some recording, so that its discretisation error is not known."""
+    others = inference.problem.others(inference.setting)
+    return bool(others) and any(len(own) == len(others) for own in inference.unable.values())
