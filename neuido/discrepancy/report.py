@@ -194,7 +194,7 @@ def _errors(c: dict[str, Any]) -> str:
         if e["before"].get(name) is not None:
             rows.append((label, e["before"][name], e["after"][name]))
     rows = [(label, before, after, None if None in (before, after) else before / max(after, 1e-300)) for label, before, after in rows]
-    known = ", ".join(dict.fromkeys(e["noise_from"].values()))
+    known = ", ".join(dict.fromkeys(e.get("noise_from", {}).values())) or "not told whence"
     floors = f"Floors: noise {e['noise_floor']:.3g} {e['unit']} ({known}), discretisation {e['discretisation_floor']:.3g} {e['unit']}."
     out = f"<h2>Error [{escaped(e['unit'])}]</h2>" + table(("recording", "before", "after", "ratio"), rows) + f"<p>{escaped(floors)}</p>"
     return out + _settings(e)

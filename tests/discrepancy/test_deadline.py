@@ -133,7 +133,7 @@ def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
         assert found.answer == "effect" and found.left_out == ()
         assert found.after["drag_linear.k"] == pytest.approx(3.0, rel=0.02)
     else:
-        assert found.answer == "unfinished" and found.left_out == ("a further effect", "two effects at once")
+        assert found.answer == "unfinished" and found.left_out == ("a further effect",)
         assert found.leads[0].fit.point["drag_linear.k"] == pytest.approx(3.0, rel=0.05)
 
 
@@ -151,5 +151,5 @@ def test_more_minutes_go_on_from_there(block, tmp_path, capsys):
     assert (out / ".work").is_dir() and "nothing is named yet" in page and "<h2>Rejected</h2>" not in page
     status, told, _ = command.run(capsys, *asked, "--minutes", "0")
     content = json.loads((out / "diagnosis.json").read_text())
-    assert status == 0 and content["left_out"] == [] and content["effects"][0]["name"] == "drag_linear" and "minutes" not in told
+    assert status == 0 and content["left_out"] == [] and content["effects"][0]["name"] == "drag_linear" and "give more minutes" not in told
     assert not (out / ".work").exists()

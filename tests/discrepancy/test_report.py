@@ -66,7 +66,7 @@ def test_page_is_whole_and_needs_nothing_else(found):
     checker.feed(page)
     assert checker.outside == []
     assert checker.open == []
-    for word in ("drag_linear", "gravity", "90 % interval", "family-wise", "Next experiment", "<svg", "Floors"):
+    for word in ("drag_linear", "gravity", "90 % interval", "linear model", "Next experiment", "<svg", "Floors"):
         assert word in page
 
 
