@@ -219,7 +219,7 @@ def _diagnosis(names: list[str]) -> Schema:
     part: Schema = {
         "type": "object",
         "properties": {
-            "answer": one_of(["effect", "class", "none", "unknown", "insufficient"]),
+            "answer": one_of(["effect", "class", "none", "unknown", "insufficient", "unfinished"]),
             "effects": {"type": "array", "items": effect},
             "declared": quantities,
             "after": quantities,
