@@ -98,7 +98,7 @@ def effect_page() -> str:
     ]
     rows = []
     for e in LIBRARY:
-        marks = ["✓" if ok else "" for ok in (True, e.name in OF_TESTS, e.name in OF_TRACKS, True, e.name != "cohesion")]
+        marks = ["✓" if ok else "" for ok in (True, e.name in OF_TESTS, e.name in OF_TRACKS, True, True)]
         rows.append([f"[{e.name}](#{anchor(e.name)})", *marks, ", ".join(e.confusions)])
     head = ["effect", "points or video of a body", "stress and stretch", "track of a point", "MPM", "finite elements", "looks like"]
     parts.append(table(head, rows))
