@@ -17,7 +17,7 @@ from neuido.commands.cli.sweep_file import Metric, Run, SweepFile, command_of, r
 from neuido.commands.interruption import SIGNALS, STATE
 from neuido.data.files.lock import Held, OwnedLock
 from neuido.data.files.score_tables import read_rows, write_rows
-from neuido.data.files.sweep_run import FOLDER, FORMAT, note, status_of
+from neuido.data.files.sweep_run import FOLDER, FORMAT, note, read_status
 from neuido.errors import UserError
 
 
@@ -80,7 +80,7 @@ def _one(plan: SweepFile, run: Run, folder: Path) -> str:
             return f"another process runs it: {error}"
         environment = _environment(plan, run, folder)
         words = command_of(plan, run, environment)
-        before = status_of(folder)
+        before = read_status(folder)
         if before.get("status") == "done" and before.get("command") == words:
             return "done before"
         if not (_interrupted(before) and before.get("command") == words and (folder / STATE).is_file()):  # else it is taken up again
@@ -137,7 +137,7 @@ def _execute(words: list[str], environment: Mapping[str, str], log: Path, lock: 
 def _empty(folder: Path) -> None:
     """Remove what an earlier try left; a folder that is no run of a sweep is left alone."""
     there = [path for path in folder.iterdir() if not path.name.startswith(".lock")]
-    if there and not status_of(folder):
+    if there and not read_status(folder):
         raise UserError(f"{folder} holds something that is no run of this sweep: give another folder by --out")
     for path in sorted(there, key=lambda path: path.name == "run.json"):  # what tells whose folder it is goes last
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
@@ -183,7 +183,7 @@ def collect(plan: SweepFile, runs: list[Run], folder: Path) -> list[dict[str, An
     with OwnedLock(folder / ".lock", f"the sweep {folder}", wait=-1):  # of two shards the later one has all rows
         rows = []
         for run in runs:
-            state = status_of(folder / run.name)
+            state = read_status(folder / run.name)
             if not state:
                 continue
             row = {"run": run.name, "status": state["status"], "seconds": state.get("seconds", ""), **run.parameters}

@@ -22,7 +22,7 @@ SHEAR = 1e-2
 
 
 def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """The rotation (..., 3, 3) and the scale (...) of a similarity, by the polar decomposition.
+    """Return the rotation (..., 3, 3) and the scale (...) of a similarity, by the polar decomposition.
 
     Files carry rotations that are rounded, and NeuMA's BouncyBall ones that are scaled by 0.41; neither moves a projected point.
 
@@ -40,25 +40,25 @@ def nearest_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def invert(pose: Tensor) -> Tensor:
-    """Inverse of rigid motions (..., 4, 4)."""
+    """Return the inverse of rigid motions (..., 4, 4)."""
     R, t = pose[..., :3, :3], pose[..., :3, 3:]
     return _rigid(R.mT, -R.mT @ t)
 
 
 def from_opengl(c2w: Tensor) -> Tensor:
-    """OpenCV world-to-camera (..., 4, 4) of OpenGL camera-to-world (..., 3 or 4, 4), re-orthonormalised."""
+    """Return OpenCV world-to-camera (..., 4, 4) of OpenGL camera-to-world (..., 3 or 4, 4), re-orthonormalised."""
     R, _ = nearest_rotation(c2w[..., :3, :3])
     return invert(_rigid(R * R.new_tensor([1.0, -1.0, -1.0]), c2w[..., :3, 3:]))
 
 
 def to_opengl(viewmats: Tensor) -> Tensor:
-    """OpenGL camera-to-world (..., 4, 4) of OpenCV world-to-camera (..., 4, 4)."""
+    """Return OpenGL camera-to-world (..., 4, 4) of OpenCV world-to-camera (..., 4, 4)."""
     c2w = invert(viewmats)
     return _rigid(c2w[..., :3, :3] * c2w.new_tensor([1.0, -1.0, -1.0]), c2w[..., :3, 3:])
 
 
 def from_quaternion(quaternion: Tensor, translation: Tensor) -> Tensor:
-    """World-to-camera (..., 4, 4) of COLMAP's quaternion w, x, y, z (..., 4) and translation (..., 3)."""
+    """Return world-to-camera (..., 4, 4) of COLMAP's quaternion w, x, y, z (..., 4) and translation (..., 3)."""
     length = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
     if bool((length < 1e-6).any()):
         raise UserError("the camera's quaternion is zero")
@@ -69,7 +69,7 @@ def from_quaternion(quaternion: Tensor, translation: Tensor) -> Tensor:
 
 
 def to_quaternion(viewmats: Tensor) -> tuple[Tensor, Tensor]:
-    """COLMAP's quaternion w, x, y, z with w >= 0 (..., 4) and translation (..., 3) of world-to-camera (..., 4, 4).
+    """Return COLMAP's quaternion w, x, y, z with w >= 0 (..., 4) and translation (..., 3) of world-to-camera (..., 4, 4).
 
     The quaternion is the main eigenvector of a symmetric matrix (Bar-Itzhack 2000), which no rotation makes ill-conditioned.
     """
@@ -86,12 +86,12 @@ def to_quaternion(viewmats: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def from_rodrigues(rotation: Tensor, translation: Tensor) -> Tensor:
-    """World-to-camera (..., 4, 4) of OpenCV's rotation vector `rvec` [rad] (..., 3) and `tvec` (..., 3)."""
+    """Return world-to-camera (..., 4, 4) of OpenCV's rotation vector `rvec` [rad] (..., 3) and `tvec` (..., 3)."""
     return _rigid(torch.linalg.matrix_exp(_cross(rotation)), translation[..., None])
 
 
 def intrinsics(width: int, height: int, *, focal: float | None = None, angle: float | None = None) -> Tensor:
-    """K (3, 3), float64, of a camera with its principal point in the middle.
+    """Return K (3, 3), float64, of a camera with its principal point in the middle.
 
     Args:
         width, height: Size of the image [px].
@@ -113,7 +113,7 @@ def intrinsics(width: int, height: int, *, focal: float | None = None, angle: fl
 
 
 def look_at(eye: Vector, target: Vector, up: Vector = (0.0, 1.0, 0.0)) -> Tensor:
-    """World-to-camera (4, 4), float64, of a camera at `eye` that looks at `target` [m] with `up` upwards in its image.
+    """Return world-to-camera (4, 4), float64, of a camera at `eye` that looks at `target` [m] with `up` upwards in its image.
 
     Raises:
         UserError: The camera sits at its target, or looks along `up`.
@@ -139,7 +139,7 @@ def orbit(
     width: int = 400,
     height: int = 400,
 ) -> Cameras:
-    """Cameras evenly around a target, +y up.
+    """Place cameras evenly around a target, +y up.
 
     Args:
         view_count: Number of views.
@@ -168,7 +168,7 @@ def orbit(
 
 
 def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Pixels x, y (V, N, 2) and depths [m] (V, N) of points [m] (N, 3); a point at depth <= 0 is not seen."""
+    """Return pixels x, y (V, N, 2) and depths [m] (V, N) of points [m] (N, 3); a point at depth <= 0 is not seen."""
     viewmats, Ks = cameras.viewmats.to(points.dtype), cameras.Ks.to(points.dtype)
     seen = points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     image = seen @ Ks.mT
@@ -176,13 +176,13 @@ def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def select(cameras: Cameras, views: Sequence[int]) -> Cameras:
-    """The cameras of some views, in the order given."""
+    """Return the cameras of some views, in the order given."""
     chosen = torch.as_tensor(list(views), dtype=torch.long, device=cameras.viewmats.device)
     return cameras._replace(viewmats=cameras.viewmats[chosen], Ks=cameras.Ks[chosen])
 
 
 def resize(cameras: Cameras, width: int, height: int) -> Cameras:
-    """The same cameras with images of another size; the intrinsics are scaled with it."""
+    """Return the same cameras with images of another size; the intrinsics are scaled with it."""
     if width < 1 or height < 1:
         raise UserError(f"an image needs at least 1 pixel a side, got {width} x {height}")
     scale = cameras.Ks.new_tensor([width / cameras.width, height / cameras.height, 1.0])
@@ -190,7 +190,7 @@ def resize(cameras: Cameras, width: int, height: int) -> Cameras:
 
 
 def move(cameras: Cameras, *, scale: float = 1.0, rotation: Tensor | None = None, shift: Vector = (0.0, 0.0, 0.0)) -> Cameras:
-    """The same views of a world that is moved by x -> scale rotation x + shift: a point and its image stay together.
+    """Return the same views of a world that is moved by x -> scale rotation x + shift: a point and its image stay together.
 
     NeuMA's and other recordings need it to get from the world in which they were filmed to the simulation's domain.
     """
@@ -204,13 +204,13 @@ def move(cameras: Cameras, *, scale: float = 1.0, rotation: Tensor | None = None
 
 
 def _rigid(R: Tensor, t: Tensor) -> Tensor:
-    """(..., 4, 4) of a rotation (..., 3, 3) and a translation (..., 3, 1)."""
+    """Return (..., 4, 4) of a rotation (..., 3, 3) and a translation (..., 3, 1)."""
     bottom = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*R.shape[:-2], 1, 4)
     return torch.cat([torch.cat([R, t], dim=-1), bottom], dim=-2)
 
 
 def _cross(v: Tensor) -> Tensor:
-    """The matrices (..., 3, 3) of v x, for v (..., 3)."""
+    """Return the matrices (..., 3, 3) of v x, for v (..., 3)."""
     x, y, z = v.unbind(-1)
     o = torch.zeros_like(x)
     return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))

@@ -28,7 +28,7 @@ PUBLISHED = {
 
 
 def check_ranges(family: str, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """Raise UserError for an unknown family, or ranges that are not those of its parameters, run backwards or are impossible."""
+    """Raise UserError for an unknown family, or for ranges of other parameters, reversed ranges and impossible ones."""
     if family not in PARAMETERS:
         raise UserError(f"unknown family {family!r} in families: choose from {', '.join(PARAMETERS)}")
     if set(ranges) != set(PARAMETERS[family]):
@@ -44,7 +44,7 @@ def check_ranges(family: str, ranges: Mapping[str, tuple[float, float]]) -> None
 
 
 def draw_parameters(family: str, ranges: Mapping[str, tuple[float, float]], random: np.random.Generator) -> dict[str, float]:
-    """Parameters of a family, each even over its range or over the logarithm of it."""
+    """Draw the parameters of a family, each uniform over its range or log-uniform."""
     drawn = {}
     for name in PARAMETERS[family]:
         low, high = ranges[name]
@@ -54,7 +54,7 @@ def draw_parameters(family: str, ranges: Mapping[str, tuple[float, float]], rand
 
 
 def laws(family: str, parameters: list[dict[str, float]]) -> tuple[ElasticLaw, PlasticLaw]:
-    """The laws of several instances of one family as one batched pair (S = len(parameters))."""
+    """Return the laws of several instances of one family as one batched pair (S = len(parameters))."""
     columns = {name: torch.tensor([p[name] for p in parameters], dtype=torch.float64) for name in PARAMETERS[family]}
     stiffness = {name: columns[name] for name in ("young", "poisson")}
     if family == "elastic":
@@ -63,7 +63,7 @@ def laws(family: str, parameters: list[dict[str, float]]) -> tuple[ElasticLaw, P
 
 
 def evaluate(law: ElasticLaw | PlasticLaw, F: Tensor) -> Tensor:
-    """A law of float32 F (..., 3, 3) computed in float64, in float32."""
+    """Evaluate a law of float32 F (..., 3, 3) in float64; return float32."""
     if isinstance(law, Identity):
         return F
     flat = F.reshape(-1, 3, 3).double()

@@ -35,7 +35,7 @@ class SceneSetup(NamedTuple):
 
 
 def data_root(option: str | os.PathLike | None = None) -> Path:
-    """The folder that holds the data: the option, else the variable NEUIDO_DATA.
+    """Return the folder that holds the data: the option, else the variable NEUIDO_DATA.
 
     Raises:
         UserError: Neither is given, or the folder is not there.
@@ -50,7 +50,7 @@ def data_root(option: str | os.PathLike | None = None) -> Path:
 
 
 def scene_names() -> list[str]:
-    """Names that `load_scene` knows: the files of configs/scenes of its format (others hold lists of scenes for `neuido simulate`)."""
+    """List the names that `load_scene` knows: files of configs/scenes of its format (others list scenes for `neuido simulate`)."""
     return sorted(path.stem for path in scenes_folder().glob("*.yaml") if f"\nformat: {FORMAT}\n" in path.read_text())
 
 
@@ -94,7 +94,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
 
 
 def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any]) -> Scene:
-    """The scene of an experiment file's `scene` and `discretisation` keys.
+    """Return the scene of an experiment file's `scene` and `discretisation` keys.
 
     Args:
         scene: domain, gravity; optional colliders, clamps, attached_masses, and walls (contact, friction, inset in cells; null for
@@ -125,7 +125,7 @@ def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any])
 
 
 def model_from_dict(model: Mapping[str, Any]) -> dict[str, Any]:
-    """An experiment file's `model` key, checked: density [kg/m^3], elasticity, plasticity.
+    """Return an experiment file's `model` key, checked: density [kg/m^3], elasticity, plasticity.
 
     Raises:
         UserError: An unknown or missing key, or an impossible material.
@@ -142,7 +142,7 @@ def model_from_dict(model: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def body_volume(x: np.ndarray) -> float:
-    """Volume [m^3] of a body that is filled with particles x (P, 3) [m], by voxel occupancy.
+    """Return the volume [m^3] of a body that is filled with particles x (P, 3) [m], by voxel occupancy.
 
     A voxel is twice the mean spacing (V / P)^(1/3) wide, so that about eight particles fill it and none inside stays empty; V and
     the voxel are found together by iteration. A voxel that touches an empty one counts 2/3: the surface cuts it. The mean over
@@ -162,7 +162,7 @@ def body_volume(x: np.ndarray) -> float:
 
 
 def _occupied(x: np.ndarray) -> float:
-    """Unit cells that hold a point of x >= 0, those at the surface counted 2/3."""
+    """Count the unit cells that hold a point of x >= 0; those at the surface count 2/3."""
     cells = np.floor(x).astype(np.int64) + 1
     occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
     occupied[tuple(cells.T)] = True
@@ -173,7 +173,7 @@ def _occupied(x: np.ndarray) -> float:
 
 
 def scenes_folder() -> Path:
-    """configs/scenes beside the package in a checkout, else inside the installed package."""
+    """Return configs/scenes beside the package in a checkout, else inside the installed package."""
     package = Path(__file__).resolve().parents[2]
     checkout = package.parent / "configs" / "scenes"
     return checkout if checkout.is_dir() else package / "configs" / "scenes"

@@ -19,7 +19,7 @@ def cube(
     velocity: Vector = (0.0, 0.0, 0.0),
     angular_velocity: Vector = (0.0, 0.0, 0.0),
 ) -> Body:
-    """A cube on a regular grid that includes its faces, the filling of NCLaw (its issue 3 admits that the volume is then approximate).
+    """Fill a cube with a regular grid that includes its faces, as NCLaw does (its issue 3 admits that the volume is then approximate).
 
     Args:
         length: Edge [m].
@@ -50,7 +50,7 @@ def box(
     velocity: Vector = (0.0, 0.0, 0.0),
     angular_velocity: Vector = (0.0, 0.0, 0.0),
 ) -> Body:
-    """A box on a cell-centred lattice.
+    """Fill a box with a cell-centred lattice.
 
     Args:
         lower: Lower corner [m].
@@ -83,7 +83,7 @@ def ball(
     velocity: Vector = (0.0, 0.0, 0.0),
     angular_velocity: Vector = (0.0, 0.0, 0.0),
 ) -> Body:
-    """A ball: the lattice points of `box` that lie inside it; the particles share its exact volume.
+    """Fill a ball with the lattice points of `box` inside it; the particles share its exact volume.
 
     Args:
         centre: Centre [m].
@@ -116,7 +116,7 @@ def cylinder(
     velocity: Vector = (0.0, 0.0, 0.0),
     angular_velocity: Vector = (0.0, 0.0, 0.0),
 ) -> Body:
-    """A cylinder along a coordinate axis: the lattice points of `box` that lie inside it; the particles share its exact volume.
+    """Fill a cylinder along a coordinate axis with the lattice points of `box` inside it; the particles share its exact volume.
 
     Args:
         centre: Centre [m].
@@ -145,7 +145,7 @@ def cylinder(
 
 
 def rigid_velocity(x: Tensor, *, centre: Vector, velocity: Vector, angular_velocity: Vector) -> Tensor:
-    """Velocity of a rigid body [m/s], v + omega x (x - centre), shape (P, 3), for x [m] (P, 3)."""
+    """Return the velocity of a rigid body [m/s], v + omega x (x - centre), shape (P, 3), for x [m] (P, 3)."""
     about = [
         torch.tensor(_vector(n, a), dtype=x.dtype, device=x.device)
         for n, a in (("centre", centre), ("velocity", velocity), ("angular_velocity", angular_velocity))

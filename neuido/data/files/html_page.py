@@ -24,7 +24,7 @@ class Best(NamedTuple):
 
 
 def page(title: str, body: str, *, style: str = "") -> str:
-    """A whole page.
+    """Return a whole HTML page.
 
     Args:
         title: Of the window.
@@ -36,12 +36,12 @@ def page(title: str, body: str, *, style: str = "") -> str:
 
 
 def escaped(value: Any) -> str:
-    """A value as HTML text."""
+    """Return a value as HTML text."""
     return html.escape(str(value))
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, digits: int = 4) -> str:
-    """A table; numbers stand to the right with so many digits, NaN and None are empty, a `Best` is bold."""
+    """Return a table as HTML: numbers at the right with `digits` digits, NaN and None empty, a `Best` in bold."""
     if not rows:
         return "<p>None.</p>"
 
@@ -60,17 +60,17 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, digits: int = 4
 
 
 def picture(path: Path) -> str:
-    """A PNG file."""
+    """Return the HTML of a PNG file."""
     return png(path.read_bytes(), path.stem)
 
 
 def png(data: bytes, name: str) -> str:
-    """A picture from the bytes of a PNG file."""
+    """Return a picture from the bytes of a PNG file."""
     return f'<p><img alt="{escaped(name)}" src="data:image/png;base64,{base64.b64encode(data).decode()}"></p>'
 
 
 def video(path: Path, caption: str, *, width: int = 520) -> str | None:
-    """A video file in the page, as WebM: browsers do not play the MPEG-4 that OpenCV writes; none where it cannot be read.
+    """Return the HTML of a video file, as WebM because browsers do not play OpenCV's MPEG-4; none where it cannot be read.
 
     Args:
         path: The file.
@@ -85,7 +85,7 @@ def video(path: Path, caption: str, *, width: int = 520) -> str | None:
 
 
 def webm(path: Path, width: int) -> bytes | None:
-    """A video as WebM with VP9, at most so many pixels wide; none where OpenCV cannot read or write it."""
+    """Return a video as WebM with VP9, at most `width` pixels wide; none where OpenCV cannot read or write it."""
     import cv2
 
     source = cv2.VideoCapture(str(path))
@@ -127,7 +127,7 @@ class _quiet:
 
 
 def figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any] | None:
-    """A figure without a window and its axes (rows, columns), or None where matplotlib is not installed."""
+    """Return a figure without a window and its axes (rows, columns), or None where matplotlib is not installed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -139,7 +139,7 @@ def figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any
 
 
 def svg(made: Any) -> str:
-    """A figure as an inline element."""
+    """Return a figure as an inline element."""
     import matplotlib
 
     stream = io.StringIO()
@@ -149,7 +149,7 @@ def svg(made: Any) -> str:
 
 
 def small(ax: Any) -> None:
-    """Small ticks, and no frame above and to the right."""
+    """Make the ticks small, and leave out the frame above and at the right."""
     ax.tick_params(which="both", labelsize=7)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from neuido.data.files.score_tables import folder_of, read_rows
-from neuido.data.files.sweep_run import status_of
+from neuido.data.files.sweep_run import read_status
 from neuido.errors import UserError
 
 
@@ -29,26 +29,26 @@ class Entry(NamedTuple):
     """Whether it is the last stage of its run."""
 
     def of(self, scene: str) -> dict[str, Any]:
-        """The row of a scene; empty where there is none."""
+        """Return the row of a scene; empty where there is none."""
         return next((row for row in self.rows if str(row.get("scene")) == scene), {})
 
     def folder(self, scene: str) -> Path | None:
-        """Where the results of a scene are."""
+        """Return the folder of a scene's results."""
         return None if self.scores is None else folder_of(self.scores, scene)
 
     def by_frame(self, scene: str) -> list[dict[str, Any]]:
-        """particles.csv of a scene, a row a time step."""
+        """Return the rows of a scene's particles.csv, one for each time step."""
         path = (self.folder(scene) or Path()) / self.stage / "particles.csv"
         return read_rows(path) if self.scores is not None and path.is_file() else []
 
     def videos(self, scene: str) -> list[Path]:
-        """The videos of a scene: of what came out of a run."""
+        """Return the videos of a scene: of what came out of a run."""
         folder = self.folder(scene)
         return sorted(folder.glob("*.mp4")) if folder and folder.is_dir() and self.last else []
 
 
 def open_runs(given: Sequence[str]) -> list[Entry]:
-    """The entries of some runs, in order.
+    """Return the entries of some runs, in order.
 
     Args:
         given: Folders, each of a run, of results, or of a sweep, whose finished runs then count one by one; `label=folder` gives it a name.
@@ -62,8 +62,8 @@ def open_runs(given: Sequence[str]) -> list[Entry]:
         folder = Path(path).expanduser()
         if not folder.is_dir():
             raise UserError(f"runs: there is no folder {folder}")
-        sweep = sorted(each for each in folder.iterdir() if status_of(each).get("status") == "done")
-        found = [entry for each in sweep or [folder] for entry in _entries(each, label, status_of(each).get("parameters", {}))]
+        sweep = sorted(each for each in folder.iterdir() if read_status(each).get("status") == "done")
+        found = [entry for each in sweep or [folder] for entry in _entries(each, label, read_status(each).get("parameters", {}))]
         if not found:
             raise UserError(f"runs: {folder} holds neither scores.csv, test.csv nor metrics.csv: run `neuido fit` or `neuido test` first")
         entries += found
@@ -81,13 +81,13 @@ def _entries(folder: Path, label: str, parameters: dict[str, Any]) -> list[Entry
         stages = list(dict.fromkeys(str(row.get("stage", "")) for row in rows))
         for stage in stages:
             part = [row for row in rows if str(row.get("stage", "")) == stage]
-            told = f"{name}, {stage}" if len(stages) > 1 else name
-            out.append(Entry(told, folder, place, part, parameters, stage, stage == stages[-1]))
+            title = f"{name}, {stage}" if len(stages) > 1 else name
+            out.append(Entry(title, folder, place, part, parameters, stage, stage == stages[-1]))
     return out
 
 
 def tables(folder: Path) -> dict[Path, list[dict[str, Any]]]:
-    """The scores below a folder by where they are: rows of scores.csv, and of test.csv, in which a finished fit was scored again."""
+    """Return the scores below a folder by where they are: rows of scores.csv, and of test.csv, in which a finished fit was scored again."""
     paths = sorted({*folder.rglob("scores.csv"), *folder.rglob("test.csv")}, key=lambda path: (path.parent, path.name))
     return {place: [row for path in paths if path.parent == place for row in read_rows(path)] for place in {p.parent: 0 for p in paths}}
 
@@ -98,7 +98,7 @@ def _name(folder: Path) -> str:
 
 
 def _distinct(entries: list[Entry]) -> list[Entry]:
-    """With the parent folder in labels that come twice."""
+    """Add the parent folder to labels that come twice."""
     labels = [entry.label for entry in entries]
     return [
         entry._replace(label=f"{entry.root.resolve().parent.name}/{entry.label}") if labels.count(entry.label) > 1 else entry
@@ -107,12 +107,12 @@ def _distinct(entries: list[Entry]) -> list[Entry]:
 
 
 def logs(root: Path) -> list[Path]:
-    """The metrics.csv files below a folder, the newest last."""
+    """Return the metrics.csv files below a folder, the newest last."""
     return sorted(root.rglob("metrics.csv"), key=lambda path: path.stat().st_mtime)
 
 
 def curves(root: Path) -> dict[str, list[tuple[float, float]]]:
-    """(step, value) of each logged column; of a column in several files the newest counts."""
+    """Return (step, value) of each logged column; of a column in several files the newest counts."""
     out: dict[str, list[tuple[float, float]]] = {}
     for path in logs(root):
         own: dict[str, list[tuple[float, float]]] = {}
@@ -126,10 +126,10 @@ def curves(root: Path) -> dict[str, list[tuple[float, float]]]:
 
 
 def scenes_of(entries: Sequence[Entry]) -> list[str]:
-    """The names of all scenes, in the order in which they come."""
+    """Return the names of all scenes, in the order in which they come."""
     return list(dict.fromkeys(str(row["scene"]) for entry in entries for row in entry.rows if "scene" in row))
 
 
 def mean(values: Sequence[Any]) -> float:
-    """The mean of numbers; NaN where one is missing."""
+    """Return the mean of numbers; NaN where one is missing."""
     return sum(values) / len(values) if values and all(isinstance(v, float) and math.isfinite(v) for v in values) else math.nan

@@ -38,7 +38,7 @@ def read_rows(path: str | os.PathLike) -> list[dict[str, Any]]:
 
 
 def number(text: str) -> float | str:
-    """A cell as a float, or as it is."""
+    """Return a cell as a float where it is a number, else as text."""
     try:
         return float(text)
     except (TypeError, ValueError):
@@ -46,6 +46,6 @@ def number(text: str) -> float | str:
 
 
 def folder_of(out: str | os.PathLike, name: str) -> Path:
-    """The folder of a scene's results, under a name that stays inside `out`."""
+    """Return the folder of a scene's results, under a name that stays inside `out`."""
     clean = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).lstrip(".") or "scene"
     return Path(out) / clean

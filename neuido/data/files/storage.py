@@ -114,12 +114,12 @@ class Files:
         return {"paths": self.paths}
 
     def gather(self, rows: Tensor) -> TrajectoryBatch:
-        """The samples at the rows t P + p of each trajectory, (M, n) int64, on the CPU."""
+        """Return the samples at the rows t P + p of each trajectory, (M, n) int64, on the CPU."""
         picked = np.stack([array[index] for array, index in zip(self.arrays, rows.numpy(), strict=True)])
         return split(torch.from_numpy(picked))
 
     def load(self, device: torch.device) -> Tensor:
-        """Everything, (M, T P, 27) float32 on the device."""
+        """Load everything, (M, T P, 27) float32 on the device."""
         out = torch.empty(len(self.arrays), *self.arrays[0].shape, dtype=torch.float32, device=device)
         for target, array in zip(out, self.arrays, strict=True):
             target.copy_(torch.from_numpy(np.array(array)))
@@ -127,7 +127,7 @@ class Files:
 
 
 def split(rows: Tensor) -> TrajectoryBatch:
-    """Stored columns (M, n, 27) as a batch of M n samples sorted by trajectory."""
+    """Return stored columns (M, n, 27) as a batch of M n samples sorted by trajectory."""
     trajectories, samples = rows.shape[:2]
     trial, corrected, stress = rows.reshape(-1, 3, 3, 3).transpose(0, 1).contiguous()
     index = torch.arange(trajectories, device=rows.device).repeat_interleave(samples)

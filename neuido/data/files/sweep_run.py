@@ -10,8 +10,8 @@ FOLDER = "NEUIDO_RUN"
 """The environment variable that names the folder of a run, into which everything of it goes."""
 
 
-def status_of(folder: Path) -> dict[str, Any]:
-    """What `run.json` of a run says; empty where there is none."""
+def read_status(folder: Path) -> dict[str, Any]:
+    """Return the content of a run's `run.json`; empty where there is none."""
     try:
         content = json.loads((folder / "run.json").read_text())
     except (OSError, ValueError):
@@ -27,7 +27,7 @@ def note(folder: Path, state: Mapping[str, Any]) -> None:
 
 
 def own_folder(environment: Mapping[str, str]) -> Path | None:
-    """The folder of this process where it is a run of a sweep, of this command or of wandb's agent."""
+    """Return the folder of this process where it is a run of a sweep, of this command or of wandb's agent."""
     if environment.get(FOLDER):
         return Path(environment[FOLDER])
     if environment.get("WANDB_SWEEP_ID") and environment.get("WANDB_RUN_ID"):

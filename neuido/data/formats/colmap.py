@@ -34,7 +34,7 @@ class Image(NamedTuple):
 
 
 def read_cameras(path: Path) -> dict[int, Camera]:
-    """The cameras of `cameras.bin` by their id.
+    """Return the cameras of `cameras.bin` by their id.
 
     Raises:
         UserError: The file is missing, cut short, or has a lens that is no pinhole.
@@ -57,7 +57,7 @@ def read_cameras(path: Path) -> dict[int, Camera]:
 
 
 def read_images(path: Path) -> list[Image]:
-    """The registered images of `images.bin`, by name.
+    """Return the registered images of `images.bin`, by name.
 
     Raises:
         UserError: The file is missing or cut short.
@@ -82,7 +82,7 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
 
 
 def views(model: Path, pictures: Path, *, folder: Path, name: str, masks: Path | None = None) -> MultiView:
-    """The registered images of a model folder, each one a view; masks, where there are any, are PNG files of the same names."""
+    """Return the registered images of a model folder, each one a view; masks, where there are any, are PNG files of the same names."""
     lenses = read_cameras(model / "cameras.bin")
     shots = []
     sizes = set()

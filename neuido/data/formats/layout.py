@@ -130,7 +130,7 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
 
 
 def matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
-    """Numbers of one of the shapes, float64.
+    """Return numbers of one of the shapes as float64.
 
     Raises:
         UserError: Another shape, text, a NaN or an infinity.
@@ -147,7 +147,7 @@ def matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
 
 
 def opengl(value: Any, where: str) -> Tensor:
-    """OpenCV world-to-camera (4, 4), float64, of a written OpenGL camera-to-world matrix (3, 4) or (4, 4).
+    """Return OpenCV world-to-camera (4, 4), float64, of an OpenGL camera-to-world matrix (3, 4) or (4, 4) in a file.
 
     Raises:
         UserError: No such matrix, or a rotation that is sheared or mirrored.
@@ -160,7 +160,7 @@ def opengl(value: Any, where: str) -> Tensor:
 
 
 def calibration(value: Any, where: str) -> Tensor:
-    """An intrinsic matrix K (3, 3).
+    """Return an intrinsic matrix K (3, 3).
 
     Raises:
         UserError: Not a matrix, a focal length that is not positive, or a skew.
@@ -174,7 +174,7 @@ def calibration(value: Any, where: str) -> Tensor:
 
 
 def natural(text: str) -> list[tuple[int, str]]:
-    """A key that sorts `r_2` before `r_10`."""
+    """Return a key that sorts `r_2` before `r_10`."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text) if part]
 
 

@@ -139,7 +139,7 @@ def _names(content: dict[str, Any], key: str, file: Path) -> list[str]:
 
 
 def _shot(entry: dict[str, Any], folder: Path, where: str, poses: dict[tuple, str]) -> tuple[Shot, tuple[int, int]]:
-    """A frame, with the keys of the file as its defaults, and the size of its image."""
+    """Return a frame, with the keys of the file as its defaults, and the size of its image."""
     image = _image(folder, take(entry, "file_path", where), where)
     viewmat = opengl(take(entry, "transform_matrix", where), f"{where}.transform_matrix")
     model = entry.get("camera_model", "OPENCV")
@@ -181,7 +181,7 @@ def _lens(entry: dict[str, Any], size: tuple[int, int], where: str) -> Tensor:
 
 
 def _image(folder: Path, given: Any, where: str) -> Path:
-    """Blender leaves the ending away."""
+    """Return the path of an image; Blender leaves its ending away."""
     path = inside(folder, given, f"{where}.file_path")
     if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
         return path
@@ -189,7 +189,7 @@ def _image(folder: Path, given: Any, where: str) -> Path:
 
 
 def _timed(shots: list[Shot], frame_interval: float | None, folder: Path) -> list[Shot]:
-    """The shots with their times: those of the file, else one moment, else the order in each view."""
+    """Return the shots with times: those of the file, else one moment, else the order in each view."""
     timeless = [shot for shot in shots if np.isnan(shot.time)]
     if timeless and len(timeless) < len(shots):
         raise UserError(f"{folder}: {len(timeless)} of {len(shots)} frames have no time ({timeless[0].image.name}): give all or none one")

@@ -125,7 +125,7 @@ def _real(path: Path, interval: float) -> MultiView:
 
 
 def dynamic_lens(static: colmap.Camera, size: tuple[int, int]) -> Tensor:
-    """K of the video from the still camera's: its focal lengths scaled to the video's size, the principal point in the middle.
+    """Return K of a video from the still camera's, its focal lengths scaled, the principal point in the middle.
 
     NeuMA and Spring-Gaus exchange the two focal lengths (which differ by 0.04 %); here they are not.
     """
@@ -135,7 +135,7 @@ def dynamic_lens(static: colmap.Camera, size: tuple[int, int]) -> Tensor:
 
 
 def extrinsics(calibrated: dict[str, Any], view: str, file: Path) -> Tensor:
-    """World-to-camera (4, 4) of a view's `rvecs` and `tvecs`, which OpenCV writes as (3,), (3, 1) or (1, 3)."""
+    """Return world-to-camera (4, 4) of a view's `rvecs` and `tvecs`, which OpenCV writes as (3,), (3, 1) or (1, 3)."""
     entry = calibrated.get(view)
     if not isinstance(entry, dict):
         raise UserError(f"{file} lacks the view {view!r}")
@@ -154,7 +154,7 @@ def _view_and_step(image: Path, where: str) -> tuple[str, int]:
 
 
 def _load(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
-    """A file of torch.save with these keys, weights only."""
+    """Return a file of torch.save with these keys, weights only."""
     try:
         with torch.serialization.safe_globals([torch.Size]):
             content = torch.load(path, map_location="cpu", weights_only=True)

@@ -40,7 +40,7 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
 
 
 def read_static(path: Path, name: str) -> MultiView:
-    """The stills of an object of real_capture, in COLMAP's own frame and scale: the object has to be registered to the video."""
+    """Return the stills of an object of real_capture, in COLMAP's own frame and scale: the object has to be registered to the video."""
     static = path / "static"
     model = inside(static, f"colmap/{name}", "the object's name")
     return colmap.views(model, static / "images" / name, folder=path, name=name, masks=static / "masks" / name)

@@ -19,7 +19,7 @@ WAVES = ["frequency", *(f"{part}{a}" for part in "sc" for a in "xyz")]
 
 
 def read_header(folder: Path, name: str, form: str) -> tuple[Path, dict[str, Any]]:
-    """The YAML file `name` of a folder (or given itself) and its content, whose `format` must be `form`.
+    """Return the YAML file `name` of a folder (or given itself) and its content, whose `format` must be `form`.
 
     Raises:
         UserError: The file is missing, no YAML, or of another format.
@@ -36,7 +36,7 @@ def read_header(folder: Path, name: str, form: str) -> tuple[Path, dict[str, Any
 
 @contextlib.contextmanager
 def errors_of(file: Path) -> Iterator[None]:
-    """Say of what is wrong with its content which file it stands in."""
+    """Add the file's name to errors in its content."""
     try:
         yield
     except UserError as error:
@@ -46,7 +46,7 @@ def errors_of(file: Path) -> Iterator[None]:
 
 
 def read_entries(given: Any, key: str, what: str, read: Callable[[Any, str], Entry]) -> tuple[Entry, ...]:
-    """The entries of a list that is not empty, each of another name.
+    """Return the entries of a list that is not empty, each of another name.
 
     Args:
         given: The list.
@@ -68,7 +68,7 @@ def read_entries(given: Any, key: str, what: str, read: Callable[[Any, str], Ent
 
 
 def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: Mapping[str, float]) -> tuple[dict[str, np.ndarray], range]:
-    """The columns that `entry` names of its CSV file.
+    """Return the columns that `entry` names of its CSV file.
 
     Args:
         folder: The folder that must hold the file.
@@ -111,7 +111,7 @@ def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: M
 
 
 def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str, float]:
-    """Effects that a model declares, as flat figures, for example {"drag_quadratic.k": 0.01}.
+    """Read the effects that a model declares, as flat parameters, for example {"drag_quadratic.k": 0.01}.
 
     Args:
         given: "name.parameter" -> number, or name -> a mapping of its parameters, a list in their order, or a number where there is one
@@ -148,7 +148,7 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
 
 
 def read_free(given: Any, known: tuple[str, ...], where: str = "model.free") -> tuple[str, ...]:
-    """The figures of a model that are to be fitted."""
+    """Return the figures of a model that are to be fitted."""
     if not isinstance(given, list):
         raise UserError(f"{where} must be a list of figures, got {given!r}")
     for key in given:
@@ -160,21 +160,21 @@ def read_free(given: Any, known: tuple[str, ...], where: str = "model.free") -> 
 
 
 def read_text(given: Any, where: str) -> str:
-    """Text that is not blank."""
+    """Return text that is not blank."""
     if not isinstance(given, str) or not given.strip():
         raise UserError(f"{where} must be text, got {given!r}")
     return given
 
 
 def read_role(given: Any, where: str) -> str:
-    """`fit` or `held_out`."""
+    """Return a role, `fit` or `held_out`."""
     if given not in ROLES:
         raise UserError(f"{where}.role = {given!r} is not known; one of {', '.join(ROLES)}")
     return given
 
 
-def rising(t: np.ndarray, where: str) -> np.ndarray:
-    """Times [s] (n,) that rise.
+def check_increasing(t: np.ndarray, where: str) -> np.ndarray:
+    """Return times [s] (n,), which must increase from row to row.
 
     Raises:
         UserError: They do not.

@@ -78,14 +78,14 @@ class Experiment:
     recordings: tuple[Recording, ...]
 
     def __getitem__(self, name: str) -> Recording:
-        """The recording of a name."""
+        """Return the recording of a name."""
         for recording in self.recordings:
             if recording.name == name:
                 return recording
         raise UserError(f"recording = {name!r} is not in {self.name}; one of {', '.join(r.name for r in self.recordings)}")
 
     def of(self, role: str) -> tuple[Recording, ...]:
-        """The recordings of a role."""
+        """Return the recordings of a role."""
         return tuple(recording for recording in self.recordings if recording.role == role)
 
 
@@ -144,7 +144,7 @@ def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
 
 
 def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The keys `scene` and `discretisation` of an experiment, the inverse of `scenes.scene_from_dict`."""
+    """Return the keys `scene` and `discretisation` of an experiment, the inverse of `scenes.scene_from_dict`."""
 
     def corners(box: Box) -> list[list[float]]:
         return [list(box.lower), list(box.upper)]
@@ -165,7 +165,7 @@ def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def read_belief(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """`read_model` for a body, whose model may have a key `law`: a neural law in place of elasticity and plasticity.
+    """Read the model of a body, which may have a key `law`: a neural law in place of elasticity and plasticity.
 
     Args:
         given: As `read_model` takes it, and `law`: a `file` and a factor on its stress, `stiffness`, which may be free.
@@ -190,7 +190,7 @@ def read_belief(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any]
 
 
 def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The key `model` of a file: what is believed, and which of its figures are free."""
+    """Return the assumed model in the key `model` of a file, and which of its parameters are free."""
     given = mapping(given, "model")
     free = given.pop("free", [])
     effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY))
@@ -241,7 +241,7 @@ def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path)
 
 
 def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
-    """The arrays of particles.npz, checked."""
+    """Return the arrays of particles.npz, checked."""
     arrays = _arrays(path)
     shapes = {"x": ("T", "N", 3), "t": ("T",), "x0": ("P", 3), "v0": ("P", 3), "volume": ("P",), "F0": ("P", 3, 3), "track": ("N",),
               "anchor": ("N", 3)}  # fmt: skip

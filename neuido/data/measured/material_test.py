@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 
 from neuido.data.files.values import check_keys, file_name, mapping, number, vector
-from neuido.data.measured.columns import errors_of, read_columns, read_effects, read_entries, read_header, read_role, read_text, rising
+from neuido.data.measured.columns import (
+    check_increasing,
+    errors_of,
+    read_columns,
+    read_effects,
+    read_entries,
+    read_header,
+    read_role,
+    read_text,
+)
 from neuido.data.measured.experiment import read_model
 from neuido.errors import UserError
 from neuido.types import Vector
@@ -74,11 +83,11 @@ class MaterialTests:
     tests: tuple[MaterialTest, ...]
 
     def of(self, role: str) -> tuple[MaterialTest, ...]:
-        """The tests of a role."""
+        """Return the tests of a role."""
         return tuple(test for test in self.tests if test.role == role)
 
     def histories(self) -> tuple[tuple[int, ...], ...]:
-        """Which tests are one and the same specimen, in order, by index.
+        """Group the tests of one and the same specimen, in order, by index.
 
         Tests of one file whose row ranges adjoin, with the same columns, mode and direction, are one loading history: the later one
         starts in the state in which the earlier one ends. Every other test starts with a virgin specimen.
@@ -167,13 +176,13 @@ def _test(entry: Any, where: str, folder: Path) -> MaterialTest:
         file=folder / entry["file"],
         columns=tuple(columns.values()),
         rows=rows,
-        time=rising(data["time"], where) if "time" in data else None,
+        time=check_increasing(data["time"], where) if "time" in data else None,
         direction=tuple((direction / np.linalg.norm(direction)).tolist()),
     )
 
 
 def _choose(columns: Mapping[str, Any], keys: tuple[str, ...], others: Mapping[str, str], where: str) -> tuple[str, ...]:
-    """The keys, or their alternatives (logarithmic strain, true stress) where the columns have these."""
+    """Return the keys, or their alternatives (logarithmic strain, true stress) where the columns have these."""
     other = tuple(others.get(key, key) for key in keys)
     if other == keys:
         return keys

@@ -10,6 +10,7 @@ import numpy as np
 
 from neuido.data.files.values import check_keys, file_name, mapping, number, vector
 from neuido.data.measured.columns import (
+    check_increasing,
     errors_of,
     read_columns,
     read_effects,
@@ -18,7 +19,6 @@ from neuido.data.measured.columns import (
     read_header,
     read_role,
     read_text,
-    rising,
 )
 from neuido.errors import UserError
 from neuido.types import Vector
@@ -72,7 +72,7 @@ class Tracks:
     recordings: tuple[Track, ...] = ()
 
     def of(self, role: str, body: str | None = None) -> tuple[Track, ...]:
-        """The recordings of a role, of one body or of all."""
+        """Return the recordings of a role, of one body or of all."""
         return tuple(track for track in self.recordings if track.role == role and body in (None, track.body))
 
 
@@ -140,7 +140,7 @@ def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) 
         name=name,
         body=entry["body"],
         role=role,
-        t=rising(data["t"], where),
+        t=check_increasing(data["t"], where),
         x=np.stack([data[AXES[a]] for a in axes], 1),
         axes=axes,
         spin=vector(entry["spin"], f"{where}.spin") if entry.get("spin") is not None else None,

@@ -149,7 +149,7 @@ class FilmDataModule(LightningDataModule):
         return kept
 
     def read(self, number: int) -> Clip:
-        """A clip by its number."""
+        """Return a clip by its number."""
         return read_clip(self.root / f"{self.clips[number]['name']}.npz")
 
     def train_dataloader(self) -> DataLoader:

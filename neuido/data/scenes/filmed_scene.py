@@ -194,7 +194,7 @@ def load_views(
 
 
 def from_background(images: Tensor) -> tuple[Tensor, Tensor]:
-    """What images of an object before one colour say without masks.
+    """Return the background's colour and the masks of images of an object before one colour.
 
     The colour is the median of the rims of the first frame. A pixel at the outline is a mixture: its share of the object is its
     difference from the background over the largest one within two pixels; further inside it is one.

@@ -23,7 +23,7 @@ KEYS = {"reconstruction": ("reconstruction", "recording", "views"), "particles":
 
 
 def in_order(scenes: Sequence[VisualScene], *, rank: int = 0, ranks: int = 1) -> DataLoader:
-    """Scenes as they stand, each by one of the processes."""
+    """Load scenes in their order, each by one of the processes."""
     return DataLoader(_Listed(scenes[rank::ranks]), batch_size=1, collate_fn=_only)
 
 
@@ -80,7 +80,7 @@ class OneByOne(Resumable[VisualScene]):
 
 
 def train_on(batch: MultiViewBatch, views: int | list[int]) -> MultiViewBatch:
-    """The batch without the views that training is not to see; those that are held out stay.
+    """Return the batch without the views that training is not to see; those that are held out stay.
 
     Args:
         batch: Images of V views.
@@ -186,11 +186,11 @@ class VisualDataModule(LightningDataModule):
         return self.test_dataloader()
 
     def __str__(self) -> str:
-        """Lightning's own opens all loaders to describe them, and takes a scene for a collection of them."""
+        """Return a summary without opening the loaders, as Lightning's own would."""
         return f"VisualDataModule({len(self.given)} scenes, {len(self.given_unseen)} unseen)"
 
     def transfer_batch_to_device(self, batch: VisualScene, device: torch.device, dataloader_idx: int) -> VisualScene:
-        """Not here: the model brings a scene to the device once, and keeps it there."""
+        """Return the batch as it is: the model moves a scene to the device once."""
         return batch
 
     def _all(self, given: list[str | dict[str, Any]], where: str) -> list[VisualScene]:

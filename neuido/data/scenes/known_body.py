@@ -50,7 +50,7 @@ def load_known(
 
 
 def cropped(batch: MultiViewBatch, crop: Sequence[int]) -> MultiViewBatch:
-    """The part of the images from column `left` to before `right` and row `top` to before `bottom`, with cameras to match.
+    """Return the part of the images from column `left` to before `right` and row `top` to before `bottom`, with cameras to match.
 
     Raises:
         UserError: No part of the images.

@@ -113,7 +113,7 @@ class SceneViews:
         return [self.found.views[v] for v in self.chosen]
 
     def load(self, views: Sequence[int], frames: Sequence[int] | None = None) -> tuple[Tensor, Tensor]:
-        """Images (V, T, H, W, 3) and masks (V, T, H, W), float32 in [0, 1], of some of the chosen views and frames (by position).
+        """Load images (V, T, H, W, 3) and masks (V, T, H, W), float32 in [0, 1], of chosen views and frames by position.
 
         Raises:
             UserError: A file that is no image, or one of another shape than its camera's.
@@ -128,7 +128,7 @@ class SceneViews:
         return rgba[..., :3].contiguous(), rgba[..., 3].contiguous()
 
     def _image(self, v: int, t: int) -> np.ndarray:
-        """RGB over the background, and the mask, (H, W, 4) uint8."""
+        """Return RGB over the background, and the mask, (H, W, 4) uint8."""
         if (v, t) in self._kept:
             return self._kept[v, t]
         found = self.found
@@ -304,7 +304,7 @@ def _indices(found: MultiView, names: Sequence[Any], option: str) -> list[int]:
 
 
 def _read(path: Path | None, cameras: Cameras, *, channel: bool = False) -> np.ndarray:
-    """An image as RGBA (H, W, 4), or as one channel (H, W), float32 in [0, 1], in the size of the cameras."""
+    """Return an image as RGBA (H, W, 4), or as one channel (H, W), float32 in [0, 1], in the size of the cameras."""
     raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if raw is None or raw.dtype not in (np.uint8, np.uint16):
         raise UserError(f"{path} is missing or no image of 8 or 16 bits that OpenCV can read")
@@ -324,13 +324,13 @@ def _read(path: Path | None, cameras: Cameras, *, channel: bool = False) -> np.n
 
 
 def _difference(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """A rough mask (H, W): where an image differs from that of the empty scene, without single pixels."""
+    """Return a rough mask (H, W): where an image differs from that of the empty scene, without single pixels."""
     differs = (np.abs(image - empty).max(axis=2) > DIFFERENT).astype(np.uint8)
     return cv2.medianBlur(differs, 3).astype(np.float32)
 
 
 def _undistort(layers: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Layers (H, W, C) as an ideal pinhole with the same K would see them; OpenCV has pixel centres at whole numbers."""
+    """Return layers (H, W, C) as a pinhole with the same K sees them; OpenCV has pixel centres at whole numbers."""
     K = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     parts = [cv2.undistort(np.ascontiguousarray(layers[..., c]), K, distortion) for c in range(layers.shape[2])]
     return np.stack(parts, axis=2)

@@ -56,7 +56,7 @@ def read(path: str | os.PathLike, format: str = "auto", *, recording: str | None
 
 
 def detect(folder: Path) -> str:
-    """The format of a folder, by the files in it.
+    """Return the format of a folder, by the files in it.
 
     Raises:
         UserError: None is known by them.

@@ -44,7 +44,7 @@ PARTS = ("scene", "model", "body", "discretisation")
 OWN = ("name", "base", "velocity", "angular_velocity", "shift", "belief", "split", "substeps")
 SPLITS = ("train", "unseen")
 JELLY = {"density": 1000.0, "elasticity": {"law": "fixed_corotated", "young": 1e5, "poisson": 0.2}, "plasticity": {"law": "identity"}}
-"""What the experimenter believes unless told otherwise: NCLaw's jelly, from which NeuMA starts too."""
+"""What the experimenter believes unless a scene says otherwise: NCLaw's jelly, from which NeuMA starts too."""
 
 IMAGES_AT_ONCE = {"cpu": 8, "cuda": 80}
 WIDTH = 0.45
@@ -86,7 +86,7 @@ class Dense(NamedTuple):
     """RGB, (P M, 3)."""
 
     def at(self, x: Tensor, F: Tensor) -> tuple[Tensor, Tensor]:
-        """Centres (T, P M, 3) [m] and covariances (T, P M, 3, 3) [m^2] where the particles are at x (T, P, 3) with F (T, P, 3, 3)."""
+        """Return centres (T, P M, 3) [m], covariances (T, P M, 3, 3) [m^2] for particles at x (T, P, 3) with F (T, P, 3, 3)."""
         centres = x.unsqueeze(2) + torch.einsum("tpij,pmj->tpmi", F, self.offset)
         covariances = self.spread.square()[:, None, None] * (F @ F.mT)
         return centres.flatten(1, 2), covariances.repeat_interleave(self.offset.shape[1], dim=1)
@@ -203,7 +203,7 @@ def make_scene(
     cameras = orbit(film)
     recording = folder / RECORDING
     nerfstudio.write_transforms(recording, cameras, times, held_out=film.held_out)
-    dense = dress(plan.body, film.density, seed=plan.name, device=device)
+    dense = surround_with_gaussians(plan.body, film.density, seed=plan.name, device=device)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         previews = _film(dense, frames, cameras, film, recording, draw, pool, advance)
     _write_preview(previews, folder / "preview.png")
@@ -221,7 +221,7 @@ def make_scene(
 
 
 def move(plan: Plan, film: Film, device: torch.device) -> ParticleState:
-    """The true motion, frames x (T, P, 3) and F (T, P, 3, 3) first of all."""
+    """Simulate the true motion; return frames with x (T, P, 3) and F (T, P, 3, 3)."""
     simulator = Simulator(plan.scene, plan.body, density=plan.law["density"], device=device)
     if film.frames == 1:
         return ParticleState(*(part[None] for part in simulator.state))
@@ -231,13 +231,13 @@ def move(plan: Plan, film: Film, device: torch.device) -> ParticleState:
 
 
 def orbit(film: Film) -> Cameras:
-    """The cameras of a film."""
+    """Return the cameras of a film."""
     options = {"target": film.target, "radius": film.radius, "elevations": film.elevations, "angle": film.angle}
     return convert.orbit(film.views, width=film.width, height=film.height, start=18.0, **options)
 
 
-def dress(body: Body, density: int, *, seed: str, device: torch.device | str = "cpu") -> Dense:
-    """Gaussians around the particles of a body, with the texture of this seed."""
+def surround_with_gaussians(body: Body, density: int, *, seed: str, device: torch.device | str = "cpu") -> Dense:
+    """Surround the particles of a body with Gaussians, textured by this seed."""
     generator = np.random.default_rng(list(seed.encode()))
     edge = body.volume.double().pow(1 / 3).numpy()
     spread = WIDTH * edge / density ** (1 / 3)
@@ -248,7 +248,7 @@ def dress(body: Body, density: int, *, seed: str, device: torch.device | str = "
 
 
 def texture(x: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """A solid texture: RGB in 0..1 (N, 3) of points x (N, 3), patches of four colours with a fine grain.
+    """Return a solid texture: RGB in 0..1 (N, 3) of points x (N, 3), patches of four colours with a fine grain.
 
     The patches are some tenths of the body's size wide, so that optical flow finds something to follow everywhere.
     """
@@ -267,7 +267,7 @@ def texture(x: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 
 def _waves(x: np.ndarray, generator: np.random.Generator, length: float, count: int = 8) -> np.ndarray:
-    """A random field of mean square one half: waves of about this length in all directions."""
+    """Return a random field of mean square one half: waves of about this length in all directions."""
     k = generator.normal(size=(count, 3))
     k *= 2 * np.pi / (length * generator.uniform(0.7, 1.4, (count, 1)) * np.linalg.norm(k, axis=1, keepdims=True))
     return np.sin(x @ k.T + generator.uniform(0, 2 * np.pi, count)).sum(1) / np.sqrt(count)
@@ -318,7 +318,7 @@ def _write_png(path: Path, rgba: np.ndarray, compression: int) -> None:
 
 
 def _write_preview(images: np.ndarray, path: Path, side: int = 160) -> None:
-    """A sheet of two views over time, on white."""
+    """Return a sheet of two views over time, on white."""
     rows = []
     for row in images:
         rgb = [(i[..., :3] * (i[..., 3:] / 255) + 255 - i[..., 3:]).astype(np.uint8) for i in row]
@@ -327,7 +327,7 @@ def _write_preview(images: np.ndarray, path: Path, side: int = 160) -> None:
 
 
 def _set_off(body: Body, given: Mapping[str, Any]) -> tuple[Body, Motion]:
-    """The body with the velocity that the entry gives, else with its own, and that motion, which must be rigid."""
+    """Return the body with the velocity that the entry gives, else with its own, and that motion, which must be rigid."""
     centre = tuple(round(c, 6) for c in body.x.double().mean(0).tolist())
     if "velocity" in given or "angular_velocity" in given:
         velocity = vector(given.get("velocity", [0.0, 0.0, 0.0]), "velocity")
@@ -340,7 +340,7 @@ def _set_off(body: Body, given: Mapping[str, Any]) -> tuple[Body, Motion]:
 
 
 def _rigid(body: Body, centre: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Velocity of the centre and angular velocity of a body that moves as a rigid one."""
+    """Return the velocity of the centre and the angular velocity of a body that moves as a rigid one."""
     r, v = body.x.double() - torch.tensor(centre, dtype=torch.float64), body.v.double()
     mean = v.mean(0)
     inertia = r.square().sum() * torch.eye(3, dtype=torch.float64) - r.T @ r

@@ -86,7 +86,7 @@ class Instance:
 
 
 def plan(setup: Setup) -> list[Instance]:
-    """All trajectories in their order: the training instances family by family, then the held-out ones."""
+    """Return all trajectories in their order: the training instances family by family, then the held-out ones."""
     made = []
     for split, numbers in (
         ("train", range(setup.instances)),
@@ -183,7 +183,7 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
 
 
 def _samples(setup: Setup, F: Tensor, C: Tensor, elastic: ElasticLaw, plastic: PlasticLaw) -> Tensor:
-    """The recorded columns (T, P, 27) of a rollout's frames F, C (K, P, 3, 3).
+    """Return the recorded columns (T, P, 27) of a rollout's frames F, C (K, P, 3, 3).
 
     The targets are the laws in float64 of the float32 inputs that are stored, so that they are exact for them; the rollout's own
     F differs from them by its rounding.
@@ -211,7 +211,7 @@ def _write_index(folder: Path, setup: Setup, everything: list[Instance]) -> None
 
 
 def _statistics(path: Path) -> dict[str, float]:
-    """Root mean square over the samples of the Frobenius norms of the stress [Pa] and of the plastic correction F_hat - F_tr [-]."""
+    """Return the RMS over the samples of the Frobenius norms of the stress [Pa] and of the plastic correction F_hat - F_tr [-]."""
     array = np.load(path, mmap_mode="r")
     stress = residual = 0.0
     for rows in np.array_split(array, max(1, len(array) // 100)):

@@ -43,12 +43,12 @@ class Order:
         self._epoch: tuple[int, torch.device] | None = None
 
     def __len__(self) -> int:
-        """Steps in an epoch."""
+        """Return the number of steps in an epoch."""
         full, rest = divmod(len(self.rows), self.samples)
         return full + (1 if rest and not self.drop_last else 0)
 
     def __call__(self, epoch: int, step: int, device: torch.device) -> Tensor:
-        """Rows of each trajectory, (M, n) int64; the last step of an epoch may have fewer."""
+        """Return rows of each trajectory, (M, n) int64; the last step of an epoch may have fewer."""
         if self._epoch != (epoch, device):
             seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0] >> np.uint64(1))
             generator = torch.Generator().manual_seed(seed)
@@ -76,7 +76,7 @@ class Resumable(Generic[T]):
         self._resume: tuple[int, int] | None = None
 
     def batches(self, epoch: int, start: int) -> Iterable[T]:
-        """The batches of an epoch from number `start` on."""
+        """Return the batches of an epoch from number `start` on."""
         raise NotImplementedError
 
     @property

@@ -179,7 +179,7 @@ class TrajectoryDataModule(LightningDataModule):
         return torch.isin(block, chosen), points
 
     def rows(self, part: str) -> Tensor:
-        """Row numbers t P + p of a part of each trajectory: `train`, or held out by `particles`, or else by `steps`."""
+        """Return row numbers t P + p of a part of each trajectory: `train`, or held out by `particles` or by `steps`."""
         late, points = (m for m in self.held_out)
         masks = {
             "train": ~late[:, None] & ~points,
@@ -229,11 +229,11 @@ class TrajectoryDataModule(LightningDataModule):
     # Samples.
 
     def gather(self, epoch: int, step: int) -> TrajectoryBatch:
-        """The training batch of a step, read from the files: M n samples sorted by trajectory."""
+        """Return the training batch of a step, read from the files: M n samples sorted by trajectory."""
         return self.files.gather(self.order(epoch, step, torch.device("cpu")))
 
     def instance_batches(self) -> tuple[TrajectoryBatch, TrajectoryBatch]:
-        """Samples of the held-out instances: (to fit a latent with, to score it with).
+        """Return samples of the held-out instances: (to fit a latent with, to score it with).
 
         The first come from the steps and particles that training uses, the second from the held-out ones. Both are sorted by
         instance (`trajectory` counts the held-out instances from 0) with min(instance_samples, all there are) samples each.
@@ -254,7 +254,7 @@ class TrajectoryDataModule(LightningDataModule):
         return Batches([files.gather(part) for part in rows.split(samples, dim=1)])
 
     def _held_out_rows(self, samples: int, trajectories: int, *, salt: int) -> Tensor:
-        """Half from the held-out particles, half from the held-out steps, (trajectories, <= samples)."""
+        """Draw half from the held-out particles, half from the held-out steps, (trajectories, <= samples)."""
         points = self._draw(self.rows("particles"), (samples + 1) // 2, trajectories, salt=salt)
         late = self._draw(self.rows("steps"), samples // 2, trajectories, salt=salt + 100)
         return torch.cat([points, late], dim=1)
@@ -264,7 +264,7 @@ class TrajectoryDataModule(LightningDataModule):
         return torch.stack([rows[torch.randperm(len(rows), generator=generator)[:samples]] for _ in range(trajectories)])
 
     def _preload(self, device: torch.device) -> bool:
-        """Put the training set on the device if that is wished and possible; whether it is there."""
+        """Put the training set on the device if that is asked for and possible; return whether it is there."""
         if self.preload is False:
             return False
         if self._resident is not None and self._resident.device == device:

@@ -28,7 +28,7 @@ from neuido.data.undeclared.random_effects import (
     draw_effect,
     entry_of,
 )
-from neuido.data.undeclared.sizing import LEAST, MOST, OVER_FLOOR, Again, rms, short, sized
+from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, OVER_FLOOR, Redraw, rms, rounded_to_4, scale_to_separation
 from neuido.errors import UserError
 from neuido.types import Body
 
@@ -40,7 +40,7 @@ SLOW_LOSS = ("drag_linear", "viscosity_shear", "restitution")
 
 
 def draw_kinds(rng: np.random.Generator, case: Case) -> tuple[str, ...]:
-    """The effects of a case: none of them, one, two, or one outside the library."""
+    """Draw the effects of a case: none, one, two, or one outside the library."""
     if case.kind is not None:
         return () if case.kind == "none" else tuple(case.kind.split("+"))
     u = rng.random()
@@ -58,10 +58,10 @@ def draw_kinds(rng: np.random.Generator, case: Case) -> tuple[str, ...]:
 def body_case(
     rng: np.random.Generator, case: Case, name: str, device: str, advance: Callable[[int], Any]
 ) -> tuple[Callable[[Path], None], dict[str, Any]]:
-    """What writes the folder, and the key.
+    """Return a function that writes the folder, and the key.
 
     Raises:
-        Again: What was drawn does not make a case.
+        Redraw: What was drawn does not make a case.
     """
     made = BodyCase(rng, case, device, advance)
     made.size_effects(case.separation)
@@ -109,7 +109,7 @@ class BodyCase:
         self.effects: list[Drawn] = []
 
     def _solver(self, case: Case, entries: Sequence[Kind]) -> tuple[str, list[str]]:
-        """A solver, and the declared plasticities that suit it and the effects."""
+        """Draw a solver, and return the declared plasticities that suit it and the effects."""
         models = [m for m in ANY if all(m in e.models for e in entries)]
         if not models:
             raise UserError(f"case.kind = {'+'.join(self.kinds)}: no declared plasticity suits both")
@@ -121,7 +121,7 @@ class BodyCase:
             if case.solver is not None and case.kind is not None:
                 raise UserError(f"case.solver = elements does not suit {'+'.join(self.kinds)}: give same or finer")
             if case.solver is not None:
-                raise Again(f"elements do not suit {'+'.join(self.kinds)}")
+                raise Redraw(f"elements do not suit {'+'.join(self.kinds)}")
             chosen = "finer"
         if len(models) == len(ANY) and self.rng.random() < 0.5:
             models = [ELASTIC]
@@ -133,22 +133,22 @@ class BodyCase:
         return {key: value for one in self.effects for key, value in one.values.items()}
 
     def run(self, solver: Solver, values: Mapping[str, float], started: list[Body] | None = None, extra: float = 0.0) -> Motion:
-        """Move the body from every launch (or as `started`)."""
+        """Move the body from every launch, or from the states `started`."""
         law = {"density": self.material.density, "elasticity": self.material.elasticity, "plasticity": self.material.plasticity}
         started = self.declared if started is None else started
         seconds = self.seconds + extra
         try:
             moved = move(solver, self.scene, started, law, values, seconds=seconds, interval=self.interval / 2, device=self.device)
         except UserError as error:
-            raise Again(str(error)) from error
+            raise Redraw(str(error)) from error
         finally:
             self.advance(1)
         if not (moved.x.min() > MARGIN and moved.x.max() < 1 - MARGIN):
-            raise Again("the body leaves the domain")
+            raise Redraw("the body leaves the domain")
         return moved
 
     def seen(self, motion: Motion) -> np.ndarray:
-        """Marked points at the frames, (S, T, N, 3)."""
+        """Return the marked points at the frames, (S, T, N, 3)."""
         return np.stack([self.markers.follow(motion.at(self.at, i)[0], i) for i in range(len(motion.x))])
 
     def size_effects(self, separation: float | None) -> None:
@@ -173,14 +173,14 @@ class BodyCase:
         def apart(one: Drawn) -> float:
             return rms(self.seen(self.run(self.suggested, one.values, self.declared[:1]))[0] - self.plain[0])
 
-        least = 1.2 * max(LEAST * self.noise, OVER_FLOOR * floor)
+        least = 1.2 * max(MIN_SEPARATION * self.noise, OVER_FLOOR * floor)
         for kind in self.kinds:
             ratio = separation or float(np.exp(self.rng.uniform(np.log(20.0), np.log(110.0))))
-            target = min(max(ratio * self.noise, 1.5 * OVER_FLOOR * floor), 0.9 * MOST * self.noise)
-            self.effects.append(sized(draw_effect(kind, self.rng, scales), target, apart, least).rounded())
+            target = min(max(ratio * self.noise, 1.5 * OVER_FLOOR * floor), 0.9 * MAX_SEPARATION * self.noise)
+            self.effects.append(scale_to_separation(draw_effect(kind, self.rng, scales), target, apart, least).rounded())
 
     def record(self, nuisances: bool | None) -> None:
-        """Simulate with everything, with all but each effect, and at the suggested setting."""
+        """Simulate with all effects, without each one, and at the suggested setting."""
         wanted = nuisances if nuisances is not None else not self.kinds and self.rng.random() < 0.5
         self.off = wrong_nuisances(self.rng, self.plain, self.interval, float(np.ptp(self.points, axis=0).max())) if wanted else []
         started = [
@@ -199,21 +199,23 @@ class BodyCase:
             without = self.seen(self.run(self.solver, rest)) if rest else self.bare
             self.apart = [min(a, rms(x - y)) for a, x, y in zip(self.apart, self.recorded, without)]
         self.reference = [rms(x - y) for x, y in zip(self.recorded, reference)]
-        if self.effects and not (LEAST <= self.apart[0] / self.noise <= MOST and self.apart[1] >= LEAST * self.noise):
-            raise Again(f"the effect moves the points by {self.apart[0]:.2g} and {self.apart[1]:.2g} m")
+        if self.effects and not (
+            MIN_SEPARATION <= self.apart[0] / self.noise <= MAX_SEPARATION and self.apart[1] >= MIN_SEPARATION * self.noise
+        ):
+            raise Redraw(f"the effect moves the points by {self.apart[0]:.2g} and {self.apart[1]:.2g} m")
         if self.effects and self.apart[0] < OVER_FLOOR * self.reference[0]:
-            raise Again("the effect moves the points by little more than the solvers differ")
+            raise Redraw("the effect moves the points by little more than the solvers differ")
 
     def truth(self) -> dict[str, Any]:
-        """The key, in the form of an experiment's truth.yaml."""
+        """Return the key, in the form of an experiment's truth.yaml."""
         rows = []
         for i in range(2):
             row: dict[str, Any] = {"name": f"take{i + 1}", "role": ("fit", "held_out")[i]}
             if self.effects:
-                row["separation_rms_m"] = short(self.apart[i])
-                row["separation_over_noise"] = short(self.apart[i] / self.noise)
-            row["reference_rms_m"] = short(self.reference[i])
-            row["best_achievable_rms_m"] = short(math.hypot(self.noise, self.reference[i]))
+                row["separation_rms_m"] = rounded_to_4(self.apart[i])
+                row["separation_over_noise"] = rounded_to_4(self.apart[i] / self.noise)
+            row["reference_rms_m"] = rounded_to_4(self.reference[i])
+            row["best_achievable_rms_m"] = rounded_to_4(math.hypot(self.noise, self.reference[i]))
             rows.append(row)
         material = self.material
         figures = {k: v for part in (material.elasticity, material.plasticity) for k, v in part.items() if k != "law"}
@@ -230,7 +232,7 @@ class BodyCase:
         return truth | ({"nuisances": {row["name"]: own for row, own in zip(rows, self.off)}} if self.off else {})
 
     def writer(self, name: str) -> Callable[[Path], None]:
-        """What writes the experiment, with its noise and its gaps, and reads it again."""
+        """Return a function that writes the experiment, with noise and gaps, and reads it again."""
         gaps = self.rng.random() < 0.3
         recordings = []
         for i, x in enumerate(self.recorded):

@@ -15,7 +15,7 @@ from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, entry_of
-from neuido.data.undeclared.sizing import Again, rms, short, sized
+from neuido.data.undeclared.sizing import Redraw, rms, rounded_to_4, scale_to_separation
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import material
@@ -34,7 +34,7 @@ PERIOD = 2.0
 def curve_case(
     rng: np.random.Generator, case: Case, name: str, device: str, advance: Callable[[int], Any]
 ) -> tuple[Callable[[Path], None], dict[str, Any]]:
-    """What writes the folder, and the key. The CPU does it, whatever the device."""
+    """Return a function that writes the folder, and the key; the CPU computes it, whatever the device."""
     for option in ("solver", "nuisances", "particles", "seconds"):
         if getattr(case, option):
             raise UserError(f"case.{option} = {getattr(case, option)} is for bodies; leave it out with case.measured = {case.measured}")
@@ -53,15 +53,22 @@ def _effect(
         return None
     values, names, least, most = sizes[kind]
     drawn = Drawn(kind, {f"{kind}.{k}": float(v) for k, v in values.items()}, tuple(f"{kind}.{k}" for k in names.split()), least, most)
-    found = sized(drawn, target, lambda one: apart(one.values), 16.0 * noise)
+    found = scale_to_separation(drawn, target, lambda one: apart(one.values), 16.0 * noise)
     return found.rounded()
 
 
 def _rows(true: list[np.ndarray], plain: list[np.ndarray], noise: float, roles: list[str], names: list[str], unit: str) -> list[dict]:
     rows = []
     for x, y, role, name in zip(true, plain, roles, names):
-        apart = rms(x - y)
-        rows.append({"name": name, "role": role, f"separation_rms_{unit}": short(apart), "separation_over_noise": short(apart / noise)})
+        separation = rms(x - y)
+        rows.append(
+            {
+                "name": name,
+                "role": role,
+                f"separation_rms_{unit}": rounded_to_4(separation),
+                "separation_over_noise": rounded_to_4(separation / noise),
+            }
+        )
     return rows
 
 
@@ -91,7 +98,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
             found.append(stress_along(specimen, mode, given, time=torch.from_numpy(t))[0, :, 0].numpy())
         advance(1)
         if not all(np.isfinite(one).all() for one in found):
-            raise Again("the specimen finds no equilibrium")
+            raise Redraw("the specimen finds no equilibrium")
         return found
 
     plain = stresses({})
@@ -111,7 +118,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
                      **{k: v for part in (elasticity, plasticity) for k, v in part.items() if k != "law"}},
         "started_from": start,
         "simulated_with": "the law along the path",
-        "noise": short(noise),
+        "noise": rounded_to_4(noise),
         "tests": _rows(true, plain, noise, roles, names, "pa") if drawn else [],
     }  # fmt: skip
     tests = []
@@ -127,7 +134,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
 
 
 def _test_sizes(rng: np.random.Generator, young: float, flow: float) -> Sizes:
-    """Of each effect: values to start from, the parameters that are sized, their least and their most."""
+    """Return for each effect its starting values, the parameters that are sized, and their smallest and largest values."""
     return {
         "viscosity_shear": ({"eta": 0.01 * young * PERIOD}, "eta", 0.01, 30),
         "maxwell": ({"ratio": 0.3, "time": PERIOD * 10 ** rng.uniform(-1.3, 0.0)}, "ratio", 0.05, 8),
@@ -197,7 +204,7 @@ def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance
 
 
 def _track_sizes(rng: np.random.Generator) -> Sizes:
-    """As `_test_sizes`."""
+    """Return for each effect of a track what `_test_sizes` returns for a test."""
     level = np.array([1.0, 0.2, 1.0]) * rng.normal(size=3)
     level /= np.linalg.norm(level)
     turn = rng.normal(size=3)

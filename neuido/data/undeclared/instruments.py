@@ -38,21 +38,21 @@ class Markers:
             self.maps.append((index.numpy(), weight.numpy()))
 
     def follow(self, x: np.ndarray, recording: int) -> np.ndarray:
-        """Their positions (T, N, 3) where the particles are at x (T, P, 3)."""
+        """Return the markers' positions (T, N, 3) for particles at x (T, P, 3)."""
         if not self.glued:
             return x[:, self.track]
         index, weight = self.maps[recording]
         return np.einsum("nk,tnkc->tnc", weight, x[:, index])
 
     def named(self, recording: int) -> dict[str, torch.Tensor]:
-        """`track` or `anchor` of a recording."""
+        """Return `track` or `anchor` of a recording."""
         if self.glued:
             return {"anchor": torch.from_numpy(self.places[recording]).float()}
         return {"track": torch.from_numpy(self.track.astype(np.int64))}
 
 
 def wrong_nuisances(rng: np.random.Generator, plain: np.ndarray, interval: float, length: float) -> list[dict[str, float]]:
-    """What is off in each of two recordings, plain motion (2, T, N, 3) [m]."""
+    """Draw the nuisances of two recordings whose motion without nuisances is (2, T, N, 3) [m]."""
     out = []
     for i in range(2):
         speed = fastest(plain[i], interval)
@@ -67,7 +67,7 @@ def wrong_nuisances(rng: np.random.Generator, plain: np.ndarray, interval: float
 
 
 def recorded(motion: Motion, markers: Markers, i: int, at: np.ndarray, off: Mapping[str, float]) -> np.ndarray:
-    """What the instruments see: clock and ruler may be off."""
+    """Return the positions that the instruments measure; clock and ruler may be off."""
     place, _ = motion.at(at * (1 + off.get("time_base", 0.0)) + off.get("release_time", 0.0), i)
     x = markers.follow(place, i)
     centre = x[0].mean(axis=0)
@@ -75,10 +75,10 @@ def recorded(motion: Motion, markers: Markers, i: int, at: np.ndarray, off: Mapp
 
 
 def vector(own: Mapping[str, float], name: str) -> np.ndarray:
-    """The velocity or the spin of some nuisances."""
+    """Return the velocity or the spin of some nuisances."""
     return np.array([own[f"{name}_{a}"] for a in "xyz"])
 
 
 def fastest(x: np.ndarray, interval: float) -> float:
-    """The largest speed of the mean point [m/s], (T, N, 3)."""
+    """Return the largest speed of the mean point [m/s], (T, N, 3)."""
     return float(np.linalg.norm(np.diff(x.mean(axis=1), axis=0), axis=1).max() / interval)

@@ -38,7 +38,7 @@ class Solver(NamedTuple):
     """Elements a particle."""
 
     def words(self) -> str:
-        """For the key."""
+        """Return the solver in words, for the key."""
         if self.name == "elements":
             return f"explicit finite elements, {self.tetrahedra} linear tetrahedra a cell, {self.density:.2f} elements a particle"
         return f"a material point method, {self.cells} cells a side, {self.dt:g} s a substep"
@@ -55,7 +55,7 @@ class Motion(NamedTuple):
     """From frame to frame [s]."""
 
     def at(self, times: np.ndarray, recording: int) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities (T, P, 3) of a recording at some times by cubic Hermite interpolation; uniform motion before 0."""
+        """Interpolate positions and velocities (T, P, 3) of a recording by cubic Hermite splines; uniform motion before 0."""
         x, v, h = self.x[recording], self.v[recording], self.interval
         k = np.clip(np.floor(times / h + 1e-9).astype(int), 0, len(x) - 2)
         u = (times / h - k)[:, None, None]
@@ -129,7 +129,7 @@ def _simulator(solver: Solver, scene: Scene, bodies: Sequence[Body], density: fl
 
 
 def _sorted(values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """The effects of the library by flat names, and those outside it by name and parameter."""
+    """Return the effects of the library by flat names, and those outside it by name and parameter."""
     known: dict[str, float] = {}
     own: dict[str, dict[str, float]] = {}
     for name, value in values.items():
@@ -142,7 +142,7 @@ def _sorted(values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, di
 
 
 def _graded(simulator: Simulator | FiniteElements, slope: Mapping[str, float]) -> Tensor:
-    """Masses with a gradient over each body, the same in all."""
+    """Return masses with a gradient over each body, the same in all."""
     x, mass = simulator.state.x.double(), simulator.mass.double()
     s = torch.tensor([slope[a] for a in "xyz"], dtype=torch.float64, device=x.device)
     factor = torch.cat([linear_gradient(x[i:j], s) for i, j in zip(simulator.particles.offsets[:-1], simulator.particles.offsets[1:])])
@@ -151,7 +151,7 @@ def _graded(simulator: Simulator | FiniteElements, slope: Mapping[str, float]) -
 
 
 def _shaken(lift: Mapping[str, float], steps: int, dt: float) -> dict[str, Any]:
-    """The inertia in the frame of a floor at amplitude (1 - cos w t); it starts at rest, so velocities are the same in both frames."""
+    """Return the inertia in the frame of a floor at amplitude (1 - cos w t), which starts at rest: velocities agree in both frames."""
     w = 2 * math.pi * lift["frequency"]
     t = torch.arange(steps + 1, dtype=torch.float64) * dt
     force = torch.zeros(steps + 1, 3, dtype=torch.float64)
@@ -162,7 +162,7 @@ def _shaken(lift: Mapping[str, float], steps: int, dt: float) -> dict[str, Any]:
 def _split(
     simulator: Simulator, elasticity, plasticity, effects: Effects, own: dict[str, dict[str, float]], frames: int, every: int
 ) -> ParticleState:
-    """Rollouts between kicks (Strang's splitting); the library's effects beside them must not remember anything."""
+    """Alternate rollouts and kicks (Strang's splitting); effects of the library beside them must have no memory."""
     dt = float(simulator.dt[0])
     pieces = max(1, math.ceil(every * dt / SPLIT - 1e-9))
     while every % pieces:
@@ -214,7 +214,7 @@ def _fields(own: Mapping[str, Mapping[str, float]], mean, scene: Tensor, state: 
 
 
 def _kick(state: ParticleState, fields: Sequence[Field], h: float) -> ParticleState:
-    """Velocities, and their gradients by central differences across a millimetre."""
+    """Return velocities, and their gradients by central differences across a millimetre."""
     x, v, C, F = state
     reach = 1e-3
     for field in fields:

@@ -38,7 +38,7 @@ class Material(NamedTuple):
     """Starting values of `free`."""
 
     def model(self) -> dict[str, Any]:
-        """The `model` of an experiment file, with what is believed."""
+        """Return the `model` of an experiment file, with the assumed parameters."""
 
         def part(given: dict[str, Any]) -> dict[str, Any]:
             return {key: self.believed.get(key, value) for key, value in given.items()}
@@ -47,7 +47,7 @@ class Material(NamedTuple):
 
 
 def draw_body(rng: np.random.Generator, count: int) -> tuple[str, np.ndarray, float]:
-    """A shape: its name, the points of a lattice in it about their mean (P, 3) [m], and the volume of each [m^3]."""
+    """Draw a shape: its name, lattice points in it about their mean (P, 3) [m], and the volume of each [m^3]."""
     name = str(rng.choice(SHAPES))
     half = rng.uniform([0.1, 0.08, 0.08], [0.16, 0.13, 0.13])
     if name in ("ball", "cross"):
@@ -81,7 +81,7 @@ def draw_body(rng: np.random.Generator, count: int) -> tuple[str, np.ndarray, fl
 def draw_launches(
     rng: np.random.Generator, points: np.ndarray, floor: float, seconds: float, *, turned: bool, sliding: bool, hard: bool
 ) -> list[Launch]:
-    """Two launches of a body [m] (P, 3) over a floor, towards each other's side and with other spins.
+    """Draw two launches of a body [m] (P, 3) over a floor, in opposite directions and with different spins.
 
     Args:
         rng: Source.
@@ -121,7 +121,7 @@ def draw_launches(
 
 
 def rotation(rng: np.random.Generator, angle: float) -> np.ndarray:
-    """A turn by `angle` [rad] about a random axis, (3, 3)."""
+    """Draw a rotation by `angle` [rad] about a random axis, (3, 3)."""
     a = rng.normal(size=3)
     x, y, z = a / np.linalg.norm(a)
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -131,7 +131,7 @@ def rotation(rng: np.random.Generator, angle: float) -> np.ndarray:
 def launched(
     points: np.ndarray, volume: float, launch: Launch, *, velocity: np.ndarray | None = None, spin: np.ndarray | None = None
 ) -> Body:
-    """The body at t = 0; `velocity` [m/s] and `spin` [rad/s] are added to the launch's."""
+    """Return the body at t = 0; `velocity` [m/s] and `spin` [rad/s] are added to the launch's."""
     arm = points @ launch.rotation.T
     v = launch.velocity + (0.0 if velocity is None else velocity) + arm @ launch.gradient.T
     if spin is not None:
@@ -141,7 +141,7 @@ def launched(
 
 
 def draw_material(rng: np.random.Generator, plastic: str, *, soft: bool = False) -> Material:
-    """A material of a declared kind of plasticity (identity, von_mises, drucker_prager) with wrong starting values of its free figures.
+    """Draw a material of a kind of plasticity (identity, von_mises, drucker_prager), its free parameters with wrong starting values.
 
     Of a `soft` one the modulus is below 1e5 Pa.
     """
@@ -174,7 +174,7 @@ def draw_material(rng: np.random.Generator, plastic: str, *, soft: bool = False)
 
 
 def draw_scene(rng: np.random.Generator, material: Material, *, slippery: bool = False) -> Scene:
-    """The declared scene with the suggested grid and step; a `slippery` floor has no friction."""
+    """Draw the declared scene with the suggested grid and step; a `slippery` floor has no friction."""
     floor = float(rng.choice(FLOORS))
     sand = material.plasticity["law"] == "drucker_prager"
     mu = 0.4 if sand else 0.0 if slippery else float(rng.choice([0.0, 0.0, 0.2, 0.3]))

@@ -49,12 +49,12 @@ class Drawn(NamedTuple):
     """Factors on the sizes as drawn."""
 
     def times(self, factor: float) -> "Drawn":
-        """With sizes `factor` as large."""
+        """Return the effect with its sizes multiplied by `factor`."""
         values = {name: value * factor if name in self.sizes else value for name, value in self.values.items()}
         return self._replace(values=values, least=self.least / factor, most=self.most / factor)
 
     def rounded(self, digits: int = 4) -> "Drawn":
-        """With figures that a person could read."""
+        """Return the effect with rounded parameters."""
         return self._replace(values={name: float(f"{value:.{digits}g}") for name, value in self.values.items()})
 
 
@@ -98,7 +98,7 @@ def _vector(size: Callable[[Scales], float], most: float, *, level: bool = False
 
 
 def _scalar(name: str, size: Callable[[Scales], float], most: float, *, least: float = 0.02, negative: float = 0.0, low: float = 1.0):
-    """`low` is the share of `most` that a negative size may reach."""
+    """Return a drawer of one number; `low` is the share of `most` that a negative size may reach."""
 
     def draw(rng: np.random.Generator, s: Scales):
         sign = _sign(rng, negative) if negative else 1.0
@@ -224,7 +224,7 @@ OUTSIDE: dict[str, Kind] = {
 
 
 def draw_effect(kind: str, rng: np.random.Generator, scales: Scales) -> Drawn:
-    """An effect of a kind with figures of a usual size."""
+    """Draw an effect of a kind with parameters of a usual size."""
     entry = KINDS[kind] if kind in KINDS else OUTSIDE[kind]
     values, sizes, least, most = entry.draw(rng, scales)
     name = kind.partition(":")[0]
@@ -234,7 +234,7 @@ def draw_effect(kind: str, rng: np.random.Generator, scales: Scales) -> Drawn:
 
 
 def entry_of(drawn: Drawn, *, free: tuple[str, ...] = ()) -> dict:
-    """What the key says of an effect, in the form of an experiment's `undeclared` list."""
+    """Return the key's entry for an effect, in the form of an experiment's `undeclared` list."""
     kind = KINDS[drawn.kind] if drawn.kind in KINDS else OUTSIDE[drawn.kind]
     name = drawn.kind.partition(":")[0]
     values = {key.partition(".")[2]: value for key, value in drawn.values.items()}

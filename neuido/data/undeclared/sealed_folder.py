@@ -17,7 +17,7 @@ from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.curves import curve_case
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
-from neuido.data.undeclared.sizing import LEAST, MOST, Again
+from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, Redraw
 from neuido.errors import UserError
 from neuido.physics.runtime.device import choose_device
 
@@ -26,7 +26,7 @@ TRIES = 12
 
 
 def make(seed: int, out: str | Path, *, case: Case, device: str, progress: bool) -> Path:
-    """`undeclared.make_undeclared`."""
+    """Do the work of `undeclared.make_undeclared`."""
     folder = Path(out).expanduser().absolute()
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", folder.name):
         raise UserError(f"out = {out}: the folder's name is the case's; give letters, digits, - and _")
@@ -45,7 +45,7 @@ def make(seed: int, out: str | Path, *, case: Case, device: str, progress: bool)
             try:
                 write_folder, truth = maker(rng, case, folder.name, chosen, bar.update)
                 break
-            except Again as again:
+            except Redraw as again:
                 reason = str(again)
                 bar.set_postfix_str(f"drawn again: {reason}")
         else:
@@ -78,8 +78,10 @@ def _check(case: Case) -> None:
             raise UserError(f"case.kind = {case.kind!r}; at most two different ones, and two only of the library")
     if case.nuisances and case.kind not in (None, "none"):
         raise UserError("case.nuisances goes with case.kind none: an effect beside them could not be scored")
-    if case.separation is not None and not LEAST <= case.separation <= MOST:
-        raise UserError(f"case.separation = {case.separation}; it must lie in {LEAST:g} to {MOST:g} standard deviations of the noise")
+    if case.separation is not None and not MIN_SEPARATION <= case.separation <= MAX_SEPARATION:
+        raise UserError(
+            f"case.separation = {case.separation}; it must lie in {MIN_SEPARATION:g} to {MAX_SEPARATION:g} standard deviations of the noise"
+        )
     if case.particles < 0 or (0 < case.particles < 100) or case.seconds < 0 or (0 < case.seconds < 0.05):
         raise UserError(f"case.particles = {case.particles}, case.seconds = {case.seconds}: give at least 100 and 0.05, or 0 to draw them")
 

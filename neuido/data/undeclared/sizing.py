@@ -7,18 +7,18 @@ import numpy as np
 
 from neuido.data.undeclared.random_effects import Drawn
 
-LEAST, MOST = 15.0, 150.0
+MIN_SEPARATION, MAX_SEPARATION = 15.0, 150.0
 """Separation over noise that a case may have."""
 OVER_FLOOR = 2.0
 """Separation over what the solvers differ by, at the least; an effect below it could not be named by anybody."""
 
 
-class Again(Exception):
+class Redraw(Exception):
     """What was drawn does not make a case."""
 
 
-def sized(drawn: Drawn, target: float, separation: Callable[[Drawn], float], least: float) -> Drawn:
-    """The effect scaled until it moves the points by `target` [m], as near as its range allows; by `least` at the least."""
+def scale_to_separation(drawn: Drawn, target: float, separation: Callable[[Drawn], float], least: float) -> Drawn:
+    """Scale an effect until it moves the points by `target` [m], as near as its range allows, and by at least `least`."""
     s = separation(drawn)
     low, high = drawn.least, drawn.most
     factor, slope, previous = 1.0, 1.0, None
@@ -34,15 +34,15 @@ def sized(drawn: Drawn, target: float, separation: Callable[[Drawn], float], lea
             break
         s = separation(drawn.times(factor))
     if not least < s < 2.0 * target:
-        raise Again(f"{drawn.kind} moves the points by {s:.2g} m and not by {target:.2g} m")
+        raise Redraw(f"{drawn.kind} moves the points by {s:.2g} m and not by {target:.2g} m")
     return drawn.times(factor)
 
 
 def rms(d: np.ndarray) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(d**2)))
 
 
-def short(value: float) -> float:
-    """Four digits of it."""
+def rounded_to_4(value: float) -> float:
+    """Round to four digits."""
     return float(f"{value:.4g}")

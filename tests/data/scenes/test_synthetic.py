@@ -99,7 +99,7 @@ def test_images_show_the_particles(ball):
 
 def test_gaussians_follow_a_deformation():
     body = scenes.body_from_dict(BALL["body"], None)
-    dense = synthetic.dress(body, 3, seed="a")
+    dense = synthetic.surround_with_gaussians(body, 3, seed="a")
     F = torch.tensor([[1.2, 0.3, 0.0], [0.0, 0.9, 0.0], [0.1, 0.0, 1.0]])
     means, covariances = dense.at((body.x @ F.T)[None], F.expand(1, len(body.x), 3, 3))
     start, round_ = dense.at(body.x[None], torch.eye(3).expand(1, len(body.x), 3, 3))
@@ -107,8 +107,8 @@ def test_gaussians_follow_a_deformation():
     torch.testing.assert_close(means, start @ F.T)
     torch.testing.assert_close(covariances, F @ round_ @ F.T)
     assert dense.colour.std(0).min() > 0.05 and dense.colour.min() >= 0 and dense.colour.max() <= 1
-    assert torch.equal(dense.colour, synthetic.dress(body, 3, seed="a").colour)
-    assert not torch.equal(dense.colour, synthetic.dress(body, 3, seed="b").colour)
+    assert torch.equal(dense.colour, synthetic.surround_with_gaussians(body, 3, seed="a").colour)
+    assert not torch.equal(dense.colour, synthetic.surround_with_gaussians(body, 3, seed="b").colour)
 
 
 def test_same_bytes_again_and_whole_scenes_are_kept(ball, tmp_path):
