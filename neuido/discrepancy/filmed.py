@@ -10,7 +10,8 @@ from torch import Tensor
 from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import project
 from neuido.data.measured.experiment import Experiment, Recording
-from neuido.data.scenes.filmed_scene import RECONSTRUCTION, from_background, read_body, read_motion
+from neuido.data.scenes.filmed_scene import RECONSTRUCTION, read_body, read_motion
+from neuido.data.scenes.masks import from_background
 from neuido.data.scenes.multiview import SceneViews
 from neuido.discrepancy.silhouettes import LEVEL, usable
 from neuido.errors import UserError
@@ -109,7 +110,7 @@ def read_film(experiment: Experiment, recording: Recording) -> Film:
     found = recording.video
     kept = [v for v in range(len(found.views)) if v not in found.held_out] or list(range(len(found.views)))
     kept = [kept[i] for i in _evenly(len(kept), MOST_VIEWS)]
-    views = SceneViews(found, views=[found.views[v] for v in kept], cache=False)
+    views = SceneViews(found, views=[found.views[v] for v in kept], find_masks=True, cache=False)
     frames = _evenly(len(views.frames), MOST_FRAMES)
     if len(frames) < 4:
         raise UserError(f"recording {recording.name} has {len(frames)} frames; a diagnosis needs at least 4")
@@ -198,7 +199,7 @@ def body_of(experiment: Experiment, recording: Recording) -> tuple[Body, bool]:
         raise UserError(
             f"recording {recording.name} has one view and no particles.npz: a body cannot be made of one silhouette; give x0, v0 and volume"
         )
-    views = SceneViews(found, views=chosen, cache=False)
+    views = SceneViews(found, views=chosen, find_masks=True, cache=False)
     first = min(4, len(views.frames))
     masks = np.stack([_masks(views, v, list(range(first))) for v in range(len(chosen))], axis=1)
     if body is None:

@@ -1,6 +1,13 @@
-"""COLMAP's binary `cameras.bin` and `images.bin`, as Spring-Gaus and NeuMA carry them: a set of views of one moment."""
+"""COLMAP's models, binary (`cameras.bin`, `images.bin`) or text (`cameras.txt`, `images.txt`): a set of views of one moment.
 
+Spring-Gaus and NeuMA carry binary ones. `colmap image_undistorter` writes `sparse/`, the mapper `sparse/0/`. Masks are in `masks/`, named
+`<image name>.png` as COLMAP has it, or as the image with the ending `.png`.
+"""
+
+import contextlib
+import math
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,10 +15,14 @@ import torch
 from torch import Tensor
 
 from neuido.data import cameras as convert
+from neuido.data.files.parsing import check_limit, one_line, read_text
 from neuido.data.files.values import inside
 from neuido.data.formats.layout import MultiView, Shot, assemble, natural
 from neuido.errors import UserError
 
+NAMES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+         "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE")  # fmt: skip
+"""COLMAP's lens models by their number."""
 MODELS = {0: ("f", "cx", "cy"), 1: ("fx", "fy", "cx", "cy"), 2: ("f", "cx", "cy", "k1"), 3: ("f", "cx", "cy", "k1", "k2"),
           4: ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")}  # fmt: skip
 """Parameters of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV; the other models are no pinholes."""
@@ -34,69 +45,143 @@ class Image(NamedTuple):
 
 
 def read_cameras(path: Path) -> dict[int, Camera]:
-    """Return the cameras of `cameras.bin` by their id.
+    """Return the cameras of `cameras.bin` or `cameras.txt` by their id.
 
     Raises:
         UserError: The file is missing, cut short, or has a lens that is no pinhole.
     """
-    data = _Bytes(path)
     out = {}
-    for _ in range(data.take("<Q")[0]):
-        number, model, width, height = data.take("<iiQQ")
-        if model not in MODELS:
-            raise UserError(f"{path}: camera {number} has the lens model {model}, no pinhole: undistort the images with COLMAP first")
-        given = dict(zip(MODELS[model], data.take(f"<{len(MODELS[model])}d")))
+    for number, model, width, height, values in _camera_lines(path) if path.suffix == ".txt" else _camera_records(path):
+        given = dict(zip(MODELS[model], values))
         fx, fy = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
         K = torch.tensor([[fx, 0, given["cx"]], [0, fy, given["cy"]], [0, 0, 1]], dtype=torch.float64)
         if not (fx > 0 and fy > 0 and width > 0 and height > 0 and bool(torch.isfinite(K).all())):
             raise UserError(f"{path}: camera {number} has focal lengths {fx:g}, {fy:g} and the size {width} x {height}")
-        out[number] = Camera(width, height, K, tuple(given.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")))
+        lens = tuple(given.get(key, 0.0) for key in ("k1", "k2", "p1", "p2"))
+        if not all(math.isfinite(term) for term in lens):
+            raise UserError(f"{path}: camera {number} has a lens term that is not finite: {list(lens)}")
+        check_limit(width * height, "NEUIDO_MAX_IMAGE_PIXELS", f"{path}: camera {number} has {width} x {height} pixels")
+        out[number] = Camera(width, height, K, lens)
     if not out:
         raise UserError(f"{path} holds no camera")
     return out
 
 
+def _camera_records(path: Path) -> Iterator[tuple[int, int, int, int, tuple[float, ...]]]:
+    data = _Bytes(path)
+    for _ in range(data.take("<Q")[0]):
+        number, model, width, height = data.take("<iiQQ")
+        if model not in MODELS:
+            raise _no_pinhole(path, number, NAMES[model] if 0 <= model < len(NAMES) else str(model))
+        yield number, model, width, height, data.take(f"<{len(MODELS[model])}d")
+
+
+def _camera_lines(path: Path) -> Iterator[tuple[int, int, int, int, tuple[float, ...]]]:
+    for i, line in enumerate(read_text(path).splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        with _line_errors(path, i, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"):
+            number, name, width, height, *values = line.split()
+            if name not in NAMES or NAMES.index(name) not in MODELS:
+                raise _no_pinhole(path, number, name)
+            model = NAMES.index(name)
+            if len(values) != len(MODELS[model]):
+                raise UserError(f"{path}, line {i}: {name} has {len(MODELS[model])} parameters, got {len(values)}")
+            yield int(number), model, int(width), int(height), tuple(float(value) for value in values)
+
+
+def _no_pinhole(path: Path, number: int | str, name: str) -> UserError:
+    return UserError(f"{path}: camera {number} has the lens model {name}, no pinhole: undistort the images with COLMAP first")
+
+
+@contextlib.contextmanager
+def _line_errors(path: Path, line: int, form: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, OverflowError) as error:
+        raise UserError(f"{path}, line {line} is not {form}: {one_line(error)}") from error
+
+
 def read_images(path: Path) -> list[Image]:
-    """Return the registered images of `images.bin`, by name.
+    """Return the registered images of `images.bin` or `images.txt`, by name.
 
     Raises:
         UserError: The file is missing or cut short.
     """
-    data = _Bytes(path)
     out = []
-    for _ in range(data.take("<Q")[0]):
-        _, *pose, camera = data.take("<i7di")
-        name = data.text()
-        data.skip(24 * data.take("<Q")[0])  # its 2D points
-        viewmat = convert.from_quaternion(torch.tensor(pose[:4], dtype=torch.float64), torch.tensor(pose[4:], dtype=torch.float64))
+    for name, camera, pose in _image_lines(path) if path.suffix == ".txt" else _image_records(path):
+        try:
+            viewmat = convert.from_quaternion(torch.tensor(pose[:4], dtype=torch.float64), torch.tensor(pose[4:], dtype=torch.float64))
+        except UserError as error:
+            raise UserError(f"{path}: {name}: {error}") from error
         if not bool(torch.isfinite(viewmat).all()):
             raise UserError(f"{path}: the pose of {name} holds a NaN")
         out.append(Image(name, camera, viewmat))
     return sorted(out, key=lambda image: natural(image.name))
 
 
+def _image_records(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
+    data = _Bytes(path)
+    for _ in range(data.take("<Q")[0]):
+        _, *pose, camera = data.take("<i7di")
+        name = data.text()
+        data.skip(24 * data.take("<Q")[0])  # its 2D points
+        yield name, camera, tuple(pose)
+
+
+def _image_lines(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
+    lines = [(i, line) for i, line in enumerate(read_text(path).splitlines(), 1) if not line.startswith("#")]
+    while lines and not lines[0][1].strip():  # blank lines between the comments and the first image
+        lines.pop(0)
+    for i, line in lines[::2]:  # each second line has the 2D points, and may be empty
+        if not line.strip():
+            continue
+        with _line_errors(path, i, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
+            words = line.split(maxsplit=9)
+            yield words[9].strip() if len(words) > 9 else "", int(words[8]), tuple(float(word) for word in words[1:8])
+
+
+def find_model(path: Path) -> Path | None:
+    """Return the folder of the model in a project: `sparse/0`, `sparse` or the project itself; none where there is none."""
+    for folder in (path / "sparse" / "0", path / "sparse", path):
+        if any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt")):
+            return folder
+    return None
+
+
 def read(path: Path, *, recording: str | None = None, frame_interval: float | None = None) -> MultiView:
-    """Read a COLMAP project: `sparse/0/*.bin` (or the two files in the folder itself) and the pictures in `images`."""
-    model = path / "sparse" / "0" if (path / "sparse" / "0").is_dir() else path
-    return views(model, path / "images", folder=path, name=path.resolve().name)
+    """Read a COLMAP project: a model in `sparse/0`, `sparse` or the folder itself, pictures in `images`, perhaps masks in `masks`.
+
+    Raises:
+        UserError: No model, a lens that is no pinhole, an image that is missing, or masks for some images alone.
+    """
+    model = find_model(path)
+    if model is None:
+        raise UserError(f"{path} has no COLMAP model: images.bin or images.txt is missing in it, in sparse and in sparse/0")
+    masks = path / "masks" if (path / "masks").is_dir() else None
+    return views(model, path / "images", folder=path, name=path.resolve().name, masks=masks)
 
 
 def views(model: Path, pictures: Path, *, folder: Path, name: str, masks: Path | None = None) -> MultiView:
-    """Return the registered images of a model folder, each one a view; masks, where there are any, are PNG files of the same names."""
-    lenses = read_cameras(model / "cameras.bin")
+    """Read the registered images of a model folder, each one a view."""
+    kind = "bin" if (model / "images.bin").is_file() or not (model / "images.txt").is_file() else "txt"
+    cameras, images = model / f"cameras.{kind}", model / f"images.{kind}"
+    lenses = read_cameras(cameras)
     shots = []
-    sizes = set()
-    for image in read_images(model / "images.bin"):
+    for image in read_images(images):
         if image.camera not in lenses:
-            raise UserError(f"{model / 'images.bin'}: {image.name} names camera {image.camera}, which cameras.bin lacks")
+            raise UserError(f"{images}: {image.name} names camera {image.camera}, which {cameras.name} lacks")
         lens = lenses[image.camera]
-        sizes.add((lens.width, lens.height))
-        file = inside(pictures, image.name, f"{model / 'images.bin'}: name")
-        mask = None if masks is None else inside(masks, image.name, "name").with_suffix(".png")
-        shots.append(Shot(image.name, 0.0, file, image.viewmat, lens.K, mask, lens.distortion))
-    if len(sizes) > 1:
-        raise UserError(f"{model} has images of {len(sizes)} sizes ({sorted(sizes)[:2]} ...); all views must have one")
-    return assemble(shots, size=next(iter(sizes), None), folder=folder, name=name, format="colmap")
+        file = inside(pictures, image.name, f"{images}: name")
+        mask = None if masks is None else _mask(masks, image.name)
+        shots.append(Shot(image.name, 0.0, file, image.viewmat, lens.K, mask, lens.distortion, (lens.width, lens.height)))
+    return assemble(shots, folder=folder, name=name, format="colmap")
+
+
+def _mask(masks: Path, name: str) -> Path:
+    """Return the mask of an image: `<name>.png`, or the name with the ending `.png`."""
+    own = inside(masks, f"{name}.png", "name")
+    return own if own.is_file() else inside(masks, name, "name").with_suffix(".png")
 
 
 class _Bytes:

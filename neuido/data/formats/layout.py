@@ -16,6 +16,7 @@ from neuido.errors import UserError
 from neuido.types import Body, Cameras
 
 SAME_TIME = 1e-6  # s
+SAME_SHAPE = 0.01  # of the aspect ratios of two images
 SAME_POSE = 1e-5  # absolute, of the entries of a world-to-camera matrix
 
 Grid = tuple[tuple[Path | None, ...], ...]
@@ -61,6 +62,8 @@ class Shot(NamedTuple):
     """(3, 3) float64, in pixels of the full image."""
     mask: Path | None = None
     distortion: tuple[float, ...] = ()
+    size: tuple[int, int] | None = None
+    """Width and height [px] to which K refers; none: those of the recording."""
 
 
 def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, folder: Path, **fields: Any) -> MultiView:
@@ -68,12 +71,12 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
 
     Args:
         shots: All images of one motion.
-        size: Width and height [px] to which the intrinsics refer; none: those of the first image.
+        size: Width and height [px] of all views; none: those of the first view. The intrinsics of a view of another size are scaled.
         folder: The folder that holds them.
         fields: The other fields of `MultiView`; `held_out` and `backgrounds` by name of view.
 
     Raises:
-        UserError: No shot, a missing file, two images for one view and frame, or a view whose camera moves.
+        UserError: No shot, a missing file, two images for one view and frame, a view whose camera moves, or views of several shapes.
     """
     if not shots:
         raise UserError(f"{folder} names no image")
@@ -82,13 +85,7 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
         raise UserError(f"the image {missing[0]} is missing{more}; {folder} names it")
     views = list(dict.fromkeys(shot.view for shot in shots))
-    times = [0.0]
-    for k, time in enumerate(sorted(shot.time for shot in shots)):
-        if k == 0:
-            times = [time]
-        elif time - times[-1] > SAME_TIME:
-            times.append(time)
-    at = np.searchsorted(np.array(times) + SAME_TIME, [shot.time for shot in shots])
+    times, at = _frames(shots)
     first: dict[str, Shot] = {}
     grid: dict[tuple[str, int], Shot] = {}
     for shot, frame in zip(shots, at):
@@ -97,13 +94,20 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
             raise UserError(f"view {shot.view} has two images at {shot.time:g} s: {grid[key].image.name} and {shot.image.name}")
         grid[key] = shot
         camera = first.setdefault(shot.view, shot)
+        if camera.size != shot.size:
+            raise UserError(
+                f"view {shot.view} has images of 2 sizes, {camera.size} and {shot.size}: {camera.image.name}, {shot.image.name}"
+            )
         if not (torch.allclose(camera.viewmat, shot.viewmat, rtol=0, atol=SAME_POSE) and torch.allclose(camera.K, shot.K)):
             raise UserError(
                 f"view {shot.view} moves between {camera.image.name} and {shot.image.name}: give each pose of a camera a view of its own"
             )
-    width, height = size or image_size(shots[0].image)
+    width, height = size or first[views[0]].size or image_size(shots[0].image)
     cameras = Cameras(
-        torch.stack([first[view].viewmat for view in views]).float(), torch.stack([first[view].K for view in views]).float(), width, height
+        torch.stack([first[view].viewmat for view in views]).float(),
+        torch.stack([_resized(first[view], width, height) for view in views]).float(),
+        width,
+        height,
     )
     distortion = torch.zeros(len(views), 5, dtype=torch.float64)
     for v, view in enumerate(views):
@@ -127,6 +131,40 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
         backgrounds=tuple(backgrounds.get(view) for view in views) if backgrounds else None,
         **fields,
     )
+
+
+def _frames(shots: Sequence[Shot]) -> tuple[list[float], list[int]]:
+    """Return the times of the frames [s] and the frame of each shot.
+
+    Shutters of several cameras may differ by up to a quarter of the frame interval; a frame then has the mean of their times.
+    """
+    own: dict[str, list[float]] = {}
+    for shot in shots:
+        own.setdefault(shot.view, []).append(shot.time)
+    gaps = [gap for times in own.values() for gap in np.diff(np.sort(times)) if gap > SAME_TIME]
+    tolerance = max(SAME_TIME, 0.25 * min(gaps)) if gaps else SAME_TIME
+    groups: list[list[float]] = []
+    for time in sorted(shot.time for shot in shots):
+        if groups and time - groups[-1][0] <= tolerance:
+            groups[-1].append(time)
+        else:
+            groups.append([time])
+    times = [group[0] if group[-1] - group[0] <= SAME_TIME else float(np.mean(group)) for group in groups]
+    starts = np.array([group[0] for group in groups])
+    return times, [int(i) for i in np.searchsorted(starts, [shot.time for shot in shots], side="right") - 1]
+
+
+def _resized(shot: Shot, width: int, height: int) -> Tensor:
+    """Return K of a shot for images of a size, which must have the shape of its own up to a per cent."""
+    if shot.size is None or shot.size == (width, height):
+        return shot.K
+    own_width, own_height = shot.size
+    if abs(own_width * height / (own_height * width) - 1) > SAME_SHAPE:
+        raise UserError(
+            f"view {shot.view} ({shot.image.name}) has {own_width} x {own_height} pixels, another view {width} x {height}: crop the images "
+            "of all views to one aspect ratio, and move cx and cy with them"
+        )
+    return shot.K * shot.K.new_tensor([width / own_width, height / own_height, 1.0])[:, None]
 
 
 def matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
@@ -153,6 +191,9 @@ def opengl(value: Any, where: str) -> Tensor:
         UserError: No such matrix, or a rotation that is sheared or mirrored.
     """
     c2w = matrix(value, where, (3, 4), (4, 4))
+    if len(c2w) == 4 and not torch.allclose(c2w[3], c2w.new_tensor([0.0, 0.0, 0.0, 1.0]), atol=1e-6):
+        hint = ": it is written column by column, give the transpose" if torch.allclose(c2w[:3, 3], c2w.new_zeros(3), atol=1e-6) else ""
+        raise UserError(f"{where} has the last row {[round(float(n), 6) for n in c2w[3]]}, not 0, 0, 0, 1{hint}")
     try:
         return convert.from_opengl(c2w)
     except UserError as error:

@@ -17,13 +17,17 @@ from torch import Tensor
 from neuido.data import cameras as convert
 from neuido.data.files.parsing import image_size, read_json
 from neuido.data.files.values import inside, listed, number, take
-from neuido.data.formats.layout import MultiView, Shot, assemble, natural, opengl
+from neuido.data.formats.layout import MultiView, Shot, assemble, matrix, natural, opengl
 from neuido.errors import UserError
 from neuido.types import Cameras
 
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+UNKNOWN_TERMS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2")
+"""Terms of lens models that are not applied; they must be zero."""
+FISHEYES = ("is_fisheye", "fisheye", "ftheta_p0", "equirectangular")
+FOCAL = {"fl_x", "camera_angle_x", "camera_angle_y"}
 ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 
 
@@ -39,7 +43,6 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
     folder, files = (path.parent, [path]) if path.is_file() else (path, _files(path))
     shots: list[Shot] = []
     held_out: set[str] = set()
-    sizes: set[tuple[int, int]] = set()
     poses: dict[tuple, str] = {}
     seen: set[Path] = set()
     for file in files:
@@ -49,17 +52,14 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
         kept = {name for key in ("val_filenames", "test_filenames") for name in _names(content, key, file)}
         for i, entry in enumerate(listed(take(content, "frames", str(file)), f"{file}: frames")):
             where = f"{file.name}: frames[{i}]"
-            shot, size = _shot(content | entry, folder, where, poses)
-            sizes.add(size)
+            shot = _shot(entry, content, folder, where, poses)
             if file.name in SPLITS[1:] or str(entry["file_path"]) in kept:
                 held_out.add(shot.view)
             if shot.image not in seen:  # GIC writes the test views into all three files
                 shots.append(shot)
             seen.add(shot.image)
-    if len(sizes) > 1:
-        raise UserError(f"{folder} has images of {len(sizes)} sizes ({sorted(sizes)[:2]} ...); all views must have one")
     shots = sorted(_timed(shots, frame_interval, folder), key=lambda shot: natural(shot.view))
-    return assemble(shots, size=sizes.pop(), folder=folder, held_out=held_out, name=folder.resolve().name, format="nerfstudio")
+    return assemble(shots, folder=folder, held_out=held_out, name=folder.resolve().name, format="nerfstudio")
 
 
 def write(
@@ -138,16 +138,20 @@ def _names(content: dict[str, Any], key: str, file: Path) -> list[str]:
     return [str(name) for name in given]
 
 
-def _shot(entry: dict[str, Any], folder: Path, where: str, poses: dict[tuple, str]) -> tuple[Shot, tuple[int, int]]:
-    """Return a frame, with the keys of the file as its defaults, and the size of its image."""
+def _shot(own: dict[str, Any], shared: dict[str, Any], folder: Path, where: str, poses: dict[tuple, str]) -> Shot:
+    """Return a frame; what it does not say is taken from the keys of the file."""
+    entry = shared | own
     image = _image(folder, take(entry, "file_path", where), where)
     viewmat = opengl(take(entry, "transform_matrix", where), f"{where}.transform_matrix")
     model = entry.get("camera_model", "OPENCV")
     if model not in PINHOLES:
         raise UserError(f"{where}.camera_model = {model!r} is no pinhole; undistort the images first (one of {', '.join(PINHOLES)})")
-    size = image_size(image) if "w" not in entry or "h" not in entry else _size(entry, where)
-    K = _lens(entry, size, where)
-    lens = tuple(number(entry.get(key, 0.0), f"{where}.{key}") for key in DISTORTION)
+    for key in FISHEYES:
+        if entry.get(key):
+            raise UserError(f"{where}.{key} = {entry[key]!r}: a fisheye or panoramic lens is no pinhole; undistort the images first")
+    size = _size(entry, where) if "w" in entry and "h" in entry else image_size(image)
+    K = _lens(own, shared, size, where)
+    lens = _distortion(own, shared, where)
     mask = inside(folder, entry["mask_path"], f"{where}.mask_path") if "mask_path" in entry else None
     if "view" in entry:
         view = entry["view"]
@@ -158,7 +162,23 @@ def _shot(entry: dict[str, Any], folder: Path, where: str, poses: dict[tuple, st
         pose = tuple(np.round(viewmat.numpy(), 6).ravel()) + tuple(np.round(K.numpy(), 3).ravel())
         view = poses.setdefault(pose, str(len(poses)))
     time = number(entry["time"], f"{where}.time", least=0.0) if "time" in entry else float("nan")
-    return Shot(view, time, image, viewmat, K, mask, lens), size
+    return Shot(view, time, image, viewmat, K, mask, lens, size)
+
+
+def _distortion(own: dict[str, Any], shared: dict[str, Any], where: str) -> tuple[float, ...]:
+    """Return k1, k2, p1, p2, k3 of a frame, of single keys or of `distortion_params` (k1, k2, k3, k4, p1, p2, as Nerfstudio has them)."""
+    entry = shared | own
+    terms = {key: number(entry.get(key, 0.0), f"{where}.{key}") for key in (*DISTORTION, *UNKNOWN_TERMS)}
+    if (given := entry.get("distortion_params")) is not None:
+        values = matrix(given, f"{where}.distortion_params", (6,)).tolist()
+        for key, value in zip(("k1", "k2", "k3", "k4", "p1", "p2"), values):
+            if key in entry and terms[key] != value:
+                raise UserError(f"{where}: {key} = {terms[key]:g} and distortion_params say different things; leave one out")
+            terms[key] = value
+    for key in UNKNOWN_TERMS:
+        if terms[key] != 0:
+            raise UserError(f"{where}.{key} = {terms[key]:g}: this term of a lens is not applied; undistort the images first")
+    return tuple(terms[key] for key in DISTORTION)
 
 
 def _size(entry: dict[str, Any], where: str) -> tuple[int, int]:
@@ -166,14 +186,25 @@ def _size(entry: dict[str, Any], where: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _lens(entry: dict[str, Any], size: tuple[int, int], where: str) -> Tensor:
+def _lens(own: dict[str, Any], shared: dict[str, Any], size: tuple[int, int], where: str) -> Tensor:
+    """Return K of a frame; a focal length of the frame, in pixels or as an angle, comes before that of the file."""
     width, height = size
-    if "fl_x" in entry:
-        fx = number(entry["fl_x"], f"{where}.fl_x", above=0.0)
-        fy = number(entry.get("fl_y", fx), f"{where}.fl_y", above=0.0)
-    elif "camera_angle_x" in entry:
-        angle = number(entry["camera_angle_x"], f"{where}.camera_angle_x", above=0.0)
-        fx = fy = float(convert.intrinsics(width, height, angle=angle)[0, 0])
+    entry = shared | own
+    keys = next((given for given in (own, shared) if FOCAL & set(given)), {})
+    if "fl_x" in keys:
+        fx = number(keys["fl_x"], f"{where}.fl_x", above=0.0)
+        fy = number(keys.get("fl_y", fx), f"{where}.fl_y", above=0.0)
+    elif keys:
+        focal = {}
+        for key, side in (("camera_angle_x", width), ("camera_angle_y", height)):
+            if key in keys:
+                angle = number(keys[key], f"{where}.{key}", above=0.0)
+                try:
+                    focal[key] = float(convert.intrinsics(side, side, angle=angle)[0, 0])
+                except UserError as error:
+                    raise UserError(f"{where}.{key}: {error}") from error
+        fx = focal.get("camera_angle_x", focal.get("camera_angle_y", 0.0))
+        fy = focal.get("camera_angle_y", fx)
     else:
         raise UserError(f"{where} has neither fl_x nor camera_angle_x: the focal length is not known")
     cx, cy = (number(entry.get(key, half / 2), f"{where}.{key}") for key, half in (("cx", width), ("cy", height)))

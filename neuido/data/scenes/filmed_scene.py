@@ -34,7 +34,7 @@ from neuido.data.files.parsing import read_arrays, read_yaml
 from neuido.data.files.storage import write
 from neuido.data.files.values import check_keys, mapping, number, vector
 from neuido.data.measured.experiment import read_experiment, scene_to_dict
-from neuido.data.scenes.multiview import DIFFERENT, UP, SceneViews
+from neuido.data.scenes.multiview import UP, SceneViews
 from neuido.data.scenes.readers import read
 from neuido.errors import UserError
 from neuido.types import Body, MultiViewBatch, Scene, Vector
@@ -159,8 +159,8 @@ def load_views(
 ) -> MultiViewBatch:
     """Read images and cameras of one recording, in the simulation's coordinates.
 
-    Where no image has a mask, the colour of the images' rims is taken for the background: the mask is what differs from it, and the
-    batch's `background` is that colour. That needs a plain background.
+    The mask of an image that has none is what differs from the colour of the images' rims, which needs a plain background. Where no image
+    has a mask, the images keep their background, and the batch's `background` is that colour.
 
     Args:
         folder: Any recording that `data.formats` reads.
@@ -174,10 +174,12 @@ def load_views(
         UserError: As `readers.read` and `SceneViews`.
     """
     found = read(folder, recording=recording, frame_interval=frame_interval)
-    views = SceneViews(found, scale=placing.scale, shift=placing.shift, up=placing.up, cache=False, **options)
+    views = SceneViews(found, scale=placing.scale, shift=placing.shift, up=placing.up, cache=False, find_masks=True, **options)
     pairs = [(v, t) for v in range(len(views.chosen)) for t in range(len(views.frames))]
     shape = (len(views.chosen), len(views.frames), views.cameras.height, views.cameras.width)
     images, masks = torch.empty(*shape, 3), torch.empty(shape)
+
+    _ = views.unmasked, views.plain_background  # once, before several threads ask for it
 
     def fill(pair: tuple[int, int]) -> None:
         image, mask = views.load([pair[0]], [pair[1]])
@@ -186,42 +188,9 @@ def load_views(
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         for _ in pool.map(fill, pairs):
             pass
-    colour = torch.full((3,), 1.0 if views.background == "white" else 0.0)
-    if bool((masks == 1).all()):
-        colour, masks = from_background(images)
+    colour = torch.from_numpy(views.background_colour)
     held_out = torch.tensor(views.held_out)
     return MultiViewBatch(0, views.name, images, masks, views.cameras, views.times, held_out, colour)
-
-
-def from_background(images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the background's colour and the masks of images of an object before one colour.
-
-    The colour is the median of the rims of the first frame. A pixel at the outline is a mixture: its share of the object is its
-    difference from the background over the largest one within two pixels; further inside it is one.
-
-    Args:
-        images: (V, T, H, W, 3).
-
-    Returns:
-        The colour (3,), and masks (V, T, H, W) in 0..1.
-
-    Raises:
-        UserError: The rims have no one colour.
-    """
-    first = images[:, 0]
-    rim = torch.cat([part.reshape(-1, 3) for part in (first[:, 0], first[:, -1], first[:, :, 0], first[:, :, -1])])
-    colour = rim.median(dim=0).values
-    far = float((rim - colour).abs().amax(1).gt(DIFFERENT).float().mean())
-    if far > 0.2:
-        raise UserError(f"the images have no masks, and {far:.0%} of their rims differ from one colour: give an alpha channel or mask_path")
-    masks = torch.empty(images.shape[:-1])
-    for view, mask in zip(images, masks):
-        difference = (view - colour).abs().amax(-1)
-        differs = (difference > DIFFERENT).float()
-        inside = 1 - torch.nn.functional.max_pool2d(1 - differs[:, None], 5, 1, 2)[:, 0]
-        most = torch.nn.functional.max_pool2d(difference[:, None], 5, 1, 2)[:, 0]
-        mask.copy_(torch.maximum(inside, differs * difference / most.clamp(min=DIFFERENT)))
-    return colour, masks
 
 
 def read_setting(path: Path, *, recording: str | None = None) -> Setting:

@@ -13,8 +13,10 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from neuido.data import cameras as convert
+from neuido.data.files.parsing import read_image
 from neuido.data.files.values import number
-from neuido.data.formats.layout import MultiView, matrix
+from neuido.data.formats.layout import SAME_SHAPE, MultiView, matrix
+from neuido.data.scenes.masks import mask_before, mask_channel, mask_from_empty, rim_colour
 from neuido.data.scenes.readers import read
 from neuido.errors import UserError
 from neuido.types import Cameras, MultiViewBatch, Vector
@@ -27,8 +29,6 @@ UP = {
     "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
 }
 """Rotations that carry the axis which points upwards in a recording to +y."""
-SAME_SHAPE = 0.01
-DIFFERENT = 0.06  # of the colour range: more than what noise and a soft shadow change
 
 
 class SceneViews:
@@ -47,6 +47,7 @@ class SceneViews:
         scale, shift [m], up: The similarity x -> scale R x + shift from the recording's world to the simulation's domain, where R turns
             the axis `up` (y, -y, z, -z) upwards.
         cache: Keep images in memory once they are read (four bytes a pixel).
+        find_masks: Find the mask of an image that has none by its difference from a plain background, before any undistortion.
 
     Raises:
         UserError: An unknown view, no frame left, a view that lacks a chosen frame.
@@ -68,7 +69,9 @@ class SceneViews:
         shift: Vector = (0.0, 0.0, 0.0),
         up: str = "y",
         cache: bool = True,
+        find_masks: bool = False,
     ) -> None:
+        self.find_masks = find_masks
         if background not in BACKGROUNDS or up not in UP:
             raise UserError(f"background = {background!r} must be one of {', '.join(BACKGROUNDS)}, and up = {up!r} of {', '.join(UP)}")
         counts = (
@@ -127,28 +130,71 @@ class SceneViews:
         rgba = torch.from_numpy(out).float().div_(255)
         return rgba[..., :3].contiguous(), rgba[..., 3].contiguous()
 
-    def _image(self, v: int, t: int) -> np.ndarray:
-        """Return RGB over the background, and the mask, (H, W, 4) uint8."""
-        if (v, t) in self._kept:
-            return self._kept[v, t]
+    @cached_property
+    def plain_background(self) -> np.ndarray | None:
+        """The colour (3,) of the first frames' rims where an image there has no mask; none where all have one, or none is sought.
+
+        Raises:
+            UserError: The rims have no one colour.
+        """
+        if not self.find_masks:
+            return None
+        rims = []
+        for v in self.chosen:
+            rgba, masked = self._recorded(v, self.frames[0])
+            if not masked:
+                rims += [rgba[0, :, :3], rgba[-1, :, :3], rgba[:, 0, :3], rgba[:, -1, :3]]
+        return rim_colour(np.concatenate(rims)) if rims else None
+
+    @cached_property
+    def unmasked(self) -> bool:
+        """Whether no first frame has a mask: then images keep their background, whose colour is `plain_background`."""
+        return self.find_masks and not any(self._recorded(v, self.frames[0])[1] for v in self.chosen)
+
+    @property
+    def background_colour(self) -> np.ndarray:
+        """The colour (3,) behind the object."""
+        if self.unmasked and self.plain_background is not None:
+            return self.plain_background
+        return np.full(3, BACKGROUNDS[self.background], np.float32)
+
+    def _recorded(self, v: int, t: int) -> tuple[np.ndarray, bool]:
+        """Return an image as recorded with its mask as alpha, (H, W, 4), and whether anything says what the mask is."""
         found = self.found
         path, mask = found.images[v][t], found.masks[v][t] if found.masks else None
         rgba = _read(path, found.cameras)
         if mask is not None:
             rgba[..., 3] = _read(mask, found.cameras, channel=True)
-        elif found.backgrounds and found.backgrounds[v] is not None and bool((rgba[..., 3] == 1).all()):
-            rgba[..., 3] = _difference(rgba[..., :3], _read(found.backgrounds[v], found.cameras)[..., :3])
-        shown = rgba[..., 3:] if self.masked else np.ones_like(rgba[..., 3:])
+            return rgba, True
+        if bool((rgba[..., 3] < 1).any()):
+            return rgba, True
+        if found.backgrounds and found.backgrounds[v] is not None:
+            rgba[..., 3] = mask_from_empty(rgba[..., :3], _read(found.backgrounds[v], found.cameras)[..., :3])
+            return rgba, True
+        return rgba, False
+
+    def _image(self, v: int, t: int) -> np.ndarray:
+        """Return RGB over the background, and the mask, (H, W, 4) uint8."""
+        if (v, t) in self._kept:
+            return self._kept[v, t]
+        found = self.found
+        rgba, masked = self._recorded(v, t)
+        if not masked and self.find_masks:
+            colour = self.plain_background
+            if colour is None:  # the first frames have masks, this one has none
+                colour = rim_colour(np.concatenate([rgba[0, :, :3], rgba[-1, :, :3], rgba[:, 0, :3], rgba[:, -1, :3]]))
+            rgba[..., 3] = mask_before(rgba[..., :3], colour)
+        keeps = not self.masked or (not masked and (self.unmasked or not self.find_masks))
+        shown = np.ones_like(rgba[..., 3:]) if keeps else rgba[..., 3:]
         # premultiplied, so that no colour from outside the mask bleeds in when pixels are averaged
         layers = np.concatenate([rgba[..., :3] * shown, rgba[..., 3:], shown], axis=2)
         if found.distortion is not None:
             layers = _undistort(layers, found.cameras.Ks[v].double().numpy(), found.distortion[v].numpy())
         size = (self.cameras.width, self.cameras.height)
         if size != (found.cameras.width, found.cameras.height):
-            smaller = size[0] < found.cameras.width
-            layers = cv2.resize(layers, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
-        image = layers[..., :3] + BACKGROUNDS[self.background] * (1 - layers[..., 4:])
-        done = np.rint(255 * np.concatenate([image, layers[..., 3:4]], axis=2)).astype(np.uint8)
+            layers = _resize(layers, size)
+        image = layers[..., :3] + self.background_colour * (1 - layers[..., 4:])
+        done = np.rint(255 * np.clip(np.concatenate([image, layers[..., 3:4]], axis=2), 0, 1)).astype(np.uint8)
         if self.cache:
             self._kept[v, t] = done
         return done
@@ -305,28 +351,32 @@ def _indices(found: MultiView, names: Sequence[Any], option: str) -> list[int]:
 
 def _read(path: Path | None, cameras: Cameras, *, channel: bool = False) -> np.ndarray:
     """Return an image as RGBA (H, W, 4), or as one channel (H, W), float32 in [0, 1], in the size of the cameras."""
-    raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if raw is None or raw.dtype not in (np.uint8, np.uint16):
-        raise UserError(f"{path} is missing or no image of 8 or 16 bits that OpenCV can read")
-    image = raw.astype(np.float32) / np.iinfo(raw.dtype).max
+    if path is None:
+        raise UserError("an image is missing")
+    image = mask_channel(path) if channel else _rgba(path)
     height, width = image.shape[:2]
     if (width, height) != (cameras.width, cameras.height):
         if abs(width * cameras.height / (height * cameras.width) - 1) > SAME_SHAPE:
             raise UserError(f"{path} has {width} x {height} pixels, its camera {cameras.width} x {cameras.height}")
         image = cv2.resize(image, (cameras.width, cameras.height), interpolation=cv2.INTER_AREA)
-    if channel:
-        if image.ndim == 3 and image.shape[2] == 4 and bool((image[..., 3] < 1).any()):
-            return image[..., 3]
-        return image if image.ndim == 2 else image[..., :3].max(axis=2)
-    if image.ndim == 2:
+    return image
+
+
+def _rgba(path: Path) -> np.ndarray:
+    raw = read_image(path)
+    image = raw.astype(np.float32) / np.iinfo(raw.dtype).max
+    if image.ndim == 2 or image.shape[2] == 1:
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA)
+    if image.shape[2] == 2:  # grey and alpha
+        return np.concatenate([image[..., :1].repeat(3, axis=2), image[..., 1:]], axis=2)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
-def _difference(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """Return a rough mask (H, W): where an image differs from that of the empty scene, without single pixels."""
-    differs = (np.abs(image - empty).max(axis=2) > DIFFERENT).astype(np.uint8)
-    return cv2.medianBlur(differs, 3).astype(np.float32)
+def _resize(layers: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return layers (H, W, C) in another size; OpenCV averages areas of four channels at most at ratios that are no whole numbers."""
+    method = cv2.INTER_AREA if size[0] < layers.shape[1] else cv2.INTER_LINEAR
+    parts = [cv2.resize(np.ascontiguousarray(layers[..., c : c + 1]), size, interpolation=method) for c in range(layers.shape[2])]
+    return np.stack(parts, axis=2)
 
 
 def _undistort(layers: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:

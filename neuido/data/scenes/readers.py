@@ -16,7 +16,7 @@ MARKS = {
     "neuma": ("data_dynamic.json", "dynamics"),
     "springgaus": ("camera.json", "dynamic/cameras_calib.json"),
     "nerfstudio": ("transforms.json", "transforms_train.json"),
-    "colmap": ("sparse/0/images.bin", "images.bin"),
+    "colmap": tuple(f"{place}images.{kind}" for place in ("sparse/0/", "sparse/", "") for kind in ("bin", "txt")),
 }
 """By which entries of a folder its format is known, in the order of the search."""
 FORMATS = tuple(MARKS)

@@ -1,6 +1,8 @@
 """A recorded scene with all that stays constant while a law is read from it or fitted to it, on one device."""
 
+import math
 import os
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -107,11 +109,14 @@ def prepare(
         cache: Folder in which flows are kept.
 
     Raises:
-        UserError: Frames that are no whole number of substeps apart, no training view, and as `Simulator` and
+        UserError: Two frames at one time, no training view, and as `Simulator` and
             `DynamicsEncoder.measure_flow`.
     """
     batch, device = scene.batch, as_device(device)
-    every, recorded_frames = frame_substeps(batch.times, scene.scene.dt, scene.name)
+    dt = fitting_step(batch.times, scene.scene.dt)
+    if dt != scene.scene.dt:
+        scene = scene._replace(scene=replace(scene.scene, dt=dt))
+    every, recorded_frames = frame_substeps(batch.times, dt, scene.name)
     training = (~batch.held_out).nonzero()[:, 0].tolist()
     if not training:
         raise UserError(f"{scene.name} has no training view: all {len(batch.held_out)} are held out")
@@ -142,6 +147,21 @@ def prepare(
         conditions=conditions,
         recorded_frames=recorded_frames,
     )
+
+
+def fitting_step(times: Tensor, dt: float) -> float:
+    """Return the largest step [s] up to `dt` of which the even interval of frames is a whole multiple; `dt` for uneven times.
+
+    A step that already divides the interval to one part in a thousand stays as it is.
+    """
+    steps = torch.as_tensor(times, dtype=torch.float64).diff()
+    if not len(steps) or not float(steps.min()) > 0 or float((steps - steps.mean()).abs().max()) > 0.01 * float(steps.mean()):
+        return dt
+    interval = float(steps.mean())
+    every = round(interval / dt)
+    if every >= 1 and abs(every * dt - interval) <= 1e-3 * interval:
+        return dt
+    return interval / max(1, math.ceil(interval / dt))
 
 
 def frame_substeps(times: Tensor, dt: float, name: str) -> tuple[int, tuple[int, ...] | None]:

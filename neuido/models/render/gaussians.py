@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.data.formats.gaussian_ply import column_names, read_gaussian_vertices
 from neuido.errors import UserError
 from neuido.physics.linalg.decompositions import polar
 from neuido.types import Gaussians
@@ -203,7 +204,7 @@ def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
     shape = [opacities[:, None], scales.clamp(min=1e-12).log(), quaternions]
     columns = [gaussians.means, torch.zeros_like(gaussians.means), base, rest, *shape]
     table = torch.cat([c.detach().double().cpu() for c in columns], 1).numpy().astype(np.float32)
-    vertices = np.empty(len(table), [(name, "f4") for name in _names(rest.shape[1])])
+    vertices = np.empty(len(table), [(name, "f4") for name in column_names(rest.shape[1])])
     for name, column in zip(vertices.dtype.names, table.T, strict=True):
         vertices[name] = column
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
@@ -213,23 +214,11 @@ def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device
     """Read a 3DGS PLY file.
 
     Raises:
-        UserError: No such file, not a PLY file, or one whose vertices lack what a Gaussian needs.
+        UserError: No such file, not a PLY file, or one whose vertices lack what a Gaussian needs. Rows that are not finite are left out
+            with a warning.
     """
-    from plyfile import PlyData, PlyParseError
-
-    if not Path(path).is_file():
-        raise UserError(f"no PLY file {path}")
-    try:
-        content = PlyData.read(str(path))
-        vertices = content["vertex"].data
-    except (PlyParseError, KeyError) as error:
-        raise UserError(f"{path} is not a PLY file with vertices: {error}") from error
+    vertices = read_gaussian_vertices(Path(path))
     rest = sum(name.startswith("f_rest_") for name in vertices.dtype.names)
-    needed = [name for name in _names(rest) if not name.startswith("n")]
-    if missing := [name for name in needed if name not in vertices.dtype.names]:
-        raise UserError(f"{path} is not a 3DGS file: its vertices lack {', '.join(missing)}")
-    if rest not in (0, 9, 24, 45):
-        raise UserError(f"{path} has {rest} f_rest columns; needed 0, 9, 24 or 45")
 
     def columns(*names: str) -> Tensor:
         return torch.from_numpy(np.stack([vertices[name].astype(np.float64) for name in names], 1))
@@ -241,9 +230,3 @@ def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device
     covariances = covariances_of(columns("scale_0", "scale_1", "scale_2").exp(), quaternions)
     parts = (columns("x", "y", "z"), covariances, columns("opacity").squeeze(1).sigmoid(), harmonics)
     return Gaussians(*(part.to(device, dtype) for part in parts))
-
-
-def _names(rest: int) -> list[str]:
-    """Return columns of a 3DGS file with `rest` harmonics above degree 0."""
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(rest)), "opacity"]
-    return [*names, *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]

@@ -169,3 +169,13 @@ def test_a_shorter_sequence_replaces_a_longer_one(tools, tmp_path):
         write_plys(tmp_path, rollout_latent(prepared, operator, operator.latent("jelly")))
         write_plys(tmp_path, rollout_latent(prepared, operator, operator.latent("jelly"), 3))
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["000.ply", "001.ply", "002.ply"]
+
+
+@pytest.mark.parametrize("rate", [15, 24, 29.97, 30, 48, 50, 60, 90, 120, 240])
+def test_step_adapts_to_the_frame_rate(rate):
+    from neuido.models.inference.prepared_scene import fitting_step, frame_substeps
+
+    times = torch.arange(5, dtype=torch.float64) / rate
+    dt = fitting_step(times, 5e-4)
+    every, picks = frame_substeps(times, dt, "video")
+    assert 2.5e-4 < dt <= 5e-4 * 1.001 and picks is None and every * dt == pytest.approx(1 / rate, rel=1e-3)

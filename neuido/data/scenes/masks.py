@@ -1,0 +1,103 @@
+"""Masks of an object: read from files of any usual encoding, or found before a plain or a known background."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuido.data.files.parsing import image_size, read_image
+from neuido.errors import UserError
+
+DIFFERENT = 0.06  # of the colour range: more than what noise and a soft shadow change
+
+
+def mask_channel(path: Path) -> np.ndarray:
+    """Return a mask file as the object's share of each pixel, (H, W) float32 in [0, 1].
+
+    The mask is the alpha channel where it says anything, the indices of a palette that are not zero, or else the largest channel. A file
+    with zero and one other value says yes or no, whatever that value is (0 and 1, 0 and 255, a label); with more values it is a soft mask.
+    """
+    labels = _palette_indices(path)
+    if labels is not None:
+        return (labels != 0).astype(np.float32)
+    raw = read_image(path)
+    if raw.ndim == 3 and raw.shape[2] in (2, 4) and bool((raw[..., -1] < np.iinfo(raw.dtype).max).any()):
+        plane = raw[..., -1]
+    else:
+        plane = raw if raw.ndim == 2 else raw[..., :3].max(axis=2)
+    values = np.unique(plane)
+    if len(values) == 1 and values[0] > 0:
+        return np.ones(plane.shape, np.float32)
+    if len(values) == 2 and values[0] == 0:
+        return (plane > 0).astype(np.float32)
+    if values[-1] <= 20 and len(values) > 2 and (np.diff(values) == 1).all():
+        raise UserError(
+            f"{path} has the values {', '.join(map(str, values[:5]))}{', ...' if len(values) > 5 else ''}: labels of several objects; "
+            "write a mask of one object, 0 and 255"
+        )
+    return plane.astype(np.float32) / np.iinfo(raw.dtype).max
+
+
+def _palette_indices(path: Path) -> np.ndarray | None:
+    """Return the indices (H, W) of an image with a palette; none of any other image."""
+    from PIL import Image
+
+    image_size(path)  # which refuses what is missing or too large
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image) if image.mode == "P" and "transparency" not in image.info else None
+    except Exception:  # what Pillow cannot read, OpenCV may
+        return None
+
+
+def rim_colour(rims: np.ndarray) -> np.ndarray:
+    """Return the colour (3,) of a plain background from the pixels of images' rims (N, 3).
+
+    Raises:
+        UserError: The rims have no one colour.
+    """
+    colour = np.median(rims, axis=0).astype(np.float32)
+    far = float((np.abs(rims - colour).max(axis=1) > DIFFERENT).mean())
+    if far > 0.2:
+        raise UserError(
+            f"the images have no masks, and {far:.0%} of their rims differ from one colour: give an alpha channel, mask_path in "
+            "transforms.json, or masks/<image name>.png beside a COLMAP model"
+        )
+    return colour
+
+
+def mask_before(image: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    """Return the mask (H, W) of an object before a plain background, for an image (H, W, 3).
+
+    A pixel at the outline is a mixture: its share of the object is its difference from the background over the largest one within two
+    pixels; further inside it is one.
+    """
+    difference = np.abs(image - colour).max(axis=2)
+    differs = (difference > DIFFERENT).astype(np.float32)
+    window = np.ones((5, 5), np.uint8)
+    inside = cv2.erode(differs, window, borderType=cv2.BORDER_CONSTANT, borderValue=1.0)
+    largest = cv2.dilate(difference, window, borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
+    return np.maximum(inside, differs * difference / np.maximum(largest, DIFFERENT))
+
+
+def mask_from_empty(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
+    """Return a rough mask (H, W): where an image differs from that of the empty scene, without single pixels."""
+    differs = (np.abs(image - empty).max(axis=2) > DIFFERENT).astype(np.uint8)
+    return cv2.medianBlur(differs, 3).astype(np.float32)
+
+
+def from_background(images: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the colour (3,) of the plain background of images (V, T, H, W, 3), and their masks (V, T, H, W) in 0..1.
+
+    The colour is the median of the rims of the first frames.
+
+    Raises:
+        UserError: The rims have no one colour.
+    """
+    first = images[:, 0].numpy()
+    rims = [part.reshape(-1, 3) for part in (first[:, 0], first[:, -1], first[:, :, 0], first[:, :, -1])]
+    colour = rim_colour(np.concatenate(rims))
+    masks = [[torch.from_numpy(mask_before(image.numpy(), colour)) for image in view] for view in images]
+    return torch.from_numpy(colour), torch.stack([torch.stack(view) for view in masks])
