@@ -28,6 +28,7 @@ def reconstruct(
     velocity: tuple[float, float, float] | None = None,
     angular_velocity: tuple[float, float, float] | None = None,
     width: int | None = None,
+    frame_interval: float | None = None,
     steps: int = 2000,
     start: int = 5000,
     gaussians: int = 25000,
@@ -60,6 +61,7 @@ def reconstruct(
         velocity: Velocity of the body at t = 0, m/s; that of motion.yaml or particles.npz in the folder where absent, else zero.
         angular_velocity: Angular velocity about its centre at t = 0, rad/s; likewise.
         width: Width to which images are reduced, px.
+        frame_interval: Seconds from one frame to the next, where the recording has no times.
         steps: Optimiser steps.
         start: Gaussians at the start.
         gaussians: Most Gaussians.
@@ -91,7 +93,7 @@ def reconstruct(
     target = Path(out).expanduser() if out is not None else source / RECONSTRUCTION
     chosen = choose_device(device)
     around = _setting(source, setting, recording, scale, shift, up)
-    batch = load_views(source, placing=around.placing, recording=recording, frame_count=1, width=width)
+    batch = load_views(source, placing=around.placing, recording=recording, frame_interval=frame_interval, frame_count=1, width=width)
     if (trained := int((~batch.held_out).sum())) < 2:
         raise UserError(f"{source} has {trained} views to train on; a reconstruction needs at least two")
     target.mkdir(parents=True, exist_ok=True)

@@ -119,6 +119,7 @@ def load_visual(
     frame_count: int | None = None,
     width: int | None = None,
     background: str = "white",
+    frame_interval: float | None = None,
 ) -> VisualScene:
     """Read a filmed and reconstructed body.
 
@@ -131,6 +132,7 @@ def load_visual(
         frame_count: Number of frames; all where absent.
         width: Width of the images [px]; as recorded where absent.
         background: `white` or `black`, where a mask is known.
+        frame_interval: Seconds between frames where the recording does not say.
 
     Raises:
         UserError: A missing or malformed file; one line that names it.
@@ -142,7 +144,7 @@ def load_visual(
             raise UserError(f"{own / name} is missing: run `neuido reconstruct {folder}` first, or name its folder by reconstruction")
     setting = read_setting(own / "scene.yaml")
     options = {"views": views, "frame_step": frame_step, "frame_count": frame_count, "width": width, "background": background}
-    batch = load_views(folder, placing=setting.placing, recording=recording, **options)
+    batch = load_views(folder, placing=setting.placing, recording=recording, frame_interval=frame_interval, **options)
     body = read_body(own / "body.npz")
     truth = read_truth(folder, frame_step=frame_step, frames=len(batch.times))
     return VisualScene(setting.name, setting.scene, setting.density, setting.model, body, own / "gaussians.ply", batch, truth)

@@ -18,7 +18,10 @@ from neuido.data.trajectories.sampling import Resumable
 from neuido.errors import UserError
 from neuido.types import MultiViewBatch
 
-KEYS = {"reconstruction": ("reconstruction", "recording", "views"), "particles": ("recording", "views", "dt", "crop")}
+KEYS = {
+    "reconstruction": ("reconstruction", "recording", "views", "frame_interval"),
+    "particles": ("recording", "views", "dt", "crop", "frame_interval"),
+}
 """What a scene's mapping takes beside `path`, by where its body comes from (`body`)."""
 
 
@@ -109,8 +112,8 @@ class VisualDataModule(LightningDataModule):
     Training and validation take `scenes`; test and predict take `scenes` and `unseen`. Under several processes each trains on its own.
 
     Args:
-        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views` (as `load_visual` takes them); with
-            `body: particles` instead of `recording`, `views`, `dt`, `crop` (as `load_known` takes them).
+        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views`, `frame_interval` (as `load_visual` takes
+            them); with `body: particles` instead of `recording`, `views`, `dt`, `crop`, `frame_interval` (as `load_known` takes them).
         unseen: Scenes that training never sees.
         root: Folder to which the paths of scenes are relative; none: the current one, and what is not there is sought in NEUIDO_DATA.
         reconstructions: Folder that holds a reconstruction for each scene under the name of the scene's folder; none: inside each scene.
