@@ -8,7 +8,7 @@ from neuido.data.bodies.scene_files import VARIABLE
 from neuido.data.scenes.filmed_scene_module import VisualDataModule
 from neuido.data.scenes.known_body import cropped, load_known
 from neuido.errors import UserError
-from neuido.models.inference.pipeline import draw
+from neuido.models.inference.pipeline import render_motion
 from neuido.models.inference.prepared_scene import prepare
 from neuido.models.scoring.motion_scores import intersection_over_union
 from neuido.types import ParticleState
@@ -42,9 +42,9 @@ def test_particles_cover_what_the_body_covers(folder):
     source = load_known(folder)
     prepared = prepare(source, None)
     state = prepared.simulator.state
-    alphas = draw(prepared, ParticleState(*(t[None] for t in state)), [0])[1][0]
+    alphas = render_motion(prepared, ParticleState(*(t[None] for t in state)), [0])[1][0]
     part = prepare(source._replace(batch=cropped(source.batch, [2, 4, source.batch.images.shape[3], source.batch.images.shape[2]])), None)
-    again = draw(part, ParticleState(*(t[None] for t in state)), [0])[1][0]
+    again = render_motion(part, ParticleState(*(t[None] for t in state)), [0])[1][0]
     assert torch.allclose(again, alphas[:, 4:, 2:], atol=1e-4)
     side = float(source.body.volume.mean()) ** (1 / 3)
     lower, upper = source.body.x.amin(0) - side / 2, source.body.x.amax(0) + side / 2
@@ -110,8 +110,8 @@ def test_the_silicone_video():
     if not folder.is_dir():
         pytest.skip(f"{folder} is missing")
     prepared = prepare(load_known(folder, dt=1.2e-4, crop=[120, 90, 298, 330]), None)
-    assert prepared.frames == 13 and prepared.picks[0] == 0 and len(prepared.picks) == 13
-    times = np.array(prepared.picks) * prepared.every * 1.2e-4
+    assert prepared.frames == 13 and prepared.recorded_frames[0] == 0 and len(prepared.recorded_frames) == 13
+    times = np.array(prepared.recorded_frames) * prepared.every * 1.2e-4
     assert np.abs(times - prepared.source.batch.times.numpy()).max() < 4e-4
-    alphas = draw(prepared, ParticleState(*(t[None] for t in prepared.simulator.state)), [0])[1][:, 0]
+    alphas = render_motion(prepared, ParticleState(*(t[None] for t in prepared.simulator.state)), [0])[1][:, 0]
     assert float(intersection_over_union(alphas, prepared.silhouettes([0], 1)[:, 0])) > 0.93  # what the given start covers of frame 0
