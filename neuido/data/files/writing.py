@@ -119,7 +119,7 @@ def check_writable(folder: Path, option: str = "out") -> None:
 
 
 def _literal(text: str) -> str:
-    """A text as a pattern of `glob` that matches it alone."""
+    """Return a text as a pattern of `glob` that matches it alone."""
     return "".join(f"[{c}]" if c in "*?[" else c for c in text)
 
 
