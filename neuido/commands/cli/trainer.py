@@ -7,7 +7,7 @@ import importlib
 import os
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import neuido
 from neuido.commands import interruption
@@ -51,7 +51,11 @@ def run_lightning(args: list[str]) -> "LightningCLI":
 
         def _parse_ckpt_path(self) -> None:  # Lightning reads the hyperparameters of the checkpoint here
             _check_checkpoint(self.config[self.config.subcommand].get("ckpt_path"))
-            super()._parse_ckpt_path()
+            options = self.config[self.config.subcommand]
+            if options.get("ckpt_path") and Path(options["ckpt_path"]).is_file():
+                numbers = _numbers_of(options["ckpt_path"], options.model.class_path)
+                model = {"class_path": options.model.class_path, "init_args": numbers}
+                self.config = self.parser.parse_object({self.config.subcommand: {"model": model}}, self.config)
 
         def before_instantiate_classes(self) -> None:
             # Lightning loads a remote checkpoint with pickle unless told otherwise; here that takes an explicit `--weights_only false`.
@@ -83,6 +87,24 @@ def run_lightning(args: list[str]) -> "LightningCLI":
         parser_kwargs={"prog": "neuido", "version": neuido.__version__, **parser, **{name: dict(parser) for name in HEAVY}},
         args=args,
     )
+
+
+def _numbers_of(checkpoint: str, class_path: str) -> dict[str, Any]:
+    """Return the hyperparameters of a checkpoint that are numbers. What could be a path, a module or a class comes from the user alone.
+
+    Raises:
+        UserError: The checkpoint is of another class.
+    """
+    import torch
+
+    found = torch.load(checkpoint, weights_only=True, map_location="cpu")
+    found = found.get("hyper_parameters") if isinstance(found, dict) else None
+    if not isinstance(found, dict):
+        return {}
+    name = found.get("_class_path", class_path)
+    if str(name).rpartition(".")[2] != class_path.rpartition(".")[2]:
+        raise UserError(f"ckpt_path = {checkpoint} is a checkpoint of {str(name)[:80]!r}, and the model is {class_path}")
+    return {key: value for key, value in found.items() if isinstance(value, int | float)}
 
 
 def _check_checkpoint(given: str | None) -> None:
