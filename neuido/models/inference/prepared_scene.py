@@ -49,6 +49,11 @@ class PreparedScene(NamedTuple):
     recorded_frames: tuple[int, ...] | None = None
     """Which frames of a rollout are the recording's, of T recorded at uneven times; none: all."""
 
+    def __repr__(self) -> str:
+        views, frames, height, width = self.images.shape[:4]
+        seen = f"{views} views ({len(self.training_views)} for training), {frames} frames, {width} x {height} px"
+        return f"PreparedScene({self.source.name!r}, {len(self.source.body.x)} particles, {seen}, {self.images.device})"
+
     @property
     def frames(self) -> int:
         """T."""

@@ -12,6 +12,7 @@ from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus
 from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.device import choose_device
 from neuido.types import Scene, Walls
 
 CELLS, DT, EVERY, FRAMES = 16, 5e-4, 4, 151
@@ -29,9 +30,12 @@ class Interpolation(NamedTuple):
     motion: Tensor
     """Positions of the drop test [m], (K, N, P, 3)."""
 
+    def __repr__(self) -> str:
+        return f"Interpolation({self.names[0]!r} to {self.names[1]!r}, {len(self.rows)} laws, {len(self.motion)} frames)"
+
 
 def interpolate(
-    operator: IntrinsicDynamicsOperator, ends: tuple[str, str], *, count: int = 9, height: float = 0.3, device: str = "cpu"
+    operator: IntrinsicDynamicsOperator, ends: tuple[str, str], *, count: int = 9, height: float = 0.3, device: str = "auto"
 ) -> Interpolation:
     """Roll out the laws of latents on the line between two, all in one launch.
 
@@ -43,20 +47,21 @@ def interpolate(
         ends: Names of two latents.
         count: Latents, the ends included.
         height: Of the ball's centre at the start [m].
-        device: Where to simulate.
+        device: `auto` (CUDA where there is one), `cpu` or `cuda`.
 
     Raises:
         UserError: A name that there is not, fewer than three latents, a law that cannot run.
     """
     if count < 3:
         raise UserError(f"count = {count}: at least 3 latents, the ends included, are needed")
-    operator = operator.to(device)
+    chosen = choose_device(device)
+    operator = operator.to(chosen)
     a, b = (operator.latent(name) for name in ends)
     shares = torch.linspace(0, 1, count, device=a.device)
     z = torch.lerp(a, b, shares[:, None])
     body = ball(centre=(0.5, height, 0.5), radius=0.12, spacing=0.03, velocity=(0.0, -2.0, 0.0))
     scene = Scene(cells=CELLS, dt=DT, walls=Walls(inset=2.0))
-    simulator = Simulator([scene] * count, [body] * count, device=device)
+    simulator = Simulator([scene] * count, [body] * count, device=chosen)
     with torch.no_grad():
         moduli = p_wave_modulus(operator, z).tolist()
         motion = simulator.rollout((FRAMES - 1) * EVERY, *operator.laws(z), every=EVERY)

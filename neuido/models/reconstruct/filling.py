@@ -38,6 +38,9 @@ class Volume(NamedTuple):
     spacing: float
     """Edge of a cell [m]."""
 
+    def __repr__(self) -> str:
+        return f"Volume({' x '.join(map(str, self.values.shape))} cells of {self.spacing:.3g} m)"
+
     def centres(self) -> Tensor:
         """Return centres of the cells [m], (X, Y, Z, 3)."""
         axes = [torch.arange(n, device=self.lower.device) + 0.5 for n in self.values.shape]

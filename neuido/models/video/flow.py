@@ -77,6 +77,10 @@ class Velocities(NamedTuple):
     frame_interval: float
     """[s]"""
 
+    def __repr__(self) -> str:
+        views, steps, side = self.flow.shape[:3]
+        return f"Velocities({views} views, {steps} steps of {self.frame_interval:.3g} s, {side} x {side} cells)"
+
 
 def body_window(masks: Tensor, margin: float = 0.1) -> tuple[int, int, int]:
     """Return top, left and side [px] of the square, within the image, that holds a body in all frames of a video.

@@ -58,6 +58,7 @@ def test_read_law_is_the_inference_of_predict(operator, encoder, tmp_path):
     assert (found.scene, found.views, found.frames) == ("tiny", 2, 6)
     motion, _ = found.rollout(3)
     assert motion.x.shape == (3, len(scene.body.x), 3)
+    assert repr(found.prepared).startswith("PreparedScene('tiny', ") and "tensor" not in repr(found.prepared)
     assert "Pa" in repr(found) and "tensor" not in repr(found)
 
     found.save(tmp_path / "law.safetensors")
