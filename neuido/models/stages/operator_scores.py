@@ -71,6 +71,7 @@ def fit_latents(
     steps: int = 300,
     lr: float = 0.1,
     samples: int = 128,
+    plastic_target: str = "residual",
     progress: bool = False,
 ) -> Tensor:
     """Fit only the latents of materials that the operator has not seen; its weights stay as they are.
@@ -86,6 +87,7 @@ def fit_latents(
         steps: Number of steps.
         lr: Learning rate at the start.
         samples: Samples of each material in a step, taken in turn.
+        plastic_target: As for `evaluate_operator`; an operator is fitted best by the loss that it was trained with.
         progress: Write the error to stderr ten times.
 
     Returns:
@@ -100,7 +102,7 @@ def fit_latents(
     def errors(z: Tensor, step: int) -> Tensor:
         rows = order[(torch.arange(min(samples, total), device=order.device) + step * samples) % total]
         part = TrajectoryBatch(*(t[:, rows].contiguous() for t in (trial, corrected, stress)), batch.trajectory)
-        answers = evaluate_operator(operator, z, part, stress_epsilon, residual_epsilon)
+        answers = evaluate_operator(operator, z, part, stress_epsilon, residual_epsilon, plastic_target)
         return (answers.stress_error + answers.plastic_error).mean(1)
 
     trainable = [p for p in operator.parameters() if p.requires_grad]

@@ -206,6 +206,7 @@ class PretrainModule(LightningModule):
                 steps=self.hparams.instance_steps,
                 lr=self.hparams.instance_lr,
                 samples=self.hparams.instance_samples,
+                plastic_target=self.hparams.plastic_target,
                 progress=self.trainer.is_global_zero,
             )
             metrics = ConstitutiveMetrics("instance/", data.instance_families).to(self.device)
