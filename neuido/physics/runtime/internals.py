@@ -4,7 +4,6 @@ They save time and change no result. With a version that was not tried a warning
 """
 
 import ctypes
-import importlib.metadata
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,13 +13,12 @@ import warp as wp
 from torch import Tensor
 from torch.nn import functional
 
-TRIED = {"torch": ((2, 11), (2, 13)), "warp-lang": ((1, 19), (1, 19))}
+TRIED = {"torch": ((2, 11), (2, 13)), "warp": ((1, 19), (1, 19))}
 """First and last minor version of each package with which the private parts were tried."""
 
 
-def was_tried(package: str) -> bool:
-    """Return whether the installed version of a package is in `TRIED`, and warn in one line where it is not."""
-    version = importlib.metadata.version(package)
+def was_tried(package: str, version: str) -> bool:
+    """Return whether this version of a package is in `TRIED`, and warn in one line where it is not."""
     numbers = version.split("+")[0].split(".")[:2]
     first, last = TRIED[package]
     if first <= tuple(int(n) if n.isdigit() else 0 for n in numbers) <= last:
@@ -31,7 +29,7 @@ def was_tried(package: str) -> bool:
     return False
 
 
-TORCH_TRIED, WARP_TRIED = was_tried("torch"), was_tried("warp-lang")
+TORCH_TRIED, WARP_TRIED = was_tried("torch", torch.__version__), was_tried("warp", wp.__version__)
 
 
 # Warp.
