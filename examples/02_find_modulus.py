@@ -30,6 +30,7 @@ for _ in range(25):
     errors.append(1e3 * error.sqrt().item())
     optimiser.step()
 print(f"found {moduli[-1]:.3g} Pa, true 6e+04 Pa; {errors[0]:.1f} mm became {errors[-1]:.2f} mm")
+assert abs(moduli[-1] / 6e4 - 1) < 0.02, "the modulus was not found"
 
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3))

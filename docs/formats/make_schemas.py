@@ -215,7 +215,21 @@ def _diagnosis(names: list[str]) -> Schema:
         },
         "required": ["name", "class", "parameters", "p_value", "where"],
     }
-    errors: Schema = {"type": "object", "properties": {"by_recording": {"type": "object"}}, "required": ["fit", "by_recording"]}
+    maybe: Schema = {"type": ["number", "null"]}
+    texts: Schema = {"type": "array", "items": {"type": "string"}}
+    scores: Schema = {key: maybe for key in ("fit", "held_out", "validation", "test")}
+    errors: Schema = {"type": "object", "properties": scores | {"by_recording": {"type": "object"}}, "required": ["fit", "by_recording"]}
+    measured: Schema = {"type": "object", "properties": {"value": figure, "unit": {"type": "string"}}, "required": ["value", "unit"]}
+    lead: Schema = {
+        "type": "object",
+        "properties": {"name": one_of(names), "error_ratio": NUMBER, "parameters": {"type": "object", "additionalProperties": measured}},
+        "required": ["name", "error_ratio", "parameters"],
+    }
+    hidden: Schema = {
+        "type": "object",
+        "properties": {"name": one_of(names), "parameter": TEXT, "unit": {"type": "string"}, "up_to": maybe},
+        "required": ["name", "parameter", "unit", "up_to"],
+    }
     part: Schema = {
         "type": "object",
         "properties": {
@@ -225,10 +239,25 @@ def _diagnosis(names: list[str]) -> Schema:
             "after": quantities,
             "error": {
                 "type": "object",
-                "properties": {"measure": TEXT, "unit": TEXT, "before": errors, "after": errors},
+                "properties": {
+                    "measure": TEXT,
+                    "unit": TEXT,
+                    "left_over_floor": maybe,
+                    "left_over_noise": maybe,
+                    "noise_from": {"type": "object", "additionalProperties": one_of(["stated", "estimated", "assumed"])},
+                    "before": errors,
+                    "after": errors,
+                },
                 "required": ["measure", "unit", "noise_floor", "discretisation_floor", "before", "after"],
             },
             "rejected": {"type": "array", "items": {"type": "object", "required": ["name", "reason"]}},
+            "why": texts,
+            "would_help": texts,
+            "leads": {"type": "array", "items": lead},
+            "untried": {"type": "array", "items": one_of(names)},
+            "not_excluded": {"type": "array", "items": hidden},
+            "left_out": texts,
+            "settings_not_run": {"type": "object", "additionalProperties": texts},
         },
         "required": ["answer", "effects", "declared", "after", "error", "rejected"],
     }
