@@ -10,7 +10,7 @@ import yaml
 from neuido.data.cameras import orbit
 from neuido.data.formats import nerfstudio
 from neuido.data.measured.experiment import Experiment, Recording, write_experiment
-from neuido.data.scenes.synthetic import dress
+from neuido.data.scenes.synthetic import surround_with_gaussians
 from neuido.models.render.splatting import rasterize
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import material
@@ -96,7 +96,7 @@ def filmed(
             out = simulator.rollout(
                 20 * (frames - 1), *material(MODEL["elasticity"], MODEL["plasticity"]), every=20, effects=Effects.of(effects)
             )
-        dense = dress(b, 27, seed=name)
+        dense = surround_with_gaussians(b, 27, seed=name)
         means, covariances = dense.at(out.x, out.F)
         alphas = rasterize(means, covariances, torch.full((means.shape[1],), 0.9), dense.colour, *cameras)[1]
         shot = np.zeros((views, frames, width, width, 4), np.uint8)

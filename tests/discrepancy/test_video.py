@@ -12,7 +12,7 @@ import torch
 import yaml
 
 from neuido.data.measured.experiment import read_experiment
-from neuido.data.scenes.synthetic import dress
+from neuido.data.scenes.synthetic import surround_with_gaussians
 from neuido.discrepancy import silhouettes
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.filmed import Splats, looks, read_film
@@ -164,7 +164,7 @@ def test_gaussians_of_the_folder_are_what_is_drawn(folders, tmp_path):
     folder = tmp_path / "folder"
     shutil.copytree(folders["drag"], folder)
     for r in read_experiment(folder).recordings:
-        dense = dress(r.body, 27, seed="splats")
+        dense = surround_with_gaussians(r.body, 27, seed="splats")
         means, covariances = dense.at(r.body.x[None], torch.eye(3).expand(1, len(r.body.x), 3, 3))
         opacity = torch.full((means.shape[1],), 0.9)
         save_ply(folder / r.name / "gaussians.ply", Gaussians(means[0], covariances[0], opacity, harmonics_of(dense.colour)))
