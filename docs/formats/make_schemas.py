@@ -15,6 +15,13 @@ POSITIVE: Schema = {"type": "number", "exclusiveMinimum": 0}
 NOT_NEGATIVE: Schema = {"type": "number", "minimum": 0}
 TEXT: Schema = {"type": "string", "minLength": 1}
 VECTOR: Schema = {"type": "array", "items": NUMBER, "minItems": 3, "maxItems": 3}
+NOT_ZERO: Schema = {"type": "number", "not": {"const": 0}}
+SCALE: Schema = {
+    "type": "object",
+    "properties": {f"{quantity}{part}": NOT_ZERO for quantity in ("nominal_stress", "true_stress") for part in ("", "_1", "_2")}
+    | {"shear_stress": NOT_ZERO},
+    "additionalProperties": POSITIVE,
+}
 BOX: Schema = {"type": "array", "items": VECTOR, "minItems": 2, "maxItems": 2, "description": "lower and upper corner [m]"}
 ROWS: Schema = {
     "type": "array",
@@ -137,7 +144,7 @@ def schemas() -> dict[str, Schema]:
                             "columns": {"anyOf": [record(c, {"time": TEXT}) for c in columns]},
                             "role": role,
                         },
-                        {"scale": {"type": "object", "additionalProperties": POSITIVE}, "rows": ROWS, "direction": VECTOR},
+                        {"scale": SCALE, "rows": ROWS, "direction": VECTOR},
                     )
                 ),
             }
@@ -161,7 +168,12 @@ def schemas() -> dict[str, Schema]:
                             "columns": record({"t": TEXT}, dict.fromkeys(track.AXES, TEXT), minProperties=2),
                             "role": role,
                         },
-                        {"rows": ROWS, "spin": VECTOR, "noise": POSITIVE},
+                        {
+                            "rows": ROWS,
+                            "scale": record({}, dict.fromkeys(track.AXES, NOT_ZERO) | {"t": POSITIVE}),
+                            "spin": VECTOR,
+                            "noise": POSITIVE,
+                        },
                     )
                 ),
             },

@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from neuido.data.files.parsing import read_table, read_yaml
+from neuido.data.files.delimited import is_number, read_delimited
+from neuido.data.files.parsing import read_yaml
 from neuido.data.files.values import check_keys, inside, mapping, number
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY, Effects
@@ -87,13 +88,12 @@ def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: M
         raise UserError(f"{where}: the file {path} is missing")
     columns = mapping(entry["columns"], f"{where}.columns")
     try:
-        table = read_table(path)
+        table = read_delimited(path).rows
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
     if not table:
         raise UserError(f"{where}: {path} is empty")
-    header, *lines = table
-    header = [title.strip() for title in header]
+    header, lines = _titles(table, [title for title in columns.values() if isinstance(title, str)])
     rows = _rows(entry.get("rows"), len(lines), where)
     out = {}
     for key, title in columns.items():
@@ -183,6 +183,15 @@ def check_increasing(t: np.ndarray, where: str) -> np.ndarray:
         i = int(np.argmax(np.diff(t) <= 0))
         raise UserError(f"{where}: times must rise, got {t[i]:g} s and then {t[i + 1]:g} s")
     return t
+
+
+def _titles(table: list[list[str]], wanted: list[str]) -> tuple[list[str], list[list[str]]]:
+    """Return the titles of a table and its data rows; the titles are the first row with all that are wanted, a row of units is left out."""
+    first = next((i for i, row in enumerate(table) if set(wanted) <= set(row)), 0)
+    lines = table[first + 1 :]
+    if lines and len(lines[0]) > 1 and not any(is_number(cell) or cell.lower() in ("nan", "inf") for cell in lines[0]) and all(lines[0]):
+        lines = lines[1:]
+    return table[first], lines
 
 
 def _rows(given: Any, count: int, where: str) -> range:

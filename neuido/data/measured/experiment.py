@@ -18,6 +18,7 @@ from neuido.data.files.values import check_keys, file_name, inside, mapping, num
 from neuido.data.formats import nerfstudio
 from neuido.data.formats.layout import MultiView
 from neuido.data.measured.columns import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
+from neuido.data.measured.plausibility import check_positions, mask_unseen
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY
 from neuido.types import Body, Box, Plane, Scene, Walls
@@ -263,6 +264,8 @@ def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
     if min(sizes.values()) < 1:
         raise UserError(f"{path}: {', '.join(f'{n} = {m}' for n, m in sizes.items())}; none may be zero")
     x, t = arrays["x"], arrays["t"]
+    if not np.isinf(x).any():
+        x = arrays["x"] = mask_unseen(x, str(path))
     if np.isinf(x).any() or (np.isnan(x).any(axis=2) != np.isnan(x).all(axis=2)).any():
         raise UserError(f"{path}: x holds an infinity, or a point that is NaN in one coordinate only")
     if t[0] != 0 or (np.diff(t) <= 0).any():
@@ -281,6 +284,7 @@ def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
         raise UserError(f"{path}: F0 must have positive determinants; one is {np.linalg.det(arrays['F0']).min():.3g}")
     if "track" in arrays and not ((arrays["track"] >= -1) & (arrays["track"] < sizes["P"])).all():
         raise UserError(f"{path}: track must lie in -1..{sizes['P'] - 1}, got {arrays['track'].min()}..{arrays['track'].max()}")
+    check_positions(x, arrays["x0"], arrays.get("track"), lower, upper, str(path))
     tensors = {key: torch.from_numpy(array.astype(np.float32)) for key, array in arrays.items() if key not in ("t", "track")}
     return {
         "x": tensors["x"],

@@ -20,6 +20,7 @@ from neuido.data.measured.columns import (
     read_text,
 )
 from neuido.data.measured.experiment import read_model
+from neuido.data.measured.plausibility import check_order, check_stress, check_stretches
 from neuido.errors import UserError
 from neuido.types import Vector
 
@@ -133,6 +134,7 @@ def read_material_tests(path: str | os.PathLike, *, model: Mapping[str, Any] | N
         tests = read_entries(content["tests"], "tests", "test", lambda entry, where: _test(entry, where, folder))
         if not any(test.role == "fit" for test in tests):
             raise UserError("tests has none whose role is fit")
+        _check(tests, believed)
         if incompressible and believed["plasticity"]["law"] == "drucker_prager":
             raise UserError("model.incompressible: drucker_prager depends on the pressure, which an incompressible law does not know")
     return MaterialTests(name, folder, believed, free, incompressible, effects, tests)
@@ -154,7 +156,8 @@ def _test(entry: Any, where: str, folder: Path) -> MaterialTest:
     for key, factor in scale.items():
         if key not in columns:
             raise UserError(f"unknown key {key!r} in {where}.scale; it takes {', '.join(columns)}")
-        scale[key] = number(factor, f"{where}.scale.{key}", above=0.0)
+        stress = key in stress_keys
+        scale[key] = number(factor, f"{where}.scale.{key}") if stress and factor else number(factor, f"{where}.scale.{key}", above=0.0)
     direction = entry.get("direction", [1, 0, 0])
     direction = np.array(vector(direction, f"{where}.direction"))
     if not np.linalg.norm(direction) > 0:
@@ -179,6 +182,23 @@ def _test(entry: Any, where: str, folder: Path) -> MaterialTest:
         time=check_increasing(data["time"], where) if "time" in data else None,
         direction=tuple((direction / np.linalg.norm(direction)).tolist()),
     )
+
+
+def _check(tests: tuple[MaterialTest, ...], model: Mapping[str, Any]) -> None:
+    """Refuse what the tests cannot have measured; those of one specimen together, as the rows of one may be far from rest."""
+    groups: dict[tuple, list[int]] = {}
+    for i, test in enumerate(tests):
+        groups.setdefault((test.file, test.columns, test.mode, test.direction), []).append(i)
+        if test.time is None and test.path.shape[1] == 1:
+            check_order(test.path[:, 0], f"tests[{i}] ({test.name}), {test.file.name}")
+    for members in groups.values():
+        first = tests[members[0]]
+        where = f"tests[{members[0]}] ({first.name}), {first.file.name}"
+        path, stress = (np.concatenate([getattr(tests[i], key) for i in members]) for key in ("path", "stress"))
+        shear = first.mode == "simple_shear"
+        if not shear:
+            check_stretches(path, where)
+        check_stress(path, stress, model, where, timed=first.time is not None, rest=0.0 if shear else 1.0)
 
 
 def _choose(columns: Mapping[str, Any], keys: tuple[str, ...], others: Mapping[str, str], where: str) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from neuido.data.measured.columns import (
     read_role,
     read_text,
 )
+from neuido.data.measured.plausibility import check_flight
 from neuido.errors import UserError
 from neuido.types import Vector
 
@@ -96,6 +97,9 @@ def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = No
         recordings = read_entries(
             content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, bodies, file.parent)
         )
+        for i, track in enumerate(recordings):
+            for column, a in enumerate(track.axes):
+                check_flight(track.t, track.x[:, column], gravity[a], AXES[a], f"recordings[{i}] ({track.name})")
         for body in bodies:
             if not any(track.body == body and track.role == "fit" for track in recordings):
                 raise UserError(f"recordings has none of the body {body!r} whose role is fit")
@@ -123,7 +127,7 @@ def _bodies(given: Any) -> dict[str, dict[str, float]]:
 
 
 def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) -> Track:
-    optional = ("rows", "spin", "noise")
+    optional = ("rows", "spin", "noise", "scale")
     check_keys(entry, where, ("name", "body", "file", "columns", "role", *optional), optional)
     name = file_name(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
@@ -135,7 +139,12 @@ def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) 
     axes = tuple(a for a, key in enumerate(AXES) if key in columns)
     if not axes:
         raise UserError(f"{where}.columns names none of {', '.join(AXES)}")
-    data, _ = read_columns(folder, entry, where, scale={})
+    scale = mapping(entry.get("scale", {}), f"{where}.scale")
+    check_keys(scale, f"{where}.scale", ("t", *AXES), ("t", *AXES))
+    for key, factor in scale.items():
+        if not number(factor, f"{where}.scale.{key}", **({"above": 0.0} if key == "t" else {})):
+            raise UserError(f"{where}.scale.{key} must not be zero")
+    data, _ = read_columns(folder, entry, where, scale=scale)
     return Track(
         name=name,
         body=entry["body"],

@@ -1,0 +1,119 @@
+"""Tables as text of any dialect: encoding, separator, decimal comma, comments, lines before the titles. The files are not trusted."""
+
+import csv
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from neuido.data.files.parsing import check_limit, one_line
+from neuido.errors import UserError
+
+DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","))
+"""Separator and decimal sign, the likeliest first; a blank stands for any white space."""
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_COMMA = re.compile(r"[+-]?(\d+|\d*,\d+)([eE][+-]?\d+)?")
+_GROUPED = {".": re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d+)?"), ",": re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d+)?")}
+_SAMPLE = 400
+"""Lines from which the dialect is told."""
+
+
+class Delimited(NamedTuple):
+    """The cells of a table, its numbers with a decimal point."""
+
+    rows: list[list[str]]
+    """Those that are not empty, without comments."""
+    lines: list[int]
+    """The line of the file that each row is, from 1."""
+    encoding: str
+    separator: str
+    decimal: str
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell holds one finite number with a decimal point."""
+    return NUMBER.fullmatch(cell.strip()) is not None
+
+
+def read_delimited(path: Path) -> Delimited:
+    """Read a table of text, whatever its encoding, separator and decimal sign.
+
+    Raises:
+        UserError: The file is missing, too large, or no text.
+    """
+    text, encoding = _decoded(path)
+    numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
+    separator, decimal = _dialect([line for _, line in numbered[-_SAMPLE:]])
+    rows, lines = [], []
+    for i, line in numbered:
+        try:
+            cells = _split(line, separator)
+        except csv.Error as error:
+            raise UserError(f"{path} is no CSV file: line {i}: {one_line(error)}") from error
+        cells = [_with_point(cell, decimal) for cell in cells]
+        if any(cells):
+            rows.append(cells)
+            lines.append(i)
+    return Delimited(rows, lines, encoding, separator, decimal)
+
+
+def _decoded(path: Path) -> tuple[str, str]:
+    if not path.is_file():
+        raise UserError(f"{path} is missing" if not path.exists() else f"{path} is no file")
+    try:
+        size = path.stat().st_size
+        check_limit(size, "NEUIDO_MAX_TEXT_BYTES", f"{path} has {size} bytes")
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path} is no CSV file: {one_line(error)}") from error
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        encodings = ["utf-16"]
+    else:
+        encodings = ["utf-8-sig", "cp1252"]
+    if b"\0" in data and encodings[0] != "utf-16":
+        raise UserError(f"{path} is no CSV file: it holds zero bytes; a sheet of Excel is read by `neuido import`")
+    for encoding in encodings:
+        try:
+            return data.decode(encoding), encoding
+        except UnicodeDecodeError:
+            continue
+    raise UserError(f"{path} is no CSV file: its text is in none of the encodings {', '.join(encodings)}; save it as UTF-8")
+
+
+def _dialect(lines: list[str]) -> tuple[str, str]:
+    best, chosen = 0.0, DIALECTS[0]
+    for separator, decimal in DIALECTS:
+        score = 0.0
+        for line in lines:
+            try:
+                cells = [cell for cell in _split(line, separator) if cell]
+            except csv.Error:
+                continue
+            numbers = sum(_in_dialect(cell, decimal) for cell in cells)
+            score += numbers - 2 * (len(cells) - numbers) if numbers else 0
+        if score > best:
+            best, chosen = score, (separator, decimal)
+    if best > 0:
+        return chosen
+    counts = {separator: sum(line.count(separator) for line in lines) for separator in ("\t", ";", ",")}  # no number: by the titles
+    most = max(counts, key=counts.__getitem__)
+    return (most if counts[most] > counts[","] else ","), "."
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        return line.split()
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, strict=True, skipinitialspace=True))]
+
+
+def _in_dialect(cell: str, decimal: str) -> bool:
+    number = _COMMA.fullmatch(cell) if decimal == "," else NUMBER.fullmatch(cell)
+    return number is not None or _GROUPED[decimal].fullmatch(cell) is not None
+
+
+def _with_point(cell: str, decimal: str) -> str:
+    """Return a number with a decimal point and no groups of thousands; other text as it is."""
+    if not _in_dialect(cell, decimal):
+        return cell
+    if _GROUPED[decimal].fullmatch(cell):
+        cell = cell.replace("," if decimal == "." else ".", "")
+    return cell.replace(",", ".")
