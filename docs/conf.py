@@ -76,6 +76,8 @@ sphinx_gallery_conf = {
     "ignore_pattern": r"/(?!\d\d_)[^/]*\.py$",
     "image_scrapers": (saved_pictures.SavedPictures(),),
     "capture_repr": (),
+    "within_subsection_order": "FileNameSortKey",
+    "thumbnail_size": (460, 230),
     "download_all_examples": False,
     "show_memory": False,
     "show_signature": False,

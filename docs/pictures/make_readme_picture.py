@@ -6,7 +6,7 @@
     neuido demo --parts loop
     python docs/pictures/make_readme_picture.py film/Ball runs/predict/Ball runs/demo/loop/diagnosis
 
-The left half shows the film, and the same view drawn from the law that the encoder read in one pass. The right half shows a
+The upper half shows the film, and the same view drawn from the law that the encoder read in one pass. The lower half shows a
 measured throw that no fit has seen, and its prediction by the declared model and by the model with the effect that the diagnosis named.
 """
 
@@ -49,12 +49,12 @@ def draw(video: list[np.ndarray], law: dict, diagnosis: Path, k: int) -> Image.I
     scored = content["error"]["after"]["by_recording"]
     with np.load(diagnosis / "predicted" / "toss.npz" if "toss" in scored else next((diagnosis / "predicted").glob("*.npz"))) as archive:
         motion = {key: archive[key] for key in ("t", "measured", "before", "after")}
-    figure = Figure(figsize=(9.6, 3.1), facecolor="white")
+    figure = Figure(figsize=(5.4, 4.9), facecolor="white")
     boxes = {
-        "film": (0.005, 0.04, 0.21, 0.74),
-        "drawn": (0.225, 0.04, 0.21, 0.74),
-        "throw": (0.50, 0.17, 0.23, 0.60),
-        "error": (0.815, 0.17, 0.175, 0.60),
+        "film": (0.02, 0.545, 0.47, 0.32),
+        "drawn": (0.51, 0.545, 0.47, 0.32),
+        "throw": (0.125, 0.09, 0.41, 0.31),
+        "error": (0.665, 0.09, 0.295, 0.31),
     }
     panels = {name: figure.add_axes(box) for name, box in boxes.items()}
     image = video[min(k, len(video) - 1)]
@@ -62,16 +62,9 @@ def draw(video: list[np.ndarray], law: dict, diagnosis: Path, k: int) -> Image.I
     for name, half, title in (("film", halves[0], "video in"), ("drawn", halves[1], "predicted motion out")):
         panels[name].imshow(half, interpolation="lanczos")
         panels[name].axis("off")
-        panels[name].set_title(title, fontsize=9, color=INK)
-    figure.text(
-        0.215,
-        0.93,
-        f"law read in one pass: {law['modulus'] / 1e3:.0f} kPa (true: {law['true'] / 1e3:.0f} kPa)",
-        ha="center",
-        fontsize=10,
-        weight="bold",
-        color=INK,
-    )
+        panels[name].set_title(title, fontsize=10, color=INK, pad=3)
+    said = f"law read in one pass: {law['modulus'] / 1e3:.0f} kPa (true: {law['true'] / 1e3:.0f} kPa)"
+    figure.text(0.5, 0.945, said, ha="center", fontsize=11.5, weight="bold", color=INK)
     throw, error = panels["throw"], panels["error"]
     for when, colour in (("before", BEFORE), ("after", AFTER)):
         throw.plot(*motion[when][k, :, :2].T, "o", ms=3.2, color=colour, alpha=0.75, mew=0, label=f"model {when}")
@@ -79,27 +72,27 @@ def draw(video: list[np.ndarray], law: dict, diagnosis: Path, k: int) -> Image.I
     every = np.concatenate([motion[w][..., :2].reshape(-1, 2) for w in ("measured", "before", "after")])
     low, high = np.nanmin(every, 0) - 0.04, np.nanmax(every, 0) + 0.04
     throw.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    throw.set_xlabel("x [m]", fontsize=7)
-    throw.set_ylabel("height [m]", fontsize=7)
-    throw.set_title("a throw that no fit has seen", fontsize=9, color=INK)
+    throw.set_xlabel("x [m]", fontsize=8.5, labelpad=1)
+    throw.set_ylabel("height [m]", fontsize=8.5, labelpad=1)
+    throw.set_title("a throw that no fit has seen", fontsize=10, color=INK, pad=3)
     rms = {w: 1e3 * np.sqrt(np.nanmean(((motion["measured"] - motion[w]) ** 2).sum(-1), axis=1)) for w in ("before", "after")}
     for when, colour in (("before", BEFORE), ("after", AFTER)):
         error.plot(motion["t"][: k + 1], rms[when][: k + 1], color=colour, label=when)
         error.plot(motion["t"][k], rms[when][k], "o", ms=4, color=colour)
     error.set(xlim=(0, motion["t"][-1]), ylim=(0, 1.05 * np.nanmax(rms["before"])))
     error.locator_params(axis="x", nbins=4)
-    error.set_xlabel("time [s]", fontsize=7)
-    error.set_title("error [mm]", fontsize=9, color=INK)
-    error.legend(fontsize=7, frameon=False, loc="upper left")
-    throw.legend(fontsize=6, frameon=False, loc="lower left", handletextpad=0.1, borderpad=0.1)
+    error.set_xlabel("time [s]", fontsize=8.5, labelpad=1)
+    error.set_title("error [mm]", fontsize=10, color=INK, pad=3)
+    error.legend(fontsize=9, frameon=False, loc="upper left")
+    throw.legend(fontsize=8, frameon=False, loc="upper right", handletextpad=0.1, borderpad=0.1)
     for panel in (throw, error):
-        panel.tick_params(labelsize=6, length=2)
+        panel.tick_params(labelsize=8, length=2)
         panel.spines[["top", "right"]].set_visible(False)
     effect = content["effects"][0]
     name, figures = next(iter(effect["parameters"].items()))
     said = f"missing effect found: {effect['name'].replace('_', ' ')}, {figures['value']:.2f} {figures['unit']}"
-    figure.text(0.745, 0.93, said, ha="center", fontsize=10, weight="bold", color=INK)
-    figure.add_artist(Line2D([0.445, 0.445], [0.05, 0.97], color="0.85", lw=1))
+    figure.text(0.5, 0.465, said, ha="center", fontsize=11.5, weight="bold", color=INK)
+    figure.add_artist(Line2D([0.03, 0.97], [0.525, 0.525], color="0.85", lw=1))
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=110)
     return Image.open(buffer).convert("RGB")
