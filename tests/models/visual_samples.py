@@ -89,6 +89,9 @@ class TinyScenes(LightningDataModule):
         self.folder, self.youngs, self.unseen_youngs, self.seed = Path(folder), youngs, unseen, seed
         self.steps_in_a_row = None
 
+    def __str__(self):
+        return f"TinyScenes(youngs={self.youngs}, unseen={self.unseen_youngs})"
+
     @cached_property
     def scenes(self):
         return [tiny_scene(self.folder, f"tiny-{i}", young=young) for i, young in enumerate(self.youngs)]

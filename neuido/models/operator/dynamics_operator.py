@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
+from neuido.data.files.missing_weights import how_to_make
 from neuido.data.files.writing import replacing
 from neuido.errors import UserError
 from neuido.physics.laws.neural import networks
@@ -235,8 +236,8 @@ class IntrinsicDynamicsOperator(nn.Module):
         named = PRETRAINED.get(str(path))
         path = named or Path(path)
         if not path.is_file():
-            advice = " (make it: neuido fit --config configs/stage1.yaml, then `save_to`)" if named else ""
-            raise UserError(f"init_from: the weights {path} are missing{advice}")
+            remedy = "make them: neuido fit --config configs/stage1.yaml, then `save_to`" if named else how_to_make(path)
+            raise UserError(f"init_from: the weights {path} are missing: {remedy}")
         try:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}

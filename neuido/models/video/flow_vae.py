@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
+from neuido.data.files.missing_weights import how_to_make
 from neuido.data.files.writing import replacing
 from neuido.errors import UserError
 
@@ -196,7 +197,7 @@ def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -
     """
     path = Path(path)
     if not path.is_file():
-        raise UserError(f"{option}: the weights {path} are missing")
+        raise UserError(f"{option}: the weights {path} are missing: {how_to_make(path)}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
