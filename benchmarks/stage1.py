@@ -20,6 +20,8 @@ from pathlib import Path
 
 import torch
 
+from neuido.data.files.results import logs
+
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = {32: (1023.0, 3.598e-8), 64: (839.2, 3.211e-8), 256: (688.5, 3.341e-8)}
 """Stress MSE and plastic MSE of the paper's Table 3, which leaves out d = 128. The data are not the same: the paper gives no ranges."""
@@ -54,7 +56,7 @@ def command(options: argparse.Namespace, name: str) -> list[str]:
 def figures(folder: Path) -> dict[str, float]:
     """The last value of each column of a run's metrics.csv."""
     found: dict[str, float] = {}
-    for path in sorted(folder.glob("version_*/metrics.csv"), key=lambda p: p.stat().st_mtime):
+    for path in logs(folder):
         with path.open() as file:
             for row in csv.DictReader(file):
                 found |= {key: float(value) for key, value in row.items() if value not in ("", None)}

@@ -1,8 +1,10 @@
 """The `simulate` command: Stage I trajectories, or filmed scenes where the configuration names some. `--help` loads no torch."""
 
 import inspect
+from pathlib import Path
 from typing import Any
 
+from neuido.data.files.writing import check_writable
 from neuido.data.trajectories.options import Film
 from neuido.data.trajectories.options import simulate as trajectories
 from neuido.data.undeclared import Case, make_undeclared
@@ -48,6 +50,7 @@ def simulate(
     Raises:
         UserError: An impossible material or option, a step above the stability limit, a folder that holds another set-up.
     """
+    check_writable(Path(out))
     if model is not None and experiment is None:
         raise UserError(f"model = {model} is for the recordings of an experiment: give experiment too")
     if experiment is not None:

@@ -150,8 +150,10 @@ def _last_line(path: Path) -> str:
 
 def logged(folder: Path) -> dict[str, float]:
     """The last value of each column of the metrics.csv files below a folder, the newest file last."""
+    from neuido.data.files.results import logs
+
     values: dict[str, float] = {}
-    for path in sorted(folder.rglob("metrics.csv"), key=lambda path: path.stat().st_mtime):
+    for path in logs(folder):
         for row in read_rows(path):
             values |= {name: value for name, value in row.items() if isinstance(value, float)}
     return values

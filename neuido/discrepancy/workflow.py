@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuido.data.files.writing import check_writable
 from neuido.discrepancy.diagnosis import Diagnosis
 from neuido.errors import UserError
 
@@ -81,8 +82,8 @@ def diagnose(
         raise UserError(f"minutes = {minutes} must not be negative; 0 sets no limit")
     folder = os.fspath(source) if isinstance(source, str | os.PathLike) else None
     kind, place = ("", Path()) if folder is None else kind_of(folder)
-    if out is not None and Path(out).expanduser().exists() and not Path(out).expanduser().is_dir():
-        raise UserError(f"out = {out} is a file: give a folder")
+    if out is not None:
+        check_writable(Path(out).expanduser())
 
     from neuido.discrepancy import answer
     from neuido.discrepancy import resume as store

@@ -111,13 +111,15 @@ def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any])
     cells = discretisation["grid"]
     if not isinstance(cells, int) or isinstance(cells, bool) or cells < 4:
         raise UserError(f"discretisation.grid must be a whole number of at least 4 cells, got {cells!r}")
+    colliders = _list(scene, "colliders")
+    check_limit(len(colliders), "NEUIDO_MAX_COLLIDERS", f"scene.colliders has {len(colliders)} planes")
     return Scene(
         lower=domain.lower,
         upper=domain.upper,
         cells=cells,
         dt=number(discretisation["dt"], "discretisation.dt", above=0.0),
         gravity=vector(scene["gravity"], "scene.gravity"),
-        colliders=tuple(_plane(c, f"scene.colliders[{i}]") for i, c in enumerate(_list(scene, "colliders"))),
+        colliders=tuple(_plane(c, f"scene.colliders[{i}]") for i, c in enumerate(colliders)),
         walls=_walls(scene["walls"]) if "walls" in scene else Walls(),
         clamps=tuple(_boxed(c, f"scene.clamps[{i}]") for i, c in enumerate(_list(scene, "clamps"))),
         attached_masses=tuple(_attached(m, f"scene.attached_masses[{i}]") for i, m in enumerate(_list(scene, "attached_masses"))),

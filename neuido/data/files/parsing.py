@@ -26,8 +26,10 @@ LIMITS = {
     "NEUIDO_MAX_ARRAY_ELEMENTS": 1 << 31,
     "NEUIDO_MAX_IMAGE_PIXELS": 1 << 27,
     "NEUIDO_MAX_PARTICLES": 20_000_000,
+    "NEUIDO_MAX_COLLIDERS": 256,
 }
-"""The largest bytes of a text file, nodes of a YAML file, elements of an array, pixels of an image, particles of a body or a PLY file."""
+"""The largest bytes of a text file, nodes of a YAML file, elements of an array, pixels of an image, particles of a body or a PLY file,
+colliders of a scene."""
 
 
 def limit(name: str) -> int:

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -107,8 +108,13 @@ def _distinct(entries: list[Entry]) -> list[Entry]:
 
 
 def logs(root: Path) -> list[Path]:
-    """Return the metrics.csv files below a folder, the newest last."""
-    return sorted(root.rglob("metrics.csv"), key=lambda path: path.stat().st_mtime)
+    """Return the metrics.csv files below a folder, the newest last: version_10 after version_9, whatever the clock says."""
+    return sorted(root.rglob("metrics.csv"), key=_numbered)
+
+
+def _numbered(path: Path) -> list[tuple[str, int]]:
+    """Return a path as a key to sort by, its numbers as numbers."""
+    return [(text, int(number or 0)) for text, number in re.findall(r"([^0-9]*)([0-9]*)", path.as_posix())]
 
 
 def curves(root: Path) -> dict[str, list[tuple[float, float]]]:

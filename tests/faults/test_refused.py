@@ -1,0 +1,46 @@
+"""What cannot be done is refused before work begins, and the clock does not say what is newer."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from neuido.commands.simulate import simulate
+from neuido.commands.sweep import logged
+from neuido.data.bodies.scene_files import scene_from_dict
+from neuido.data.files.results import curves
+from neuido.discrepancy import workflow
+from neuido.errors import UserError
+
+PLANE = {"type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 1.0, 0.0], "contact": "separate", "friction": 0.0}
+SCENE = {"domain": [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], "gravity": [0.0, -9.8, 0.0]}
+
+
+def test_logs_are_ordered_by_their_version(tmp_path):
+    for time, version in ((3, 2), (1, 10), (2, 9)):  # as a copy of a folder may date them
+        path = tmp_path / f"version_{version}" / "metrics.csv"
+        path.parent.mkdir()
+        path.write_text(f"step,loss\n1,{version}\n")
+        os.utime(path, (time, time))
+    assert logged(tmp_path)["loss"] == 10
+    assert curves(tmp_path)["loss"] == [(1.0, 10.0)]
+
+
+def test_out_below_a_file_is_refused_before_work(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("neuido.commands.simulate.trajectories", lambda *a, **k: pytest.fail("work began"))
+    with pytest.raises(UserError, match="is a file"):
+        simulate(str(tmp_path / "file" / "out"))
+    monkeypatch.setattr(workflow, "choose_device", lambda *a, **k: pytest.fail("work began"))
+    monkeypatch.setattr(workflow, "kind_of", lambda folder: ("experiment", Path(folder)))
+    with pytest.raises(UserError, match="is a file"):
+        workflow.diagnose(tmp_path, out=tmp_path / "file" / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_too_many_colliders_are_refused(monkeypatch):
+    numbers = {"grid": 8, "dt": 1e-4}
+    assert len(scene_from_dict(SCENE | {"colliders": [PLANE] * 3}, numbers).colliders) == 3
+    monkeypatch.setenv("NEUIDO_MAX_COLLIDERS", "2")
+    with pytest.raises(UserError, match="NEUIDO_MAX_COLLIDERS"):
+        scene_from_dict(SCENE | {"colliders": [PLANE] * 3}, numbers)
