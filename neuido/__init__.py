@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neuido.data.bodies import shapes as shapes
     from neuido.data.bodies.scene_files import load_scene as load_scene
+    from neuido.data.importers.importing import import_file as import_file
     from neuido.data.measured.experiment import read_experiment as read_experiment
     from neuido.data.measured.material_test import read_material_tests as read_material_tests
     from neuido.data.measured.track import read_tracks as read_tracks
@@ -53,6 +54,7 @@ _PLACES = {  # name: its module, and after a colon its name there; a module alon
     "diagnose": "discrepancy.workflow:diagnose",
     "effects": "physics.effects",
     "export": "export",
+    "import_file": "data.importers.importing:import_file",
     "laws": "physics.laws",
     "load_scene": "data.bodies.scene_files:load_scene",
     "rasterize": "models.render.splatting:rasterize",
@@ -86,6 +88,7 @@ __all__ = [
     "diagnose",
     "effects",
     "export",
+    "import_file",
     "laws",
     "load_scene",
     "rasterize",

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 PUBLIC = {
     "neuido": """
         AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Gaussians Operator ParticleState Plane Scene Simulator UserError
-        Walls __version__ configs_root diagnose effects export laws load_scene rasterize read_experiment read_law
+        Walls __version__ configs_root diagnose effects export import_file laws load_scene rasterize read_experiment read_law
         read_material_tests read_recording read_tracks render shapes
     """,
     "neuido.data": """

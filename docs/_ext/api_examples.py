@@ -193,6 +193,15 @@ try:
 except UserError as error:
     print(error)
 """,
+    "import_file": """
+from pathlib import Path
+
+from neuido import import_file
+
+Path("throw.txt").write_text("t;x;y\\n0,0;0,0;0,0\\n0,1;0,1;0,35\\n0,2;0,2;0,60\\n0,3;0,3;0,76\\n")
+for line in import_file("throw.txt", None):  # a folder in place of None is written
+    print(line)
+""",
     "read_tracks": """
 from pathlib import Path
 

@@ -28,6 +28,8 @@ from neuido.errors import UserError, one_line, shortened
 LIGHT = {  # name: (module, function, one line for the list); the module must import torch only inside its functions
     "simulate": ("neuido.commands.simulate", "simulate", "Generate the trajectories of Stage I, or filmed scenes."),
     "reconstruct": ("neuido.commands.reconstruct", "reconstruct", "Gaussians and particles of a filmed body's first frame."),
+    "import": ("neuido.commands.import_data", "import_data", "Turn tables of a testing machine or a tracker into a folder to diagnose."),
+    "check": ("neuido.commands.import_data", "check", "Say whether measured data are plausible."),
     "diagnose": ("neuido.commands.diagnose", "diagnose", "Find the effect that a model lacks, from measured motion."),
     "sweep": ("neuido.commands.sweep", "sweep", "Run a wandb sweep file without a server, offline, into one CSV."),
     "report": ("neuido.commands.report", "report", "One page of several runs: tables, curves, videos side by side."),

@@ -1,0 +1,127 @@
+"""The `import` and `check` commands."""
+
+
+def import_data(
+    files: list[str],
+    *,
+    out: str | None = None,
+    kind: str = "auto",
+    mode: str = "uniaxial",
+    columns: dict[str, str] | None = None,
+    units: dict[str, str] | None = None,
+    strain_unit: str | None = None,
+    length: str | None = None,
+    width: str | None = None,
+    thickness: str | None = None,
+    section_diameter: str | None = None,
+    compression: bool = False,
+    density: float | None = None,
+    young: float | None = None,
+    poisson: float | None = None,
+    scale: float | None = None,
+    y_down: bool = False,
+    up: str = "y",
+    frame_rate: float | None = None,
+    point: str | None = None,
+    mass: float | None = None,
+    diameter: float | None = None,
+    volume: float | None = None,
+    floor: float | None = None,
+    held_out: str = "",
+    dry_run: bool = False,
+) -> None:
+    """Turn tables of a testing machine, or exports of a tracker or of motion capture, into a folder that `neuido diagnose` reads.
+
+    Prints what was understood. What a file does not say is asked for, by the name of its option.
+
+    Args:
+        files: Files, one a recording; text of any dialect, xlsx, trc or c3d.
+        out: Folder to write, which must not be there.
+        kind: auto, material (a testing machine), track (a body as one point) or body (points on a deforming body).
+        mode: Of a material test: uniaxial, equibiaxial, pure_shear, biaxial or simple_shear.
+        columns: Quantity and title, where titles do not say it: --columns.force "Channel 2".
+        units: Quantity and unit, where the table gives none: --units.force kN.
+        strain_unit: Unit of the strain: percent, or a ratio such as mm/mm.
+        length: Gauge length of the specimen with its unit, as "50 mm".
+        width: Its width, with a unit.
+        thickness: Its thickness, with a unit.
+        section_diameter: Of a round specimen, with a unit.
+        compression: Whether the table counts compression as positive.
+        density: kg/m^3.
+        young: A guess of Young's modulus, in Pa.
+        poisson: Poisson's ratio; a material test without it is incompressible.
+        scale: Metres a unit of the positions, for example metres a pixel.
+        y_down: Whether y points down, as in images.
+        up: The axis that points up, y or z.
+        frame_rate: Frames a second, where the file counts frames.
+        point: Of several points the one to follow, or mean.
+        mass: Of the body in kg.
+        diameter: Of the body in m.
+        volume: Of a deforming body in m^3; the hull of the first frame where absent.
+        floor: Height of a floor in m.
+        held_out: Names of recordings that are only scored, with commas; the last of several where absent.
+        dry_run: Only say what was understood.
+
+    Raises:
+        UserError: What cannot be read or is missing.
+    """
+    from neuido.data.importers.importing import import_file
+    from neuido.data.importers.testing_machine import Specimen
+    from neuido.errors import UserError
+
+    if out is None and not dry_run:
+        raise UserError("give --out FOLDER, or --dry_run true")
+    lines = import_file(
+        files,
+        None if dry_run else out,
+        kind=kind,
+        mode=mode,
+        columns=columns,
+        units={**({"strain": strain_unit} if strain_unit else {}), **(units or {})},
+        specimen=Specimen(length, width, thickness, section_diameter),
+        compression=compression,
+        density=density,
+        young=young,
+        poisson=poisson,
+        scale=scale,
+        y_down=y_down,
+        up=up,
+        frame_rate=frame_rate,
+        point=point,
+        mass=mass,
+        diameter=diameter,
+        volume=volume,
+        floor=floor,
+        held_out=[name for name in held_out.split(",") if name],
+    )
+    print("\n".join(lines))
+
+
+def check(folder: str) -> None:
+    """Read measured data and say whether they are plausible: units, signs, times, order, markers.
+
+    Args:
+        folder: A folder with experiment.yaml, test.yaml or track.yaml.
+
+    Raises:
+        UserError: What is wrong, with the file and the key to change.
+    """
+    from pathlib import Path
+
+    from neuido.errors import UserError
+
+    given = Path(folder).expanduser()
+    here = given.name if given.is_file() else next((n for n in ("experiment.yaml", "test.yaml", "track.yaml") if (given / n).is_file()), "")
+    if here == "experiment.yaml":
+        from neuido.data.measured.experiment import read_experiment as read
+    elif here == "test.yaml":
+        from neuido.data.measured.material_test import read_material_tests as read
+    elif here == "track.yaml":
+        from neuido.data.measured.track import read_tracks as read
+    else:
+        raise UserError(f"{folder} has none of experiment.yaml, test.yaml, track.yaml: `neuido import` makes such a folder")
+    found = read(given)
+    entries = found.tests if here == "test.yaml" else found.recordings
+    for entry in entries:
+        print(f"{entry.name}: {entry.role}")
+    print(f"{found.name} is plausible: {len(entries)} recordings")

@@ -1,0 +1,155 @@
+"""Exports of trackers and motion capture as positions of named points: OptiTrack, Vicon, TRC, DeepLabCut, C3D, and plain tables."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from neuido.data.files.delimited import is_number
+from neuido.data.files.parsing import parser_errors
+from neuido.data.importers.columns import meanings
+from neuido.data.importers.tables import read_cells, read_titled
+from neuido.data.importers.units import factor, needed
+from neuido.errors import UserError
+
+LIKELY = 0.6
+"""Points of DeepLabCut below this likelihood count as not seen."""
+
+
+class Motion(NamedTuple):
+    """Positions of named points, T frames."""
+
+    t: np.ndarray
+    """Times [s], (T,), or frame numbers where `frames`."""
+    points: dict[str, np.ndarray]
+    """(T, A) each, NaN where not seen."""
+    unit: str
+    """Of the positions; empty where the file gives none."""
+    frames: bool
+    """Whether `t` counts frames."""
+    notes: list[str]
+
+
+def read_motion(path: Path, columns: dict[str, str]) -> Motion:
+    """Read a tracker's export, whose layout is told from its content.
+
+    Raises:
+        UserError: No layout that is known.
+    """
+    if path.suffix.lower() == ".c3d":
+        return _c3d(path)
+    rows, notes = read_cells(path)
+    first = [cell.lower() for cell in rows[0]] if rows else []
+    if "format version" in first:
+        return _optitrack(path, rows)
+    if first and first[0].startswith("pathfiletype"):
+        return _trc(path, rows)
+    if first and first[0] in ("trajectories", "model outputs"):
+        return _vicon(path, rows)
+    if first and first[0] == "scorer":
+        return _deeplabcut(path, rows)
+    return _plain(path, columns)
+
+
+def _floats(rows: list[list[str]], width: int) -> np.ndarray:
+    out = np.full((len(rows), width), np.nan)
+    for i, row in enumerate(rows):
+        for j, cell in enumerate(row[:width]):
+            if is_number(cell):
+                out[i, j] = float(cell)
+    return out
+
+
+def _numbers_from(path: Path, rows: list[list[str]], start: int) -> tuple[int, np.ndarray]:
+    first = next((i for i in range(start, len(rows)) if rows[i][0] and is_number(rows[i][0]) and len(rows[i]) > 2), None)
+    if first is None or len(rows) - first < 3:
+        raise UserError(f"{path}: fewer than 3 frames follow the titles")
+    return first, _floats(rows[first:], max(len(row) for row in rows[first:]))
+
+
+def _optitrack(path: Path, rows: list[list[str]]) -> Motion:
+    info = dict(zip([cell.lower() for cell in rows[0][::2]], rows[0][1::2]))
+    first, data = _numbers_from(path, rows, 1)
+    titles, kinds = rows[first - 1], rows[first - 2]
+    names = next((row for row in rows[1:first] if len(row) > 1 and "name" in (row[0].lower(), row[1].lower())), None)
+    if names is None:
+        raise UserError(f"{path}: the row of names is missing; export with headers")
+    points: dict[str, np.ndarray] = {}
+    for j in range(2, min(len(titles), len(kinds), len(names)) - 2):
+        if kinds[j].lower() == "position" and [t.upper() for t in titles[j : j + 3]] == ["X", "Y", "Z"]:
+            points[names[j] or f"point {j}"] = data[:, j : j + 3]
+    return Motion(data[:, 1], points, info.get("length units", "m"), False, [f"OptiTrack, {len(points)} points"])
+
+
+def _trc(path: Path, rows: list[list[str]]) -> Motion:
+    info = dict(zip([cell.lower() for cell in rows[1]], rows[2]))
+    first, data = _numbers_from(path, rows, 4)
+    names = [cell for cell in rows[3][2:] if cell]
+    points = {name: data[:, 2 + 3 * i : 5 + 3 * i] for i, name in enumerate(names) if 5 + 3 * i <= data.shape[1]}
+    return Motion(data[:, 1], points, info.get("units", "mm"), False, [f"TRC, {len(points)} markers"])
+
+
+def _vicon(path: Path, rows: list[list[str]]) -> Motion:
+    if len(rows) < 6 or not is_number(rows[1][0]) or not float(rows[1][0]) > 0:
+        raise UserError(f"{path}: the rate of a Vicon export is missing in its second row")
+    first, data = _numbers_from(path, rows, 4)
+    units, names = rows[first - 1], rows[2]
+    points = {name.rpartition(":")[2]: data[:, j : j + 3] for j, name in enumerate(names) if name and j + 3 <= data.shape[1]}
+    unit = next((cell for cell in units if cell), "mm")
+    return Motion((data[:, 0] - data[0, 0]) / float(rows[1][0]), points, unit, False, [f"Vicon, {float(rows[1][0]):g} Hz"])
+
+
+def _deeplabcut(path: Path, rows: list[list[str]]) -> Motion:
+    first, data = _numbers_from(path, rows, 3)
+    parts, kinds = rows[1], rows[2]
+    points = {}
+    for j in range(1, len(kinds) - 2):
+        if [kind.lower() for kind in kinds[j : j + 3]] == ["x", "y", "likelihood"]:
+            points[parts[j]] = np.where(data[:, j + 2 : j + 3] < LIKELY, np.nan, data[:, j : j + 2])
+    return Motion(data[:, 0], points, "pixel", True, [f"DeepLabCut, {len(points)} body parts, likelihood below {LIKELY} as not seen"])
+
+
+def _c3d(path: Path) -> Motion:
+    ezc3d = needed("ezc3d", path.name)
+    with parser_errors(path, "C3D file"):
+        content = ezc3d.c3d(str(path))
+        given = content["parameters"]["POINT"]
+        x = np.asarray(content["data"]["points"], dtype=float)[:3]
+        rate, labels, unit = float(given["RATE"]["value"][0]), list(given["LABELS"]["value"]), (given["UNITS"]["value"] or ["mm"])[0]
+    points = {str(name): x[:, i].T.copy() for i, name in enumerate(labels[: x.shape[1]])}
+    return Motion(np.arange(x.shape[2]) / rate, points, unit, False, [f"C3D, {len(points)} markers, {rate:g} Hz"])
+
+
+def _plain(path: Path, columns: dict[str, str]) -> Motion:
+    table = read_titled(path)
+    found = meanings(table.titles, columns)
+    axes = [axis for axis in "xyz" if axis in found]
+    clock = next((name for name in ("time", "frame") if name in found), None)
+    if not axes or clock is None:
+        titles = ", ".join(filter(None, table.titles))
+        raise UserError(f"{path.name} has no time or no position: name them, --columns.time TITLE --columns.x TITLE ({titles})")
+    units = {table.units[found[axis]] for axis in axes}
+    if len(units) > 1:
+        raise UserError(f"{path.name}: the axes have several units, {', '.join(sorted(units))}")
+    t = table.data[:, found[clock]]
+    if clock == "time" and table.units[found["time"]]:
+        t = t * factor(table.units[found["time"]], "s", f"{path.name}, time")
+    x = table.data[:, [found[axis] for axis in axes]]
+    notes = [*table.notes, *(f"column {found[key] + 1} {table.titles[found[key]]!r} -> {key}" for key in (clock, *axes))]
+    if axes == ["y"]:
+        x = np.stack([np.zeros(len(x)), x[:, 0]], 1)
+    if "id" not in found:
+        return Motion(t, {_label(path): x}, units.pop(), clock == "frame", notes)
+    ids, times = table.data[:, found["id"]], np.unique(t[np.isfinite(t)])
+    points = {}
+    for own in np.unique(ids[np.isfinite(ids)]):
+        chosen = (ids == own) & np.isfinite(t)
+        values = np.full((len(times), x.shape[1]), np.nan)
+        values[np.searchsorted(times, t[chosen])] = x[chosen]
+        points[f"{own:g}"] = values
+    return Motion(times, points, units.pop(), clock == "frame", [*notes, f"{len(points)} points by id"])
+
+
+def _label(path: Path) -> str:
+    return re.sub(r"[^\w-]+", "-", path.stem).strip("-._") or "track"

@@ -1,0 +1,79 @@
+"""Units of columns and options, by pint."""
+
+import re
+from functools import cache
+from typing import Any
+
+from neuido.errors import UserError
+
+_SPELLED = {
+    "°c": "degC", "sec": "s", "seconds": "s", "msec": "ms", "n/mm²": "N/mm^2", "n/mm2": "N/mm^2", "mm/mm": "", "-": "", "%": "percent",
+    "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "kn": "kN", "newton": "N", "px": "pixel",
+    "meters": "m", "millimeters": "mm", "centimeters": "cm",
+}  # fmt: skip
+
+
+def needed(module: str, what: str) -> Any:
+    """Import a library of the extra `import`.
+
+    Raises:
+        UserError: It is not installed.
+    """
+    import importlib
+
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UserError(f"{what} needs {module}: pip install 'neuido[import]'") from error
+
+
+@cache
+def _registry() -> Any:
+    return needed("pint", "a unit").UnitRegistry(non_int_type=float)
+
+
+def factor(unit: str, to: str, where: str) -> float:
+    """Return what a figure in a unit is multiplied by to be in another.
+
+    Raises:
+        UserError: No unit, or one of another kind.
+    """
+    own = _spelled(unit)
+    try:
+        if not re.fullmatch(r"[\w\s/*^.µ%·-]{0,30}", own):
+            raise ValueError("no unit")
+        return float(_registry().Quantity(1.0, own or "dimensionless").to(to or "dimensionless").magnitude)
+    except Exception as error:  # pint raises errors of several kinds
+        raise UserError(f"{where}: the unit {unit[:40]!r} is not one of {to or 'a ratio'}") from error
+
+
+def quantity(text: str, to: str, option: str) -> float:
+    """Return an option such as `25.4 mm` in another unit.
+
+    Raises:
+        UserError: No number with a unit, or not above 0.
+    """
+    found = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([^\s\d].*)", str(text))
+    if found is None or found[1].count(".") > 1:
+        raise UserError(f"--{option} = {text!r} must be a number and its unit, for example '25.4 mm'")
+    value = float(found[1]) * factor(found[2].strip(), to, f"--{option}")
+    if not value > 0:
+        raise UserError(f"--{option} = {text!r} must be above 0")
+    return value
+
+
+def is_unit(text: str) -> bool:
+    """Whether a cell of a row of units names one."""
+    text = text.strip().strip("()[]")
+    if not text or _spelled(text) == "":
+        return True
+    try:
+        factor_of = _registry().parse_units(_spelled(text))
+    except Exception:  # pint raises errors of several kinds
+        return False
+    return factor_of is not None and re.fullmatch(r"[\w/^%µ°²·* -]{1,12}", text) is not None
+
+
+def _spelled(unit: str) -> str:
+    unit = unit.strip().strip("()[]").strip()
+    return _SPELLED.get(unit.lower(), unit.replace("²", "^2"))
