@@ -10,8 +10,8 @@ import numpy as np
 import yaml
 
 from neuido.data.files.writing import new_folder
-from neuido.data.importers.tables import read_cells
 from neuido.data.importers.testing_machine import Specimen, read_machine
+from neuido.data.importers.titled_tables import read_cells
 from neuido.data.importers.tracker_exports import Motion, read_motion
 from neuido.data.importers.units import factor
 from neuido.errors import UserError
@@ -133,7 +133,7 @@ def import_file(
 
 def _kind(path: Path, columns: Mapping[str, str]) -> str:
     """Return what a file holds: a material test, a track or a body."""
-    from neuido.data.importers.tables import read_titled
+    from neuido.data.importers.titled_tables import read_titled
     from neuido.data.importers.titles import meanings
 
     if path.suffix.lower() in (".c3d", ".trc"):

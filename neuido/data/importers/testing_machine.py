@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuido.data.files.delimited import is_number
-from neuido.data.importers.tables import Table, read_titled
+from neuido.data.importers.titled_tables import Table, read_titled
 from neuido.data.importers.titles import meanings
 from neuido.data.importers.units import factor, quantity
 from neuido.errors import UserError

@@ -8,7 +8,7 @@ import numpy as np
 
 from neuido.data.files.delimited import is_number
 from neuido.data.files.parsing import parser_errors
-from neuido.data.importers.tables import read_cells, read_titled
+from neuido.data.importers.titled_tables import read_cells, read_titled
 from neuido.data.importers.titles import meanings
 from neuido.data.importers.units import factor, needed
 from neuido.errors import UserError
