@@ -23,10 +23,11 @@ from neuido.commands.cli.config_files import find_configs
 from neuido.commands.cli.functions import run_function
 from neuido.commands.cli.suggestions import refuse_abbreviations, suggest
 from neuido.commands.cli.trainer import HEAVY, run_lightning
+from neuido.commands.simulate_scene import is_scene
 from neuido.errors import UserError, one_line, shortened
 
 LIGHT = {  # name: (module, function, one line for the list); the module must import torch only inside its functions
-    "simulate": ("neuido.commands.simulate", "simulate", "Generate the trajectories of Stage I, or filmed scenes."),
+    "simulate": ("neuido.commands.simulate", "simulate", "Run a scene file; or generate the trajectories of Stage I, or filmed scenes."),
     "reconstruct": ("neuido.commands.reconstruct", "reconstruct", "Gaussians and particles of a filmed body's first frame."),
     "import": ("neuido.commands.import_data", "import_data", "Turn tables of a testing machine or a tracker into a folder to diagnose."),
     "check": ("neuido.commands.import_data", "check", "Say whether measured data are plausible."),
@@ -108,6 +109,8 @@ def _dispatch(args: list[str]) -> int:
     refuse_abbreviations()
     if name in LIGHT:
         module, function, _ = LIGHT[name]
+        if name == "simulate" and is_scene(args[1:]):
+            module, function = "neuido.commands.simulate_scene", "simulate_scene"
         return run_function(name, module, function, args[1:])
     run_lightning(args)
     return 0

@@ -27,6 +27,8 @@ def simulate(
 ) -> None:
     """Simulate the constitutive trajectories of Stage I, or, where `scenes` are given, scenes with images from several views.
 
+    `neuido simulate SCENE --out FOLDER` runs one scene file; `neuido simulate SCENE --help` lists its options.
+
     Trajectories: a spinning cube is thrown into a box, for many materials; the set-up is NCLaw's, and its three published materials
     are instance 0 of their families. Scenes: one experiment folder each, with images, cameras and the truth
     (configs/scenes/six.yaml); of the options below only film, data_root, device and progress are for them. A run that was interrupted

@@ -8,11 +8,13 @@ import yaml
 from neuido import configs_root
 
 
-def how_to_make(path: str | os.PathLike) -> str:
+def how_to_make(path: str | os.PathLike, option: str = "init_from") -> str:
     """Return the words that end an error about missing weights: the command that makes the file, or where others come from.
 
     A configuration makes a file when its `save_to` names it.
     """
+    if option == "law":
+        return "`neuido predict` writes a law.safetensors for each scene"
     root = configs_root()
     for config in sorted(root.rglob("*.yaml"), key=lambda file: (len(file.parts), file.name)):
         content = yaml.safe_load(config.read_text())

@@ -197,7 +197,7 @@ def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -
     """
     path = Path(path)
     if not path.is_file():
-        raise UserError(f"{option}: the weights {path} are missing: {how_to_make(path)}")
+        raise UserError(f"{option}: the weights {path} are missing: {how_to_make(path, option)}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

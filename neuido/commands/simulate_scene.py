@@ -1,0 +1,101 @@
+"""`neuido simulate SCENE --out FOLDER`: the motion of one scene file. `--help` loads no torch."""
+
+import time
+from pathlib import Path
+
+from neuido import configs_root
+from neuido.errors import UserError
+
+FRAMES = 100
+"""Frames that are written at most where `every` is not given."""
+
+
+def simulate_scene(
+    scene: str,
+    *,
+    out: str,
+    law: str | None = None,
+    steps: int | None = None,
+    every: int | None = None,
+    data_root: str | None = None,
+    device: str = "auto",
+) -> None:
+    """Simulate the body of a scene file and write its motion.
+
+    Args:
+        scene: Scene file, or the name of one that comes with neuido (bouncy-ball, nclaw-cube, ...).
+        out: Folder to write, new or empty: frames.npz, and a point cloud a frame in ply/.
+        law: Neural law of `neuido predict` (law.safetensors) in place of the scene's elasticity and plasticity.
+        steps: Substeps; those of the scene file where absent.
+        every: Write a frame every so many substeps, a divisor of `steps`; such that at most 100 frames follow the first where absent.
+        data_root: Folder of the particles that a scene names; that of NEUIDO_DATA where absent.
+        device: auto, cpu or cuda.
+
+    Raises:
+        UserError: An impossible scene or option, a folder that is in use, a step above the stability limit.
+    """
+    from neuido.data.bodies.scene_files import load_scene
+    from neuido.models.inference.law_file import load_law
+    from neuido.physics.laws.classical import material
+    from neuido.physics.mpm.simulator import Simulator
+
+    folder = _unused(out)
+    setup = load_scene(_one_scene(scene), data_root)
+    count = setup.info["steps"] if steps is None else steps
+    if count < 1:
+        raise UserError(f"steps is {count}; it must be a positive whole number")
+    spacing = next(k for k in range(-(-count // FRAMES), count + 1) if count % k == 0) if every is None else every
+    laws = material(setup.info["elasticity"], setup.info["plasticity"]) if law is None else load_law(law)
+    simulator = Simulator(setup.scene, setup.body, density=setup.info["density"], device=device)
+    start = time.perf_counter()
+    frames = simulator.rollout(count, *laws, every=spacing)
+    seconds = time.perf_counter() - start
+    try:
+        frames.save(folder / "frames.npz")
+        frames.save(folder / "ply" / "frame.ply")
+    except OSError as error:
+        raise UserError(f"out = {out}: {error.strerror or error}") from error
+    told = f"the law of {law}" if law else ", ".join(_told(setup.info[part]) for part in ("elasticity", "plasticity"))
+    print(
+        f"simulated {setup.info['name']}: {frames.x.shape[1]} particles, {count} substeps of {setup.scene.dt:g} s, "
+        f"{len(frames.x)} frames, on {simulator.device}, {seconds:.1f} s"
+    )
+    print(f"law: {told}; density {setup.info['density']:g} kg/m^3")
+    print(
+        f"results in {folder}: frames.npz opens with numpy.load (x, v, C, F, times), "
+        "ply/frame_0000.ply and on in ParaView, MeshLab or Blender"
+    )
+
+
+def is_scene(words: list[str]) -> bool:
+    """Return whether the words after `neuido simulate` start with a scene, and not with the folder to write."""
+    if not words or words[0].startswith("-"):
+        return False
+    given_out = any(word == "--out" or word.startswith("--out=") for word in words)
+    return given_out or words[0].endswith((".yaml", ".yml")) or (configs_root() / "scenes" / f"{words[0]}.yaml").is_file()
+
+
+def _unused(out: str) -> Path:
+    """Return the folder to write, which must be new or empty."""
+    folder = Path(out)
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"out = {out} is a file: name a folder")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise UserError(f"out = {out} holds files already: name another folder, or empty this one")
+    return folder
+
+
+def _one_scene(scene: str) -> str:
+    """Return a scene's file or name; a file that lists several scenes is an error that names the command for it."""
+    from neuido.data.files.parsing import read_yaml
+
+    own = Path(scene) if scene.endswith((".yaml", ".yml")) else configs_root() / "scenes" / f"{scene}.yaml"
+    if own.is_file() and "scenes" in read_yaml(own):
+        raise UserError(f"{scene} lists several scenes to film: `neuido simulate --config {scene} --out FOLDER` makes them")
+    return scene
+
+
+def _told(law: dict) -> str:
+    """Return a law in words, such as `fixed_corotated (young 30000, poisson 0.2)`."""
+    figures = ", ".join(f"{name} {value}" for name, value in law.items() if name != "law")
+    return f"{law['law']} ({figures})" if figures else str(law["law"])

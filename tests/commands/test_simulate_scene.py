@@ -1,0 +1,87 @@
+"""`neuido simulate SCENE --out FOLDER`: a scene file is run, and what cannot be run is one line."""
+
+import numpy as np
+import pytest
+import torch
+
+from neuido.data.bodies.scene_files import load_scene
+from neuido.physics.laws.classical import material
+from neuido.physics.mpm.simulator import Simulator
+from tests.command import run
+
+SCENE = """
+format: neuido-scene/1
+name: little-ball
+scene:
+  domain: [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
+  gravity: [0.0, -9.8, 0.0]
+model:
+  density: 1000.0
+  elasticity: {law: fixed_corotated, young: 3.0e+4, poisson: 0.2}
+body: {shape: ball, centre: [0.5, 0.5, 0.5], radius: 0.12, spacing: 0.04, velocity: [0.0, -2.0, 0.0]}
+discretisation: {grid: 16, dt: 1.0e-3}
+steps: 30
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "ball.yaml"
+    path.write_text(SCENE)
+    return path
+
+
+def test_a_scene_file_is_run(scene, tmp_path, capsys):
+    out = tmp_path / "out"
+    status, printed, err = run(capsys, "simulate", scene, "--out", out, "--steps", 20, "--every", 5, "--device", "cpu")
+    assert status == 0, err
+    assert "simulated little-ball" in printed and "20 substeps" in printed and "fixed_corotated (young 30000.0, poisson 0.2)" in printed
+    assert f"results in {out}: frames.npz" in printed
+    setup = load_scene(scene)
+    frames = Simulator(setup.scene, setup.body, density=1000.0, device="cpu").rollout(
+        20, *material(setup.info["elasticity"], setup.info["plasticity"]), every=5
+    )
+    with np.load(out / "frames.npz") as saved:
+        assert torch.equal(torch.from_numpy(saved["x"]), frames.x)
+        assert np.allclose(saved["times"], [0.0, 0.005, 0.01, 0.015, 0.02])
+    assert len(list((out / "ply").glob("frame_*.ply"))) == 5
+
+
+def test_a_scene_runs_by_its_name_and_for_its_own_steps(scene, tmp_path, capsys):
+    status, printed, err = run(capsys, "simulate", "nclaw-cube", "--out", tmp_path / "cube", "--steps", 4, "--device", "cpu")
+    assert status == 0, err
+    assert "simulated nclaw-cube: 1000 particles, 4 substeps" in printed
+    status, printed, _ = run(capsys, "simulate", scene, "--out", tmp_path / "own", "--device", "cpu")
+    assert status == 0 and "30 substeps" in printed and "31 frames" in printed
+
+
+def test_help_of_a_scene(capsys, scene):
+    status, printed, _ = run(capsys, "simulate", scene, "--help")
+    assert status == 0 and "--law" in printed and "--instances" not in printed
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["{scene}", "--out", "{scene}"], ["is a file"]),
+        (["{scene}", "--out", "{used}"], ["holds files already"]),
+        (["{scene}", "--out", "{new}", "--steps", "10", "--every", "3"], ["every is 3"]),
+        (["{scene}", "--out", "{new}", "--steps", "0"], ["steps is 0"]),
+        (["{scene}", "--out", "{new}", "--law", "absent.safetensors"], ["absent.safetensors", "neuido predict"]),
+        (["bouncy-bal", "--out", "{new}"], ["bouncy-bal", "bouncy-ball"]),
+        (["six_small", "--out", "{new}"], ["several scenes", "neuido simulate --config six_small"]),
+        (["absent.yaml", "--out", "{new}"], ["no scene file absent.yaml"]),
+        (["{scene}", "--out", "{new}", "--stepz", "3"], ["--stepz", "did you mean 'steps'?"]),
+    ],
+)
+def test_what_cannot_be_run_is_one_line(words, told, scene, tmp_path, capsys):
+    used = tmp_path / "used"
+    used.mkdir()
+    (used / "mine.txt").write_text("kept")
+    names = {"scene": scene, "used": used, "new": tmp_path / "new"}
+    status, printed, err = run(capsys, "simulate", *(word.format(**names) for word in words))
+    assert status == 2 and printed == "" and err.count("\n") == 1
+    for part in told:
+        assert part in err
+    assert not (tmp_path / "new").exists()
+    assert scene.read_text() == SCENE and (used / "mine.txt").read_text() == "kept"
