@@ -59,7 +59,7 @@ def test_predicts_the_closed_form_for_every_point(tmp_path):
 
 def test_impossible_points_are_nan_alone(tmp_path):
     l = np.linspace(1.0, 3.0, 12)
-    problem = MaterialProblem(write(tmp_path, [{"name": "a"}], L=l, S=l - 1))
+    problem = MaterialProblem(write(tmp_path, [{"name": "a"}], L=l, S=YOUNG * (l - 1)))
     out = problem.predict([{"second_invariant.c": 0.1}, {"second_invariant.c": -2.0}, {}], 0)
     assert np.isfinite(out[[0, 2]]).all() and np.isnan(out[1]).all()
 
@@ -69,7 +69,7 @@ def test_which_effects_are_asked_for(tmp_path):
     l, t = np.linspace(1.0, 2.0, 12), np.linspace(0, 1, 12)
 
     def names(tests, **more):
-        return {c.name for c in MaterialProblem(write(tmp_path, tests, **({"L": l, "S": l - 1, "T": t} | more))).candidates}
+        return {c.name for c in MaterialProblem(write(tmp_path, tests, **({"L": l, "S": YOUNG * (l - 1), "T": t} | more))).candidates}
 
     plain = names([{"name": "a"}])
     assert plain == {"strain_stiffening", "second_invariant", "yield"}
@@ -77,9 +77,9 @@ def test_which_effects_are_asked_for(tmp_path):
     rates = {"viscosity_shear", "maxwell", "hysteresis", "stiffness_change"}
     assert names([{"name": "a", "columns": {"stretch": "L", "nominal_stress": "S", "time": "T"}}]) == plain | rates
     there = np.concatenate([l[::2], l[::-2]])
-    assert names([{"name": "a"}], L=there, S=there - 1) == plain | {"softening"}
+    assert names([{"name": "a"}], L=there, S=YOUNG * (there - 1)) == plain | {"softening"}
     around = np.concatenate([l[::2], 1 / l[::2]])
-    assert names([{"name": "a"}], L=around, S=around - 1) == plain | {"softening", "tension_compression"}
+    assert names([{"name": "a"}], L=around, S=YOUNG * (around - 1)) == plain | {"softening", "tension_compression"}
     steel = {"elasticity": {"law": "sigma", "young": 2e11, "poisson": 0.3}, "plasticity": {"law": "von_mises", "yield_stress": 3e8},
              "incompressible": False}  # fmt: skip
     small = 1 + 0.01 * np.sin(np.linspace(0, 12, 40))
@@ -91,7 +91,9 @@ def test_which_effects_are_asked_for(tmp_path):
 def test_stiffening_is_found_and_the_model_after_answers_it(tmp_path):
     rng = np.random.default_rng(0)
     l = np.linspace(1.05, 4.0, 30)
-    truth = MaterialProblem(write(tmp_path, [{"name": "a"}], L=l, S=l)).predict([{"young": YOUNG, "strain_stiffening.k": 0.02}], 0)[0]
+    truth = MaterialProblem(write(tmp_path, [{"name": "a"}], L=l, S=YOUNG * (l - 1))).predict(
+        [{"young": YOUNG, "strain_stiffening.k": 0.02}], 0
+    )[0]
     S = truth + 2e3 * rng.standard_normal(len(l))
     problem = MaterialProblem(
         write(tmp_path, [{"name": "low", "rows": [0, 20]}, {"name": "high", "rows": [20, 30], "role": "held_out"}], L=l, S=S)
@@ -119,7 +121,7 @@ def test_a_held_out_half_of_a_test_starts_where_the_first_ends(tmp_path):
              "incompressible": False, "free": ["young", "yield_stress"]}  # fmt: skip
     tests = [{"name": "first", "rows": [0, 21]}, {"name": "then", "rows": [21, 41], "role": "held_out"}]
     columns = {"log_strain": "E", "true_stress": "S"}
-    problem = MaterialProblem(write(tmp_path, [t | {"columns": columns} for t in tests], model=steel, E=strain, S=0 * strain))
+    problem = MaterialProblem(write(tmp_path, [t | {"columns": columns} for t in tests], model=steel, E=strain, S=2e11 * strain))
     then = problem.predict([{}], 1)[0]
     level = math.sqrt(1.5) * 3e8
     assert then[0] == pytest.approx(level - 2e11 * 0.0015, rel=0.01) and then[-1] == pytest.approx(-level, rel=0.01)
@@ -135,7 +137,7 @@ def test_kinematic_hardening_of_steel_is_told_from_isotropic(tmp_path):
              "incompressible": False, "free": ["yield_stress"]}  # fmt: skip
     tests = [{"name": "first", "rows": [0, 31]}, {"name": "then", "rows": [31, 46], "role": "held_out"}]
     tests = [t | {"columns": {"log_strain": "E", "true_stress": "S"}} for t in tests]
-    truth = MaterialProblem(write(tmp_path, [tests[0] | {"rows": [0, 46]}], model=steel, E=strain, S=strain))
+    truth = MaterialProblem(write(tmp_path, [tests[0] | {"rows": [0, 46]}], model=steel, E=strain, S=2e11 * strain))
     S = truth.predict([{"kinematic_hardening.h": 4e9}], 0)[0]
     problem = MaterialProblem(write(tmp_path, tests, model=steel, E=strain, S=S + 1e6 * np.random.default_rng(1).standard_normal(len(S))))
     point, fit, held = fitted(problem, ("kinematic_hardening",))
