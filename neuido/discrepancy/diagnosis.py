@@ -4,6 +4,7 @@ import json
 import math
 import os
 import shutil
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -260,7 +261,7 @@ class Diagnosis:
             ax.set_title(path.stem, fontsize=9)
         if paths:
             figure.axes[0].legend(fontsize=7, frameon=False)
-        figure.suptitle(self.line.splitlines()[0], fontsize=9)
+        figure.suptitle(textwrap.fill(self.line.splitlines()[0], 52 * max(len(paths), 1)), fontsize=9)
         return figure
 
     def _motion(self, name: str) -> Path | None:
