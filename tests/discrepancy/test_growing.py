@@ -175,7 +175,7 @@ def test_growing_fits_end_with_the_time(over, horizons, monkeypatch):
     inference = Inference(problem)
     base = inference.start()
     asked, fits = [], inference.fits
-    monkeypatch.setattr(type(inference.deadline), "past", lambda self, share: over)
+    monkeypatch.setattr(type(inference.deadline), "ends", lambda self, share=1.0: over)
     monkeypatch.setattr(Inference, "fits", lambda self, *args, **options: asked.append(1) or fits(*args, **options))
     grown = inference.growing(base.fit, base.floor, problem.candidates)
     assert len(asked) == horizons
@@ -217,7 +217,7 @@ def test_pairs_do_not_grow_where_little_is_left_or_late(monkeypatch):
     monkeypatch.setattr(pairs, "IN_TIME", -1.0)
     monkeypatch.setattr(base_fits, "STEPWISE_ONE_BY_ONE", 6)
     late = diagnose(Swing(PAIR, jerk=True), draws=39, seconds=1e6)
-    assert late.answer == "unknown" and "two effects that grow together" in late.left_out
+    assert late.answer == "unfinished" and not late.effects and "two effects that grow together" in late.left_out
 
 
 @pytest.mark.parametrize("together", [True, False])

@@ -383,9 +383,10 @@ def test_impossible_runs_are_named(tmp_path):
     data.scenes = [scene._replace(batch=scene.batch._replace(held_out=held))]
     with pytest.raises(UserError, match="stop_on"):
         trainer(tmp_path).fit(module(tmp_path, stop_on="view"), data)
+    interval = float(scene.batch.times[1] - scene.batch.times[0])
     fine = replace(scene.scene, dt=0.0171)
-    with pytest.raises(UserError, match="whole number"):
-        prepare(scene._replace(scene=fine), None)
+    steps = interval / prepare(scene._replace(scene=fine), None).source.scene.dt
+    assert steps == pytest.approx(round(steps)), "the step adapts to the frame rate"
 
 
 SCRIPT = """

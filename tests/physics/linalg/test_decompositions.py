@@ -156,7 +156,7 @@ def test_float32_and_leading_axes():
 
 def test_the_kernel_frame_decomposes_as_torch_does():
     """What CUDA uses in place of torch's SVD, run here on the CPU: same singular values, rotations, and product."""
-    from neuido.physics.laws.classical_kernels import kernels
+    from neuido.physics.linalg import frame_kernels
     from neuido.physics.runtime.device import launch, real_of
 
     g = torch.Generator().manual_seed(5)
@@ -164,7 +164,7 @@ def test_the_kernel_frame_decomposes_as_torch_does():
     F[:50] = torch.eye(3, dtype=torch.float64) + 1e-3 * F[:50]
     F[0] = torch.eye(3)
     U, V, sigma = torch.empty_like(F), torch.empty_like(F), torch.empty(200, 3, dtype=torch.float64)
-    launch(kernels(real_of(F.dtype)).decompose, 200, [F, U, sigma, V], F.device)
+    launch(frame_kernels.build(real_of(F.dtype)).decompose, 200, [F, U, sigma, V], F.device)
     expected = linalg.svd(F, gap=0.0)[1]
     assert torch.allclose(sigma, expected, atol=1e-12)
     assert torch.allclose(U @ torch.diag_embed(sigma) @ V.mT, F, atol=1e-12)
