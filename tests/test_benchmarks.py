@@ -91,6 +91,7 @@ def test_exponent():
     assert scaling.exponent([1, 2], [0.0, 1.0]) != scaling.exponent([1, 2], [0.0, 1.0])  # NaN
 
 
+@pytest.mark.slow
 def test_scaling_writes_its_table_and_its_picture(tmp_path, capsys):
     scaling.main(["--device", "cpu", "--quick", "--out", str(tmp_path / "out")])
     text = (tmp_path / "out" / "scaling.md").read_text()

@@ -94,6 +94,7 @@ def runs_to_try(path) -> list:
 @pytest.mark.parametrize(
     ("path", "run"), [(path, run) for path in SWEEPS for run in runs_to_try(path)], ids=lambda v: getattr(v, "stem", None)
 )
+@pytest.mark.slow
 def test_command_line_accepts_the_runs_of_a_sweep(path, run, capsys, monkeypatch):
     monkeypatch.chdir(ROOT.parent)  # from where the file says that it is run
     commands = commands_of(read_sweep(path), run)

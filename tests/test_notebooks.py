@@ -32,6 +32,7 @@ def closed_loop(tmp_path_factory):
     return out, execute("closed_loop", out, NEUIDO_DATA="")
 
 
+@pytest.mark.slow
 def test_closed_loop(closed_loop):
     out, printed = closed_loop
     answer, again = (line for line in printed.splitlines() if "held-out error" in line)

@@ -150,6 +150,7 @@ def run_example(name: str, folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_simulate_gives_a_gradient_through_the_drop(tmp_path):
     height, slope = map(float, re.findall(r"(-?\d\.\d+(?:e-?\d+)?) m", run_example("simulate_a_drop", tmp_path)))
     assert 0.1 < height < 0.5
@@ -157,6 +158,7 @@ def test_simulate_gives_a_gradient_through_the_drop(tmp_path):
     assert (tmp_path / "drop.npz").is_file()
 
 
+@pytest.mark.slow
 def test_diagnose_names_the_drag(tmp_path):
     said = run_example("diagnose_a_throw", tmp_path)
     assert "the declared model lacks" in said

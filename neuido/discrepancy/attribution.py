@@ -254,7 +254,7 @@ def decided(
     first = steps[0]
     if cut:
         return "unfinished", []
-    wrong = findings(inference.problem.declared, after.fit.point)
+    wrong = findings(inference, after)
     if wrong:
         return "insufficient", wrong
     missing = bool(found) or first.unsure or inference.is_unexplained(first)

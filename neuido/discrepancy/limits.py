@@ -11,6 +11,8 @@ from neuido.discrepancy.problem import Parameter, Point
 from neuido.discrepancy.rounds import Inference
 from neuido.discrepancy.trials import Round, Stand, Trial
 
+TOLD = 3.84
+"""The 95 % quantile of chi squared with one degree of freedom: a figure whose change costs less is not told by the data."""
 AT_BOUND = 1e-6
 """Relative distance from a bound at which a figure stands on it."""
 FREE_AT = {"poisson": "upper"}
@@ -27,19 +29,27 @@ class Hidden(NamedTuple):
     """Size; none: any within the effect's range."""
 
 
-def findings(declared: Sequence[Parameter], point: Point) -> list[str]:
-    """What is wrong with fitted figures of the declared model, in words: those at a bound, and those far from what was declared."""
-    out = []
-    for p in declared:
+def findings(inference: Inference, at: Stand) -> list[str]:
+    """Return what is wrong with fitted figures of the declared model, in words: those at a bound, and those far from what was declared.
+
+    A figure counts where the data tell it: put back to what is plausible, the others as they are, the fit is worse by more than chance.
+    """
+    point, out = at.fit.point, []
+    for p in inference.problem.declared:
         value = point.get(p.name, p.value)
         said = f"{p.name} would be {value:.3g} {p.unit} (declared: {p.value:.3g} {p.unit})"
         ends = [
             side for side in ("lower", "upper") if FREE_AT.get(p.name) != side and _is_at(p, value, side) and not _is_at(p, p.value, side)
         ]
         ratio = max(value / p.value, p.value / value) if p.log else 1.0
+        if not ends and ratio <= IMPLAUSIBLE:
+            continue
+        back = {**point, p.name: min(max(value, p.value / IMPLAUSIBLE), p.value * IMPLAUSIBLE) if ratio > IMPLAUSIBLE else p.value}
+        if inference.costs([back], at.floor)[0] - inference.costs([point], at.floor)[0] < TOLD:
+            continue
         if ends:
             out.append(f"{said}, the {ends[0]} end of what is possible")
-        elif ratio > IMPLAUSIBLE:
+        else:
             out.append(f"{said}, {ratio:.0f} times {'more' if value > p.value else 'less'}")
     return out
 

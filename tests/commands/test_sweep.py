@@ -294,6 +294,7 @@ def test_redirect():
     assert options.model.init_args.save_to is None
 
 
+@pytest.mark.slow
 def test_real_fits_with_wandb_offline(tmp_path):
     """A plain sweep file over `neuido fit`: everything goes to each run's folder, wandb's offline run included."""
     pytest.importorskip("wandb")

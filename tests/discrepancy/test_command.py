@@ -220,6 +220,7 @@ def track_answer(folders, tmp_path_factory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_track_finds_its_drag(track_answer):
     content = json.loads((track_answer / "diagnosis.json").read_text())
     assert content["answer"] in ("effect", "class")
@@ -237,6 +238,7 @@ def test_track_finds_its_drag(track_answer):
     assert (track_answer / "log.csv").read_text().startswith("seconds,body,stage,simulations\n")
 
 
+@pytest.mark.slow
 def test_killed_run_goes_on_to_the_same_answer(folders, track_answer, tmp_path):
     """Killed outright after some predictions are stored; the same command then finds them and ends with the same figures."""
     out = tmp_path / "out"
@@ -267,6 +269,7 @@ def test_track_with_its_drag_declared_lacks_nothing(folders, track_answer, tmp_p
     assert out.startswith("none; ")
 
 
+@pytest.mark.slow
 def test_bodies_are_diagnosed_one_by_one(tmp_path, capsys):
     made.track(tmp_path / "balls", bodies=2)
     options = ["--effects", "drag_linear,drag_quadratic", "--draws", "39"]
@@ -281,6 +284,7 @@ def test_bodies_are_diagnosed_one_by_one(tmp_path, capsys):
     assert models["ball-1"]["effects"] == {}
 
 
+@pytest.mark.slow
 def test_material_test_finds_its_stiffening(folders, tmp_path, capsys):
     options = ["--effects", "strain_stiffening,yield", "--draws", "39"]
     status, _, _ = run(capsys, folders["test"], "--out", tmp_path / "out", *options)
@@ -297,6 +301,7 @@ def test_material_test_finds_its_stiffening(folders, tmp_path, capsys):
     assert out.startswith("none; ")
 
 
+@pytest.mark.slow
 def test_experiment_closes_the_loop(folders, tmp_path, capsys):
     """Diagnose; put the model that comes out in the folder; diagnose again: nothing is missing."""
     options = ["--effects", "drag_linear,viscosity_shear", "--draws", "39"]

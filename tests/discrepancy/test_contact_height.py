@@ -81,6 +81,7 @@ def test_the_height_goes_where_the_amounts_lead(problem):
 
 
 @pytest.mark.parametrize("effect", ["", "viscosity_shear"])
+@pytest.mark.slow
 def test_a_floor_that_is_elsewhere_is_no_effect(effect, experiment):
     """The floor lies 0.4 cells higher than it is declared: where the height is held, the modulus and a viscosity take its place."""
     problem = restricted(solved_by(body_problem(experiment), "material_points"), "viscosity_shear,drag_linear,restitution")

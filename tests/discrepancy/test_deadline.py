@@ -54,6 +54,7 @@ def test_where_a_simulation_is_slow_the_search_ends_earlier():
         assert limit.share == 1.0
 
 
+@pytest.mark.slow
 def test_what_takes_long_after_the_search_is_left_out_too(block, monkeypatch):
     """A class whose next experiment would be simulated past the end."""
     clock = Clock(0.0)
@@ -89,6 +90,7 @@ def block(tmp_path_factory):
 
 
 @pytest.mark.parametrize("step", [0.0, 1e6])
+@pytest.mark.slow
 def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypatch):
     """The direction of a drag is all but exact, so that even the start of its fit is worth naming; nothing is refined, and it is told."""
     monkeypatch.setattr(attribution, "Deadline", lambda seconds, **options: Deadline(seconds, clock=Clock(step), **options))
@@ -106,6 +108,7 @@ def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypa
 
 
 @pytest.mark.parametrize("settled", [True, False])
+@pytest.mark.slow
 def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
     """When the search ends with an effect named, that is fitted to its end, and nothing is looked for beside it."""
     clock, over, asked = Clock(0.0), [], []
@@ -137,6 +140,7 @@ def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
         assert found.leads[0].fit.point["drag_linear.k"] == pytest.approx(3.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_more_minutes_go_on_from_there(block, tmp_path, capsys):
     out = tmp_path / "out"
     asked = ["diagnose", block.folder, "--out", out, "--draws", "19", "--device", "cpu", "--progress", "false"]

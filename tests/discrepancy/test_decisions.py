@@ -108,6 +108,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("stage", CASES)
+@pytest.mark.slow
 def test_each_stage_is_answered(stage, tmp_path, monkeypatch):
     case = CASES[stage]
     experiment = record(tmp_path / "block", case.truth, launches=case.launches, scene=case.scene, frames=case.frames)
@@ -165,6 +166,7 @@ def test_a_recording_that_does_not_move_is_left_out_of_the_report(lost, tmp_path
     assert [p.stem for p in (tmp_path / "out" / "predicted").iterdir()] == (["a"] if lost == {1} else [])
 
 
+@pytest.mark.slow
 def test_what_no_effect_explains_is_unknown(tmp_path, monkeypatch):
     """A body that swells: no effect of the library, and many times the floor."""
     experiment = swollen(record(tmp_path / "block", {}, launches=FLIES, frames=13), 3.0)

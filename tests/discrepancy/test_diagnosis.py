@@ -35,6 +35,7 @@ def without_time(path) -> dict:
     return content
 
 
+@pytest.mark.slow
 def test_answer_is_that_of_the_command(folder, found, tmp_path, capsys):
     options = ["--effects", DRAGS, "--draws", "39", "--device", "cpu", "--progress", "false"]
     status, out, _ = command.run(capsys, "diagnose", folder, "--out", tmp_path / "by-command", *options)
@@ -113,6 +114,7 @@ def test_model_after_closes_the_loop(folder, found):
     assert "nothing is missing" in again.summary()
 
 
+@pytest.mark.slow
 def test_bodies_are_told_apart(tmp_path):
     made.track(tmp_path / "balls", bodies=2)
     found = diagnose(tmp_path / "balls", effects="drag_linear,drag_quadratic", draws=39)

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -65,6 +66,7 @@ def content(found, tmp_path):
     return json.loads((tmp_path / "diagnosis.json").read_text())
 
 
+@pytest.mark.slow
 def test_what_is_left_beside_a_named_effect_is_told(tmp_path):
     told = content(diagnose(Line({"young": 1.5, "drag_linear.k": 3.0}, beside=0.15), draws=39), tmp_path)
     assert told["answer"] == "effect" and told["error"]["left_over_floor"] > 3.0
@@ -122,9 +124,19 @@ def test_a_declared_figure_at_its_bound_is_reported_first(tmp_path):
     assert told["error"]["before"] == told["error"]["after"]
     page = (tmp_path / "report.html").read_text()
     assert page.index("Young would be 0.1 Pa") < page.index("do not say whether something is missing")
-    young = found.problem.declared[0]
-    assert findings([young], {"young": 40.0}) and not findings([young], {"young": 20.0})
-    assert not findings([replace(young, value=0.1)], {"young": 0.1})  # declared there
+
+
+@pytest.mark.parametrize(("value", "cost", "told"), [(40.0, 1.0, True), (40.0, 0.01, False), (20.0, 1.0, False)])
+def test_a_declared_figure_far_off_is_a_finding_where_the_data_tell_it(value, cost, told):
+    """`cost`: of a unit of the figure."""
+    (young,) = Line({"young": 1.5}).declared
+    young = replace(young, value=1.0)
+    problem = SimpleNamespace(declared=(young,))
+    inference = SimpleNamespace(problem=problem, costs=lambda points, floor: [cost * (p["young"] - value) ** 2 for p in points])
+    at = SimpleNamespace(fit=SimpleNamespace(point={"young": value}), floor=None)
+    assert bool(findings(inference, at)) is told
+    problem.declared = (replace(young, value=value),)
+    assert not findings(inference, at), "declared there"
 
 
 def test_noise_is_the_same_from_any_origin_in_any_unit_and_order():

@@ -187,6 +187,7 @@ NO_MEMORY = (
 
 @pytest.mark.parametrize("error", NO_MEMORY, ids=["torch", "capture", "warp"])
 @pytest.mark.parametrize("most", [2, 1, 0])
+@pytest.mark.slow
 def test_a_launch_without_memory_is_divided(experiment, monkeypatch, most, error):
     """Until it fits; for one motion that does not, what is kept is given up once, and then it is the user's."""
     problem = body_problem(experiment)

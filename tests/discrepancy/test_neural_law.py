@@ -51,6 +51,7 @@ def test_typical_sizes_are_those_of_the_law(law, folder):
     assert young == pytest.approx(1e5, rel=0.1)  # NCLaw's jelly
 
 
+@pytest.mark.slow
 def test_drag_on_a_neural_law_is_named_and_the_model_goes_back(law, folder, tmp_path, capsys):
     out = tmp_path / "out"
     options = ["--effects", "drag_linear,viscosity_shear", "--draws", "19", "--device", "cpu"]

@@ -50,6 +50,7 @@ def test_simulate_repeats_the_recordings_under_the_model(folder, after, tmp_path
     assert np.abs(again.recordings[0].x.numpy() - plain).max() > 0.01
 
 
+@pytest.mark.slow
 def test_diagnose_of_the_repeated_recordings_answers_none(folder, after, tmp_path, capsys):
     run(capsys, "simulate", "--experiment", folder, "--model", after, "--out", tmp_path / "again", "--device", "cpu")
     options = ["--effects", "drag_linear,viscosity_shear", "--draws", "19", "--device", "cpu"]

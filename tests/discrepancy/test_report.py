@@ -76,6 +76,7 @@ def test_names_are_escaped(found):
     assert "<script>alert" not in report.page([details], [found], kind="experiment")
 
 
+@pytest.mark.slow
 def test_page_without_matplotlib_has_its_tables(tmp_path):
     code = f"""
 import sys

@@ -111,6 +111,7 @@ def test_a_prediction_goes_on_to_a_finer_step(monkeypatch):
 
 
 @pytest.mark.parametrize("effect", ["", "viscosity_shear"])
+@pytest.mark.slow
 def test_a_body_on_a_finer_grid(effect, tmp_path: Path):
     """Half as many cells again and half the step: where a fit to one setting cannot tell the grid from a viscosity."""
     experiment = record(tmp_path / "block", {}, launches=FALLS, scene=over(0.2), frames=13)

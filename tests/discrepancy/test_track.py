@@ -63,6 +63,7 @@ def test_a_true_model_is_left_with_its_noise(tmp_path):
         assert fitted(problem, name)[2] > 0.7 * left[1]  # nothing to gain
 
 
+@pytest.mark.slow
 def test_drag_is_found_on_the_body_that_has_it(tmp_path):
     """One of two bodies feels the air; what acts on both alike is left out, or narrowed, for they do not agree on it."""
     bodies = {"stone": Forces(), "feather": Forces(drag_quadratic=0.04)}

@@ -127,6 +127,7 @@ def test_the_truth_is_at_the_noise_and_the_declared_model_is_not(folders):
     np.testing.assert_allclose((drawn[0] - drawn[1])[view == 1], 0.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_drag_is_found_from_video_alone(folders):
     d = diagnose(problem_of(folders["drag"], "drag_linear", "viscosity_shear"), draws=39, most=1)
     assert d.answer == "effect"
@@ -174,6 +175,7 @@ def test_gaussians_of_the_folder_are_what_is_drawn(folders, tmp_path):
     assert problem.error(truth - problem.recordings[0].y, 0) < 2 * problem.recordings[0].noise
 
 
+@pytest.mark.slow
 def test_command_writes_the_silhouettes(folders, tmp_path, capsys):
     """The whole command, with its report; the model that comes out, put back, lacks nothing."""
     folder = tmp_path / "folder"

@@ -121,6 +121,7 @@ def test_same_bytes_again_and_whole_scenes_are_kept(ball, tmp_path):
         make(tmp_path, film=replace(FILM, width=50))
 
 
+@pytest.mark.slow
 def test_killed_run_goes_on(ball, tmp_path):
     entries = [{**BALL, "name": f"Ball-{i}", "split": "unseen" if i else "train"} for i in range(40)]
     config = tmp_path / "scenes.json"

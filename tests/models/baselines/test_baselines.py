@@ -134,6 +134,7 @@ def fit(method, scene, steps):
         ("viscosity", 200.0, 60.0, None, 0.1),
     ],
 )
+@pytest.mark.slow
 def test_a_known_law_finds_its_parameter(tmp_path, name, truth, start, plasticity, tolerance):
     true = {"young": 5e4, "poisson": 0.25, "yield_stress": 3e3, "friction_angle": 30.0, name: truth}
     shape = "box" if plasticity == SAND else "ball"
@@ -170,6 +171,7 @@ def rows_of(path):
 
 
 @pytest.mark.parametrize("name", METHODS)
+@pytest.mark.slow
 def test_a_method_is_fitted_scored_and_read_back(tmp_path, weights, name):
     build, steps, share = METHODS[name]
     data = TinyScenes(str(tmp_path), youngs=(5e4,))

@@ -65,6 +65,7 @@ def test_silhouettes_of_the_package(operator):
 
 
 @pytest.mark.parametrize(("name", "most"), [("pretrained", 0.9), ("pretrained-family", 0.95)])
+@pytest.mark.slow
 def test_few_directions_are_felt(name, most):
     """Along most of the latents' variance nothing happens to the laws; the prior takes a part of what is idle."""
     pytest.importorskip("sklearn")
@@ -160,6 +161,7 @@ def test_without_scikit_learn(operator, monkeypatch):
         latents.silhouettes(operator)
 
 
+@pytest.mark.slow
 def test_command_writes_all(tmp_path, monkeypatch):
     pytest.importorskip("sklearn")
     monkeypatch.setattr(interpolation, "FRAMES", 31)

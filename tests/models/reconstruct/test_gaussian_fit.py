@@ -108,6 +108,7 @@ def test_done_is_done_and_other_options_are_refused(box, capsys):
         reconstruct(str(box), **{**SMALL, "steps": 151})
 
 
+@pytest.mark.slow
 def test_killed_run_ends_as_one_that_was_not(box, tmp_path):
     options = [f"--{key}={str(value).lower() if isinstance(value, bool) else value}" for key, value in SMALL.items()]
     command = [sys.executable, "-m", "neuido", "reconstruct", str(box), "--out", str(tmp_path), "--save_every=40", *options]
@@ -126,6 +127,7 @@ def test_killed_run_ends_as_one_that_was_not(box, tmp_path):
         assert (tmp_path / name).read_bytes() == (box / "reconstruction" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_own_video(box, tmp_path, capsys):
     """A Nerfstudio folder in a unit and place of its own, no masks, through the command line."""
     batch, scale, shift = load_views(box), 0.5, (0.1, -0.05, 0.2)

@@ -49,6 +49,7 @@ def rows_of(path):
     return list(csv.DictReader(path.open()))
 
 
+@pytest.mark.slow
 def test_scenes_one_after_the_other(tmp_path):
     data = TinyScenes(str(tmp_path), youngs=(4e4, 2e5))
     model = module(tmp_path)
@@ -105,6 +106,7 @@ def test_silhouettes_alone(tmp_path):
     assert float(after["iou"]) > float(before["iou"]) + 0.02 and float(after["rmse"]) < 0.8 * float(before["rmse"])
 
 
+@pytest.mark.slow
 def test_velocity_is_estimated_from_the_first_frames(tmp_path):
     scene = tiny_scene(tmp_path, young=1e5, poisson=0.2, velocity=(0.8, -1.5, 0.3), spin=(0.0, 0.0, 0.0))  # jelly
     body = scene.body._replace(v=torch.zeros_like(scene.body.v))
@@ -120,6 +122,7 @@ def test_velocity_is_estimated_from_the_first_frames(tmp_path):
     assert torch.equal(loaded.twist, model.fit_of("tiny").twist)
 
 
+@pytest.mark.slow
 def test_an_uneven_filling_is_found(tmp_path):
     """A body whose upper half is heavier, of a known law: what its first frame does not show is read from its motion."""
 
@@ -148,6 +151,7 @@ def test_an_uneven_filling_is_found(tmp_path):
 
 
 @pytest.mark.parametrize(("since", "moved"), [(0.0, True), (0.5, True), (1.0, False)])
+@pytest.mark.slow
 def test_a_density_waits_for_its_share_of_the_steps(tmp_path, since, moved):
     data = TinyScenes(str(tmp_path))
     model = module(tmp_path, estimate_density=True, density_from=since, steps=4, curriculum=[])
@@ -451,6 +455,7 @@ def kill_after(process, folder, steps):
     assert process.returncode == -signal.SIGKILL and steps <= len(losses(folder)) < 8
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_where_it_was(tmp_path):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     finish(start(whole))

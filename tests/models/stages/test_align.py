@@ -41,6 +41,7 @@ def trainer(tmp_path, **options):
     return Trainer(accelerator="cpu", default_root_dir=tmp_path, enable_progress_bar=False, enable_model_summary=False, **options)
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss_and_finds_the_stiffness(vae, tmp_path):
     model = module(vae, curriculum=[], save_to=str(tmp_path / "encoder.safetensors"), cache=str(tmp_path / "flow"))
     frozen = {name: p.clone() for name, p in model.named_parameters() if "projector" not in name}
@@ -175,6 +176,7 @@ def losses(folder):
     return {(int(epoch), name): float(loss) for epoch, name, loss in rows}
 
 
+@pytest.mark.slow
 def test_two_processes_do_what_one_does_with_both_scenes(vae, tmp_path):
     runs = {count: start(tmp_path / str(count), vae, count, 2) for count in (1, 2)}
     for process in runs.values():
@@ -186,6 +188,7 @@ def test_two_processes_do_what_one_does_with_both_scenes(vae, tmp_path):
     assert len((tmp_path / "2" / "losses-1.txt").read_text().splitlines()) == 2  # each process had a scene an epoch
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_where_it_was(vae, tmp_path):
     whole, broken = start(tmp_path / "whole", vae, 0, 4), start(tmp_path / "broken", vae, 0, 4, pause=0.5)
     last = tmp_path / "broken" / "last.ckpt"

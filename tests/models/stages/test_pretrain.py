@@ -151,6 +151,7 @@ trainer.fit(model, data, ckpt_path=resume[0])
 """
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_ends_with_the_same_weights(folder, tmp_path):
     def start(out, *resume):
         (tmp_path / out).mkdir(exist_ok=True)

@@ -100,6 +100,7 @@ class Case:
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.slow
 def test_rollout_equals_its_slow_twin(name):
     case = Case(name)
     frames, fast = case.gradients(case.sim.rollout, 12)

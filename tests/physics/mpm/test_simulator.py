@@ -204,6 +204,7 @@ def test_kernel_adjoint_equals_finite_differences(name):
 
 
 @pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.slow
 def test_kernel_adjoint_equals_warp_autodiff(name):
     """Warp's own adjoint is right here but for the colliders' loop, which carries a value: `update_grid` runs it without planes."""
     stage = Stage()
