@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.discrepancy.judging import IMPLAUSIBLE
-from neuido.discrepancy.problem import Parameter, Point
+from neuido.discrepancy.problem import Parameter
 from neuido.discrepancy.rounds import Inference
 from neuido.discrepancy.trials import Round, Stand, Trial
 
