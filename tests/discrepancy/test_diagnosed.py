@@ -25,9 +25,9 @@ def test_the_effects_act_and_the_law_does_not(tmp_path):
     model = AdaptModule(LowRankAdaptation(start="jelly"), effects=DiagnosedEffects(str(path)), out=str(tmp_path / "out"))
     prepared, fit = model.load_fit(tiny_scene(tmp_path))
     with torch.no_grad():
-        moved = fit.roll(prepared, prepared.frames)
-        expected = fit.method.roll(prepared, prepared.frames, effects=Effects(drag_linear=2.5))
-        free = fit.method.roll(prepared, prepared.frames)
+        moved = fit.rollout(prepared, prepared.frames)
+        expected = fit.method.rollout(prepared, prepared.frames, effects=Effects(drag_linear=2.5))
+        free = fit.method.rollout(prepared, prepared.frames)
     assert torch.allclose(moved.x, expected.x, atol=1e-6) and not torch.allclose(moved.x, free.x, atol=1e-3)
 
 
@@ -39,4 +39,4 @@ def test_what_is_wrong_is_named(tmp_path):
     model = AdaptModule(LowRankAdaptation(start="jelly"), effects=DiagnosedEffects(str(path)), out=str(tmp_path / "out"))
     prepared, fit = model.load_fit(tiny_scene(tmp_path))
     with pytest.raises(UserError, match="magic"):
-        fit.roll(prepared, 2)
+        fit.rollout(prepared, 2)
