@@ -39,9 +39,11 @@ def shortened(text: str) -> str:
 
 def _line_of(error: BaseException) -> str | None:
     cause: BaseException | None = error
-    while cause is not None:  # jsonargparse wraps what a constructor raises
+    seen: list[BaseException] = []
+    while cause is not None and cause not in seen:  # jsonargparse wraps what a constructor raises; causes may form a circle
         if isinstance(cause, UserError):
             return str(cause)
+        seen.append(cause)
         cause = cause.__cause__
     if isinstance(error, argparse.ArgumentError):
         return _condense(str(error))

@@ -14,6 +14,7 @@ from neuido.commands import main as cli
 from neuido.commands.cli.config_files import find_configs
 from neuido.commands.main import main
 from neuido.commands.simulate import simulate
+from neuido.errors import one_line
 from tests.command import run
 
 ROOT = Path(neuido.__file__).parents[1]
@@ -250,3 +251,9 @@ class TestLightning:
         assert "neuido" in out
         assert "--ckpt_path" in out
         assert "--optimizer" not in out
+
+
+def test_causes_in_a_circle_end():
+    inner, outer = ValueError("inner"), OSError("outer")
+    inner.__cause__, outer.__cause__ = outer, inner
+    assert one_line(outer) == "outer"

@@ -26,7 +26,10 @@ def run_function(name: str, module: str, function: str, args: list[str]) -> int:
     try:
         status = auto_cli(component, args=args, as_positional=False, prog=f"neuido {name}", exit_on_error=False)
     except ArgumentError as error:
-        raise _explained(error, name, list(inspect.signature(component).parameters)) from error
+        explained = _explained(error, name, list(inspect.signature(component).parameters))
+        if explained is error:
+            raise
+        raise explained from error
     return status if isinstance(status, int) else 0
 
 
