@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from neuido.physics import laws as laws
     from neuido.physics.fem.finite_elements import FiniteElements as FiniteElements
     from neuido.physics.mpm.simulator import Simulator as Simulator
+    from neuido.physics.runtime.frames import Frames as Frames
     from neuido.types import AttachedMass as AttachedMass
     from neuido.types import Body as Body
     from neuido.types import Box as Box
@@ -48,6 +49,7 @@ _PLACES = {  # name: its module, and after a colon its name there; a module alon
     "Diagnosis": "discrepancy.diagnosis:Diagnosis",
     "Encoder": "models.video.encoder:DynamicsEncoder",
     "FiniteElements": "physics.fem.finite_elements:FiniteElements",
+    "Frames": "physics.runtime.frames:Frames",
     "Operator": "models.operator.dynamics_operator:IntrinsicDynamicsOperator",
     "Simulator": "physics.mpm.simulator:Simulator",
     "UserError": "errors:UserError",
@@ -75,6 +77,7 @@ __all__ = [
     "Diagnosis",
     "Encoder",
     "FiniteElements",
+    "Frames",
     "Gaussians",
     "Operator",
     "ParticleState",

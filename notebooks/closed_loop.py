@@ -14,12 +14,12 @@
 # %% [markdown]
 # # The closed loop
 #
-# Measured motion goes in. The declared model is fitted; what it leaves is traced to an effect that it lacks; that effect is added;
-# the error on recordings that no fit has seen is compared before and after. First on a simulated body whose truth is known, then on
-# rubber that Treloar stretched in 1944.
+# The input is measured motion. The declared model is fitted, its residual is attributed to an effect that the model lacks, the effect is
+# added, and the error on held-out recordings is compared before and after. The first example is a simulated body whose truth is known;
+# the second is the rubber that Treloar stretched in 1944.
 #
-# Open it with jupytext (`pip install 'neuido[notebook]'`), or run it: `python notebooks/closed_loop.py`. `NEUIDO_NOTEBOOK_OUT` is the
-# folder for what it writes, `NEUIDO_NOTEBOOK_SMALL=1` makes it short, `NEUIDO_DATA` is the folder of the measured data.
+# Open this file with jupytext (`pip install 'neuido[notebook]'`), or run it: `python notebooks/closed_loop.py`. `NEUIDO_NOTEBOOK_OUT` is
+# the output folder, `NEUIDO_NOTEBOOK_SMALL=1` shortens the run, and `NEUIDO_DATA` is the folder of the measured data.
 
 # %%
 import json
@@ -28,25 +28,21 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+import torch
 
-from neuido.commands.demo.closed_loop import record
-from neuido.commands.diagnose import diagnose
+from neuido import Scene, Simulator, diagnose, effects, laws, shapes
+from neuido.data import Experiment, Recording, read_experiment, read_material_tests, write_experiment
 
 out = Path(os.environ.get("NEUIDO_NOTEBOOK_OUT", "runs/notebooks/closed_loop"))
 small = os.environ.get("NEUIDO_NOTEBOOK_SMALL") == "1"
 out.mkdir(parents=True, exist_ok=True)
 
 
-def read(folder: Path) -> dict:
-    """What a diagnosis says."""
-    return json.loads((folder / "diagnosis.json").read_text())
-
-
-def ranking(folder: Path, axes) -> None:
-    """What each effect that was fitted would bring, in the first step."""
-    (first, *_), found = json.loads((folder / "trace.json").read_text())["rounds"], read(folder)["effects"]
+def plot_ranking(diagnosis, axes) -> None:
+    """Plot the gain of each candidate effect in the first round; the effects of the answer are highlighted."""
+    first, *_ = json.loads((diagnosis.folder / "trace.json").read_text())["rounds"]
     trials = sorted(first["trials"], key=lambda t: t["gain"])[-10:]
-    named = {name for effect in found for name in effect["class"]}
+    named = {name for effect in diagnosis.effects for name in (effect.name, *effect.alternatives)}
     axes.barh(
         [t["key"] for t in trials], [np.exp(t["gain"]) for t in trials], color=["C0" if t["name"] in named else "0.8" for t in trials]
     )
@@ -56,37 +52,56 @@ def ranking(folder: Path, axes) -> None:
 # %% [markdown]
 # ## A simulated block
 #
-# A block of jelly is thrown twice. It feels a drag that its model does not mention, and its modulus is declared a third too high. One
-# throw is fitted, the other is held out. A folder like this is what a motion-capture experiment gives: tracked points, the declared
-# scene, the declared law.
+# A block of jelly is thrown twice. A drag acts on it that its model lacks, and its declared modulus is a third too high. One throw is
+# fitted, the other is held out. The folder holds what a motion-capture experiment provides: tracked points, the declared scene and the
+# declared law.
 
 # %%
 measured = out / "block"
-experiment = record(measured, {"drag_linear.k": 3.0})
-for r in experiment.recordings:
+scene, every, frames, noise = Scene(cells=14, dt=1e-3), 10, 16, 4e-4
+random = np.random.default_rng(1)
+launches = {  # role, centre [m], velocity [m/s], spin about z [rad/s], stretch rate along x [1/s]
+    "throw": ("fit", (0.35, 0.5, 0.5), (1.2, 1.0, 0.3), 5.0, 3.0),
+    "toss": ("held_out", (0.68, 0.42, 0.5), (-2.4, 2.0, -0.8), -4.0, -3.0),
+}
+
+
+def simulate(name: str) -> Recording:
+    """Throw the block with the true law and drag, and track 60 of its particles with noise."""
+    role, centre, velocity, spin, stretch = launches[name]
+    body = shapes.cube(length=0.3, centre=centre, particles_per_side=5, velocity=velocity, angular_velocity=(0.0, 0.0, spin))
+    body.v.add_((body.x - torch.tensor(centre)) * torch.tensor([stretch, -stretch, 0.0]))  # makes the block vibrate
+    with torch.no_grad():
+        motion = Simulator(scene, body, device="cpu").rollout(
+            every * (frames - 1), laws.FixedCorotated(6e4, 0.3), every=every, effects=effects.Effects(drag_linear=3.0)
+        )
+    track = torch.from_numpy(random.permutation(len(body.x))[:60])
+    x = motion.x[:, track] + noise * torch.from_numpy(random.standard_normal((frames, 60, 3))).float()
+    return Recording(name, role, scene, every * scene.dt, noise, x=x, t=motion.times, body=body, track=track)
+
+
+if not (measured / "experiment.yaml").is_file():
+    declared = {"density": 1000.0, "elasticity": {"law": "fixed_corotated", "young": 8e4, "poisson": 0.3}}
+    declared["plasticity"] = {"law": "identity"}
+    write_experiment(Experiment("block", measured, scene, declared, ("young",), tuple(map(simulate, launches))), measured)
+for r in read_experiment(measured).recordings:
     print(f"{r.name} ({r.role}): {r.x.shape[1]} points, {len(r.t)} frames, noise {1e3 * r.noise:.1f} mm")
 
 # %% [markdown]
-# The command line says `neuido diagnose runs/.../block --out DIR`; this is the same function. Without `effects` every effect that could
-# act on such a body is tried, more than twenty.
+# On the command line this is `neuido diagnose runs/.../block --out DIR`. Without `effects`, every effect that could act on such a body is
+# tried; there are more than twenty.
 
 # %%
-diagnose(
-    str(measured),
-    out=str(out / "block-diagnosis"),
-    effects="drag_linear,drag_quadratic,viscosity_shear" if small else None,
-    draws=39 if small else 199,
-    device="cpu",
-    progress=False,
-)
-block = read(out / "block-diagnosis")
-for effect in block["effects"]:
-    for name, figure in effect["parameters"].items():
-        low, high = figure["interval90"]
-        print(f"{effect['name']}.{name} = {figure['value']:.3g} {figure['unit']} (90 %: {low:.3g} to {high:.3g}; truth: 3)")
+suspects = ["drag_linear", "drag_quadratic", "viscosity_shear"] if small else None
+block = diagnose(measured, out=out / "block-diagnosis", effects=suspects, draws=39 if small else 199, device="cpu")
+print(block.line)
+for effect in block.effects:
+    for name, quantity in effect.parameters.items():
+        low, high = quantity.interval
+        print(f"{effect.name}.{name} = {quantity.value:.3g} {quantity.unit} (90 %: {low:.3g} to {high:.3g}; truth: 3)")
 
 # %% [markdown]
-# The held-out error falls to the noise. What was left before has a pattern in time that no clock, ruler or launch that is slightly off
+# The held-out error falls to the noise. The residual before has a pattern in time that no error of the clock, the scale or the launch
 # explains.
 
 # %%
@@ -95,47 +110,36 @@ with np.load(out / "block-diagnosis" / "predicted" / "toss.npz") as archive:
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
 for when, colour in (("before", "C3"), ("after", "C0")):
     distance = 1e3 * np.sqrt(np.nanmean(((m["measured"] - m[when]) ** 2).sum(-1), axis=1))
-    left.plot(m["t"], distance, color=colour, label=f"{when}: {1e3 * block['error'][when]['held_out']:.2f} mm")
-left.axhline(1e3 * block["error"]["noise_floor"], color="0.3", ls=":", label="noise")
-left.set(xlabel="t [s]", ylabel="RMS distance [mm]", title="the throw that was held out", ylim=(0, None))
+    left.plot(m["t"], distance, color=colour, label=f"{when}: {1e3 * getattr(block.error, when):.2f} mm")
+left.axhline(1e3 * block.error.floor, color="0.3", ls=":", label="noise and discretisation")
+left.set(xlabel="t [s]", ylabel="RMS distance [mm]", title="the held-out throw", ylim=(0, None))
 left.legend(frameon=False)
-ranking(out / "block-diagnosis", right)
+plot_ranking(block, right)
 figure.savefig(out / "block.png", dpi=120)
 
 # %% [markdown]
-# The loop closes: with the model that came out, a second pass finds nothing more.
+# The loop closes: a second pass, which starts from the resulting model, finds nothing more.
 
 # %%
-diagnose(
-    str(measured),
-    out=str(out / "block-again"),
-    model=str(out / "block-diagnosis" / "model_after.yaml"),
-    effects="drag_linear,drag_quadratic,viscosity_shear" if small else None,
-    draws=39,
-    device="cpu",
-    progress=False,
-)
-assert read(out / "block-again")["answer"] == "none"
+again = diagnose(measured, out=out / "block-again", model=block.model_after, effects=suspects, draws=39, device="cpu")
+print(again.line)
+assert again.answer == "none"
 
 # %% [markdown]
 # ## Vulcanised rubber
 #
-# Treloar's uniaxial tension of 1944, as digitised. The declared law is neo-Hookean; it is fitted to stretches up to 6.7, and has
-# to foretell the stress up to 7.5.
+# The data are Treloar's uniaxial tension of 1944, digitised. The declared law is neo-Hookean. It is fitted at stretches up to 6.7 and has
+# to predict the stress up to 7.5.
 
 # %%
 root = os.environ.get("NEUIDO_DATA")
 rubber = Path(root) / "measured" / "treloar-rubber" if root else None
 if rubber is None or not (rubber / "test.yaml").is_file():
-    print("The measured data are not here: set NEUIDO_DATA to their folder to see this part.")
+    print("The measured data were not found: set NEUIDO_DATA to their folder to run this part.")
 else:
-    diagnose(str(rubber), out=str(out / "rubber"), draws=39 if small else 199, device="cpu", progress=False)
-    content = read(out / "rubber")
-    for effect in content["effects"]:
-        print(" or ".join(effect["class"]), {name: float(f"{p['value']:.3g}") for name, p in effect["parameters"].items()})
+    diagnosis = diagnose(rubber, out=out / "rubber", draws=39 if small else 199, device="cpu")
+    print(diagnosis.summary())
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
-    from neuido.data.measured.material_test import read_material_tests
-
     for test in read_material_tests(rubber).tests:
         with np.load(out / "rubber" / "predicted" / f"{test.name}.npz") as archive:
             stretch = np.asarray(test.path).reshape(len(archive["measured"]), -1)[:, 0]
@@ -149,14 +153,12 @@ else:
             )
             for when, colour in (("before", "C3"), ("after", "C0")):
                 left.plot(stretch, 1e-6 * archive[when], color=colour)
-    error = {when: 1e-6 * content["error"][when]["held_out"] for when in ("before", "after")}
-    left.set(
-        xlabel="stretch", ylabel="nominal stress [MPa]", title=f"held out: {error['before']:.2f} before, {error['after']:.2f} MPa after"
-    )
+    before, after = 1e-6 * diagnosis.error.before, 1e-6 * diagnosis.error.after
+    left.set(xlabel="stretch", ylabel="nominal stress [MPa]", title=f"held out: {before:.2f} MPa before, {after:.2f} MPa after")
     left.legend(frameon=False, fontsize=8)
-    ranking(out / "rubber", right)
+    plot_ranking(diagnosis, right)
     figure.savefig(out / "rubber.png", dpi=120)
 
 # %% [markdown]
-# Each diagnosis has a page of its own, `report.html`, with the motion to play, the map of the residual over the body, the reasons for
-# which the other effects were rejected, and the next experiment that would tell the most.
+# Each diagnosis writes `report.html`: an animation of the motion, a map of the residual over the body, the reasons why the other effects
+# were rejected, and the most informative next experiment.

@@ -14,33 +14,50 @@
 # %% [markdown]
 # # Between two latents
 #
-# Is a point between two latents a material between theirs? The laws on the line from the softest to the stiffest elastic latent move
-# a ball that falls onto a floor, all in one launch. The command `neuido latents` does it and writes tables; this notebook reads them.
+# Does a point between two latents stand for a material between the two materials? A ball falls onto a floor under each of the laws on the
+# line from the softest to the stiffest elastic latent; all laws run in one launch. The command `neuido latents` runs the drop test and
+# writes tables, which this notebook reads.
 #
-# Open it with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/interpolation.py`.
-# `NEUIDO_NOTEBOOK_OUT` is the folder of the tables, made where they are missing; `NEUIDO_NOTEBOOK_SMALL=1` takes fewer laws.
-# `NEUIDO_OPERATOR` names another operator.
+# Open this file with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/interpolation.py`.
+# `NEUIDO_NOTEBOOK_OUT` is the folder of the tables, which are computed if they are missing. `NEUIDO_NOTEBOOK_SMALL=1` uses fewer laws,
+# and `NEUIDO_OPERATOR` selects another operator.
 
 # %%
+import csv
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from neuido.commands.latents import latents
-from neuido.data.files.score_tables import read_rows
-
 out = Path(os.environ.get("NEUIDO_NOTEBOOK_OUT", "runs/notebooks/interpolation"))
 operator = os.environ.get("NEUIDO_OPERATOR", "pretrained-family")
 small = os.environ.get("NEUIDO_NOTEBOOK_SMALL") == "1"
+
+
+def read_rows(path: Path) -> list[dict]:
+    """Read a CSV file; cells that hold numbers become floats."""
+
+    def number(cell: str) -> float | str:
+        try:
+            return float(cell)
+        except ValueError:
+            return cell
+
+    with path.open(newline="") as file:
+        return [{key: number(cell) for key, cell in row.items()} for row in csv.DictReader(file)]
+
+
 if not (out / "interpolation.csv").is_file():  # neuido latents --config configs/experiments/interpolation.yaml
-    latents(operator=operator, out=str(out), parts=["interpolation"], count=5 if small else 9)
+    options = ["--operator", operator, "--out", out, "--parts", '["interpolation"]', "--count", 5 if small else 9, "--device", "cpu"]
+    subprocess.run([sys.executable, "-m", "neuido", "latents", *map(str, options)], check=True)
 
 # %% [markdown]
 # ## The motion
 #
-# Each column is one law, each row one time: the ball from the front.
+# Each column is one law and each row one time; the ball is seen from the front.
 
 # %%
 with np.load(out / "interpolation.npz") as archive:
@@ -53,14 +70,14 @@ for row, frame in zip(panels, frames):
         axes.set(xlim=(0.3, 0.7), ylim=(0.1, 0.5), aspect="equal", xticks=[], yticks=[])
 for axes, share in zip(panels[0], shares):
     axes.set_title(f"{share:.2f}", fontsize=8)
-figure.suptitle(f"share of {names[1]}, the rest {names[0]}", fontsize=9)
+figure.suptitle(f"share of {names[1]}; the rest is {names[0]}", fontsize=9)
 figure.savefig(out / "motion.png", dpi=120)
 
 # %% [markdown]
 # ## Apparent stiffness
 #
-# Three measures: the modulus of the law at small strain; the greatest compression; how long the floor carries the ball. The
-# rank correlation with the share is one where a measure is monotone.
+# There are three measures: the small-strain modulus of the law, the greatest compression, and the contact time with the floor. The rank
+# correlation of a measure with the share is one if the measure is monotone.
 
 # %%
 rows = read_rows(out / "interpolation.csv")
@@ -78,7 +95,7 @@ assert steady["modulus"]["spearman"] > 0.9
 # %% [markdown]
 # ## All pairs
 #
-# The two ends above are the farthest apart. Between any two latents of a family the modulus is monotone in most cases, not in all.
+# The two ends above are the farthest apart. Between two arbitrary latents of a family the modulus is monotone in most cases, not in all.
 
 # %%
 for row in read_rows(out / "pairs.csv"):

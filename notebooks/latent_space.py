@@ -12,34 +12,49 @@
 # ---
 
 # %% [markdown]
-# # The space of the latents
+# # The latent space
 #
-# Stage I gives each of its 90 trajectories a latent z. Do latents of one family lie together? The command `neuido latents` measures
-# it and writes tables; this notebook reads them.
+# Stage I learns a latent z for each of its 90 trajectories. Do the latents of a family form a cluster? The command `neuido latents`
+# measures this and writes tables, which this notebook reads.
 #
-# Open it with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/latent_space.py`.
-# `NEUIDO_NOTEBOOK_OUT` is the folder of the tables; they are made where they are missing. `NEUIDO_OPERATOR` names another operator.
+# Open this file with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/latent_space.py`.
+# `NEUIDO_NOTEBOOK_OUT` is the folder of the tables, which are computed if they are missing. `NEUIDO_OPERATOR` selects another operator.
 
 # %%
+import csv
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from neuido.commands.latents import latents
-from neuido.data.files.score_tables import read_rows
-
 out = Path(os.environ.get("NEUIDO_NOTEBOOK_OUT", "runs/notebooks/latent_space"))
 operator = os.environ.get("NEUIDO_OPERATOR", "pretrained-family")
-if not (out / "silhouettes.csv").is_file():
-    latents(operator=operator, out=str(out), parts=["space"])  # neuido latents --config configs/experiments/latent_space.yaml
+
+
+def read_rows(path: Path) -> list[dict]:
+    """Read a CSV file; cells that hold numbers become floats."""
+
+    def number(cell: str) -> float | str:
+        try:
+            return float(cell)
+        except ValueError:
+            return cell
+
+    with path.open(newline="") as file:
+        return [{key: number(cell) for key, cell in row.items()} for row in csv.DictReader(file)]
+
+
+if not (out / "silhouettes.csv").is_file():  # neuido latents --config configs/experiments/latent_space.yaml
+    options = ["--operator", operator, "--out", str(out), "--parts", '["space"]', "--device", "cpu"]
+    subprocess.run([sys.executable, "-m", "neuido", "latents", *options], check=True)
 
 # %% [markdown]
 # ## t-SNE
 #
-# Families are apart in the plane of t-SNE, and within a family the latents are in the order of their stiffness, which no
-# label told them.
+# The families are separate in the t-SNE plane. Within a family the latents are ordered by stiffness, although no label gave it.
 
 # %%
 points = read_rows(out / "embedding.csv")
@@ -58,10 +73,10 @@ figure.savefig(out / "tsne.png", dpi=120)
 # %% [markdown]
 # ## Silhouettes
 #
-# t-SNE draws clusters where distances are not clustered. The silhouette of a latent compares its mean distance to its own family with
-# that to the nearest other one: one is apart, zero is mixed. The operator `pretrained-family` was fitted with a prior that draws each
-# latent to the mean of its family, so that its latents as they are have a high one. What their laws answer to the same deformations has
-# a high one with the prior and without it.
+# t-SNE can show clusters where distances are not clustered. The silhouette of a latent compares its mean distance to its own family with
+# its mean distance to the nearest other family: one means separate, zero means mixed. The operator `pretrained-family` was fitted with a
+# prior that pulls each latent towards the mean of its family, so its raw latents have a high silhouette. The responses of the laws to the
+# same deformations have a high silhouette with and without the prior.
 
 # %%
 rows = {row["space"]: row for row in read_rows(out / "silhouettes.csv")}
@@ -71,19 +86,19 @@ for name, row in rows.items():
 assert rows["laws"]["silhouette"] > 0.3
 
 # %% [markdown]
-# ## What the laws feel of them
+# ## Directions that the laws depend on
 #
-# A latent starts as noise in 128 dimensions, and the laws feel few of these. Along the other directions that noise would stay and widen
-# every family, if the prior did not take it: without it (`NEUIDO_OPERATOR=pretrained`) the silhouette is 0.08. Below: how much a law
-# changes when only its most felt directions are kept, and how much of the variance lies along them.
+# A latent starts as noise in 128 dimensions, and the laws depend on few of them. Without the prior, the noise along the other directions
+# remains and widens every family: the silhouette is then 0.08 (`NEUIDO_OPERATOR=pretrained`). The figure shows how much a law changes if
+# only the directions with the largest influence are kept, and how much of the variance lies along them.
 
 # %%
 directions = read_rows(out / "directions.csv")
 figure, axes = plt.subplots(figsize=(5, 3.2), layout="constrained")
 count = [row["directions"] for row in directions]
 axes.plot(count, [row["variance"] for row in directions], "o-", label="share of the latents' variance")
-axes.plot(count, [row["law changes"] for row in directions], "s-", label="change of a law without the rest")
+axes.plot(count, [row["law changes"] for row in directions], "s-", label="change of a law without the other directions")
 axes.plot(count, [row["silhouette"] for row in directions], "^-", label="silhouette")
-axes.set(xlabel="directions that are kept", ylim=(0, 1))
+axes.set(xlabel="directions kept", ylim=(0, 1))
 axes.legend(frameon=False, fontsize=8)
 figure.savefig(out / "directions.png", dpi=120)

@@ -17,8 +17,8 @@ import neuido
 ROOT = Path(__file__).parents[1]
 PUBLIC = {
     "neuido": """
-        AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Gaussians Operator ParticleState Plane Scene Simulator UserError
-        Walls __version__ configs_root diagnose effects export import_file laws load_scene rasterize read_experiment read_law
+        AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Operator ParticleState Plane Scene Simulator
+        UserError Walls __version__ configs_root diagnose effects export import_file laws load_scene rasterize read_experiment read_law
         read_material_tests read_recording read_tracks render shapes
     """,
     "neuido.data": """
@@ -96,8 +96,9 @@ def test_export_is_a_function_whatever_was_imported_first():
 
 def sources() -> list[tuple[str, str]]:
     """Return name and Python of each piece of code that a user copies."""
-    found = [(p.relative_to(ROOT).as_posix(), p.read_text()) for p in (ROOT / "examples").rglob("*.py")]
-    for page in (ROOT / "docs").rglob("*.md"):
+    scripts = [path for folder in ("examples", "notebooks") for path in (ROOT / folder).rglob("*.py")]
+    found = [(path.relative_to(ROOT).as_posix(), path.read_text()) for path in scripts]
+    for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
         blocks = re.findall(r"^```(?:python|\{code-cell\}.*?)\n(.*?)^```", page.read_text(), re.M | re.S)
         found += [(f"{page.relative_to(ROOT).as_posix()}[{i}]", block) for i, block in enumerate(blocks)]
     return found

@@ -274,6 +274,6 @@ from neuido import Scene, Simulator, laws, shapes
 {_BALL}
 frames = simulator.rollout(50, laws.FixedCorotated(5e4, 0.3), every=10)
 print(frames, frames.times)
-frames.save("motion.npz")
+frames.save("motion.npz")  # or .csv, or .ply: a point cloud a frame
 """,
 }

@@ -23,7 +23,7 @@ def latents(
     count: int = 9,
     perplexity: float = 10.0,
     seed: int = 0,
-    device: str = "cpu",
+    device: str = "auto",
 ) -> None:
     """How the latents of Stage I lie, and what lies between two of them (paper, representation analysis).
 
@@ -41,7 +41,7 @@ def latents(
         count: Laws from one end to the other.
         perplexity: Of t-SNE.
         seed: Of t-SNE.
-        device: Where the drop test runs: cpu or cuda.
+        device: Device of the drop test: auto (CUDA where there is one), cpu or cuda.
 
     Raises:
         UserError: A part, a latent or a family that there is not; scikit-learn is not installed.

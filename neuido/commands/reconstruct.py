@@ -164,8 +164,8 @@ def _optimise(batch: "MultiViewBatch", around: "Setting", target: Path, device: 
     steps = options["steps"]
     sizes = {key: options[key] for key in ("steps", "views", "lr", "resolution", "seed")}
     counts = {
-        "start": options["start"],
-        "limit": max(options["gaussians"], options["start"]),
+        "initial_gaussians": options["start"],
+        "max_gaussians": max(options["gaussians"], options["start"]),
         "densify_every": max(1, min(100, steps // 12)),
     }
     module = ReconstructModule(around.scene.lower, around.scene.upper, **sizes, **counts)

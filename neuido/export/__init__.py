@@ -1,4 +1,4 @@
-"""Motion as files that other programs read. The package is its own function: `neuido.export(frames, path)`."""
+"""Export of motion to files that other programs read. The package itself is callable: `neuido.export(frames, path)`."""
 
 import os
 import sys
@@ -8,11 +8,11 @@ from typing import Any
 
 
 class _Export(ModuleType):
-    def __call__(self, frames: Any, path: str | os.PathLike) -> Path:
+    def __call__(self, frames: Any, path: str | os.PathLike, *, frame_interval: float | None = None) -> Path:
         """Write the frames of a rollout; see `neuido.export.particles.export`."""
         from neuido.export.particles import export
 
-        return export(frames, path)
+        return export(frames, path, frame_interval=frame_interval)
 
 
 sys.modules[__name__].__class__ = _Export  # a folder and a function have one name in `neuido`

@@ -3,6 +3,7 @@
 YAML gives `class_path` and `init_args` of the model and the data module.
 """
 
+import functools
 import importlib
 import os
 import zipfile
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import neuido
 from neuido.commands import interruption
 from neuido.commands.cli.console import quiet_lightning
+from neuido.data.files.renamed_options import rename_in_arguments, rename_in_configuration
 from neuido.data.files.sweep_run import own_folder, redirect
 from neuido.errors import UserError
 
@@ -44,6 +46,8 @@ def run_lightning(args: list[str]) -> "LightningCLI":
 
     for module in MODULES:
         importlib.import_module(module)
+    args = rename_in_arguments(args, "model.method", MODULES)
+    _load_former_names()
 
     class NeuidoCLI(LightningCLI):
         def add_arguments_to_parser(self, parser: "LightningArgumentParser") -> None:
@@ -87,6 +91,16 @@ def run_lightning(args: list[str]) -> "LightningCLI":
         parser_kwargs={"prog": "neuido", "version": neuido.__version__, **parser, **{name: dict(parser) for name in HEAVY}},
         args=args,
     )
+
+
+@functools.cache  # once a process
+def _load_former_names() -> None:
+    """Let configuration files give options under their former names."""
+    import yaml
+    from jsonargparse import get_loader, set_loader
+
+    load = get_loader("yaml")
+    set_loader("yaml", lambda text: rename_in_configuration(load(text)), (yaml.YAMLError,))
 
 
 def _numbers_of(checkpoint: str, class_path: str) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from neuido.data.files.renamed_options import renamed_options
 from neuido.errors import UserError
 from neuido.models.fewshot.method import Method, require_positive
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
@@ -16,6 +17,7 @@ from neuido.types import ParticleState
 PARTS = ("elasticity", "plasticity")
 
 
+@renamed_options(free="free_parameters")
 class KnownLaw(Method):
     """The parameters of a law whose family is given, by gradient through simulator and renderer (PAC-NeRF; GIC).
 
@@ -28,7 +30,7 @@ class KnownLaw(Method):
         yield_stress: Start of the yield stress [Pa] (GIC: 1000).
         friction_angle: Start of the friction angle [degrees], between 1 and 60 (GIC: 10).
         viscosity: Start of a Kelvin-Voigt shear viscosity [Pa s], fitted too; none: the body has none.
-        free: Which of these are fitted, of those that the family has; all where absent.
+        free_parameters: Names of the parameters to fit; all that the family has where absent.
         rates: Rates of some, in decades, Poisson's ratio, degrees; the others as `RATES`.
 
     Raises:
@@ -48,7 +50,7 @@ class KnownLaw(Method):
         yield_stress: float = 1e3,
         friction_angle: float = 10.0,
         viscosity: float | None = None,
-        free: list[str] | None = None,
+        free_parameters: list[str] | None = None,
         rates: dict[str, float] | None = None,
     ):
         super().__init__()
@@ -59,12 +61,12 @@ class KnownLaw(Method):
         for name, (low, high) in self.BOUNDS.items():
             if not low < self.start[name] < high:
                 raise UserError(f"model.method.{name} = {self.start[name]}: it must lie between {low:g} and {high:g}")
-        for option, names in (("free", free or []), ("rates", rates or {})):
+        for option, names in (("free_parameters", free_parameters or []), ("rates", rates or {})):
             for name in names:
-                if name not in self.RATES or (option == "free" and name not in self.start):
+                if name not in self.RATES or (option == "free_parameters" and name not in self.start):
                     raise UserError(f"model.method.{option}: there is no parameter {name!r}; they are {', '.join(self.start)}")
         require_positive(**{f"rates.{name}": rate for name, rate in (rates or {}).items()})
-        self.free, self.rates = free, {**self.RATES, **(rates or {})}
+        self.free_parameters, self.rates = free_parameters, {**self.RATES, **(rates or {})}
 
     def build(self, scene: PreparedScene) -> None:
         truth = scene.source.truth
@@ -75,7 +77,7 @@ class KnownLaw(Method):
         self.raw = nn.ParameterDict({name: nn.Parameter(torch.tensor(self._inverse(name)), self._is_free(name)) for name in names})
 
     def _is_free(self, name: str) -> bool:
-        return self.free is None or name in self.free
+        return self.free_parameters is None or name in self.free_parameters
 
     def _inverse(self, name: str) -> float:
         value = self.start[name]

@@ -120,21 +120,21 @@ class SparseLaw(Method):
         """
         fitting = torch.is_grad_enabled()
         if fitting:
-            if self._due():
-                self.drop()
+            if self._selection_is_due():
+                self.prune_terms()
             self.runs += 1
         motion = super().rollout(scene, frames, **options)
-        if fitting and self._due():
+        if fitting and self._selection_is_due():
             F = motion.F.detach()[1:].reshape(-1, 3, 3)
-            self.weigh(F[:: max(1, len(F) // SAMPLES)])
+            self.select_terms(F[:: max(1, len(F) // SAMPLES)])
         return motion
 
-    def _due(self) -> bool:
+    def _selection_is_due(self) -> bool:
         runs = int(self.runs)
         return 0 < runs <= self.interval * self.rounds and runs % self.interval == 0
 
     @torch.no_grad()
-    def weigh(self, F: Tensor) -> None:
+    def select_terms(self, F: Tensor) -> None:
         """Select the terms that matter at deformation gradients (n, 3, 3) of a motion under the present law."""
         parts = torch.einsum("nk,ngij,gk->ngkij", polynomial(F), generators(F), self.coefficients())
         total = parts.sum((1, 2)).square().mean().sqrt()
@@ -154,8 +154,8 @@ class SparseLaw(Method):
         self.becomes.copy_(torch.stack(becomes))
 
     @torch.no_grad()
-    def drop(self) -> None:
-        """Drop the terms that `weigh` did not select."""
+    def prune_terms(self) -> None:
+        """Remove the terms that `select_terms` did not select."""
         self.active.mul_(self.keep)
         self.shape.mul_(self.active)
         self.surface.copy_(torch.where(self.becomes.isnan(), self.surface, self.becomes))

@@ -6,6 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from neuido.data.files.renamed_options import renamed_options
 from neuido.errors import UserError
 from neuido.models.fewshot.method import Method, require_positive
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
@@ -14,6 +15,7 @@ from neuido.physics.springs.mass_spring import MassSpring, connect
 from neuido.types import ParticleState
 
 
+@renamed_options(per="stiffness_per", firm="full_stiffness_neighbours")
 class SpringMass(Method):
     """Anchors among the particles carry the mass, springs join them, and all other particles follow the anchors near them.
 
@@ -46,8 +48,8 @@ class SpringMass(Method):
         anchors: int = 2048,
         neighbours: int = 256,
         binding: int = 16,
-        per: Literal["anchor", "spring", "body"] = "anchor",
-        firm: int = 16,
+        stiffness_per: Literal["anchor", "spring", "body"] = "anchor",
+        full_stiffness_neighbours: int = 16,
         power: float = 0.5,
         young: float = 1e5,
         damping: float = 0.1,
@@ -56,14 +58,16 @@ class SpringMass(Method):
         other_rate: float = 0.01,
     ):
         super().__init__()
-        sizes = {"anchors": anchors - 1, "neighbours": neighbours, "binding": binding, "firm": firm}
+        sizes = {"anchors": anchors - 1, "neighbours": neighbours, "binding": binding}
+        sizes["full_stiffness_neighbours"] = full_stiffness_neighbours
         for name, value in sizes.items():
             if value < 1:
                 raise UserError(f"model.method.{name} = {value + (name == 'anchors')}: at least {1 + (name == 'anchors')} is needed")
         require_positive(
             young=young, stiffness_rate=stiffness_rate, other_rate=other_rate, **({} if damping == 0 else {"damping": damping})
         )
-        self.count, self.neighbours, self.nearest, self.per, self.firm = anchors, neighbours, binding, per, firm
+        self.count, self.neighbours, self.nearest = anchors, neighbours, binding
+        self.stiffness_per, self.full_stiffness_neighbours = stiffness_per, full_stiffness_neighbours
         self.power, self.young, self.fit_damping = power, young, fit_damping
         self.damping_start, self.stiffness_rate, self.other_rate = damping, stiffness_rate, other_rate
 
@@ -77,7 +81,7 @@ class SpringMass(Method):
         self.follow = following(x, x[self.index], self.nearest)
         self.volume = float(simulator.volume.sum())
         device, one = x.device, torch.ones(1, device=x.device)
-        size = {"anchor": len(self.index), "spring": len(self.network.rest), "body": 1}[self.per]
+        size = {"anchor": len(self.index), "spring": len(self.network.rest), "body": 1}[self.stiffness_per]
         start = math.log10(self.damping_start) if self.damping_start else 0.0
         self.soft, self.slide = nn.Parameter(0.0 * one), nn.Parameter(-one)
         self.damping = nn.Parameter(start * one, requires_grad=self.fit_damping and self.damping_start > 0)
@@ -88,10 +92,11 @@ class SpringMass(Method):
     def springs(self) -> tuple[Tensor, Tensor]:
         """Return stiffness [N/m] and damping [N s/m] of each spring, (N,)."""
         level = self.stiffness
-        if self.per == "anchor":
+        if self.stiffness_per == "anchor":
             level = level[self.network.pairs].mean(1)
         rest = self.body.rest
-        rank = ((self.network.rank - self.firm).clamp(min=0) / max(1, self.neighbours - self.firm)).to(rest)
+        weakened = max(1, self.neighbours - self.full_stiffness_neighbours)
+        rank = ((self.network.rank - self.full_stiffness_neighbours).clamp(min=0) / weakened).to(rest)
         weak = (2 - nn.functional.softplus(self.soft).exp() ** rank).clamp(0, 1)
         damping = 10**self.damping * self.body.mass[0] / rest if self.damping_start else torch.zeros_like(rest)
         return 10**level * weak / rest, damping
@@ -100,8 +105,8 @@ class SpringMass(Method):
         """Return Young's modulus [Pa] of springs in all directions alike, E = sum k L^2 / (6 V), with Poisson's ratio 1/4 (Cauchy), ()."""
         return (stiffness * self.body.rest.square()).sum() / (6 * self.volume)
 
-    def grip(self) -> Tensor:
-        """Return share of the tangential velocity that a step on the ground leaves (Spring-Gaus, `fric_k`), (1,)."""
+    def tangential_retention(self) -> Tensor:
+        """Return the share of the tangential velocity that remains after a step in contact (Spring-Gaus, `fric_k`), (1,)."""
         return (1.2 * self.slide.sigmoid() - 0.1).clamp(0, 1)
 
     def laws(self, scene: PreparedScene) -> Laws:
@@ -129,7 +134,8 @@ class SpringMass(Method):
         parts = self.body.substeps(stiffness, damping, dt)
         start = (state.x[self.index], state.v[self.index])
         every = scene.every * parts
-        x, v = self.body.rollout(scene.substeps(frames) * parts, dt / parts, *start, stiffness, damping, self.grip(), every=every)
+        parameters = stiffness, damping, self.tangential_retention()
+        x, v = self.body.rollout(scene.substeps(frames) * parts, dt / parts, *start, *parameters, every=every)
         wanted = slice(frames) if scene.recorded_frames is None else list(scene.recorded_frames[:frames])
         x, v = x[wanted], v[wanted]
         both = torch.cat([x - x[:1], v - v[:1]], -1).transpose(0, 1)  # (A, K, 6)
@@ -144,7 +150,8 @@ class SpringMass(Method):
     def describe(self) -> dict[str, Any]:
         with torch.no_grad():
             stiffness, _ = self.springs()
-            found = {"young": self.modulus(stiffness), "grip": self.grip()[0], "damping": 10 ** self.damping[0], "soft": self.soft[0]}
+            found = {"young": self.modulus(stiffness), "tangential_retention": self.tangential_retention()[0]}
+            found |= {"damping": 10 ** self.damping[0], "soft": self.soft[0]}
         found["damping"] = found["damping"] if self.damping_start else torch.zeros(())
         return {"anchors": len(self.index), "springs": len(stiffness), **{name: float(value) for name, value in found.items()}}
 

@@ -5,6 +5,7 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
+from neuido.data.files.renamed_options import renamed_options
 from neuido.errors import UserError
 from neuido.models.fewshot.method import Method, require_positive
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
@@ -43,25 +44,27 @@ class MeanLatent(LatentMethod):
         self.register_buffer("z", self.operator.latents.mean(0))
 
 
+@renamed_options(of="distribution")
 class RandomLatent(LatentMethod):
     """A random latent; nothing is learned.
 
     Args:
         operator: File of the operator, or `pretrained`.
-        of: `normal`: of the mean and deviation of Stage I's latents; `trained`: one of Stage I's at random.
-        seed: Which.
+        distribution: `normal` draws from a normal distribution with the mean and standard deviation of Stage I's latents; `trained`
+            picks one of Stage I's latents.
+        seed: Seed of the draw.
     """
 
     steps = 0
 
-    def __init__(self, operator: str = "pretrained", of: Literal["normal", "trained"] = "normal", seed: int = 0):
+    def __init__(self, operator: str = "pretrained", distribution: Literal["normal", "trained"] = "normal", seed: int = 0):
         super().__init__(operator)
-        self.of, self.seed = of, seed
+        self.distribution, self.seed = distribution, seed
 
     def build(self, scene: PreparedScene) -> None:
         generator, latents = torch.Generator().manual_seed(self.seed), self.operator.latents
         z = self.operator.random_latents(1, generator)[0]
-        if self.of == "trained":
+        if self.distribution == "trained":
             z = latents[int(torch.randint(len(latents), (), generator=generator))].clone()
         self.register_buffer("z", z)
 

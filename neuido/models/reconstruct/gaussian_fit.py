@@ -12,6 +12,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from neuido.data.files.renamed_options import renamed_options
 from neuido.errors import UserError
 from neuido.models.reconstruct.filling import LEVEL, Volume, visual_hull
 from neuido.models.render.gaussians import covariances_of, harmonics_of
@@ -23,6 +24,7 @@ RATES = {"means": 1e-3, "log_scales": 1e-2, "quaternions": 3e-3, "logits": 5e-2,
 """Adam's rates; that of the means is in sizes of the body, and falls to a hundredth."""
 
 
+@renamed_options(start="initial_gaussians", limit="max_gaussians", largest="max_scale")
 class ReconstructModule(LightningModule):
     """Gaussians of one frame.
 
@@ -51,8 +53,8 @@ class ReconstructModule(LightningModule):
         lower: Vector = (0.0, 0.0, 0.0),
         upper: Vector = (1.0, 1.0, 1.0),
         steps: int = 2000,
-        start: int = 5000,
-        limit: int = 25000,
+        initial_gaussians: int = 5000,
+        max_gaussians: int = 25000,
         views: int = 4,
         lr: float = 1.0,
         ssim: float = 0.2,
@@ -60,16 +62,17 @@ class ReconstructModule(LightningModule):
         densify_gradient: float = 2e-4,
         densify_every: int = 100,
         prune_opacity: float = 0.05,
-        largest: float = 0.02,
+        max_scale: float = 0.02,
         resolution: int = 96,
         seed: int = 0,
     ):
         super().__init__()
-        for name, value in (("steps", steps), ("start", start), ("views", views), ("lr", lr), ("densify_every", densify_every)):
+        positive = {"steps": steps, "initial_gaussians": initial_gaussians, "views": views, "lr": lr, "densify_every": densify_every}
+        for name, value in positive.items():
             if not value > 0:
                 raise UserError(f"{name} = {value}: it must be positive")
-        if limit < start:
-            raise UserError(f"limit = {limit} Gaussians is less than start = {start}")
+        if max_gaussians < initial_gaussians:
+            raise UserError(f"max_gaussians = {max_gaussians} is less than initial_gaussians = {initial_gaussians}")
         self.save_hyperparameters()
         shapes = {"means": (0, 3), "log_scales": (0, 3), "quaternions": (0, 4), "logits": (0,), "harmonics": (0, 1, 3)}
         for name in PARTS:
@@ -106,7 +109,7 @@ class ReconstructModule(LightningModule):
         inside = hull.values > LEVEL
         eroded = -torch.nn.functional.max_pool3d(-inside[None, None].float(), 3, 1, 1)[0, 0] > 0
         surface = (inside & ~eroded).nonzero()
-        picked = torch.randint(len(surface), (self.hparams.start,), generator=generator).to(surface.device)
+        picked = torch.randint(len(surface), (self.hparams.initial_gaussians,), generator=generator).to(surface.device)
         jitter = torch.rand(len(picked), 3, generator=generator).to(surface.device)
         x = hull.lower + hull.spacing * (surface[picked] + jitter)
         near = math.sqrt(len(surface) * hull.spacing**2 / len(x))  # the surface's share of one
@@ -169,7 +172,7 @@ class ReconstructModule(LightningModule):
     @torch.no_grad()
     def _after(self, done: int) -> None:
         self._accumulate_gradient()
-        low, high = math.log(1e-4 * float(self.size)), math.log(self.hparams.largest * float(self.size))
+        low, high = math.log(1e-4 * float(self.size)), math.log(self.hparams.max_scale * float(self.size))
         self.log_scales.clamp_(low, high)
         if done % self.hparams.densify_every == 0 and done <= 0.6 * self.hparams.steps:
             self._densify(done)
@@ -192,11 +195,11 @@ class ReconstructModule(LightningModule):
         spread = self.log_scales.exp().amax(1)
         kept = self.logits.sigmoid() > self.hparams.prune_opacity
         wanted = (mean > self.hparams.densify_gradient) & kept
-        room = self.hparams.limit - int(kept.sum())
+        room = self.hparams.max_gaussians - int(kept.sum())
         if int(wanted.sum()) > room:  # those that are pulled most
             order = torch.where(wanted, mean, -1.0).argsort(descending=True)
             wanted = torch.zeros_like(wanted).index_fill(0, order[: max(room, 0)], True)
-        split = wanted & (spread > 0.5 * self.hparams.largest * self.size)
+        split = wanted & (spread > 0.5 * self.hparams.max_scale * self.size)
         shift = torch.randn(self.means.shape, generator=generator).to(self.means)
         covariances = covariances_of(self.log_scales.exp().double(), self.quaternions.double())
         axes = (torch.linalg.cholesky(covariances) @ shift.double().unsqueeze(-1)).to(shift)

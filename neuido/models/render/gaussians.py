@@ -12,6 +12,7 @@ from torch import Tensor
 from neuido.data.formats.gaussian_ply import column_names, read_gaussian_vertices
 from neuido.errors import UserError
 from neuido.physics.linalg.decompositions import polar
+from neuido.physics.runtime.device import as_device
 from neuido.types import Gaussians
 
 C0 = 0.28209479177387814
@@ -210,7 +211,7 @@ def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
 
 
-def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device: str | torch.device = "cpu") -> Gaussians:
+def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device: str | torch.device = "auto") -> Gaussians:
     """Read a 3DGS PLY file.
 
     Raises:
@@ -229,4 +230,5 @@ def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device
     quaternions = columns("rot_0", "rot_1", "rot_2", "rot_3")
     covariances = covariances_of(columns("scale_0", "scale_1", "scale_2").exp(), quaternions)
     parts = (columns("x", "y", "z"), covariances, columns("opacity").squeeze(1).sigmoid(), harmonics)
-    return Gaussians(*(part.to(device, dtype) for part in parts))
+    chosen = as_device(device)
+    return Gaussians(*(part.to(chosen, dtype) for part in parts))

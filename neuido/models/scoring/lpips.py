@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neuido.errors import UserError
+from neuido.physics.runtime.device import as_device
 
 # output channels of the convolutions (kernel, stride, padding), "M" for pooling; a feature is taken after each group
 STACKS = {
@@ -110,7 +111,7 @@ class LPIPS(nn.Module):
         return total
 
 
-def open_lpips(backbone: str | None = None, net: str = "vgg", device: str | torch.device = "cpu") -> LPIPS | Absent:
+def open_lpips(backbone: str | None = None, net: str = "vgg", device: str | torch.device = "auto") -> LPIPS | Absent:
     """Open LPIPS with the weights of a local file.
 
     Args:
@@ -128,4 +129,4 @@ def open_lpips(backbone: str | None = None, net: str = "vgg", device: str | torc
         return Absent(f"no weights of the {net} backbone: give torchvision's {FILES[net]} by lpips_backbone")
     module = LPIPS(net)
     module.load_backbone(path)
-    return module.to(device)
+    return module.to(as_device(device))

@@ -80,8 +80,9 @@ class Frames(ParticleState):
     def save(self, path: str | os.PathLike) -> list[Path]:
         """Write the frames in the format that the name ends with, each file all at once.
 
-        `.npz`: arrays x, v, C, F, times and scene. `.ply`: a point cloud a frame, `NAME_0000.ply`, `NAME_0001.ply`, ..., with x, y, z [m]
-        and vx, vy, vz [m/s]; files of a longer series of that name are removed. `.csv`: a row for each frame and particle.
+        `.npz`: arrays x, v, C, F, times and scene (C and F where the motion has them). `.ply`: a point cloud a frame, `NAME_0000.ply`,
+        `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; files of a longer series of that name are removed. `.csv`: a row for
+        each frame and particle.
 
         Args:
             path: Where; folders on the way are made.
@@ -103,7 +104,7 @@ class Frames(ParticleState):
         return np.zeros(self.x.shape[1], np.int32) if self.particles is None else self.particles.scene.cpu().numpy()
 
     def _save_npz(self, path: Path) -> list[Path]:
-        arrays = {name: t.detach().cpu().numpy() for name, t in zip(self._fields, self)}
+        arrays = {name: t.detach().cpu().numpy() for name, t in zip(self._fields, self) if t is not None}
         with whole_file(path) as hidden, open(hidden, "wb") as file:
             np.savez_compressed(file, times=self.times.numpy(), scene=self._scene(), **arrays)
         return [path]

@@ -140,17 +140,18 @@ def test_a_known_law_finds_its_parameter(tmp_path, name, truth, start, plasticit
     shape = "box" if plasticity == SAND else "ball"
     scene = filmed(tiny_scene(tmp_path, young=5e4, plasticity=plasticity, shape=shape), KnownLaw(**true))
     rates = {"poisson": 0.03, "friction_angle": 2.0, "viscosity": 0.1}
-    losses, own = fit(KnownLaw(**{**true, name: start}, free=[name], rates=rates), scene, 35)
+    losses, own = fit(KnownLaw(**{**true, name: start}, free_parameters=[name], rates=rates), scene, 35)
     assert own.describe()[name] == pytest.approx(truth, rel=tolerance)
     assert losses[-1] < 0.05 * losses[0]
     assert len(own.trainable()) == 1
 
 
+SPRINGS = {"anchors": 60, "neighbours": 12, "full_stiffness_neighbours": 4, "binding": 6, "stiffness_rate": 0.05}
 METHODS = {
     "known": (lambda weights: KnownLaw(young=2e5), 12, 0.5),
     "neuma": (lambda weights: NeuMA(weights, elastic_rate=2.0), 16, 0.8),
     "uniphy": (lambda weights: UniPhy(), 12, 0.7),
-    "springs": (lambda weights: SpringMass(anchors=60, neighbours=12, firm=4, binding=6, stiffness_rate=0.05), 12, 0.95),
+    "springs": (lambda weights: SpringMass(**SPRINGS), 12, 0.95),
     "sparse": (lambda weights: SparseLaw(young=2e5, interval=5, rounds=1, stiffness_rate=0.1), 14, 0.7),
 }
 
@@ -191,7 +192,7 @@ def test_a_method_is_fitted_scored_and_read_back(tmp_path, weights, name):
 
 
 @pytest.mark.parametrize(
-    "build", [lambda w: NCLaw(w), lambda w: MeanLatent(), lambda w: RandomLatent(), lambda w: RandomLatent(of="trained")]
+    "build", [lambda w: NCLaw(w), lambda w: MeanLatent(), lambda w: RandomLatent(), lambda w: RandomLatent(distribution="trained")]
 )
 def test_what_learns_nothing_is_scored(tmp_path, weights, build):
     trainer(tmp_path).fit(module(tmp_path, build(weights)), TinyScenes(str(tmp_path), youngs=(5e4,)))
@@ -226,9 +227,9 @@ def test_sparse_law_drops_what_does_not_count(tmp_path):
         law.surface[0] = 5.0
     before = law.coefficients()
     assert {"cohesion", "friction", "expansion"} - law.describe().keys() == {"cohesion"}
-    law.weigh(F)
+    law.select_terms(F)
     assert torch.equal(law.coefficients(), before)  # nothing happens before the next run
-    law.drop()
+    law.prune_terms()
     after = law.coefficients()
     assert after[2, 3] == 0 and after[3, 2] == before[3, 2] and after[1, 0] == before[1, 0]
     assert float(law.surface[0]) == 9.0  # no strain reaches it: there is no yield
@@ -266,7 +267,7 @@ def test_impossible_options_are_named(tmp_path, weights, monkeypatch):
     for build, words in (
         (lambda: KnownLaw(young=-1.0), "young = -1"),
         (lambda: KnownLaw(poisson=0.5), "poisson = 0.5"),
-        (lambda: KnownLaw(free=["viscosity"]), "no parameter 'viscosity'"),
+        (lambda: KnownLaw(free_parameters=["viscosity"]), "no parameter 'viscosity'"),
         (lambda: KnownLaw(rates={"stiffness": 1.0}), "no parameter 'stiffness'"),
         (lambda: NeuMA(weights, rank=0), "rank = 0"),
         (lambda: NeuMA(weights, alpha=0.0), "alpha = 0"),

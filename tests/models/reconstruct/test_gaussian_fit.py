@@ -75,7 +75,7 @@ def test_files_are_what_stage_two_reads(box):
     # the velocity that is known: that of the true body's motion
     v = torch.tensor([0.2, -1.5, 0.0]) + torch.linalg.cross(torch.tensor([[0.0, 0.0, 2.0]]), visual.body.x - truth.x0.mean(0))
     torch.testing.assert_close(visual.body.v, v, rtol=0, atol=1e-4)
-    gaussians = load_ply(visual.gaussians)
+    gaussians = load_ply(visual.gaussians, device="cpu")
     binding = bind(gaussians, visual.body.x)
     assert float((binding.rest - gaussians.means).norm(dim=1).max()) < 0.1
     # it moves as the truth does, under the true law
@@ -184,6 +184,6 @@ def test_errors(box, tmp_path):
     (copy / "reconstruction" / "scene.yaml").write_text(text + "colour: red\n")
     with pytest.raises(UserError, match="unknown key 'colour'"):
         load_visual(copy)
-    with pytest.raises(UserError, match="limit = 3"):
-        ReconstructModule(start=4, limit=3)
+    with pytest.raises(UserError, match="max_gaussians = 3"):
+        ReconstructModule(initial_gaussians=4, max_gaussians=3)
     assert not (tmp_path / "out" / "report.json").exists()

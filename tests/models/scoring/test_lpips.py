@@ -23,7 +23,7 @@ def backbone(path, net="alex"):
 
 def test_properties(tmp_path):
     weights = backbone(tmp_path / "alex.pth")
-    measure = open_lpips(str(tmp_path / "alex.pth"), "alex")
+    measure = open_lpips(str(tmp_path / "alex.pth"), "alex", "cpu")
     assert torch.equal(measure.groups[0][0].weight, weights["features.0.weight"])
     torch.manual_seed(1)
     image = torch.rand(2, 3, 64, 64)

@@ -134,7 +134,7 @@ def test_an_uneven_filling_is_found(tmp_path):
     true = uneven(scene.body.x)
     data = TinyScenes(str(tmp_path))
     data.scenes = [scene]
-    known = {"method": KnownLaw(young=5e4, free=["young"], rates={"young": 1e-6}), "steps": 40, "views_per_step": 0}
+    known = {"method": KnownLaw(young=5e4, free_parameters=["young"], rates={"young": 1e-6}), "steps": 40, "views_per_step": 0}
     trainer(tmp_path).fit(module(tmp_path, out=str(tmp_path / "even"), **known), data)
     model = module(tmp_path, estimate_density=True, density_lr=0.1, **known)
     trainer(tmp_path).fit(model, data)
