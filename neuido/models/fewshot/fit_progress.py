@@ -1,4 +1,4 @@
-"""How far the fit of one scene has come: its clock and memory, its best parameters, and the last ones whose law ran."""
+"""Progress of the fit of one scene: time, memory, the best parameters, and the last parameters whose simulation succeeded."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -7,58 +7,58 @@ import torch
 from torch import Tensor, nn
 
 MIN_IMPROVEMENT = 0.01
-"""The share by which a loss must fall to count as lower."""
+"""Relative decrease by which a loss counts as lower."""
 FAILURE_WINDOW = 5
-"""Steps after a failure within which another one counts as of the same row."""
+"""Number of steps within which two failures count as consecutive."""
 MAX_FAILURES = 3
-"""Failures in a row that say that the last parameters that ran are themselves at the edge."""
+"""Consecutive failures after which the last working parameters are considered unstable themselves."""
 RATE_RECOVERY = 2.0**0.1
-"""Factor on the rates of each step that runs, up to their own."""
+"""Factor by which each successful step raises reduced learning rates."""
 
 
 @dataclass
 class Progress:
-    """What a checkpoint keeps of a scene beside its parameters; plain figures and tensors alone."""
+    """State of the fit of a scene that a checkpoint stores besides the parameters: only numbers and tensors."""
 
     steps: int = 0
-    """Optimiser steps done."""
+    """Optimiser steps taken."""
     seconds: float = 0.0
-    """Time of these steps."""
+    """Duration of these steps [s]."""
     peak_memory_gb: float = 0.0
-    """Of torch, on a GPU."""
+    """Peak memory of torch on a GPU [GB]."""
     warp_memory_gb: float = 0.0
-    """Of Warp's pool, since the process began."""
+    """Peak memory of the Warp pool since the start of the process [GB]."""
     done: bool = False
     damping: float = 1.0
-    """Factor on the rates; it is halved when a step has led to a law that does not run, and comes back in ten that do."""
+    """Factor on the learning rates: halved after a law whose simulation failed, and restored by ten successful steps."""
     failed_at: int = -FAILURE_WINDOW - 1
     """Step of the last failure."""
     failures: int = 0
-    """In a row."""
+    """Number of consecutive failures."""
     lowest: float = float("inf")
     lowest_at: int = 0
     over: bool = False
-    """Whether the loss has not fallen for too long."""
+    """Whether early stopping has ended the fit."""
     best: dict[str, Tensor] = field(default_factory=dict)
-    """The parameters of the lowest loss."""
+    """Parameters of the lowest loss."""
     good: dict[str, Tensor] = field(default_factory=dict)
-    """The last parameters that ran."""
+    """Last parameters whose simulation succeeded."""
     first: dict[str, Tensor] = field(default_factory=dict)
-    """The first ones that did."""
+    """First parameters whose simulation succeeded."""
 
     def record_success(self, fit: nn.Module) -> None:
-        """Record that the present parameters ran, and let the learning rates recover."""
+        """Record that the simulation of the current parameters succeeded, and let the learning rates recover."""
         self.good = snapshot(fit)
         self.first = self.first or self.good
         self.damping = min(1.0, self.damping * RATE_RECOVERY)
 
     def restore_last_good(self, fit: nn.Module, *, ran: bool = False) -> bool:
-        """Restore the last parameters that ran, or move them halfway to the first ones after repeated failures; return whether there were
-        any.
+        """Restore the last working parameters, after repeated failures moved halfway to the first ones; return whether there were any.
 
         Args:
-            fit: What to bring back.
-            ran: The law ran and only its gradient is not finite: momentum may lead on, so that nothing else changes at first.
+            fit: The module whose parameters to restore.
+            ran: The simulation succeeded and only its gradient is not finite. The parameters are then kept at first, because momentum may
+                move them on.
         """
         self.failures = self.failures + 1 if self.steps - self.failed_at <= FAILURE_WINDOW else 1
         self.failed_at = self.steps
@@ -70,14 +70,14 @@ class Progress:
         return restore(fit, self.good)
 
     def record_loss(self, value: float, fit: nn.Module, patience: int) -> None:
-        """Record the loss of a fit; set `over` after `patience` steps without a lower one."""
+        """Record the loss of a fit; set `over` after `patience` steps without a lower loss."""
         if value < (1 - MIN_IMPROVEMENT) * self.lowest:
             self.lowest, self.lowest_at, self.best = value, self.steps, snapshot(fit)
         elif self.steps - self.lowest_at >= patience:
             self.over = True
 
     def state(self) -> dict[str, Any]:
-        """Return the content of a checkpoint, from which `Progress(**state)` is made again."""
+        """Return the content for a checkpoint; `Progress(**state)` restores it."""
         return dict(vars(self))
 
 
@@ -88,7 +88,7 @@ def snapshot(fit: nn.Module) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def restore(fit: nn.Module, kept: dict[str, Tensor]) -> bool:
-    """Put a `snapshot` back; whether there was one."""
+    """Restore the parameters of a `snapshot`; return whether it held any."""
     parameters = dict(fit.named_parameters())
     for name, value in kept.items():
         parameters[name].copy_(value)

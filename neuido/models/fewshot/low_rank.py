@@ -1,7 +1,7 @@
-"""Ours, few-shot: LoRA on both trunks, and the latent refined with it (paper, "Few-Shot Dynamics Adaptation").
+"""Few-shot adaptation of the paper: LoRA on both trunks, and refinement of the latent ("Few-Shot Dynamics Adaptation").
 
-The adapter is PEFT's: `save` writes `adapter_model.safetensors` and `adapter_config.json` as PEFT does, and any tool that reads these reads
-ours. Before a rollout the adapter is merged into the effective networks, so that it costs nothing there.
+The adapter is a PEFT adapter: `save` writes `adapter_model.safetensors` and `adapter_config.json` in the format of PEFT. Before a rollout
+the adapter is merged into the effective networks, so it adds no cost there.
 """
 
 import copy
@@ -31,20 +31,21 @@ PEFT_FILES = ("adapter_config.json", "adapter_model.safetensors")
 
 
 class LowRankAdaptation(Method):
-    """LoRA on both trunks, jointly with the scene's latent z.
+    """Fit LoRA adapters of both trunks jointly with the latent z of the scene.
 
     Args:
-        operator: File of the operator, or `pretrained`; all of it stays frozen.
-        start: Where z starts: `encoder` (its zero-shot value), `mean` (of Stage I's latents), a family of these (`elastic`: their mean) or
-            the name of one, or a law file of `neuido predict`.
-        init_from: The encoder, a file or `pretrained`; read only for `start: encoder`.
-        rank: r of LoRA (paper: 16); 0: no adapter, z alone is refined.
-        alpha: Of LoRA (paper: 16); the adapter's product is scaled with alpha / r.
-        lr: Rate of the adapter.
-        latent_lr: Rate of z.
-        prior_weight: Pulls z to its start, per squared unit: the mean over z's components.
-        plausibility_weight: Keeps the elastic law where it can run (`law_properties.implausibility`); paper: 0.
-        seed: Of the adapter's random half; the other half is zero, so that fitting starts at the law of the start.
+        operator: File of the operator, or `pretrained`; its weights stay frozen.
+        start: Initial z: `encoder` (its zero-shot estimate), `mean` (of the latents of Stage I), the name of a family (the mean of its
+            latents, e.g. `elastic`) or of a single latent, or a law file of `neuido predict`.
+        init_from: File of the encoder, or `pretrained`; only read for `start: encoder`.
+        rank: LoRA rank r (paper: 16); 0: no adapter, only z is refined.
+        alpha: LoRA alpha (paper: 16); the low-rank update is scaled by alpha / r.
+        lr: Learning rate of the adapter.
+        latent_lr: Learning rate of z.
+        prior_weight: Weight of the squared distance of z from its initial value, mean over the components of z.
+        plausibility_weight: Weight of the penalty on elastic laws that a rollout would not survive (`law_properties.implausibility`);
+            paper: 0.
+        seed: Seed of the random factor of LoRA. The other factor is zero, so the fit starts at the unchanged law.
     """
 
     def __init__(
@@ -76,19 +77,19 @@ class LowRankAdaptation(Method):
             given, wanted = encoder.projector.config["latent_dim"], self.operator.latent_dim
             if given != wanted:
                 raise UserError(
-                    f"model.method.init_from = {init_from} gives latents of {given} numbers, operator = {operator} takes {wanted}"
+                    f"model.method.init_from = {init_from} gives latents of length {given}, but operator = {operator} takes {wanted}"
                 )
-            object.__setattr__(self, "encoder", encoder)  # shared by all scenes, and no part of a checkpoint
+            object.__setattr__(self, "encoder", encoder)  # shared by all scenes, not part of a checkpoint
         else:
             self._named_start()
 
     @property
     def operator(self) -> IntrinsicDynamicsOperator:
-        """The operator, with the adapter's layers in its trunks."""
+        """The operator, with the adapter layers in its trunks."""
         return self.tuned if isinstance(self.tuned, IntrinsicDynamicsOperator) else self.tuned.get_base_model()
 
     def _named_start(self) -> Tensor:
-        """Return the latent of `mean`, of a family, of a Stage I trajectory, or of a law file."""
+        """Return the latent that `start` names: the mean, a family, a trajectory of Stage I, or a law file."""
         latents = self.operator.latents
         own = [i for i, family in enumerate(self.operator.latent_families) if self.start in ("mean", family)]
         if own:
@@ -104,7 +105,7 @@ class LowRankAdaptation(Method):
         return tensors["z"]
 
     def build(self, scene: PreparedScene) -> None:
-        """Create z at its start, and an adapter whose product is zero."""
+        """Create z at its initial value, and an adapter whose update is zero."""
         device = scene.images.device
         self.tuned.to(device)
         if self.encoder is not None:
@@ -136,13 +137,13 @@ class LowRankAdaptation(Method):
         return total
 
     def recovery_loss(self) -> Tensor:
-        """Return the distance of z from the mean latent of Stage I, whose law runs, and of the adapter from zero."""
+        """Return the squared distance of z from the mean latent of Stage I, whose law can be simulated, and of the adapter from zero."""
         stable = self.operator.latents.mean(0).to(self.z) if len(self.operator.latents) else torch.zeros_like(self.z)
         adapter = [p.square().mean() for name, p in self.trainable().items() if "lora_B" in name]
         return (self.z - stable).square().mean() + sum(adapter)
 
     def merged(self) -> IntrinsicDynamicsOperator:
-        """Return a plain operator with the adapter merged into its weights by PEFT."""
+        """Return an operator whose weights include the adapter, merged by PEFT."""
         tuned = copy.deepcopy(self.tuned)
         return tuned if isinstance(tuned, IntrinsicDynamicsOperator) else tuned.merge_and_unload()
 
@@ -153,14 +154,14 @@ class LowRankAdaptation(Method):
         return {"modulus": float(modulus[1]), "latent_moved": moved, "rank": self.rank, "latent": self.z.tolist()}
 
     def save(self, folder: Path) -> None:
-        """Write PEFT's two files, z, the law (`law_file.save_law`), and `method.json`."""
+        """Write the two PEFT files, z, the law (`law_file.save_law`), and `method.json`."""
         folder.mkdir(parents=True, exist_ok=True)
         if self.rank:
             hidden = folder / f".{uuid.uuid4().hex}.tmp"
             self.tuned.save_pretrained(str(hidden), save_embedding_layers=False)
             for name in PEFT_FILES:
                 os.replace(hidden / name, folder / name)
-            for rest in hidden.iterdir():  # a model card without content
+            for rest in hidden.iterdir():  # an empty model card
                 rest.unlink()
             hidden.rmdir()
         write_tensors(folder / LATENT, {"z": self.z.detach().cpu().clone(), "origin": self.origin.cpu().clone()})
@@ -171,10 +172,10 @@ class LowRankAdaptation(Method):
         return super().card() | {"operator": self.fingerprint}
 
     def load(self, folder: Path) -> None:
-        """Take what `save` wrote; the rank may differ from the option.
+        """Load what `save` wrote; the stored rank takes precedence over the option.
 
         Raises:
-            UserError: A file that is missing or damaged, an adapter of another operator.
+            UserError: A file is missing or damaged, or the adapter belongs to another operator.
         """
         content = self.check_card(folder)
         if content.get("operator") != self.fingerprint:
@@ -190,7 +191,7 @@ class LowRankAdaptation(Method):
         plain = copy.deepcopy(self.tuned)
         if not isinstance(plain, IntrinsicDynamicsOperator):
             plain = plain.unload()
-            vars(plain).pop("peft_config", None)  # or PEFT would take it for a second adapter
+            vars(plain).pop("peft_config", None)  # otherwise PEFT would consider it a second adapter
         self.rank = 0
         self.tuned = plain
         if (folder / PEFT_FILES[0]).exists() or content.get("found", {}).get("rank"):
@@ -202,11 +203,11 @@ def load_adapter(operator: IntrinsicDynamicsOperator, folder: Path) -> nn.Module
     """Wrap the operator with an adapter in PEFT's format.
 
     Raises:
-        UserError: A file that is missing, damaged, or for other layers.
+        UserError: A file is missing, damaged, or made for other layers.
     """
     from peft import PeftModel
 
-    for name in PEFT_FILES:  # PEFT would look for them on a server
+    for name in PEFT_FILES:  # PEFT would try to download missing files
         if not (folder / name).is_file():
             raise UserError(f"model.adapter: {folder / name} is missing")
     try:
@@ -220,7 +221,7 @@ def load_adapter(operator: IntrinsicDynamicsOperator, folder: Path) -> nn.Module
 
 
 def fingerprint(operator: nn.Module) -> str:
-    """Return twelve hexadecimal digits of the weights' SHA-256: an adapter fits only the weights that it was trained on."""
+    """Return the first twelve hexadecimal digits of the SHA-256 of the weights; an adapter only fits the weights it was trained on."""
     digest = hashlib.sha256()
     for name, tensor in sorted(operator.state_dict().items()):
         digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())

@@ -1,6 +1,6 @@
-"""Ways to fit the law of one scene to its images, behind one interface: ours (`low_rank`) and those of the peers (`baselines`).
+"""Common interface of the methods that fit the law of one scene to its images: ours (`low_rank`) and the `baselines`.
 
-`AdaptModule` trains any of them: it draws the motion of `Method.rollout`, compares images, and steps over the method's parameters.
+`AdaptModule` trains any of them: it renders the motion of `Method.rollout`, compares the images, and optimises the parameters.
 """
 
 import copy
@@ -28,15 +28,15 @@ PARAMETERS, CARD = "parameters.safetensors", "method.json"
 
 
 class Method(nn.Module):
-    """How a law is fitted to the images of a scene.
+    """Base class of methods that fit a law to the images of a scene.
 
-    What YAML constructs (`class_path`, and primitives as `init_args`) is a plan; `for_scene` makes a copy of it for one scene, with that
-    scene's parameters. A subclass writes `build` and `laws`, and of the rest what differs; one that is no MPM law writes `roll`.
+    A configuration constructs a template (`class_path`, and primitives as `init_args`); `for_scene` copies it and adds the parameters of
+    one scene. A subclass implements `build` and `laws`; a method that is not an MPM law overrides `rollout` instead.
 
     Attributes:
-        steps: Optimiser steps a scene takes unless told otherwise; 0: nothing is learned, the scene is only scored.
-        lr: Rate of the one group of parameters of the default `parameter_groups`.
-        encoder: What embeds a scene's flow (`PreparedScene.volume`); none: the method needs no flow.
+        steps: Default number of optimiser steps for a scene; 0: nothing is learned and the scene is only scored.
+        lr: Learning rate in the default `parameter_groups`.
+        encoder: Encoder that embeds the flow of a scene (`PreparedScene.volume`), if the method needs flow.
     """
 
     steps: int = 100
@@ -44,7 +44,7 @@ class Method(nn.Module):
     encoder: DynamicsEncoder | None = None
 
     def for_scene(self, scene: PreparedScene) -> Self:
-        """Copy the method with parameters for one scene, on its device; the encoder is shared."""
+        """Return a copy with parameters for one scene, on the device of the scene; the encoder is shared."""
         own = copy.deepcopy(self, {id(self.encoder): self.encoder})
         own.build(scene)
         own.to(scene.images.device)
@@ -52,10 +52,10 @@ class Method(nn.Module):
         return own
 
     def build(self, scene: PreparedScene) -> None:
-        """Create the scene's parameters at their start values, the same ones at each call (seed what is random)."""
+        """Create the parameters of the scene at their initial values, reproducibly: seed what is random."""
 
     def laws(self, scene: PreparedScene) -> Laws:
-        """Return the elastic and the plastic law of the scene; their tensors are graph nodes of the parameters."""
+        """Return the elastic and the plastic law of the scene, differentiable in the parameters."""
         raise NotImplementedError
 
     def rollout(
@@ -67,37 +67,37 @@ class Method(nn.Module):
         effects: Effects | None = None,
         segment: int = 0,
     ) -> ParticleState:
-        """Simulate the first `frames` frames, differentiably in parameters and `state`; other kinds of simulation override this.
+        """Simulate the first `frames` frames, differentiably in the parameters and `state`.
 
         Args:
-            scene: The scene; its step may be finer than that of `build` (`pipeline.rollout_with_retries`).
-            frames: Number of frames K, the start included.
-            state: Start, (P, ...); the scene's body where absent.
-            effects: Effects that act on top of the laws.
-            segment: As `pipeline.rollout_laws`, in frames.
+            scene: The scene; its time step may be smaller than that of `build` (`pipeline.rollout_with_retries`).
+            frames: Number of frames K, including the initial one.
+            state: Initial state, (P, ...); that of the scene where absent.
+            effects: Effects that act in addition to the laws.
+            segment: As in `pipeline.rollout_laws`, in frames.
 
         Returns:
             x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3).
 
         Raises:
-            UserError: As `Simulator.rollout`.
+            UserError: As in `Simulator.rollout`.
         """
         return rollout_laws(scene, self.laws(scene), frames, segment=segment, state=state, effects=effects)
 
     def trainable(self) -> dict[str, nn.Parameter]:
-        """Return the parameters that are fitted, by name."""
+        """Return the trainable parameters by name."""
         return {name: p for name, p in self.named_parameters() if p.requires_grad}
 
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Return groups for the optimiser, each with `params` and its rate `lr`."""
+        """Return parameter groups for the optimiser, each with `params` and a learning rate `lr`."""
         return [{"params": list(self.trainable().values()), "lr": self.lr}] if self.trainable() else []
 
     def optimizer(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-        """Return the optimiser over the groups of all scenes."""
+        """Return the optimiser of the parameter groups of all scenes."""
         return torch.optim.AdamW(groups, weight_decay=0.0)
 
     def rate(self, done: float) -> float:
-        """Return the factor on the learning rates after the share `done` of a scene's steps: a cosine to zero."""
+        """Return the factor on the learning rates after a fraction `done` of the steps: a cosine to zero."""
         return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
 
     def regulariser(self) -> Tensor | float:
@@ -105,16 +105,16 @@ class Method(nn.Module):
         return 0.0
 
     def recovery_loss(self) -> Tensor:
-        """Return the loss of a step whose law could not run: the mean squared distance from the start."""
+        """Return the loss of a step whose simulation failed: the mean squared distance of the parameters from their initial values."""
         parts = [(p - start.to(p)).square().sum() for p, start in zip(self.trainable().values(), self._start)]
         return torch.stack(parts).sum() / max(1, sum(start.numel() for start in self._start))
 
     def describe(self) -> dict[str, Any]:
-        """Return what was identified, as numbers, words and lists of numbers: parameters in SI units, moduli, the latent."""
+        """Return the identified quantities as numbers, strings and lists: parameters in SI units, moduli, the latent."""
         return {}
 
     def save(self, folder: Path) -> None:
-        """Write what was fitted to a folder: parameters as safetensors, `describe` as JSON."""
+        """Write the fit to a folder: the parameters as safetensors, and `describe` as JSON."""
         tensors = {name: p.detach().cpu().contiguous().clone() for name, p in self.trainable().items()}
         write_tensors(folder / PARAMETERS, tensors)
         self.write_card(folder)
@@ -129,17 +129,17 @@ class Method(nn.Module):
         write(folder / CARD, json.dumps(self.card(), indent=1) + "\n")
 
     def load(self, folder: Path) -> None:
-        """Take what `save` wrote.
+        """Load what `save` wrote.
 
         Raises:
-            UserError: A file that is missing or of another method, a tensor that is missing or of another shape.
+            UserError: A file is missing or belongs to another method, or a tensor is missing or has another shape.
         """
         self.check_card(folder)
         given = read_tensors(folder / PARAMETERS)
         for name, p in self.trainable().items():
             if name not in given or given[name].shape != p.shape:
                 found = tuple(given[name].shape) if name in given else "missing"
-                raise UserError(f"model.adapter: {folder / PARAMETERS}: {name} is {found}, needed {tuple(p.shape)}")
+                raise UserError(f"model.adapter: {folder / PARAMETERS}: {name} is {found}, expected {tuple(p.shape)}")
             with torch.no_grad():
                 p.copy_(given[name])
 
@@ -147,21 +147,21 @@ class Method(nn.Module):
         """Read `method.json` and check that it belongs to this method.
 
         Raises:
-            UserError: It is missing, or another method wrote it.
+            UserError: The file is missing, or another method wrote it.
         """
         path = folder / CARD
         try:
             content = json.loads(path.read_text())
         except (OSError, ValueError) as error:
-            raise UserError(f"model.adapter: {path} is missing or no JSON: {error}") from error
+            raise UserError(f"model.adapter: {path} is missing or not JSON: {error}") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("method") != type(self).__name__:
             found = content.get("method") if isinstance(content, dict) else None
-            raise UserError(f"model.adapter: {path} is of method {found!r}, model.method is {type(self).__name__}")
+            raise UserError(f"model.adapter: {path} is of the method {found!r}, but model.method is {type(self).__name__}")
         return content
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Write a safetensors file, all at once."""
+    """Write a safetensors file atomically."""
     with replacing(path) as hidden:
         save_file(tensors, hidden)
 
@@ -170,7 +170,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     """Read a safetensors file.
 
     Raises:
-        UserError: It is missing or damaged.
+        UserError: The file is missing or damaged.
     """
     if not path.is_file():
         raise UserError(f"model.adapter: {path} is missing")
@@ -181,15 +181,15 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def scalars(found: dict[str, Any]) -> dict[str, Any]:
-    """Select the entries of `describe` that fit into a table: numbers and words."""
+    """Select the entries of `describe` that fit into a table: numbers and strings."""
     return {name: value for name, value in found.items() if isinstance(value, int | float | str)}
 
 
 def require_positive(**values: float) -> None:
-    """Refuse options of a method that are not positive numbers.
+    """Check that options of a method are positive and finite.
 
     Raises:
-        UserError: Names the option and the value.
+        UserError: An option is not; the message names it and its value.
     """
     for name, value in values.items():
         if not 0 < value < math.inf:

@@ -1,8 +1,8 @@
-"""How densely a body is filled, as a field over its rest shape: what a reconstruction from a first frame cannot see.
+"""Relative density of a body, as a field over its rest shape, which a reconstruction from the first frame cannot observe.
 
-Images show a surface, so that a reconstructed body is filled evenly. A real one need not be: a hollow or foamed body, and the bodies of
-the literature, whose particles lie closer at the surface. The factor scales mass and elastic stress together (`Effects.relative_density`;
-Gibson and Ashby 1997, chapter 5, exponent 1), so that a uniform one changes nothing.
+Images show only the surface, so a reconstructed body is filled evenly. Real bodies may be hollow or foamed, and the bodies of published
+data sets have denser particles near the surface. The relative density scales mass and elastic stress together
+(`Effects.relative_density`; Gibson and Ashby 1997, chapter 5, exponent 1), so a uniform factor has no effect.
 """
 
 import math
@@ -15,17 +15,17 @@ from neuido.errors import UserError
 from neuido.models.fewshot.method import read_tensors, write_tensors
 
 BOUND = math.log(20.0)
-"""No place is denser or looser than the mean by more than about this, in natural logarithms."""
+"""Approximate bound on the natural logarithm of the density relative to the mean."""
 LEVELS = 3
 
 
 class RelativeDensity(nn.Module):
-    """The exponential of a sum of trilinear fields on lattices of spacing h, 2 h, 4 h, with the body's mass kept.
+    """Exponential of a sum of trilinear fields on lattices of spacing h, 2 h and 4 h, normalised to preserve the mass of the body.
 
     Args:
-        x: Particles at rest [m], (P, 3).
-        volume: Their volumes [m^3], (P,).
-        h: Finest spacing [m], the edge of a cell of the simulation's grid: what is finer the grid does not see.
+        x: Rest positions of the particles [m], (P, 3).
+        volume: Particle volumes [m^3], (P,).
+        h: Finest spacing [m]: the cell size of the simulation grid, which does not resolve finer fields.
         levels: Number of lattices.
     """
 
@@ -41,7 +41,7 @@ class RelativeDensity(nn.Module):
             self.fields.append(nn.Parameter(x.new_zeros(size)))
 
     def forward(self) -> Tensor:
-        """Return the relative density of each particle [-], (P,), with mean one over the volume."""
+        """Return the relative density of each particle [-], (P,), whose volume average is one."""
         total = self.fields[0].new_zeros(())
         for level, field in enumerate(self.fields):
             total = total + (field[getattr(self, f"index_{level}")] * getattr(self, f"weight_{level}")).sum(1)
@@ -49,19 +49,19 @@ class RelativeDensity(nn.Module):
         return factor * (self.volume.sum() / (self.volume * factor).sum())
 
     def prior(self) -> Tensor:
-        """Return mean square of the logarithm over the volume, (): zero where the body is filled evenly."""
+        """Return the volume average of the squared logarithm, (): zero for an evenly filled body."""
         return (self.volume * self().log().square()).sum() / self.volume.sum()
 
     def save(self, path: Path) -> None:
-        """Write the fields as safetensors, all at once."""
+        """Write the fields to a safetensors file atomically."""
         tensors = {f"field_{level}": field.detach().cpu().clone() for level, field in enumerate(self.fields)}
         write_tensors(path, tensors | {"spacing": torch.tensor(self.spacing, dtype=torch.float64)})
 
     def load(self, path: Path) -> None:
-        """Take what `save` wrote.
+        """Load what `save` wrote.
 
         Raises:
-            UserError: A file that is missing, damaged, or of another body.
+            UserError: The file is missing, damaged, or belongs to another body.
         """
         given = read_tensors(path)
         for level, field in enumerate(self.fields):
@@ -73,14 +73,14 @@ class RelativeDensity(nn.Module):
 
 
 def lattice(x: Tensor, h: float) -> tuple[Tensor, Tensor, int]:
-    """Return trilinear weights of points on a lattice of spacing h that holds them.
+    """Return the trilinear interpolation weights of points on a lattice of spacing h that contains them.
 
     Args:
         x: Points [m], (P, 3).
         h: Spacing [m].
 
     Returns:
-        Nodes about each point (P, 8) int64, their weights (P, 8), and the number of nodes.
+        Indices of the nodes around each point (P, 8) int64, their weights (P, 8), and the number of nodes.
     """
     at = (x - x.amin(0)) / h
     low = at.floor()

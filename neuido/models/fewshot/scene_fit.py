@@ -1,4 +1,4 @@
-"""What is fitted of one scene: a method's parameters and, where they are estimated, the start of the motion and the body's filling."""
+"""The fit of one scene: the parameters of a method and, optionally, an initial velocity and a relative density."""
 
 from pathlib import Path
 from typing import Any
@@ -18,21 +18,21 @@ START, DENSITY = "start.safetensors", "density.safetensors"
 
 
 class EffectSource:
-    """Where effects come from that act on top of a scene's law, known and not fitted; YAML gives a subclass by `class_path`."""
+    """Source of known effects that act in addition to the law of a scene; a configuration names a subclass by `class_path`."""
 
     def of(self, scene: PreparedScene) -> Effects:
-        """Return the effects for a rollout of the scene, whose step may be finer than the recording's."""
+        """Return the effects for a rollout of the scene, whose time step may be smaller than that of the recording."""
         raise NotImplementedError
 
 
 class SceneFit(nn.Module):
-    """One scene's method and, where they are estimated, what its initial velocity lacks and how densely its body is filled.
+    """Method of one scene and, optionally, a correction of its initial velocity and a relative density.
 
     Args:
-        method: Of `Method.for_scene`.
-        estimate_velocity: Whether a rigid motion is added to the body's known velocity.
-        effects: What else acts on the body; none: nothing.
-        density: The body's relative density; none: it is filled evenly.
+        method: A method returned by `Method.for_scene`.
+        estimate_velocity: Whether to add a fitted rigid velocity to the known initial velocity.
+        effects: Source of further effects on the body.
+        density: Relative density of the body; evenly filled where absent.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class SceneFit(nn.Module):
         self.density = density
         self.method, self.effects = method, effects
         self.twist = nn.Parameter(torch.zeros(2, 3)) if estimate_velocity else None
-        """Velocity of the centre [m/s] and angular velocity about it [rad/s]."""
+        """Velocity of the centre of mass [m/s] and angular velocity about it [rad/s], (2, 3)."""
 
     def rollout(self, scene: PreparedScene, frames: int, segment: int = 0) -> ParticleState:
-        """Simulate with `Method.rollout` from the start state of this fit."""
+        """Simulate with `Method.rollout` from the initial state of this fit."""
         effects = None if self.effects is None else self.effects.of(scene)
         if self.density is not None:
             effects, own = Effects() if effects is None else effects, self.density()
@@ -58,7 +58,7 @@ class SceneFit(nn.Module):
         return self.method.rollout(scene, frames, state=self.start(scene.simulator), effects=effects, segment=segment)
 
     def start(self, simulator: Simulator) -> ParticleState | None:
-        """Return the state at t = 0; None where it is the body's own."""
+        """Return the state at t = 0, or None if the velocity of the body is not corrected."""
         if self.twist is None:
             return None
         linear, angular = self.twist.to(simulator.dtype)
@@ -70,12 +70,12 @@ class SceneFit(nn.Module):
         return ParticleState(x, v + linear + (x - centre) @ spin.T, C + spin, F)
 
     def regulariser(self, density_weight: float = 0.0) -> Tensor | float:
-        """Return `Method.regulariser` plus the relative density's prior times `density_weight`."""
+        """Return `Method.regulariser` plus `density_weight` times the prior of the relative density."""
         total = self.method.regulariser()
         return total if self.density is None else total + density_weight * self.density.prior()
 
     def save(self, folder: Path) -> None:
-        """Write the method, the correction of the velocity, and the relative density."""
+        """Write the fit of the method, the velocity correction and the relative density."""
         self.method.save(folder)
         if self.density is not None:
             self.density.save(folder / DENSITY)
@@ -83,10 +83,10 @@ class SceneFit(nn.Module):
             write_tensors(folder / START, {"twist": self.twist.detach().cpu().clone()})
 
     def load(self, folder: Path) -> None:
-        """Take what `save` wrote.
+        """Load what `save` wrote.
 
         Raises:
-            UserError: As `Method.load` and `RelativeDensity.load`; a file without `twist`.
+            UserError: As in `Method.load` and `RelativeDensity.load`, or a file without `twist`.
         """
         self.method.load(folder)
         if self.density is not None and (folder / DENSITY).is_file():
@@ -98,7 +98,7 @@ class SceneFit(nn.Module):
             self.twist = nn.Parameter(found.to(next(self.buffers(), found).device))
 
     def describe(self) -> dict[str, Any]:
-        """Return what was identified, with the correction of the velocity and the spread of the density's logarithm."""
+        """Return `Method.describe` with the velocity correction and the standard deviation of the log density."""
         found = self.method.describe()
         if self.density is not None:
             found = found | {"density_spread": float(self.density.prior().detach().sqrt())}

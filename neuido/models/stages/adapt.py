@@ -1,4 +1,4 @@
-"""Few-shot adaptation: a method's parameters are fitted to the images of one scene, one scene after the other (paper, "Few-Shot")."""
+"""Few-shot adaptation: fit the parameters of a method to the images of each scene in turn (paper, "Few-Shot")."""
 
 import gc
 import sys
@@ -38,41 +38,42 @@ GIGABYTE = 1e9
 
 
 class AdaptModule(ImageModule):
-    """Fits a method to each scene by itself, and scores it before and after on views that were held out.
+    """Fit a method to each scene separately, and score it on held-out views before and after.
 
-    An epoch is one scene, so that `trainer.max_epochs` is left at -1. The loss is that of Stage II (`image_losses`). The data module
-    is a `VisualDataModule`. `out/scores.csv` has two rows a scene, of `stage` before and after; `out/<scene>/fit` is of `SceneFit.save`.
+    One epoch is one scene; leave `trainer.max_epochs` at -1. The loss is that of Stage II (`image_losses`), and the data module is a
+    `VisualDataModule`. `out/scores.csv` has two rows for each scene, whose `stage` is before and after. `out/<scene>/fit` holds the fit.
 
     Args:
-        method: What is fitted (`fewshot.method`).
-        steps: Optimiser steps of each scene; none: the method's own number (ours: 100, the paper's).
-        views_per_step: Training views in a step, drawn anew for each; 0: all.
-        encoder_views: Training views that the encoder sees; 0: all.
-        fit_frames: Frames that fitting sees, the first ones; 0: all. Scores then have the rest apart, as `later_...`.
-        curriculum: Shares of these frames that are rolled out, one after the other, for equal parts of `curriculum_share` of the steps.
-        curriculum_share: Share of the steps.
-        image_weight: Of the images' squared error; 0: silhouettes alone.
-        silhouette_weight: Of the silhouettes' squared error.
-        estimate_velocity: Estimate a rigid motion at t = 0 that is added to the body's known one.
-        velocity_lr: Its rate, in m/s and rad/s a step.
-        velocity_steps: Steps before the others in which it is fitted alone, with a cosine of their own.
-        velocity_frames: Frames that these steps see.
-        estimate_density: Estimate how densely the body is filled, which no first frame shows (`fewshot.relative_density`); paper: no.
-        density_lr: Its rate, of the logarithm a step.
-        density_from: Share of the steps before it joins the law, which then has the large part of the motion to itself.
-        density_weight: Of its mean square logarithm: pulls it to an even filling.
-        stop_on: When to end a scene early: `none`, `loss` (no lower loss on all training views), `view` (no lower loss on the last
-            training view, which is then not trained on). The best parameters are kept.
-        patience: Steps without an improvement by 1 % after which a scene ends.
-        check_every: Steps between two looks at that loss.
-        segment: Keep the state of a rollout every so many frames only (`Simulator.rollout`); 0: of all. Saves memory.
-        effects: Effects that act on top of the law, of a diagnosis say; none: none.
-        adapter: Folder of a fit, for test and predict: `out` of one, or what is in `out/<scene>/fit`.
-        cache: Folder in which optical flow is kept.
+        method: The method to fit (`fewshot.method`).
+        steps: Optimiser steps for each scene; the default of the method where absent (ours: 100, as in the paper).
+        views_per_step: Training views in each step, sampled anew; 0: all.
+        encoder_views: Training views for the encoder; 0: all.
+        fit_frames: Number of initial frames to fit; 0: all. Scores of the remaining frames are reported separately, as `later_...`.
+        curriculum: Successive rollout lengths, as shares of the fitted frames. Each takes an equal part of `curriculum_share` of the steps.
+        curriculum_share: Share of the steps that the curriculum takes; the steps after it roll out all fitted frames.
+        image_weight: Weight of the squared error of the images; 0: only silhouettes.
+        silhouette_weight: Weight of the squared error of the silhouettes.
+        estimate_velocity: Estimate a rigid velocity at t = 0, which is added to the known velocity of the body.
+        velocity_lr: Learning rate of this velocity, in m/s and rad/s a step.
+        velocity_steps: Initial steps that fit only the velocity, with their own cosine schedule.
+        velocity_frames: Rollout length of these steps, in frames.
+        estimate_density: Estimate the relative density of the body, which the first frame does not show (`fewshot.relative_density`);
+            paper: no.
+        density_lr: Learning rate of the logarithm of the relative density.
+        density_from: Share of the steps after which the relative density is fitted too; before that, only the law explains the motion.
+        density_weight: Weight of the mean squared logarithm of the relative density, a prior for an even filling.
+        stop_on: Criterion for early stopping: `none`, `loss` (of all training views), or `view` (the loss of the last training view, which
+            is then excluded from training). The best parameters are kept.
+        patience: Steps without an improvement of 1 % after which the fit of a scene stops.
+        check_every: Steps between two evaluations of the criterion.
+        segment: Gradient checkpointing: keep the state of a rollout only every so many frames (`Simulator.rollout`); 0: keep all.
+        effects: Known effects that act in addition to the law, for example those of a diagnosis.
+        adapter: For test and predict: folder of an earlier fit, either its `out` or an `out/<scene>/fit`.
+        cache: Folder for cached optical flow.
         out: Folder for results.
-        lpips_backbone: Local file of VGG16's or AlexNet's weights; none: LPIPS is absent.
+        lpips_backbone: Local file with the weights of VGG16 or AlexNet; without one, LPIPS is not reported.
         lpips_net: `vgg` or `alex`.
-        condition_files: In a prediction, files of `inference.transfer` to run with the laws that were fitted.
+        condition_files: For predict: files of conditions (`inference.transfer`) to simulate with the fitted laws.
     """
 
     def __init__(
@@ -119,11 +120,11 @@ class AdaptModule(ImageModule):
         if patience < 1 or check_every < 1:
             raise UserError(f"model.patience = {patience}, check_every = {check_every}: at least 1 is needed")
         self.save_hyperparameters(ignore=["method", "effects"])
-        object.__setattr__(self, "plan", method)  # its copies are trained, one a scene
+        object.__setattr__(self, "plan", method)  # not a submodule: each scene trains its own copy
         self.effects = effects
         self.steps = method.steps if steps is None else steps
         self.ahead = velocity_steps if estimate_velocity else 0
-        """Steps of the velocity alone, before those of the method."""
+        """Number of initial steps that fit only the velocity."""
         self.fits = nn.ModuleList()
         self._names: list[str] = []
         self._current: tuple[str, PreparedScene] | None = None
@@ -131,15 +132,15 @@ class AdaptModule(ImageModule):
         self._rows: list[dict[str, Any]] = []
         self._predicted: list[tuple[PreparedScene, Laws]] = []
 
-    # What there is of a scene.
+    # Scenes.
 
     def open_scene(self, scene: VisualScene, device: torch.device, *, watched: bool) -> PreparedScene:
-        """Prepare the scene on the device; `watched`: with the flow that the method's encoder needs."""
+        """Prepare the scene on the device; `watched`: with the flow for the encoder of the method."""
         encoder = self.plan.encoder.to(device) if watched and self.plan.encoder is not None else None
         return prepare(scene, encoder, device=device, encoder_views=self.hparams.encoder_views, cache=self.hparams.cache)
 
     def new_fit(self, prepared: PreparedScene, uneven: bool = False) -> SceneFit:
-        """Create a fit at its start; `uneven`: with a relative density even if the option is off."""
+        """Create an unfitted `SceneFit`; `uneven`: with a relative density even if `estimate_density` is off."""
         density = None
         if self.hparams.estimate_density or uneven:
             simulator = prepared.simulator
@@ -166,15 +167,15 @@ class AdaptModule(ImageModule):
         return cast(SceneFit, self.fits[self._names.index(name)])
 
     def _training_views(self, prepared: PreparedScene) -> list[int]:
-        """Return the views that are trained on."""
+        """Return the indices of the views to train on."""
         if self.hparams.stop_on != "view":
             return prepared.training_views
         if len(prepared.training_views) < 2:
-            raise UserError(f"model.stop_on = view: {prepared.source.name} has one training view, and none would be left; use loss or none")
+            raise UserError(f"model.stop_on = view: {prepared.source.name} has one training view, so none would remain; use loss or none")
         return prepared.training_views[:-1]
 
     def _frames(self, prepared: PreparedScene) -> int:
-        """Return frames that fitting sees."""
+        """Return the number of frames to fit."""
         return min(prepared.frames, self.hparams.fit_frames or prepared.frames)
 
     # Fitting.
@@ -197,7 +198,7 @@ class AdaptModule(ImageModule):
             if not self.ahead + self.steps:  # Lightning then runs no epoch
                 self._begin(scene)
                 self.fit_of(scene.name).save(folder_of(self.hparams.out, scene.name) / "fit")
-            elif scene.name in self._progress and self._progress[scene.name].done:  # killed between its last step and its scores
+            elif scene.name in self._progress and self._progress[scene.name].done:  # killed between the last step and the scores
                 self._begin(scene)
                 self._finish_scene()
 
@@ -206,11 +207,11 @@ class AdaptModule(ImageModule):
         return -1 if self._progress[batch.name].done else None
 
     def _begin(self, scene: VisualScene) -> PreparedScene:
-        """Bring the scene to the device, and score it before its first step."""
+        """Prepare a scene on the device, and score it before its first step."""
         if self._current is None or self._current[0] != scene.name:
             self._finish_scene()
             self._current = None
-            gc.collect()  # the last scene's tapes, before the next one's are made
+            gc.collect()  # free the tapes of the previous scene first
             self._current = scene.name, self.open_scene(scene, self.device, watched=False)
             if scene.name not in self._progress:
                 self._progress[scene.name] = Progress()
@@ -232,7 +233,11 @@ class AdaptModule(ImageModule):
         return self._weighted(loss, silhouette) + regular
 
     def _rollout_or_restore(self, prepared: PreparedScene, fit: SceneFit, frames: int) -> ParticleState | None:
-        """Simulate; after a failure restore parameters that ran, halve the rates, and simulate those; None where there are none."""
+        """Simulate; on failure restore the last working parameters, halve the learning rates and retry.
+
+        Returns:
+            The motion, or None if there are no working parameters.
+        """
         name = prepared.source.name
         progress = self._progress[name]
         for _ in range(2):
@@ -251,14 +256,14 @@ class AdaptModule(ImageModule):
         return self.hparams.image_weight * loss + self.hparams.silhouette_weight * silhouette
 
     def rollout_frames(self, prepared: PreparedScene, step: int) -> int:
-        """Return frames of a rollout at this step of a scene."""
+        """Return the rollout length, in frames, at this step of a scene."""
         frames = self._frames(prepared)
         if step < self.ahead:
             return min(frames, self.hparams.velocity_frames)
         return curriculum_frames((step - self.ahead) / max(1, self.steps), frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Skip a step whose gradient is not finite; after repeated ones restore the last parameters that ran."""
+        """Skip a step whose gradient is not finite; restore the last working parameters if that happens repeatedly."""
         gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
         if gradients and not bool(torch.stack([g.isfinite().all() for g in gradients]).all()):
             self._log({"train/not_finite": 1.0})
@@ -294,7 +299,7 @@ class AdaptModule(ImageModule):
 
     @without_gradients
     def _check_early_stop(self, prepared: PreparedScene, progress: Progress) -> None:
-        """Evaluate the loss of all frames on all training views, or on the view that is kept from training."""
+        """Evaluate the loss of all fitted frames on all training views, or on the view reserved for early stopping."""
         fit = self.fit_of(prepared.source.name)
         motion = self._try(prepared, fit)
         if motion is None:
@@ -312,14 +317,14 @@ class AdaptModule(ImageModule):
         self._report_missing_lpips()
 
     def _finish_scene(self) -> None:
-        """Score the current scene once its steps are done, and write what was found."""
+        """Score the current scene once its steps are done, and write its fit."""
         if self._current is None:
             return
         name, prepared = self._current
         progress, fit = self._progress[name], self.fit_of(name)
         if not progress.done or any(row["scene"] == name and row["stage"] == "after" for row in self._rows):
             return
-        if not restore(fit, progress.best) and self._try(prepared, fit) is None:  # the last step's law was never run
+        if not restore(fit, progress.best) and self._try(prepared, fit) is None:  # the law after the last step has not been simulated yet
             restore(fit, progress.good)
         progress.best, progress.good, progress.first = {}, {}, {}
         fit.save(folder_of(self.hparams.out, name) / "fit")
@@ -328,7 +333,7 @@ class AdaptModule(ImageModule):
 
     @without_gradients
     def _try(self, prepared: PreparedScene, fit: SceneFit) -> ParticleState | None:
-        """Simulate all frames that fitting sees; None where the law does not run."""
+        """Simulate all fitted frames; None if the simulation fails."""
         try:
             return fit.rollout(prepared, self._frames(prepared))
         except UserError:
@@ -347,7 +352,7 @@ class AdaptModule(ImageModule):
         self._show(self._rows[-1])
 
     def score(self, prepared: PreparedScene, fit: SceneFit, stage: str) -> dict[str, Any]:
-        """Score a fit: means and what was found; rows by frame go to files in `out/<scene>/<stage>`."""
+        """Return the mean scores of a fit and its parameters; write the scores of each frame to `out/<scene>/<stage>`."""
         found = {f"found_{key}": value for key, value in scalars(fit.describe()).items()}
         try:
             motion, halvings = rollout_with_retries(prepared, lambda scene: fit.rollout(scene, prepared.frames))
@@ -377,10 +382,10 @@ class AdaptModule(ImageModule):
         self._progress = {name: Progress(**state) for name, state in kept["progress"].items()}
         self._rows = kept["rows"]
 
-    # Test and prediction, with what a fit wrote.
+    # Test and prediction, from a saved fit.
 
     def load_fit(self, scene: VisualScene) -> tuple[PreparedScene, SceneFit]:
-        """Return the scene and its fit: that of this run, of `adapter`, or one at its start."""
+        """Return the scene and its fit: from this run, from `adapter`, or else unfitted."""
         if scene.name in self._names:
             return self.open_scene(scene, self.device, watched=False), self.fit_of(scene.name)
         prepared = self.open_scene(scene, self.device, watched=True)
@@ -413,14 +418,14 @@ class AdaptModule(ImageModule):
 
     @without_gradients
     def predict_step(self, scene: VisualScene, batch_idx: int) -> dict[str, Any]:
-        """Write what was found, particles, video and picture of a scene; the paths."""
+        """Write the fit, particles, video and contact sheet of a scene; return their folder."""
         prepared, fit = self.load_fit(scene)
         folder = folder_of(self.hparams.out, scene.name)
         fit.save(folder / "fit")
         try:
             motion, _ = rollout_with_retries(prepared, lambda refined: fit.rollout(refined, prepared.frames))
         except UserError as error:
-            print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
+            print(f"{scene.name}: the law is in {folder}, but its simulation failed: {error}", file=sys.stderr)
             return {"scene": scene.name, "folder": str(folder), "failed": str(error)}
         write_prediction(folder, prepared, motion)
         if self.hparams.condition_files:

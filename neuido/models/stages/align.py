@@ -1,4 +1,4 @@
-"""Stage II: the projector learns from images which laws make the recorded motion (paper, "Visual-to-Dynamics Alignment")."""
+"""Stage II: train the projector on images, through the simulator and the renderer (paper, "Visual-to-Dynamics Alignment")."""
 
 import sys
 from pathlib import Path
@@ -32,37 +32,40 @@ from neuido.models.stages.training import open_operator_and_encoder, optimiser_s
 
 
 class AlignModule(ImageModule):
-    """Stage II, its scores, and zero-shot prediction. Trunks, heads and VAE are frozen; scenes take turns, one step each.
+    """Train and score Stage II, and predict zero-shot. Trunks, heads and VAE are frozen; each step uses the next scene.
 
-    The loss of a scene is the squared error of the images over all training views, divided by what a still image of the first frame would
-    score: one says that nothing of the motion is explained, whatever the size of the body. (AdamW does not see a scene's constant
-    factor, but the clipping of gradients does.) The paper's Stage II is `silhouette_weight: 0`, `curriculum: [1.0]`, `init_from: null`.
+    The loss of a scene is the squared error of the images over all training views, relative to that of a still first frame. A value of one
+    means that none of the motion is explained, whatever the size of the body. (AdamW is invariant to this constant factor of a scene, but
+    gradient clipping is not.) The paper's Stage II is `silhouette_weight: 0`, `curriculum: [1.0]`, `init_from: null`.
 
     The data module is a `VisualDataModule`.
 
     Args:
         operator: File of the operator, or `pretrained`.
-        init_from: Encoder to start from (of the warm-up, say, or `pretrained`); none: a new projector, near Stage I's mean latent.
-        vae: Of a new encoder: a file, `pretrained`, or `cogvideox:` and a source.
-        flow_size, flow_encoding, speed_scale, width, heads, conditions, dropout: Of a new encoder (`DynamicsEncoder`).
-        lr: AdamW with a cosine to zero over the run (paper: AdamW, cosine; it gives no rate).
-        weight_decay: Of the projector.
-        views_per_step: Training views in a step, drawn anew for each; 0: all.
-        encoder_views: Training views that the encoder sees; 0: all.
-        curriculum: Shares of the frames that are rolled out, one after the other, for equal parts of `curriculum_share` of the run; all
-            after it. Short rollouts first: while the law is far off, the gradient of a long one through several contacts points anywhere.
-        curriculum_share: Share of the run.
-        silhouette_weight: Of the squared error of the silhouettes, normalised as the images'; it pulls where colours mislead.
-        prior_weight: Pulls z to where training began, per squared unit: the mean over z's components. 0: not at all.
-        plausibility_weight: Keeps z where elastic laws can run (`law_properties.implausibility`); paper: 0.
-        segment: Keep the state of a rollout every so many frames only (`Simulator.rollout`); 0: of all. Saves memory.
-        cache: Folder in which optical flow is kept.
-        save_to: File to write the encoder to at the end of a fit.
+        init_from: Encoder to start from, for example that of the warm-up or `pretrained`; without one, a new projector starts near the mean
+            latent of Stage I.
+        vae: VAE of a new encoder: a file, `pretrained`, or `cogvideox:` and a source.
+        flow_size, flow_encoding, speed_scale, width, heads, conditions, dropout: Options of a new encoder (`DynamicsEncoder`).
+        lr: Learning rate of AdamW, with a cosine schedule to zero over the run (paper: AdamW and cosine; it gives no rate).
+        weight_decay: Weight decay of the projector.
+        views_per_step: Training views in each step, sampled anew; 0: all.
+        encoder_views: Training views for the encoder; 0: all.
+        curriculum: Successive rollout lengths, as shares of the frames. Each takes an equal part of `curriculum_share` of the run; the rest
+            of the run rolls out all frames. Short rollouts come first because the gradient of a long one through several contacts is
+            uninformative while the law is far off.
+        curriculum_share: Share of the run that the curriculum takes.
+        silhouette_weight: Weight of the squared error of the silhouettes, normalised like the images. It guides where colours mislead.
+        prior_weight: Weight of the squared distance of z from its value at the start of training, mean over the components of z; 0: none.
+        plausibility_weight: Weight of the penalty on elastic laws that a rollout would not survive (`law_properties.implausibility`);
+            paper: 0.
+        segment: Gradient checkpointing: keep the state of a rollout only every so many frames (`Simulator.rollout`); 0: keep all.
+        cache: Folder for cached optical flow.
+        save_to: File for the encoder at the end of a fit.
         out: Folder for the results of test and predict.
-        lpips_backbone: Local file of VGG16's or AlexNet's weights; none: LPIPS is absent.
+        lpips_backbone: Local file with the weights of VGG16 or AlexNet; without one, LPIPS is not reported.
         lpips_net: `vgg` or `alex`.
-        baselines: In a test, random latents to score each unseen scene with, beside the mean latent.
-        condition_files: In a prediction, files of `inference.transfer` to run with the laws that were found.
+        baselines: Number of random latents with which a test scores each unseen scene, in addition to the mean latent.
+        condition_files: For predict: files of conditions (`inference.transfer`) to simulate with the inferred laws.
     """
 
     def __init__(
@@ -111,10 +114,10 @@ class AlignModule(ImageModule):
         self._predicted: list[tuple[PreparedScene, Laws]] = []
         self._total = 1
 
-    # What there is of a scene.
+    # Scenes.
 
     def prepared(self, scene: VisualScene) -> PreparedScene:
-        """Prepare a scene when it is first seen."""
+        """Return the prepared scene, from the cache after the first call."""
         if scene.name not in self._prepared:
             options = {"encoder_views": self.hparams.encoder_views, "cache": self.hparams.cache}
             self._prepared[scene.name] = prepare(scene, self.encoder, device=self.device, **options)
@@ -130,7 +133,7 @@ class AlignModule(ImageModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def rollout_frames(self, prepared: PreparedScene) -> int:
-        """Return frames of a rollout at this point of the run."""
+        """Return the rollout length, in frames, at this point of the run."""
         done = self.global_step / max(1, self._total)
         return curriculum_frames(done, prepared.frames, self.hparams.curriculum, self.hparams.curriculum_share)
 
@@ -141,7 +144,7 @@ class AlignModule(ImageModule):
         start = self._start.setdefault(scene.name, z.detach().clone())
         try:
             motion = rollout_latent(prepared, self.operator, z, frames, segment=self.hparams.segment)
-        except UserError as error:  # a law that cannot run has no image: back towards laws that can
+        except UserError as error:  # a law that cannot be simulated has no image: move towards laws that can
             print(f"{scene.name}: {error}", file=sys.stderr)
             self._log({"train/failed": 1.0})
             return (z - self._mean_latent(z)).square().mean()
@@ -156,13 +159,13 @@ class AlignModule(ImageModule):
         return total
 
     def _mean_latent(self, z: Tensor) -> Tensor:
-        """Return the mean latent of Stage I, whose law runs."""
+        """Return the mean latent of Stage I, whose law can be simulated."""
         return self.operator.latents.mean(0).to(z) if len(self.operator.latents) else torch.zeros_like(z)
 
     # Scores.
 
     def score(self, scene: VisualScene, *, images: bool = True) -> tuple[dict[str, Any], list[dict[str, Any]], list[dict[str, Any]]]:
-        """Score zero-shot inference of a scene: means, and the rows by frame, of particles and of images."""
+        """Score zero-shot inference of a scene; return the means, and the rows of each frame for particles and images."""
         prepared = self.prepared(scene)
         found = infer_latent(self.encoder, self.operator, prepared)
         summary: dict[str, Any] = {"scene": scene.name, "seconds": found.seconds}
@@ -189,7 +192,7 @@ class AlignModule(ImageModule):
         self.log_dict(values)
 
     def _gather(self) -> list[dict[str, Any]]:
-        """Gather the rows of all processes, one a scene, ordered by name, and clear them here."""
+        """Gather the rows of all processes, one for each scene in the order of the names, and clear the local rows."""
         rows, self._rows = self._rows, []
         if self.trainer.world_size > 1:
             everyone: list[Any] = [None] * self.trainer.world_size
@@ -197,7 +200,7 @@ class AlignModule(ImageModule):
             rows = [row for part in everyone for row in part]
         return sorted({row["scene"]: row for row in rows}.values(), key=lambda row: row["scene"])
 
-    # Test: everything, with baselines for unseen scenes.
+    # Test: all scores, with baselines for unseen scenes.
 
     @without_gradients
     def test_step(self, scene: VisualScene, batch_idx: int) -> None:
@@ -210,7 +213,7 @@ class AlignModule(ImageModule):
         self._rows.append(summary)
 
     def score_baselines(self, prepared: PreparedScene) -> dict[str, float]:
-        """Score baselines by CD: Stage I's mean latent, random latents, and trained latents at random (medians over those that run)."""
+        """Return the Chamfer distance of the mean latent, of random latents and of random trained latents (medians over those that run)."""
         generator = torch.Generator().manual_seed(0)
         latents, count = self.operator.latents, self.hparams.baselines
         drawn = self.operator.random_latents(count, generator)
@@ -249,7 +252,7 @@ class AlignModule(ImageModule):
 
     @without_gradients
     def predict_step(self, scene: VisualScene, batch_idx: int) -> dict[str, Any]:
-        """Write law, particles, video and picture of a scene; return the moduli found, the folder, and the time of the inference."""
+        """Write the law, particles, video and contact sheet of a scene; return its moduli, folder and inference time."""
         prepared = self.prepared(scene)
         found = VideoLaw.infer(self.encoder, self.operator, prepared)
         folder = folder_of(self.hparams.out, scene.name)
@@ -259,10 +262,10 @@ class AlignModule(ImageModule):
         try:
             motion, halvings = found.rollout()
         except UserError as error:
-            print(f"{scene.name}: the law is in {folder}, but it does not run: {error}", file=sys.stderr)
+            print(f"{scene.name}: the law is in {folder}, but its simulation failed: {error}", file=sys.stderr)
             return answer | {"failed": str(error)}
         if halvings:
-            print(f"{scene.name}: the law runs only with a time step of dt / {2**halvings}", file=sys.stderr)
+            print(f"{scene.name}: the law needs a smaller time step, dt / {2**halvings}", file=sys.stderr)
         write_prediction(folder, prepared, motion)
         self.print(f"{scene.name}: results in {folder}")
         self._predicted.append((prepared, found.law()))

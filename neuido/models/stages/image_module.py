@@ -1,4 +1,4 @@
-"""What Stage II and few-shot adaptation share: losses of images, the curriculum of a rollout, scores, and what they write."""
+"""Shared parts of Stage II and few-shot adaptation: image losses, the rollout curriculum, scores and output files."""
 
 import functools
 import math
@@ -21,11 +21,11 @@ from neuido.types import ParticleState
 
 SCORES = ("cd", "floor", "rmse", "psnr", "ssim", "lpips", "iou", "crop_psnr", "crop_ssim", "crop_lpips")
 STILL_IMAGE, STILL_MASK = 1e-6, 1e-5
-"""Floors of the mean squared change from the first frame, of a body at rest."""
+"""Floors of the mean squared change from the first frame; it vanishes for a body at rest."""
 
 
 def without_gradients(method: Callable) -> Callable:
-    """Run a method without gradients, but outside Lightning's inference mode, whose tensors training could not write to afterwards."""
+    """Run a method without gradients but outside inference mode, whose tensors cannot be used in training afterwards."""
 
     @functools.wraps(method)
     def run(*arguments, **options):
@@ -36,23 +36,23 @@ def without_gradients(method: Callable) -> Callable:
 
 
 def check_options(counts: dict[str, int], weights: dict[str, float], shares: dict[str, float], curriculum: Sequence[float]) -> None:
-    """Refuse options that are negative, or shares that are none.
+    """Check that counts and weights are not negative and that shares lie between 0 and 1.
 
     Raises:
-        UserError: It names the option.
+        UserError: An option is out of range; the message names it.
     """
     for name, value in {**counts, **weights}.items():
         if not value >= 0:
             raise UserError(f"model.{name} = {value}: it must not be negative")
     for name, value in shares.items():
         if not 0 <= value <= 1:
-            raise UserError(f"model.{name} = {value}: it must be a share, from 0 to 1")
+            raise UserError(f"model.{name} = {value}: it must lie between 0 and 1")
     if not all(0 < share <= 1 for share in curriculum):
-        raise UserError(f"model.curriculum = {curriculum}: each must be a share, above 0 and up to 1")
+        raise UserError(f"model.curriculum = {curriculum}: each share must be above 0 and at most 1")
 
 
 def curriculum_frames(done: float, frames: int, curriculum: Sequence[float], curriculum_share: float) -> int:
-    """Return the rollout length after the share `done` of a run: each share of the curriculum in turn, then all frames."""
+    """Return the rollout length, in frames, after a fraction `done` of a run: each share of the curriculum in turn, then all frames."""
     if not curriculum or done >= curriculum_share:
         return frames
     share = curriculum[min(int(done / curriculum_share * len(curriculum)), len(curriculum) - 1)]
@@ -60,7 +60,7 @@ def curriculum_frames(done: float, frames: int, curriculum: Sequence[float], cur
 
 
 def sample_views(views: list[int], count: int, step: int) -> list[int]:
-    """Sample `count` views (0: all) with the step as the seed, so that a resumed run samples the same ones."""
+    """Sample `count` views (0: all), seeded by the step so that a resumed run samples the same views."""
     if not 0 < count < len(views):
         return views
     order = torch.randperm(len(views), generator=torch.Generator().manual_seed(step))
@@ -68,7 +68,7 @@ def sample_views(views: list[int], count: int, step: int) -> list[int]:
 
 
 def image_losses(prepared: PreparedScene, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:
-    """Return the squared errors of images and silhouettes, relative to those of a still first frame."""
+    """Return the squared errors of images and silhouettes, each relative to the error of a still first frame."""
     frames = len(motion.x)
     images, alphas = render_motion(prepared, motion, views)
     recorded, masks = prepared.recorded(views, frames), prepared.silhouettes(views, frames)
@@ -80,7 +80,7 @@ def image_losses(prepared: PreparedScene, motion: ParticleState, views: list[int
 
 
 class ImageModule(LightningModule):
-    """Scores and results of filmed scenes; its subclasses have the options `out`, `lpips_backbone` and `lpips_net`."""
+    """Base class that scores filmed scenes; subclasses have the options `out`, `lpips_backbone` and `lpips_net`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -89,13 +89,13 @@ class ImageModule(LightningModule):
     def score_motion(
         self, prepared: PreparedScene, motion: ParticleState, *, images: bool = True
     ) -> tuple[dict[str, float], list[dict[str, Any]], list[dict[str, Any]]]:
-        """Score a motion: means, and the rows by frame, of particles and of images on the held-out views."""
+        """Score a motion; return the means, and the rows of each frame for particles and for images of the held-out views."""
         particles = scores.score_motion(prepared, motion, self._floor(prepared))
         pictures = scores.score_images(prepared, motion, prepared.scoring_views, self._lpips()) if images else []
         return scores.mean_of(particles, SCORES) | scores.mean_of(pictures, SCORES), particles, pictures
 
     def _floor(self, prepared: PreparedScene) -> Tensor | None:
-        """Return the resampling floor of a scene, measured once: it depends on the truth alone."""
+        """Return the resampling floor of a scene, which is cached because it depends only on the truth."""
         name = prepared.source.name
         if prepared.source.truth is not None and name not in self._floors:
             self._floors[name] = scores.floor_per_frame(prepared)
@@ -104,7 +104,7 @@ class ImageModule(LightningModule):
     def _lpips(self) -> LPIPS | Absent:
         if not hasattr(self, "_lpips_module"):
             opened = open_lpips(self.hparams.lpips_backbone, self.hparams.lpips_net, self.device)
-            object.__setattr__(self, "_lpips_module", opened)  # no part of the checkpoint
+            object.__setattr__(self, "_lpips_module", opened)  # not part of the checkpoint
         return cast(LPIPS | Absent, self._lpips_module)
 
     def _log(self, values: dict[str, Tensor | float]) -> None:
@@ -115,17 +115,17 @@ class ImageModule(LightningModule):
     def _report_missing_lpips(self) -> None:
         absent = self._lpips()
         if isinstance(absent, Absent):
-            self.print(f"LPIPS is absent: {absent.reason}")
+            self.print(f"LPIPS is not available: {absent.reason}")
 
 
 def write_frame_scores(folder: Path, particles: list[dict[str, Any]], pictures: list[dict[str, Any]]) -> None:
-    """Write the rows of `ImageModule.score_motion`."""
+    """Write the rows of `ImageModule.score_motion` to particles.csv and images.csv."""
     write_rows(folder / "particles.csv", particles)
     write_rows(folder / "images.csv", pictures)
 
 
 def write_prediction(folder: Path, prepared: PreparedScene, motion: ParticleState) -> None:
-    """Write particles, and recorded frames beside predicted ones from one of the scoring views as a video and a picture."""
+    """Write the particles, and a video and contact sheet that compare recorded and predicted frames in one scoring view."""
     view = prepared.scoring_views[0]
     images, recorded = render_motion(prepared, motion, [view])[0][:, 0], prepared.recorded([view])[:, 0]
     write_plys(folder / "particles", motion)

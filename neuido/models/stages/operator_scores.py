@@ -1,4 +1,4 @@
-"""Scores of the operator on constitutive data: responses with their errors, latents of unseen materials, and metrics (Stage I)."""
+"""Scores of the operator on constitutive data (Stage I): responses and their errors, latents of unseen materials, metrics."""
 
 import sys
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from neuido.models.scoring.metrics import MedianRelativeError
 from neuido.types import TrajectoryBatch
 
 RESIDUAL_FLOOR = 1e-5
-"""Least epsilon of a relative plastic error [-]: an elastic trajectory has no residual at all."""
+"""Minimum epsilon of a relative plastic error [-], for elastic trajectories, whose residual is zero."""
 
 
 class OperatorResponse(NamedTuple):
-    """What an operator says about a batch of M trajectories with n samples each."""
+    """Response of an operator to a batch of M trajectories with n samples each."""
 
     stress: Tensor
     """Predicted Kirchhoff stress [Pa], (M, n, 3, 3)."""
@@ -29,7 +29,7 @@ class OperatorResponse(NamedTuple):
     plastic_error: Tensor
     """Relative error of the plastic residual F_hat - F_tr (or of F_hat), (M, n)."""
     residual_epsilon: Tensor
-    """Floor of the residual norm for each trajectory [-], (M,)."""
+    """Floor of the residual norm of each trajectory [-], (M,)."""
 
 
 def evaluate_operator(
@@ -45,11 +45,11 @@ def evaluate_operator(
     Args:
         operator: The operator.
         z: Latents (M, d).
-        batch: M n samples sorted by trajectory, n of each.
-        stress_epsilon: Floor of the stress norm for each trajectory [Pa], (M,).
-        residual_epsilon: Floor of the residual norm for each trajectory [-], (M,).
-        plastic_target: `residual` compares F_hat - F_tr; `full` compares F_hat (the paper, to the letter), whose norm is about
-            sqrt(3), so that the error is nearly absolute.
+        batch: M n samples sorted by trajectory, n for each.
+        stress_epsilon: Floor of the stress norm of each trajectory [Pa], (M,).
+        residual_epsilon: Floor of the residual norm of each trajectory [-], (M,).
+        plastic_target: `residual` compares F_hat - F_tr. `full` compares F_hat, as the paper does; its norm is about sqrt(3), so the error
+            is nearly absolute.
     """
     trial, corrected, stress = (t.view(len(z), -1, 3, 3) for t in batch[:3])
     predicted, returned = operator.elastic(z, corrected), operator.plastic(z, trial)
@@ -74,24 +74,24 @@ def fit_latents(
     plastic_target: str = "residual",
     progress: bool = False,
 ) -> Tensor:
-    """Fit only the latents of materials that the operator has not seen; its weights stay as they are.
+    """Fit the latents of unseen materials with the weights of the operator frozen.
 
-    Each latent starts at the candidate with the least error and takes AdamW steps with a cosine schedule.
+    Each latent starts at the candidate with the smallest error and is optimised by AdamW with a cosine schedule.
 
     Args:
         operator: The operator.
-        batch: Samples to fit, sorted by material, the same number of each of M.
-        candidates: Latents to start from, (K, d), such as those of the training trajectories.
+        batch: Samples to fit, sorted by material, the same number for each of the M materials.
+        candidates: Initial latents to choose from, (K, d), such as those of the training trajectories.
         stress_epsilon: As for `evaluate_operator`, (M,).
         residual_epsilon: As for `evaluate_operator`, (M,).
         steps: Number of steps.
-        lr: Learning rate at the start.
-        samples: Samples of each material in a step, taken in turn.
-        plastic_target: As for `evaluate_operator`; an operator is fitted best by the loss that it was trained with.
-        progress: Write the error to stderr ten times.
+        lr: Initial learning rate.
+        samples: Samples of each material in a step; successive steps cycle through all of them.
+        plastic_target: As for `evaluate_operator`. The loss that trained the operator gives the best fit.
+        progress: Print the error to stderr ten times.
 
     Returns:
-        Latents (M, d), without gradient.
+        Latents (M, d), detached.
     """
     count = len(stress_epsilon)
     trial, corrected, stress = (t.view(count, -1, 3, 3) for t in batch[:3])
@@ -129,15 +129,15 @@ def fit_latents(
 
 
 class ConstitutiveMetrics(nn.Module):
-    """Stress MSE [Pa^2], plastic MSE (both as in the paper's Table 3, mean over components), and median relative errors.
+    """Stress MSE [Pa^2] and plastic MSE (mean over components, as in the paper's Table 3), and median relative errors.
 
-    `stress_error` and `plastic_error` are medians over all samples, `plastic_error_yielding` over those that flow, and
-    `stress_error/<family>` and `plastic_error/<family>` over the samples of a family. Beside them stand the scores of predictors that
-    learned nothing: `stress_mse_zero` of zero stress, `plastic_mse_identity` and `plastic_error_yielding_identity` of no correction.
-    Memory does not grow with the samples.
+    `stress_error` and `plastic_error` are medians over all samples, `plastic_error_yielding` over the samples that yield, and
+    `stress_error/<family>` and `plastic_error/<family>` over the samples of a family. The scores of trivial predictors are included for
+    comparison: `stress_mse_zero` predicts zero stress; `plastic_mse_identity` and `plastic_error_yielding_identity` predict no plastic
+    correction. Memory is constant in the number of samples.
 
     Args:
-        prefix: Prepended to the names, e.g. `val/`.
+        prefix: Prefix of the metric names, e.g. `val/`.
         families: Family of each trajectory.
     """
 
@@ -158,7 +158,7 @@ class ConstitutiveMetrics(nn.Module):
         self.plastic_by_family = by_family.clone(prefix=f"{prefix}plastic_error/")
 
     def update(self, answers: OperatorResponse, batch: TrajectoryBatch) -> None:
-        """Add a batch of all trajectories."""
+        """Add a batch with samples of every trajectory."""
         trial, corrected, stress = (t.view_as(answers.stress) for t in batch[:3])
         self.stress.update(preds=answers.stress.flatten(), target=stress.flatten(), errors=answers.stress_error)
         self.plastic.update(preds=answers.corrected.flatten(), target=corrected.flatten(), errors=answers.plastic_error)

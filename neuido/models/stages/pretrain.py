@@ -1,4 +1,4 @@
-"""Stage I: trunks, heads and one latent for each trajectory, learned from constitutive data (paper, "Dynamics Operator Pretraining")."""
+"""Stage I: train trunks, heads and one latent for each trajectory on constitutive data (paper, "Dynamics Operator Pretraining")."""
 
 from typing import Any, Literal
 
@@ -15,10 +15,10 @@ from neuido.types import TrajectoryBatch
 
 
 class PretrainModule(LightningModule):
-    """Stage I.
+    """Train the operator on constitutive data (Stage I).
 
-    The data module gives balanced batches, and says of the trajectories their `names`, `families`, `stress_rms` and
-    `residual_rms`, and of the held-out instances the same with `instance_` before it (`neuido.data.trajectories.trajectory_module`).
+    The data module yields balanced batches. It provides `names`, `families`, `stress_rms` and `residual_rms` of the trajectories, and the
+    same of the held-out instances with the prefix `instance_` (`neuido.data.trajectories.trajectory_module`).
 
     Args:
         trajectory_count: Number of training trajectories, M (linked to the data by the command line).
@@ -27,20 +27,21 @@ class PretrainModule(LightningModule):
         basis_dim: Number of basis functions D (the paper does not say).
         hidden_dim: Width of the trunks (the paper does not say).
         head_dim: Width of the heads (the paper does not say).
-        latent_std: Standard deviation of the latents at the start (paper: 1). What the laws do not feel of it stays in them for good; with
-            0.1 their families lie apart in the space of the latents itself (`neuido latents`).
-        lr: Learning rate of trunks and heads; AdamW with a cosine to zero over the run (paper).
-        latent_lr_factor: The latents learn with this many times `lr`.
-        latent_decay: Weight decay of the latents. Adam moves them at random wherever the laws do not feel them, and this draws that back.
-        latent_decay_to: What that draws them to: `zero`, or the mean of their `family`.
-        weight_decay: Of trunks and heads.
-        relative_epsilon: Floor of the relative loss, as a fraction of the trajectory's RMS (design: about 1 %).
-        plastic_target: `residual`: relative error of F_hat - F_tr; `full`: of F_hat, the paper to the letter.
-        instance_steps: Steps that fit the latents of the held-out instances at the end; 0 leaves that out.
-        instance_lr: Their learning rate.
-        instance_samples: Samples of each instance in such a step.
-        save_to: File to write the operator to at the end of a fit (safetensors); none: only Lightning's checkpoints.
-        init_from: File of `IntrinsicDynamicsOperator.save`, or `pretrained`, to start from; its sizes must be the same.
+        latent_std: Initial standard deviation of the latents (paper: 1). Components that do not affect the laws keep their initial noise;
+            with 0.1 the families are separate in the latent space itself (`neuido latents`).
+        lr: Learning rate of trunks and heads, for AdamW with a cosine schedule to zero over the run (paper).
+        latent_lr_factor: Learning rate of the latents as a multiple of `lr`.
+        latent_decay: Weight decay of the latents. It counteracts the random drift that Adam causes along directions without effect on the
+            laws.
+        latent_decay_to: Target of this decay: `zero`, or the mean of the `family`.
+        weight_decay: Weight decay of trunks and heads.
+        relative_epsilon: Floor of the relative loss, as a fraction of the RMS of the trajectory (about 1 %).
+        plastic_target: `residual`: relative error of F_hat - F_tr; `full`: relative error of F_hat, as in the paper.
+        instance_steps: Steps that fit the latents of the held-out instances at the end; 0 skips them.
+        instance_lr: Learning rate of these steps.
+        instance_samples: Samples of each instance in each of these steps.
+        save_to: File for the operator at the end of a fit (safetensors); without one, only Lightning writes checkpoints.
+        init_from: Operator to start from: a file of `IntrinsicDynamicsOperator.save` of the same sizes, or `pretrained`.
         compile: Compile the trunks with torch.compile.
     """
 
@@ -111,7 +112,7 @@ class PretrainModule(LightningModule):
         data = self.trainer.datamodule
         count = self.hparams.trajectory_count
         if data.trajectory_count != count:
-            raise UserError(f"model.trajectory_count = {count}, and the data have {data.trajectory_count} trajectories")
+            raise UserError(f"model.trajectory_count = {count}, but the data have {data.trajectory_count} trajectories")
         self.stress_epsilon.copy_(self.hparams.relative_epsilon * data.stress_rms)
         self.residual_epsilon.copy_(self._residual_epsilon(data.residual_rms))
         alike = torch.tensor([[a == b for b in data.families] for a in data.families], dtype=torch.float32, device=self.device)
@@ -134,7 +135,7 @@ class PretrainModule(LightningModule):
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         if self.hparams.latent_decay_to == "family":
-            rate = optimizer.param_groups[-1]["lr"] * self.hparams.latent_decay  # decoupled, as AdamW's
+            rate = optimizer.param_groups[-1]["lr"] * self.hparams.latent_decay  # decoupled, as in AdamW
             with torch.no_grad():
                 self.latents.lerp_(self.family_mean @ self.latents, rate)
 
@@ -147,11 +148,11 @@ class PretrainModule(LightningModule):
         return stress + plastic
 
     def _evaluate(self, batch: TrajectoryBatch, target: str = "residual") -> OperatorResponse:
-        """Evaluate a batch of the training trajectories; scores compare residuals, whatever the loss compares."""
+        """Evaluate a batch of training trajectories; scores always compare residuals, whatever the loss compares."""
         return evaluate_operator(self.operator, self.latents, batch, self.stress_epsilon, self.residual_epsilon, target)
 
     def on_train_end(self) -> None:
-        """Score the held-out instances and write the operator; both go to the logger and the file's card."""
+        """Score the held-out instances, log the scores, and write the operator with the scores in its card."""
         figures = validation_scores(self) | {k: float(v) for k, v in self.score_instances().items()}
         self._publish(figures)
 
@@ -170,7 +171,7 @@ class PretrainModule(LightningModule):
             setup = getattr(data, "index", {}).get("setup", {})
             self.operator.save(self.hparams.save_to, {"stage": "I", "steps": self.global_step, "data": setup, "figures": figures})
 
-    # Validation: held-out particles and steps. Test: also held-out instances.
+    # Validation: held-out particles and time steps. Test: held-out instances as well.
 
     def validation_step(self, batch: TrajectoryBatch, batch_idx: int) -> None:
         self.metrics.update(self._evaluate(batch), batch)
@@ -188,7 +189,7 @@ class PretrainModule(LightningModule):
         self.log_dict(self.score_instances())
 
     def score_instances(self) -> dict[str, Tensor]:
-        """Fit a latent to each held-out instance with all weights frozen, and score it on that instance's held-out samples."""
+        """Fit a latent to each held-out instance with all weights frozen, and score it on the held-out samples of the instance."""
         data = self.trainer.datamodule
         if self.hparams.instance_steps == 0 or not data.instance_names:
             return {}

@@ -1,4 +1,4 @@
-"""Training of the flow VAE on flow of neuido's own clips (`neuido film`)."""
+"""Training of the flow VAE on optical flow of simulated clips (`neuido film`)."""
 
 import math
 from typing import Any
@@ -15,18 +15,18 @@ from neuido.models.video.flow_vae import FlowVAE
 
 
 class FlowVAEModule(LightningModule):
-    """Reconstruction of flow videos, with a weak pull of the latents to N(0, 1). The weights of the best validation are kept.
+    """Train the VAE to reconstruct flow videos, with a weak KL prior; the weights of the best validation are kept.
 
     Args:
-        width: Of the VAE.
-        latent_channels: Of the latents (CogVideoX: 16).
-        lr: AdamW; a short rise, then a cosine to zero over the run.
-        weight_decay: Of all weights.
-        kl_weight: Of the divergence to N(0, 1), for each latent number.
-        motion_weight: Further weight of pixels that move: most of a flow video is empty.
+        width: Width of the VAE.
+        latent_channels: Number of latent channels (CogVideoX: 16).
+        lr: Learning rate of AdamW, with a short warm-up and a cosine schedule to zero over the run.
+        weight_decay: Weight decay of all weights.
+        kl_weight: Weight of the KL divergence from N(0, 1), mean over the latent numbers.
+        motion_weight: Additional weight of moving pixels; most of a flow video does not move.
         flow_encoding: `velocity` or `wheel`.
-        speed_scale: The speed that counts as one [m/s].
-        save_to: File to write the VAE to at the end of a fit; none: only Lightning's checkpoints.
+        speed_scale: Speed that is encoded as one [m/s].
+        save_to: File for the VAE at the end of a fit; without one, only Lightning writes checkpoints.
     """
 
     def __init__(
@@ -47,12 +47,12 @@ class FlowVAEModule(LightningModule):
         self.save_hyperparameters()
         self.vae = FlowVAE(width, latent_channels)
         self.latent_sum = torch.zeros(3, dtype=torch.float64)
-        self.best: dict[str, Any] = {}  # of the smallest validation error, so that one bad step late in a run costs little
+        self.best: dict[str, Any] = {}  # weights of the smallest validation error, so that one bad step late in a run does little harm
 
     def configure_optimizers(self) -> dict[str, Any]:
         optimizer = torch.optim.AdamW(self.parameters(), lr=self.hparams.lr, weight_decay=self.hparams.weight_decay, betas=(0.9, 0.99))
         total = optimiser_steps(self.trainer)
-        first = min(100, max(1, total // 10))  # a full first step scatters the latents, and they do not come back
+        first = min(100, max(1, total // 10))  # without a warm-up the first steps scatter the latents for good
 
         def rate(step: int) -> float:
             return min((step + 1) / first, 0.5 + 0.5 * math.cos(math.pi * min(1.0, step / total)))
@@ -65,11 +65,11 @@ class FlowVAEModule(LightningModule):
         return encode_flow(batch.flow, encoding=self.hparams.flow_encoding, speed_scale=self.hparams.speed_scale)
 
     def losses(self, video: Tensor, *, sample: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Return weighted squared error, divergence for each latent number, and the mean latents."""
+        """Return the weighted squared error, the mean KL divergence of a latent number, and the latent means."""
         mean, variance = self.vae.posterior(video)
         latent = mean + (0.5 * variance).exp() * torch.randn_like(mean) if sample else mean
         error = (self.vae.reconstruct(latent) - video).square()
-        # of the wheel's image what does not move is white, of the other's it is zero
+        # pixels at rest are white in the colour wheel and zero in the velocity encoding
         rest = 1.0 if self.hparams.flow_encoding == "wheel" else 0.0
         moves = ((video - rest).abs().amax(1, keepdim=True) > 0.01).float()
         weight = 1 + self.hparams.motion_weight * moves

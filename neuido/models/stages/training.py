@@ -1,4 +1,4 @@
-"""What the training modules share: the length of a run, and what they leave at its end."""
+"""Shared parts of the training modules: the number of steps, final reports, and opening of operator and encoder."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -13,10 +13,10 @@ from neuido.models.video.encoder import DynamicsEncoder
 
 
 def optimiser_steps(trainer: Trainer) -> int:
-    """Return optimiser steps of a whole run.
+    """Return the number of optimiser steps of a whole run.
 
-    `trainer.estimated_stepping_batches` would do, but it sets up the loaders before Lightning restores their state, and a run
-    resumed in the middle of an epoch would then start that epoch anew.
+    `trainer.estimated_stepping_batches` is not used because it sets up the loaders before Lightning restores their state: a run resumed
+    within an epoch would then restart that epoch.
     """
     bounds = [trainer.max_steps] if trainer.max_steps > 0 else []
     if trainer.max_epochs is not None and trainer.max_epochs > 0:
@@ -29,7 +29,7 @@ def optimiser_steps(trainer: Trainer) -> int:
 
 
 def validation_scores(module: LightningModule) -> dict[str, float]:
-    """Return what the last validation logged, by names that begin with `val/`."""
+    """Return the metrics that the last validation logged under `val/`."""
     return {name: float(value) for name, value in module.trainer.callback_metrics.items() if name.startswith("val/")}
 
 
@@ -40,34 +40,34 @@ def report_and_save(
     card: Mapping[str, Any],
     figures: Mapping[str, float] | None = None,
 ) -> None:
-    """Print the figures of a validation and, where `save_to` names a file, write what was trained.
+    """Print the validation metrics and write the trained model to the file `save_to`, if there is one.
 
     Args:
-        module: At the end of its fit; it has the hyperparameter `save_to`.
-        save: Takes the file and its card.
-        card: What the card says beside the figures.
-        figures: By names that begin with `val/`; those of the last validation where absent.
+        module: Trained module with the hyperparameter `save_to`.
+        save: Function that takes the file and its card.
+        card: Entries of the card in addition to the metrics.
+        figures: Metrics under names that begin with `val/`; those of the last validation where absent.
     """
     figures = validation_scores(module) if figures is None else figures
     for name, value in figures.items():
-        if name.count("/") == 1:  # not of single scenes
+        if name.count("/") == 1:  # skip the metrics of single scenes
             module.print(f"{name:40s} {value:.4g}")
     if module.hparams.save_to is not None:
         save(module.hparams.save_to, {**card, "figures": dict(figures)})
 
 
 def open_operator_and_encoder(operator: str, init_from: str | None, vae: str, **sizes) -> tuple[IntrinsicDynamicsOperator, DynamicsEncoder]:
-    """Open a frozen operator, and an encoder that infers latents for it.
+    """Open a frozen operator, and an encoder that infers its latents.
 
     Args:
         operator: File of `IntrinsicDynamicsOperator.save`, or `pretrained`.
-        init_from: File of `DynamicsEncoder.save`, or `pretrained`, whose own VAE and sizes then count; none: a new projector, near
-            the mean latent of Stage I.
-        vae: Of a new projector, see `video_vae.open_vae`.
-        sizes: Options of a new `DynamicsEncoder`.
+        init_from: File of `DynamicsEncoder.save`, or `pretrained`; it brings its own VAE and sizes. Without one, a new projector starts
+            near the mean latent of Stage I.
+        vae: VAE of a new encoder, as in `video_vae.open_vae`.
+        sizes: Other options of a new `DynamicsEncoder`.
 
     Raises:
-        UserError: A file that is missing, or latents of different lengths.
+        UserError: A file is missing, or the latents have different lengths.
     """
     frozen = IntrinsicDynamicsOperator.load(operator)
     frozen.eval().requires_grad_(False)

@@ -1,7 +1,7 @@
-"""The projector's warm-up: from the flow of simulated clips to laws that are known, before any scene's images (not in the paper).
+"""Warm-up of the projector: supervised training on flow of simulated clips with known laws, before Stage II (not in the paper).
 
-Stage II alone sees few scenes, and what it learns from their images holds for them. Here the projector sees many cheap clips of `neuido
-film`, and its latent is errors by the law that the frozen operator makes of it, on samples of the true law: as in Stage I, but with z
+Stage II sees few scenes, and what it learns from their images does not generalise far. The warm-up sees many cheap clips of `neuido film`.
+Its loss compares the law that the frozen operator makes of the inferred latent with samples of the true law, as in Stage I, but with z
 from a video.
 """
 
@@ -26,18 +26,18 @@ from neuido.models.stages.training import open_operator_and_encoder, optimiser_s
 from neuido.models.video.flow import Velocities
 
 STRAIN_FLOOR = 3e-4
-"""Floor of a plastic correction's norm [-] in its relative error."""
+"""Floor of the norm of a plastic correction [-] in its relative error."""
 
 
 class LawErrors(NamedTuple):
-    """How far laws are from true ones, one number each for B materials."""
+    """Errors of the laws of B materials, one number for each, (B,)."""
 
     stress: Tensor
-    """|tau^ - tau| / (|tau^| + |tau| + 1 %), mean over samples: 0 to 1, the same for a stress twice as large as for half of it."""
+    """|tau^ - tau| / (|tau^| + |tau| + 1 %), mean over samples: from 0 to 1, equal for twice and for half the true stress."""
     plastic: Tensor
-    """The same of the correction F_hat - F_tr."""
+    """The same error of the plastic correction F_hat - F_tr."""
     size: Tensor
-    """|log| of the ratio of the stresses' root mean squares, which does not saturate."""
+    """|log| of the ratio of the RMS stresses, which does not saturate."""
 
     def total(self, size_weight: float) -> Tensor:
         """Return the training loss, (B,)."""
@@ -45,7 +45,7 @@ class LawErrors(NamedTuple):
 
 
 def compare_laws(operator: IntrinsicDynamicsOperator, z: Tensor, trial: Tensor, corrected: Tensor, stress: Tensor) -> LawErrors:
-    """Compare the laws of z (B, d) with samples of true ones: trial, corrected (B, n, 3, 3) and stress [Pa] (B, n, 3, 3)."""
+    """Compare the laws of z (B, d) with samples of the true laws: trial and corrected F, and stress [Pa], each (B, n, 3, 3)."""
     predicted, returned = operator.elastic(z, corrected), operator.plastic(z, trial)
     norm = stress.flatten(2).norm(dim=2)
     rms = norm.square().mean(1).sqrt()
@@ -59,23 +59,23 @@ def compare_laws(operator: IntrinsicDynamicsOperator, z: Tensor, trial: Tensor, 
 
 
 class WarmupModule(LightningModule):
-    """Flow of clips -> z -> law, against the law that made the clip; operator and VAE are frozen.
+    """Train the projector so that the law inferred from a clip matches the law that made it; operator and VAE are frozen.
 
     The data module is a `FilmDataModule` with `frames: 0`.
 
     Args:
         operator: File of the operator, or `pretrained`.
-        init_from: Encoder to go on from; none: a new one, near the mean latent of Stage I.
-        vae: Its VAE: a file, `pretrained`, or `cogvideox:` and a source.
-        flow_size, flow_encoding, speed_scale, width, heads, conditions, dropout: Of a new encoder (`DynamicsEncoder`).
-        lr: AdamW with a cosine to zero over the run.
-        weight_decay: Of the projector.
-        size_weight: Of `LawErrors.size` in the loss.
-        mirror: Show mirrored clips too.
-        noise: Standard deviation of noise on the flow latents, in units of theirs, in training.
-        samples: Samples of a clip's law in a step.
-        cache: Folder in which the clips' flow latents are kept; none: nowhere.
-        save_to: File to write the encoder to at the end of a fit.
+        init_from: Encoder to start from; without one, a new projector starts near the mean latent of Stage I.
+        vae: VAE of a new encoder: a file, `pretrained`, or `cogvideox:` and a source.
+        flow_size, flow_encoding, speed_scale, width, heads, conditions, dropout: Options of a new encoder (`DynamicsEncoder`).
+        lr: Learning rate of AdamW, with a cosine schedule to zero over the run.
+        weight_decay: Weight decay of the projector.
+        size_weight: Weight of `LawErrors.size` in the loss.
+        mirror: Augment with mirrored clips.
+        noise: Standard deviation of the noise added to the (normalised) flow latents in training.
+        samples: Samples of the law of each clip in a step.
+        cache: Folder for cached flow latents of the clips.
+        save_to: File for the encoder at the end of a fit.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class WarmupModule(LightningModule):
         self._load()
 
     def _load(self) -> None:
-        """Embed all clips once, since the VAE is frozen; `cache` keeps the results under a key of VAE, flow image and clips."""
+        """Embed all clips once, as the VAE is frozen; the key of the cache covers the VAE, the flow encoding and the clips."""
         if self._clips:
             return
         data: FilmDataModule = self.trainer.datamodule
@@ -150,7 +150,7 @@ class WarmupModule(LightningModule):
         return key.hexdigest()[:24]
 
     def _embed(self, clip: Clip, kept: Path | None) -> tuple[Tensor, Tensor]:
-        """Return flow latents (1 or 2 with the mirrored, V, channels, T', h, w) and conditions (V, 2)."""
+        """Return flow latents (1, or 2 with the mirrored clip, V, channels, T', h, w) and conditions (V, 2)."""
         if kept is not None and kept.is_file():
             found = load_file(kept)
             return found["volume"], found["conditions"]
@@ -194,7 +194,7 @@ class WarmupModule(LightningModule):
         error = (found.clamp(min=1.0) / true).log().abs()
         values = {"val/stress": errors.stress.mean(), "val/plastic": errors.plastic.mean(), "val/size": errors.size.mean()}
         values |= {"val/modulus_error": error.median().exp() - 1, "val/modulus_order": _spearman(found, true)}
-        if bool(elastic.any()):  # what flows does not show its stiffness
+        if bool(elastic.any()):  # a material that flows does not reveal its stiffness
             own = _spearman(found[elastic], true[elastic])
             values |= {"val/modulus_error_elastic": error[elastic].median().exp() - 1, "val/modulus_order_elastic": own}
         self.log_dict(values, prog_bar=True, sync_dist=True)
