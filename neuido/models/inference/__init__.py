@@ -1,1 +1,1 @@
-"""From a recorded scene to its law, particles and images."""
+"""Inference: from a recorded scene to its law, particles and images."""

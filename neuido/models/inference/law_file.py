@@ -20,13 +20,13 @@ WEIGHTS = ("W1", "b1", "W2", "b2", "W3", "b3")
 
 
 def save_law(path: str | os.PathLike, operator: IntrinsicDynamicsOperator, z: Tensor, card: Mapping[str, Any] | None = None) -> None:
-    """Write the law of z (d,): the effective networks, z and lambda, as safetensors, and what a person wants to know beside it as JSON.
+    """Write the law of z (d,) as safetensors (effective networks, z and lambda), and a readable description next to it as JSON.
 
     Args:
-        path: File to write, ending in .safetensors; the JSON gets the same name.
+        path: File to write, ending in .safetensors; the JSON file has the same stem.
         operator: The operator.
-        z: Latent.
-        card: Further entries of the JSON: where the law comes from.
+        z: Latent, (d,).
+        card: Further entries of the JSON file, for example the origin of the law.
     """
     with torch.no_grad():
         elastic, plastic = operator.laws(z)
@@ -43,10 +43,10 @@ def save_law(path: str | os.PathLike, operator: IntrinsicDynamicsOperator, z: Te
 
 
 def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
-    """Read the laws of a file of `save_law`, for a rollout; the operator is not needed.
+    """Read the elastic and plastic law from a file of `save_law`; the operator is not needed.
 
     Raises:
-        UserError: No such file, or not one of this kind.
+        UserError: There is no such file, or it is not a law file.
     """
     config, tensors, _ = read_weights(path, (FORMAT,), "law")
     if config.get("trunk") not in LAWS:

@@ -1,4 +1,4 @@
-"""Files of a predicted motion: particles as a PLY sequence, a video, and a contact sheet of images."""
+"""Output files of a predicted motion: a PLY sequence of particles, a video, and a contact sheet."""
 
 import os
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from neuido.types import ParticleState
 
 
 def write_plys(folder: str | os.PathLike, motion: ParticleState) -> None:
-    """Write `000.ply`, `001.ply`, ...: particles of each frame with x, y, z [m] and vx, vy, vz [m/s]."""
+    """Write the particles of each frame to `000.ply`, `001.ply`, ... with x, y, z [m] and vx, vy, vz [m/s]."""
     from plyfile import PlyData, PlyElement
 
     folder = Path(folder)
@@ -27,25 +27,25 @@ def write_plys(folder: str | os.PathLike, motion: ParticleState) -> None:
         for name, column in zip(vertices.dtype.names, np.concatenate([position, velocity], 1).T):
             vertices[name] = column
         PlyData([PlyElement.describe(vertices, "vertex")]).write(str(folder / f"{k:0{digits}d}.ply"))
-    for old in folder.glob("*.ply"):  # of a longer run before
+    for old in folder.glob("*.ply"):  # left by an earlier, longer run
         if old.stem.isdigit() and int(old.stem) >= len(x):
             old.unlink()
 
 
 def write_video(path: str | os.PathLike, images: Tensor, *, rate: float = 20.0) -> None:
-    """Write an MP4 file, all at once.
+    """Write an MP4 file atomically.
 
     Args:
-        path: File, ending in .mp4.
+        path: File to write, ending in .mp4.
         images: RGB in [0, 1], (K, H, W, 3).
-        rate: Frames a second.
+        rate: Frames per second.
 
     Raises:
-        UserError: OpenCV cannot write there.
+        UserError: OpenCV cannot write the file.
     """
     path = Path(path)
     frames = (255 * images.detach().clamp(0, 1)).round().to(torch.uint8).cpu().numpy()
-    height, width = (n - n % 2 for n in frames.shape[1:3])  # the codec wants even sides
+    height, width = (n - n % 2 for n in frames.shape[1:3])  # the codec requires even sides
     with replacing(path, keep_suffix=True) as hidden:
         writer = cv2.VideoWriter(str(hidden), cv2.VideoWriter_fourcc(*"mp4v"), rate, (width, height))
         if not writer.isOpened():
@@ -56,7 +56,7 @@ def write_video(path: str | os.PathLike, images: Tensor, *, rate: float = 20.0) 
 
 
 def contact_sheet(path: str | os.PathLike, rows: Sequence[Tensor], *, columns: int = 8) -> None:
-    """Write rows of images (K, H, W, 3) in [0, 1] as one PNG: some frames of each, evenly taken, one row below the other."""
+    """Write a PNG with one row for each sequence of images (K, H, W, 3) in [0, 1]; each row shows evenly spaced frames."""
     bands = []
     for row in rows:
         pick = torch.linspace(0, len(row) - 1, min(columns, len(row))).round().long()

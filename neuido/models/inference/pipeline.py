@@ -1,4 +1,4 @@
-"""From the video of a body to its law, and from the law to particles and images: what Stage II, zero-shot inference and scores share.
+"""From the video of a body to its law, and from the law to particles and images, for Stage II, zero-shot inference and scores.
 
 images -> flow -> frozen VAE -> projector -> z -> laws -> rollout -> Gaussians -> images
 """
@@ -22,21 +22,21 @@ from neuido.types import ParticleState
 
 
 def rollout_laws(prepared: PreparedScene, laws: Laws, frames: int, *, segment: int = 0, **options: Any) -> ParticleState:
-    """Simulate the first `frames` frames of a recording under an elastic and a plastic law.
+    """Simulate the first `frames` frames of a recording with an elastic and a plastic law.
 
     Args:
         prepared: The scene.
-        laws: As `Simulator.rollout` takes them.
-        frames: Number of frames K, the start included.
-        segment: Keep the state of a rollout with gradients every so many frames only; 0: of all.
-        options: Of `Simulator.rollout`.
+        laws: Elastic and plastic law for `Simulator.rollout`.
+        frames: Number of frames K, including the initial one.
+        segment: Gradient checkpointing: keep the state only every so many frames; 0: keep all.
+        options: Further options of `Simulator.rollout`.
 
     Raises:
-        UserError: As `Simulator.rollout`: a law too stiff for the step, a particle lost.
+        UserError: As in `Simulator.rollout`: the law is too stiff for the time step, or a particle is lost.
     """
     steps, piece = prepared.substeps(frames), segment * prepared.stride
     if 0 < piece < steps:
-        options["segment"], steps = piece, piece * -(-steps // piece)  # whole pieces; the frames beyond are dropped
+        options["segment"], steps = piece, piece * -(-steps // piece)  # whole segments; the surplus frames are discarded
     motion = prepared.simulator.rollout(steps, *laws, every=prepared.every, **options)
     wanted = slice(frames) if prepared.recorded_frames is None else list(prepared.recorded_frames[:frames])
     return ParticleState(*(t[wanted] for t in motion))
@@ -45,17 +45,20 @@ def rollout_laws(prepared: PreparedScene, laws: Laws, frames: int, *, segment: i
 def rollout_latent(
     prepared: PreparedScene, operator: IntrinsicDynamicsOperator, z: Tensor, frames: int | None = None, *, segment: int = 0
 ) -> ParticleState:
-    """Simulate the first `frames` frames, or all, under the laws of z (d,)."""
+    """Simulate the first `frames` frames (all by default) with the laws of z (d,)."""
     return rollout_laws(prepared, operator.laws(z), frames or prepared.frames, segment=segment)
 
 
 def rollout_with_retries(
     prepared: PreparedScene, run: Callable[[PreparedScene], ParticleState], halvings: int = 2
 ) -> tuple[ParticleState, int]:
-    """Return the motion of `run` and the number of halvings of the time step, at most `halvings`, that it took to run.
+    """Call `run`, and on failure retry with half the time step, up to `halvings` times.
+
+    Returns:
+        The motion, and how often the time step was halved.
 
     Raises:
-        UserError: As `run`, with the smallest substep too.
+        UserError: `run` fails with the smallest time step too.
     """
     for count in range(halvings + 1):
         try:
@@ -67,7 +70,7 @@ def rollout_with_retries(
 
 
 def with_finer_steps(prepared: PreparedScene, times: int) -> PreparedScene:
-    """Return the scene with a time step `times` times smaller; its rollouts are not captured as graphs."""
+    """Return the scene with its time step divided by `times`; its rollouts are not captured as CUDA graphs."""
     source = prepared.source
     finer = replace(source.scene, dt=source.scene.dt / times)
     simulator = Simulator(finer, source.body, density=source.density, device=prepared.simulator.device, graphs=False)
@@ -81,17 +84,17 @@ def render_motion(prepared: PreparedScene, motion: ParticleState, views: list[in
 
 
 class Inference(NamedTuple):
-    """What zero-shot inference gives."""
+    """Result of zero-shot inference."""
 
     z: Tensor
-    """(d,)"""
+    """Latent, (d,)."""
     seconds: float
-    """From the flow latents to the laws' tensors [s], the median of several passes."""
+    """Time from the flow latents to the tensors of the laws [s], median of several passes."""
 
 
 @torch.no_grad()
 def infer_latent(encoder: DynamicsEncoder, operator: IntrinsicDynamicsOperator, prepared: PreparedScene, *, repeat: int = 5) -> Inference:
-    """Infer the latent of a scene in one pass of the encoder, and measure the time until its law can run."""
+    """Infer the latent of a scene in one pass of the encoder, and measure the time until its laws are available."""
     was_training = encoder.training
     encoder.eval()
     times = []
@@ -113,16 +116,16 @@ def _wait(t: Tensor) -> None:
 
 
 def carry_points(rest: Tensor, points: Tensor, x: Tensor, nearest: int = 8) -> Tensor:
-    """Carry points that are no particles with a motion: each moves with the weighted mean displacement of nearby particles.
+    """Advect points by a particle motion: each point moves with the weighted mean displacement of nearby particles.
 
     Args:
-        rest: Particles at t = 0 [m], (P, 3).
+        rest: Particle positions at t = 0 [m], (P, 3).
         points: Points at t = 0 [m], (N, 3).
-        x: Particles in K frames [m], (K, P, 3).
-        nearest: Particles that carry a point, weighted by the inverse square of their distance.
+        x: Particle positions in K frames [m], (K, P, 3).
+        nearest: Number of nearest particles, weighted by the inverse square of their distance.
 
     Returns:
-        (K, N, 3).
+        Positions of the points [m], (K, N, 3).
     """
     from scipy.spatial import cKDTree
 

@@ -1,4 +1,4 @@
-"""A recorded scene with all that stays constant while a law is read from it or fitted to it, on one device."""
+"""A recorded scene on one device, with everything that stays constant while its law is inferred or fitted."""
 
 import math
 import os
@@ -19,35 +19,35 @@ from neuido.physics.runtime.device import choose_device
 from neuido.types import Cameras, Gaussians
 
 STEPS_PER_INTERVAL = 50
-"""Frames of a rollout between two of a recording at uneven times."""
+"""Rollout frames per mean frame interval of a recording at uneven times."""
 
 Laws = tuple[ElasticLaw, PlasticLaw | None]
 
 
 class PreparedScene(NamedTuple):
-    """A scene with everything that does not change while the projector learns, on one device."""
+    """A scene on one device, with everything that stays constant during training."""
 
     source: VisualScene
     simulator: Simulator
     gaussians: Gaussians
     binding: Binding | None
-    """None: Gaussian i is particle i."""
+    """Weights of the Gaussians on the particles; None: Gaussian i is particle i."""
     every: int
-    """Substeps from one frame of a rollout to the next."""
+    """Substeps between two frames of a rollout."""
     images: Tensor
-    """(V, T, H, W, 3) uint8."""
+    """Recorded images, (V, T, H, W, 3) uint8."""
     masks: Tensor
-    """(V, T, H, W) uint8."""
+    """Recorded masks, (V, T, H, W) uint8."""
     cameras: Cameras
     background: Tensor
     training_views: list[int]
-    """Views that are not held out."""
+    """Indices of the views that are not held out."""
     volume: Tensor | None
-    """Flow latents of the views that the encoder sees, (V', channels, T', h, w); none without an encoder."""
+    """Flow latents of the encoder views, (V', channels, T', h, w); None without an encoder."""
     conditions: Tensor | None
-    """(V', 2)"""
+    """Conditions of the encoder views, (V', 2); None without an encoder."""
     recorded_frames: tuple[int, ...] | None = None
-    """Which frames of a rollout are the recording's, of T recorded at uneven times; none: all."""
+    """Indices of the rollout frames that correspond to the recording, for uneven times; None: all frames."""
 
     def __repr__(self) -> str:
         views, frames, height, width = self.images.shape[:4]
@@ -56,42 +56,42 @@ class PreparedScene(NamedTuple):
 
     @property
     def frames(self) -> int:
-        """T."""
+        """Number of recorded frames T."""
         return self.images.shape[1]
 
     @property
     def stride(self) -> int:
-        """Substeps of the recording's mean frame interval, about."""
+        """Approximate number of substeps in the mean frame interval of the recording."""
         return self.every if self.recorded_frames is None else self.every * STEPS_PER_INTERVAL
 
     def substeps(self, frames: int) -> int:
-        """Return substeps of a rollout from the first to the last of so many frames."""
+        """Return the number of substeps from the first to the last of `frames` frames."""
         return self.every * (frames - 1 if self.recorded_frames is None else self.recorded_frames[frames - 1])
 
     @property
     def scoring_views(self) -> list[int]:
-        """The held-out views; all views of a scene that holds none out."""
+        """Indices of the held-out views, or of all views if none is held out."""
         held = self.source.batch.held_out.nonzero()[:, 0].tolist()
         return held or list(range(len(self.images)))
 
     def views(self, views: list[int]) -> Cameras:
-        """Return the cameras of some views."""
+        """Return the cameras of the given views."""
         return self.cameras._replace(viewmats=self.cameras.viewmats[views], Ks=self.cameras.Ks[views])
 
     def recorded(self, views: list[int], frames: int | None = None) -> Tensor:
-        """Return recorded images in [0, 1], (T, V, H, W, 3)."""
+        """Return the recorded images of the given views in [0, 1], (T, V, H, W, 3)."""
         return self.images[views, :frames].transpose(0, 1).float().div_(255)
 
     def silhouettes(self, views: list[int], frames: int | None = None) -> Tensor:
-        """Return recorded masks in [0, 1], (T, V, H, W)."""
+        """Return the recorded masks of the given views in [0, 1], (T, V, H, W)."""
         return self.masks[views, :frames].transpose(0, 1).float().div_(255)
 
 
 def as_device(device: str | torch.device) -> torch.device:
-    """Return a device from its name, `auto` included (CUDA where there is one).
+    """Return the device of a name; `auto` is CUDA where available.
 
     Raises:
-        UserError: `cuda` where there is none.
+        UserError: `cuda` is not available.
     """
     return choose_device(device) if isinstance(device, str) and device in ("auto", "cpu", "cuda") else torch.device(device)
 
@@ -104,18 +104,17 @@ def prepare(
     encoder_views: int = 0,
     cache: str | os.PathLike | None = None,
 ) -> PreparedScene:
-    """Bring a scene to a device, bind its Gaussians and embed its flow.
+    """Prepare a scene on a device: bind its Gaussians to the particles and embed its flow.
 
     Args:
         scene: The scene.
-        encoder: Its frozen VAE makes the flow latents; none: they are not needed.
-        device: `auto` (CUDA where there is one), `cpu`, `cuda`, or a torch device.
-        encoder_views: How many of the training views the encoder sees, the first ones; 0: all.
-        cache: Folder in which flows are kept.
+        encoder: Encoder whose frozen VAE embeds the flow; None if flow latents are not needed.
+        device: `auto` (CUDA where available), `cpu`, `cuda`, or a torch device.
+        encoder_views: Number of training views for the encoder, starting with the first; 0: all.
+        cache: Folder for cached optical flow.
 
     Raises:
-        UserError: Two frames at one time, no training view, and as `Simulator` and
-            `DynamicsEncoder.measure_flow`.
+        UserError: Two frames have the same time, there is no training view, or as in `Simulator` and `DynamicsEncoder.measure_flow`.
     """
     batch, device = scene.batch, as_device(device)
     dt = fitting_step(batch.times, scene.scene.dt)
@@ -155,9 +154,9 @@ def prepare(
 
 
 def fitting_step(times: Tensor, dt: float) -> float:
-    """Return the largest step [s] up to `dt` of which the even interval of frames is a whole multiple; `dt` for uneven times.
+    """Return the largest time step [s] up to `dt` that divides the frame interval; `dt` for uneven times.
 
-    A step that already divides the interval to one part in a thousand stays as it is.
+    `dt` is kept if it divides the interval to within 0.1 %.
     """
     steps = torch.as_tensor(times, dtype=torch.float64).diff()
     if not len(steps) or not float(steps.min()) > 0 or float((steps - steps.mean()).abs().max()) > 0.01 * float(steps.mean()):
@@ -170,12 +169,12 @@ def fitting_step(times: Tensor, dt: float) -> float:
 
 
 def frame_substeps(times: Tensor, dt: float, name: str) -> tuple[int, tuple[int, ...] | None]:
-    """Return the substeps between frames of a rollout, and the indices of the recorded frames (None where times are even to 1 %).
+    """Return the number of substeps between rollout frames, and the indices of the recorded frames (None for times even to 1 %).
 
     Uneven times are rounded to a fiftieth of the mean interval.
 
     Raises:
-        UserError: Even times that are no whole number of substeps apart, two frames at one time.
+        UserError: The interval of even times is not a whole number of substeps, or two frames have the same time.
     """
     steps = torch.as_tensor(times, dtype=torch.float64).diff()
     if len(steps) and float((steps - steps.mean()).abs().max()) > 0.01 * float(steps.mean()) > 0:
@@ -187,5 +186,5 @@ def frame_substeps(times: Tensor, dt: float, name: str) -> tuple[int, tuple[int,
     interval = frame_interval_of(times)
     every = round(interval / dt)
     if every < 1 or abs(every * dt - interval) > 1e-3 * interval:
-        raise UserError(f"{name}: frames are {interval:g} s apart, no whole number of substeps of {dt:g} s; change dt or frame_step")
+        raise UserError(f"{name}: frames are {interval:g} s apart, not a whole number of substeps of {dt:g} s; change dt or frame_step")
     return every, None

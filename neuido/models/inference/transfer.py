@@ -1,16 +1,16 @@
-"""The laws that were read from videos, under other conditions: another velocity, another shape, two bodies in contact (paper, transfer).
+"""Inferred laws under other conditions: another velocity, another shape, two bodies in contact (paper, transfer).
 
 A file of conditions, `neuido-conditions/1`:
 
     format: neuido-conditions/1
     name: thrown
-    frames: 80               # optional; of the first body's recording
-    bodies:                  # one, or several that share the first one's scene, each with the law of its own video
-      - of: 0                # number or name of the predicted scene whose law, body and look this is
-        velocity: [0.0, -3.0, 0.0]          # optional, instead of the recorded one [m/s]
+    frames: 80               # optional; default: as in the recording of the first body
+    bodies:                  # one or more bodies in the scene of the first one, each with its own law
+      - of: 0                # number or name of the predicted scene that provides law, body and appearance
+        velocity: [0.0, -3.0, 0.0]          # optional, replaces the recorded velocity [m/s]
         angular_velocity: [0.0, 0.0, 4.0]   # optional [rad/s]
         shift: [0.0, 0.1, 0.0]              # optional [m]
-        shape: {shape: ball, ...}           # optional: another body, as in a scene file's `body`
+        shape: {shape: ball, ...}           # optional: another body, as `body` in a scene file
 """
 
 import os
@@ -41,6 +41,7 @@ class BodyCondition(NamedTuple):
     """One body of a condition."""
 
     of: int | str
+    """Number or name of the predicted scene that provides law, body and appearance."""
     velocity: Vector | None = None
     angular_velocity: Vector = ZERO
     shift: Vector = ZERO
@@ -48,7 +49,7 @@ class BodyCondition(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """A file of conditions."""
+    """Content of a file of conditions."""
 
     name: str
     bodies: tuple[BodyCondition, ...]
@@ -56,10 +57,10 @@ class Condition(NamedTuple):
 
 
 def read_conditions(path: str | os.PathLike) -> Condition:
-    """Read a file of conditions, by its path or by its name in configs/conditions.
+    """Read a file of conditions, given by its path or by its name in configs/conditions.
 
     Raises:
-        UserError: No such file, an unknown or missing key, a value of the wrong kind.
+        UserError: The file is missing, or a key is unknown, missing or of the wrong type.
     """
     path = Path(path)
     if not path.is_file():
@@ -95,17 +96,17 @@ def _body(entry: Any, where: str) -> BodyCondition:
 
 
 def simulate_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]]) -> tuple[ParticleState, Gaussians, PreparedScene]:
-    """Roll a condition out.
+    """Simulate a condition.
 
     Args:
         condition: The condition.
-        known: Scenes that were predicted, with their laws.
+        known: Predicted scenes with their laws.
 
     Returns:
-        Frames of all particles, all Gaussians in these frames, and the scene that lends its surroundings and cameras.
+        Motion of all particles, all Gaussians in each frame, and the scene that provides surroundings and cameras.
 
     Raises:
-        UserError: A scene that was not predicted, bodies that overlap or leave the domain, and what a rollout refuses.
+        UserError: A scene was not predicted, bodies overlap or leave the domain, or the rollout fails.
     """
     try:
         chosen = [_find(known, body.of) for body in condition.bodies]
@@ -116,7 +117,7 @@ def simulate_condition(condition: Condition, known: list[tuple[PreparedScene, La
         device = first.volume.device
         density = first.source.density
         if any(prepared.source.density != density for prepared, _ in chosen):
-            raise UserError("the bodies have different densities; one scene takes one")
+            raise UserError("the bodies have different densities; a scene has one density")
         simulator = Simulator(first.source.scene, joined, density=density, device=device, graphs=len(chosen) == 1)
         steps = ((condition.frames or first.frames) - 1) * first.stride
         pairs = [laws for _, laws in chosen]
@@ -143,7 +144,7 @@ def simulate_condition(condition: Condition, known: list[tuple[PreparedScene, La
 
 
 def run_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]], out: str | os.PathLike) -> Path:
-    """Simulate a condition, write its particles, video and picture, and return the folder."""
+    """Simulate a condition, write its particles, video and contact sheet, and return their folder."""
     motion, gaussians, first = simulate_condition(condition, known)
     with torch.no_grad():
         images = render(gaussians, first.views([first.scoring_views[0]]), background=first.background)[0][:, 0]
@@ -171,15 +172,15 @@ def _place(body: BodyCondition, prepared: PreparedScene) -> tuple[Body, Gaussian
     if body.shape is not None:
         shape = body.shape
         spread = 0.6 * float(shape.volume.mean()) ** (1 / 3)
-        # stripes of the two commonest shades of the recorded body, so that a motion can be seen
+        # stripes in a dark and a light mean colour of the recorded body make the motion visible
         shades = colours_of(gaussians.harmonics, None, degree=0).cpu().clamp(0, 1)
         order = shades.mean(1).argsort()
         dark, light = shades[order[: len(order) // 2]].mean(0), shades[order[len(order) // 2 :]].mean(0)
         stripe = ((shape.x - shape.x.mean(0)) / (4 * spread)).floor().long().sum(1) % 2
         colours = torch.where(stripe[:, None] == 0, 0.8 * dark, light)
         like = gaussians.means
-        dressed = attach_gaussians(shape.x, shape.volume, colours, spread=0.6)
-        own, gaussians = shape, Gaussians(*(None if t is None else t.to(like) for t in dressed))
+        coloured = attach_gaussians(shape.x, shape.volume, colours, spread=0.6)
+        own, gaussians = shape, Gaussians(*(None if t is None else t.to(like) for t in coloured))
     shift = torch.tensor(body.shift, dtype=own.x.dtype)
     x, v = own.x + shift, own.v
     if body.velocity is not None or body.angular_velocity != ZERO:
@@ -189,7 +190,7 @@ def _place(body: BodyCondition, prepared: PreparedScene) -> tuple[Body, Gaussian
 
 
 def _apart(bodies: list[Body], dx: float) -> None:
-    """Refuse bodies whose particles are closer than half a cell: they would start as one body."""
+    """Check that bodies are at least half a cell apart; otherwise they would start as one body."""
     from scipy.spatial import cKDTree
 
     for i in range(len(bodies)):

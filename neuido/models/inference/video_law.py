@@ -1,4 +1,4 @@
-"""The law that a video shows, read in one pass of the encoder (zero-shot): what `read_law` and `neuido predict` return."""
+"""Zero-shot inference of a law from a video in one pass of the encoder, for `read_law` and `neuido predict`."""
 
 import os
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ class VideoLaw:
         operator: The operator.
         latent: z, (d,).
         scene: Name of the recorded scene.
-        views: Number of views that the encoder saw.
-        frames: Number of frames of the recording.
-        seconds: Time from the flow latents to the law [s], where it was measured.
-        prepared: The scene, for `rollout`; none: the law alone.
+        views: Number of views that the encoder used.
+        frames: Number of recorded frames.
+        seconds: Measured time from the flow latents to the law [s].
+        prepared: The scene, which `rollout` needs.
     """
 
     def __init__(
@@ -53,13 +53,13 @@ class VideoLaw:
     def infer(
         cls, encoder: DynamicsEncoder, operator: IntrinsicDynamicsOperator, prepared: PreparedScene, *, repeat: int = 5
     ) -> "VideoLaw":
-        """Read the law of a prepared scene.
+        """Infer the law of a prepared scene.
 
         Args:
-            encoder: On the scene's device.
-            operator: On the scene's device.
-            prepared: Of `prepare` with this encoder.
-            repeat: Passes whose median time is `seconds`.
+            encoder: Encoder on the device of the scene.
+            operator: Operator on the device of the scene.
+            prepared: Result of `prepare` with this encoder.
+            repeat: Number of passes to time; `seconds` is their median.
         """
         found = infer_latent(encoder, operator, prepared, repeat=repeat)
         views = 0 if prepared.volume is None else len(prepared.volume)
@@ -67,37 +67,37 @@ class VideoLaw:
         return cls(operator, found.z, scene=name, views=views, frames=prepared.frames, seconds=found.seconds, prepared=prepared)
 
     def law(self) -> Laws:
-        """Return the elastic and the plastic law, as `Simulator.rollout` takes them."""
+        """Return the elastic and the plastic law for `Simulator.rollout`."""
         return self.operator.laws(self.latent)
 
     def rollout(self, frames: int | None = None) -> tuple[ParticleState, int]:
-        """Simulate the recorded body under this law.
+        """Simulate the recorded body with this law.
 
         Args:
-            frames: Number of frames K, the start included; all of the recording where absent.
+            frames: Number of frames K, including the initial one; all recorded frames where absent.
 
         Returns:
-            The motion, (K, P, ...), and how often the time step was halved because the law is too stiff for the scene's own.
+            The motion, (K, P, ...), and how often the time step was halved because the law is too stiff for that of the scene.
 
         Raises:
-            UserError: The law does not run, with a quarter of the scene's time step either.
-            ValueError: The law was made without a scene.
+            UserError: The simulation fails even with a quarter of the time step of the scene.
+            ValueError: The law has no scene.
         """
         if self.prepared is None:
-            raise ValueError("this law was made without a scene: roll it out with Simulator(scene, body).rollout(steps, *law.law())")
+            raise ValueError("this law has no scene: simulate it with Simulator(scene, body).rollout(steps, *law.law())")
         with torch.no_grad():
             return rollout_with_retries(self.prepared, lambda scene: rollout_latent(scene, self.operator, self.latent, frames))
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the law to a .safetensors file, and what a person wants to know to a .json file beside it.
+        """Write the law to a .safetensors file, and a readable description to a .json file next to it.
 
-        `neuido.models.load_law` reads the file back without the operator.
+        `neuido.models.load_law` reads the file; it does not need the operator.
         """
         card: dict[str, Any] = {"scene": self.scene, "views": self.views, "frames": self.frames, "seconds": self.seconds}
         save_law(Path(path), self.operator, self.latent, card | {"young": self.moduli.young, "poisson": self.moduli.poisson})
 
     def summary(self) -> str:
-        """Return one line: the moduli with their units, and the time of the inference."""
+        """Return the moduli with their units and the inference time in one line."""
         return f"{self.moduli}" + ("" if self.seconds is None else f"; law read in {1e3 * self.seconds:.1f} ms")
 
     def __repr__(self) -> str:
@@ -119,26 +119,26 @@ def read_law(
     cache: str | os.PathLike | None = None,
     device: str | torch.device = "auto",
 ) -> VideoLaw:
-    """Read a material law from the video of a moving body, zero-shot, as `neuido predict` does.
+    """Infer a material law from the video of a moving body, zero-shot, as `neuido predict` does.
 
     Args:
         recording: Folder of a multi-view recording that `neuido reconstruct` has prepared, or a scene of `load_visual`.
         operator: File of the operator, `pretrained`, or an operator.
         encoder: File of the encoder, `pretrained`, `pretrained-small` (few, coarse frames), or an encoder.
-        reconstruction: Folder that `neuido reconstruct` wrote; `<recording>/reconstruction` where absent.
-        recording_name: Which recording of an experiment with several.
+        reconstruction: Output folder of `neuido reconstruct`; `<recording>/reconstruction` where absent.
+        recording_name: Name of the recording, for an experiment with several.
         views: Names of the views to read; all where absent.
-        frame_step: Take each n-th frame.
+        frame_step: Use every n-th frame.
         frame_count: Number of frames; all where absent.
-        encoder_views: Number of training views that the encoder sees, the first ones; 0: all.
-        cache: Folder in which optical flow is kept; none: nowhere.
-        device: `auto` (CUDA where there is one), `cpu`, or `cuda`.
+        encoder_views: Number of training views for the encoder, starting with the first; 0: all.
+        cache: Folder for cached optical flow; no cache where absent.
+        device: `auto` (CUDA where available), `cpu`, or `cuda`.
 
     Returns:
         The law: `.law()` for `Simulator.rollout`, `.moduli`, `.latent`, `.save(path)`, `.rollout()`.
 
     Raises:
-        UserError: A file that is missing or malformed, uneven frames, no training view, or latents of different lengths.
+        UserError: A file is missing or malformed, the frames are uneven, there is no training view, or the latents differ in length.
     """
     chosen = as_device(device)
     if isinstance(recording, VisualScene):

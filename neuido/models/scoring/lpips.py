@@ -1,7 +1,7 @@
-"""LPIPS without torchvision: the feature stacks of VGG16 and AlexNet, with the linear heads that torchmetrics ships (Zhang et al. 2018).
+"""LPIPS without torchvision (Zhang et al. 2018): feature layers of VGG16 or AlexNet, with the linear heads that torchmetrics ships.
 
-The backbone is read from a local file, torchvision's `vgg16-397923af.pth` or `alexnet-owt-7be5be79.pth`, or the same tensors as
-safetensors. Where there is none, there is no value: `open_lpips` says why.
+The backbone is read from a local file: `vgg16-397923af.pth` or `alexnet-owt-7be5be79.pth` of torchvision, or the same tensors as
+safetensors. Without one LPIPS is not computed, and `open_lpips` returns the reason.
 """
 
 import os
@@ -16,17 +16,17 @@ from torch.nn import functional
 from neuido.errors import UserError
 from neuido.physics.runtime.device import as_device
 
-# output channels of the convolutions (kernel, stride, padding), "M" for pooling; a feature is taken after each group
+# output channels of the convolutions, "M" for max pooling; a feature is taken after each group
 STACKS = {
     "vgg": ((64, 64), ("M", 128, 128), ("M", 256, 256, 256), ("M", 512, 512, 512), ("M", 512, 512, 512)),
     "alex": ((64,), ("M", 192), ("M", 384), (256,), (256,)),
 }
-FIRST = {64: (11, 4, 2), 192: (5, 1, 2)}
+FIRST = {64: (11, 4, 2), 192: (5, 1, 2)}  # kernel, stride and padding of AlexNet's first convolutions, by output channels
 FILES = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}
 
 
 class Absent(NamedTuple):
-    """A value that is missing, with its reason."""
+    """Placeholder for a metric that is not available, with the reason."""
 
     reason: str
 
@@ -35,10 +35,10 @@ class LPIPS(nn.Module):
     """Learned perceptual image patch similarity.
 
     Args:
-        net: `vgg` (what the peers report) or `alex`.
+        net: `vgg` (as in most publications) or `alex`.
 
     Attributes:
-        channels: Of the five features.
+        channels: Channels of the five features.
     """
 
     def __init__(self, net: str = "vgg"):
@@ -69,16 +69,16 @@ class LPIPS(nn.Module):
 
         path = Path(torchmetrics.functional.image.__file__).parent / "lpips_models" / f"{self.net}.pth"
         if not path.is_file():
-            raise UserError(f"torchmetrics comes without {path.name}: LPIPS needs a torchmetrics that ships its heads, 1.0 or later")
+            raise UserError(f"torchmetrics lacks {path.name}: LPIPS needs its linear heads, which torchmetrics 1.0 or later ships")
         weights = torch.load(path, map_location="cpu", weights_only=True)
         for i, head in enumerate(self.heads):
             head.weight.data.copy_(weights[f"lin{i}.model.1.weight"])
 
     def load_backbone(self, path: str | os.PathLike) -> None:
-        """Take the convolutions of a torchvision file (`features.N.weight`).
+        """Load the convolutions from a torchvision file (`features.N.weight`).
 
         Raises:
-            UserError: No such file, or one without these tensors.
+            UserError: The file cannot be read or lacks these tensors.
         """
         try:
             if str(path).endswith(".safetensors"):
@@ -101,7 +101,7 @@ class LPIPS(nn.Module):
                 own.data.copy_(given)
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return distance of each pair of images (B, 3, H, W) in [0, 1], (B,)."""
+        """Return the distance of each pair of images (B, 3, H, W) in [0, 1], (B,)."""
         total = a.new_zeros(len(a))
         x, y = (((2 * image - 1) - self.shift) / self.spread for image in (a, b))
         for group, head in zip(self.groups, self.heads):
@@ -115,18 +115,21 @@ def open_lpips(backbone: str | None = None, net: str = "vgg", device: str | torc
     """Open LPIPS with the weights of a local file.
 
     Args:
-        backbone: The file; none: what torch's hub has kept of torchvision, if anything.
+        backbone: File of the weights; where absent, the file of torchvision in the cache of torch.hub, if there is one.
         net: `vgg` or `alex`.
-        device: Where it runs.
+        device: `auto` (CUDA where available), `cpu`, `cuda`, or a torch device.
 
     Returns:
-        The module, or why there is none.
+        The module, or the reason why it is not available.
+
+    Raises:
+        UserError: The given file does not exist or does not fit.
     """
     path = Path(backbone).expanduser() if backbone else Path(torch.hub.get_dir()) / "checkpoints" / FILES[net]
     if not path.is_file():
         if backbone:
             raise UserError(f"lpips_backbone = {backbone}: there is no such file")
-        return Absent(f"no weights of the {net} backbone: give torchvision's {FILES[net]} by lpips_backbone")
+        return Absent(f"no weights of the {net} backbone: give the file {FILES[net]} of torchvision as lpips_backbone")
     module = LPIPS(net)
     module.load_backbone(path)
     return module.to(as_device(device))

@@ -1,4 +1,4 @@
-"""Metrics of laws and of motions, as torchmetrics: distances of point sets, and medians over samples."""
+"""Metrics of laws and motions for torchmetrics: distances of point sets, and medians over samples."""
 
 from typing import Any
 
@@ -10,14 +10,14 @@ from neuido.physics.linalg.nearest import nearest_by_pairs
 
 
 class MedianRelativeError(Metric):
-    """Median of per-sample relative errors, from a histogram of their logarithm.
+    """Median of per-sample relative errors, computed from a histogram of their logarithm.
 
-    1024 bins over 1e-8 to 1e4, so the reported median is exact to 1.4 % of itself and the memory does not grow with the samples. States
-    add up over processes. An error below 1e-8 counts as 1e-8, and the median is then reported as 0.
+    The 1024 bins cover 1e-8 to 1e4, so the median is accurate to 1.4 % and memory is constant in the number of samples. States are summed
+    over processes. A median in the lowest bin is reported as 0.
 
     Args:
-        below: The lowest error told apart.
-        above: The highest.
+        below: Lower end of the histogram; smaller errors fall into the first bin.
+        above: Upper end of the histogram; larger errors fall into the last bin.
         bins: Number of bins.
     """
 
@@ -31,13 +31,13 @@ class MedianRelativeError(Metric):
         self.add_state("histogram", default=torch.zeros(bins, dtype=torch.long), dist_reduce_fx="sum")
 
     def update(self, errors: Tensor) -> None:
-        """Add relative errors (...,) >= 0. NaN counts as the highest."""
+        """Add relative errors (...,) >= 0; NaN counts as infinite."""
         x = (torch.where(errors.isnan(), float("inf"), errors.detach()).flatten().log() - self.low) / self.width
         index = x.clamp(0, self.bins - 1).long()
         self.histogram.index_add_(0, index, torch.ones_like(index))
 
     def compute(self) -> Tensor:
-        """Return the median [-], NaN without samples."""
+        """Return the median [-]; NaN without samples."""
         total = self.histogram.sum()
         if total == 0:
             return torch.tensor(float("nan"), device=self.histogram.device)
@@ -47,22 +47,22 @@ class MedianRelativeError(Metric):
 
 
 def nearest_squared(a: Tensor, b: Tensor) -> Tensor:
-    """Return squared distance of each point to its nearest in the other set [unit of a, squared].
+    """Return the squared distance of each point to the nearest point of the other set [unit of a, squared].
 
-    On the CPU by a k-d tree a frame, on a GPU by all pairs of all frames in one launch (`physics.nearest`).
+    The CPU uses a k-d tree for each frame; a GPU compares all pairs of all frames in one launch (`physics.linalg.nearest`).
 
     Args:
-        a: Points (P, 3), or of frames (..., P, 3).
-        b: Points (Q, 3), or of as many frames (..., Q, 3).
+        a: Points (P, 3), or frames of points (..., P, 3).
+        b: Points (Q, 3), or the same number of frames (..., Q, 3).
 
     Returns:
         (P,), or (..., P).
 
     Raises:
-        ValueError: Another number of frames, or no point in `b`.
+        ValueError: The numbers of frames differ, or `b` has no point.
     """
     if a.shape[:-2] != b.shape[:-2] or a.shape[-1] != 3 or b.shape[-1] != 3 or not b.shape[-2]:
-        raise ValueError(f"points of shapes {tuple(a.shape)} and {tuple(b.shape)}; needed (..., P, 3) and (..., Q, 3), Q >= 1")
+        raise ValueError(f"points of shapes {tuple(a.shape)} and {tuple(b.shape)}; expected (..., P, 3) and (..., Q, 3) with Q >= 1")
     frames, others = a.detach().reshape(-1, *a.shape[-2:]), b.detach().reshape(-1, *b.shape[-2:]).to(a)
     if a.is_cuda:
         return nearest_by_pairs(frames, others).reshape(a.shape[:-1])
@@ -73,15 +73,15 @@ def nearest_squared(a: Tensor, b: Tensor) -> Tensor:
 
 
 def chamfer_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Return mean squared nearest distance from a (..., P, 3) to b (..., Q, 3) plus that from b to a, (...) [unit of a, squared]."""
+    """Return the mean squared nearest distance from a (..., P, 3) to b (..., Q, 3) plus that from b to a, (...) [unit of a, squared]."""
     return nearest_squared(a, b).mean(-1) + nearest_squared(b, a).mean(-1)
 
 
 def resampling_floor(points: Tensor, seed: int = 0) -> Tensor:
-    """Return the Chamfer distance between two random halves of a point set (..., P, 3): what a perfect law drawn anew would score, (...).
+    """Return the Chamfer distance between two random halves of a point set (..., P, 3), (...): the score of a resampled perfect prediction.
 
-    Halves are sparser than the set; nearest distances in three dimensions go with P^(-1/3), so the value is multiplied by 2^(-2/3).
-    All frames are halved alike.
+    The halves are sparser than the set. Nearest distances in three dimensions scale with P^(-1/3), so the squared distance is multiplied by
+    2^(-2/3). All frames are split in the same way.
     """
     count = points.shape[-2]
     order, half = torch.randperm(count, generator=torch.Generator().manual_seed(seed)).to(points.device), count // 2
@@ -89,14 +89,14 @@ def resampling_floor(points: Tensor, seed: int = 0) -> Tensor:
 
 
 def matched_rmse(a: Tensor, b: Tensor) -> Tensor:
-    """Return root mean square distance of particles that correspond, (..., P, 3) -> (); over frames and particles."""
+    """Return the root mean square distance of corresponding particles over all frames, (..., P, 3) -> ()."""
     return (a - b).square().sum(-1).mean().sqrt()
 
 
 class ChamferDistance(Metric):
-    """Chamfer distance, mean over frames: squared, both directions summed, times `scale`.
+    """Chamfer distance (squared, sum of both directions), mean over frames, times `scale`.
 
-    With `scale = 1e4` and coordinates of the unit cube this is the unit of the paper's tables.
+    `scale = 1e4` with coordinates in the unit cube gives the unit of the paper's tables.
     """
 
     full_state_update = False
@@ -111,13 +111,13 @@ class ChamferDistance(Metric):
         self.add_state("frames", default=torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
 
     def update(self, prediction: Tensor, target: Tensor) -> None:
-        """Add frames: points (P, 3) and (Q, 3), or K frames of them (K, P, 3) and (K, Q, 3)."""
+        """Add one frame of points (P, 3) and (Q, 3), or K frames (K, P, 3) and (K, Q, 3)."""
         distances = chamfer_distance(prediction, target)
         self.total += distances.double().sum()
         self.frames += distances.numel()
 
     def compute(self) -> Tensor:
-        """Return mean over frames times `scale`."""
+        """Return the mean over frames times `scale`."""
         return self.scale * self.total / self.frames
 
 
@@ -133,7 +133,7 @@ class MatchedRMSE(Metric):
         self.add_state("points", default=torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
 
     def update(self, prediction: Tensor, target: Tensor) -> None:
-        """Add points (..., P, 3) and their counterparts."""
+        """Add points (..., P, 3) and the corresponding target points."""
         square = (prediction - target).square().sum(-1)
         self.total += square.double().sum()
         self.points += square.numel()

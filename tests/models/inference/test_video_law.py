@@ -76,7 +76,7 @@ def test_latents_of_another_length_are_refused(operator, tmp_path):
 
 def test_a_law_without_a_scene_does_not_roll_out(operator):
     law = VideoLaw(operator, operator.latent("jelly"))
-    with pytest.raises(ValueError, match="made without a scene"):
+    with pytest.raises(ValueError, match="has no scene"):
         law.rollout()
     assert "nan" not in law.summary()
 
