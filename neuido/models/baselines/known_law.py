@@ -1,4 +1,4 @@
-"""The parameters of a law whose family is known, fitted by gradient (PAC-NeRF, Li et al. 2023; GIC, Cai et al. 2024)."""
+"""System identification with a known constitutive family (PAC-NeRF, Li et al. 2023; GIC, Cai et al. 2024)."""
 
 import math
 from typing import Any
@@ -19,26 +19,26 @@ PARTS = ("elasticity", "plasticity")
 
 @renamed_options(free="free_parameters")
 class KnownLaw(Method):
-    """The parameters of a law whose family is given, by gradient through simulator and renderer (PAC-NeRF; GIC).
+    """Fit the parameters of a given constitutive family by gradients through simulator and renderer (PAC-NeRF; GIC).
 
-    The family is that of the truth where a scene knows it, else that of the believed model. Young's modulus, yield stress and viscosity are
-    fitted as decimal logarithms, Poisson's ratio and the friction angle within bounds.
+    The family is that of the true law if the scene has it, else that of the declared model. Young's modulus, yield stress and viscosity are
+    fitted as decimal logarithms; Poisson's ratio and the friction angle are fitted within bounds.
 
     Args:
-        young: Start of Young's modulus [Pa] (PAC-NeRF: 316228).
-        poisson: Start of Poisson's ratio, between 0 and 0.49 (PAC-NeRF: 0.25).
-        yield_stress: Start of the yield stress [Pa] (GIC: 1000).
-        friction_angle: Start of the friction angle [degrees], between 1 and 60 (GIC: 10).
-        viscosity: Start of a Kelvin-Voigt shear viscosity [Pa s], fitted too; none: the body has none.
+        young: Initial Young's modulus [Pa] (PAC-NeRF: 316228).
+        poisson: Initial Poisson's ratio, between 0 and 0.49 (PAC-NeRF: 0.25).
+        yield_stress: Initial yield stress [Pa] (GIC: 1000).
+        friction_angle: Initial friction angle [degrees], between 1 and 60 (GIC: 10).
+        viscosity: Initial Kelvin-Voigt shear viscosity [Pa s], which is fitted too; no viscosity where absent.
         free_parameters: Names of the parameters to fit; all that the family has where absent.
-        rates: Rates of some, in decades, Poisson's ratio, degrees; the others as `RATES`.
+        rates: Learning rates that replace those of `RATES`: decades for logarithms, absolute for Poisson's ratio, degrees for the angle.
 
     Raises:
-        UserError: A start outside its range, an unknown name.
+        UserError: An initial value is out of range, or a name is unknown.
     """
 
     RATES = {"young": 0.1, "poisson": 0.01, "yield_stress": 0.1, "friction_angle": 1.0, "viscosity": 0.05}
-    """PAC-NeRF's and GIC's."""
+    """Learning rates of PAC-NeRF and GIC."""
     BOUNDS = {"poisson": (0.0, 0.49), "friction_angle": (1.0, 60.0)}
 
     steps = 100
@@ -91,7 +91,7 @@ class KnownLaw(Method):
         """Return the parameters in SI units and degrees, differentiable, () each."""
         values = {}
         for name, raw in self.raw.items():
-            if name in self.BOUNDS:  # of slope one in the middle, so that a rate has the parameter's own unit (PAC-NeRF)
+            if name in self.BOUNDS:  # slope one at the centre, so that a rate has the unit of the parameter (PAC-NeRF)
                 low, high = self.BOUNDS[name]
                 half = (high - low) / 2
                 values[name] = low + half * (1 + (raw / half).tanh())

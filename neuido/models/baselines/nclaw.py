@@ -1,4 +1,4 @@
-"""NCLaw's trained networks, as they are and adapted to images by LoRA (Ma et al. 2023; NeuMA, Cao et al. 2024)."""
+"""The trained networks of NCLaw (Ma et al. 2023), unchanged or adapted to images by LoRA (NeuMA, Cao et al. 2024)."""
 
 import math
 from pathlib import Path
@@ -17,20 +17,20 @@ from neuido.physics.laws.neural.invariants import InvariantElastic, InvariantPla
 LAYERS = (("layers.0", (64, 13)), ("layers.1", (64, 64)), ("final_layer", (9, 64)))
 PARTS = ("elasticity", "plasticity")
 MATERIALS = {"identity": "jelly", "von_mises": "plasticine", "drucker_prager": "sand"}
-"""NCLaw's material for a plasticity; NeuMA chooses so for its six scenes."""
+"""Material of NCLaw for each plasticity law; NeuMA makes the same choice for its six scenes."""
 
 
 def load_nclaw(path: str | Path) -> tuple[InvariantElastic, InvariantPlastic]:
-    """Read NCLaw's trained laws (Ma et al. 2023, `InvariantFullMeta`; see `neuido.physics.laws.neural.invariants`).
+    """Read the trained laws of NCLaw (Ma et al. 2023, `InvariantFullMeta`; see `neuido.physics.laws.neural.invariants`).
 
     Args:
         path: npz file with `elasticity.*` and `plasticity.*`, each `layers.0`, `layers.1` and `final_layer`.
 
     Returns:
-        (elastic law, plastic law) for one scene or shared by all.
+        Elastic and plastic law, for one scene or shared by all.
 
     Raises:
-        UserError: the file is missing or holds other arrays.
+        UserError: The file is missing or holds other arrays.
     """
     elastic, plastic = read_nclaw_weights(path)
     return InvariantElastic(*(w[None] for w in elastic)), InvariantPlastic(*(w[None] for w in plastic))
@@ -49,7 +49,7 @@ def read_nclaw_weights(path: str | Path) -> tuple[list[Tensor], list[Tensor]]:
         with np.load(path, allow_pickle=False) as arrays:
             weights = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
     except (ValueError, OSError, EOFError) as error:
-        raise UserError(f"NCLaw's weights {path} are no npz file: {error}") from error
+        raise UserError(f"NCLaw's weights {path} are not an npz file: {error}") from error
     return tuple([_layer(weights, f"{part}.{name}", shape, path) for name, shape in LAYERS] for part in PARTS)  # type: ignore[return-value]
 
 
@@ -61,7 +61,7 @@ def _layer(weights: dict[str, Tensor], name: str, shape: tuple[int, int], path: 
 
 
 class LoRAWeight(nn.Module):
-    """W + alpha / r B A with a fixed W (m, n): A (r, n) by Kaiming, B (m, r) zero at the start (NeuMA, `loralib`)."""
+    """Weight W + alpha / r B A with frozen W (m, n), A (r, n) initialised by Kaiming and B (m, r) by zero (NeuMA, `loralib`)."""
 
     def __init__(self, weight: Tensor, rank: int, alpha: float, generator: torch.Generator):
         super().__init__()
@@ -76,14 +76,14 @@ class LoRAWeight(nn.Module):
 
 
 class NCLaw(Method):
-    """NCLaw's networks as they were trained, without any image (Ma et al. 2023).
+    """Use the trained networks of NCLaw unchanged; no image is used (Ma et al. 2023).
 
     Args:
-        weights: Folder of nclaw-{jelly,plasticine,sand}.npz, or one such file for every scene; none: `peers` in the data folder.
-        base: Which of the three; `auto`: by the plasticity of the scene's believed model, as NeuMA chooses for its scenes.
+        weights: Folder with nclaw-{jelly,plasticine,sand}.npz, or one such file for every scene; `peers` in the data folder where absent.
+        base: Material of the network; `auto` selects it by the plasticity of the declared model, as NeuMA does.
 
     Raises:
-        UserError: In `build`: no such file.
+        UserError: `build` does not find the file.
     """
 
     steps = 0
@@ -123,20 +123,20 @@ class NCLaw(Method):
 
 
 class NeuMA(NCLaw):
-    """NCLaw's networks with LoRA on every layer, by RAdam over a thousand steps (Cao et al. 2024, configs/synthetic).
+    """Adapt NCLaw's networks by LoRA on every layer, with RAdam over a thousand steps (Cao et al. 2024, configs/synthetic).
 
     Args:
         weights, base: As for `NCLaw`.
-        rank, alpha: Of the LoRA.
-        elastic_rate, plastic_rate: Rates; where absent NeuMA's for the base: 0.008, 0.02 or 0.005, and a tenth of it.
-        seed: Of the first factors.
+        rank, alpha: LoRA rank and alpha.
+        elastic_rate, plastic_rate: Learning rates; where absent those of NeuMA for the base: 0.008, 0.02 or 0.005, and a tenth of it.
+        seed: Seed of the LoRA factors A.
 
     Raises:
-        UserError: A rank below one, an alpha or a rate that is not positive.
+        UserError: The rank is below one, or alpha or a rate is not positive.
     """
 
     RATES = {"jelly": (0.008, 0.025), "plasticine": (0.02, 0.01), "sand": (0.005, 0.04)}
-    """The elastic rate, and the share of the rates at which their cosine ends."""
+    """Elastic learning rate, and the fraction of the rates at which their cosine schedule ends."""
 
     steps = 1000
 

@@ -1,8 +1,8 @@
-"""A sparse symbolic law found by regression, as a `Method`.
+"""Sparse regression of a symbolic law, as a `Method`.
 
-It stands where VisionLaw's search would (Lin et al. 2025), which needs a language model: no text is generated here. A stress is a
-combination of generators times monomials of the strain invariants (`laws.neural.symbolic`), fitted through simulator and renderer; terms
-that add little are dropped in rounds, and the rest is fitted again (sequential thresholding, Brunton et al. 2016).
+It replaces the search of VisionLaw (Lin et al. 2025), which needs a language model. The stress is a linear combination of tensor
+generators times monomials of the strain invariants (`laws.neural.symbolic`), fitted through simulator and renderer. Terms that contribute
+little are removed in rounds, and the remaining terms are fitted again (sequential thresholding, Brunton et al. 2016).
 """
 
 import math
@@ -23,39 +23,40 @@ from neuido.physics.laws.neural.symbolic import DEGREE, SymbolicElastic, Symboli
 from neuido.types import ParticleState
 
 UNREACHABLE, ZERO_RADIUS = 9.0, -30.0
-"""Logarithms of a radius that no strain reaches, and of one that is zero."""
+"""Decimal logarithms of a yield radius that no strain reaches, and of a vanishing one."""
 
 STRAIN = 0.3
-"""Strain at which a term of any degree with the same number counts as much as the linear ones."""
+"""Strain at which equal coefficients give terms of all degrees the same size."""
 
 SAMPLES = 4096
-"""Deformation gradients on which the terms are weighed, about."""
+"""Approximate number of deformation gradients on which terms are selected."""
 
 REACHED = 1e-3
-"""Share of these at the yield surface below which it does not count."""
+"""Fraction of these at the yield surface below which the surface counts as not reached."""
 
 
 class SparseLaw(Method):
-    """28 terms of stress and three of a yield surface (cohesion, friction, a limit of expansion), fitted and thinned out.
+    """Fit 28 stress terms and three parameters of a yield surface (cohesion, friction, expansion limit) with sequential thresholding.
 
-    The start is Hencky's law. Where the scene's believed model yields (NeuMA chooses its networks by it too), there is a yield surface that
-    is reached early: one that no particle reaches would never learn.
+    The initial law is Hencky's. If the declared model of the scene is plastic (the criterion by which NeuMA selects its networks), the fit
+    starts with a yield surface that is reached early, because a surface that no particle reaches has no gradient.
 
     Args:
-        young, poisson: Start of the two linear terms [Pa], [-].
-        yields: Whether there is a yield surface; `auto`: by the believed model.
-        cohesion: Start of its radius in Hencky strain [-].
-        friction: Start of the radius's growth with compression [-].
-        expansion: Start of the largest expansion [-].
-        threshold: Share of the stress's root mean square below which a term is dropped; of the radius, below which a yield term is.
-        interval: Steps before the first round, and between two.
-        rounds: Rounds of dropping; after the last one what is left is fitted to the end.
-        sparsity: Weight of the sum of the sizes of all terms but the two linear ones.
-        plausibility_weight: Keeps the stress where it can run (`law_properties.implausible_stress`).
-        stiffness_rate, shape_rate, yield_rate: Rates of the stress's decimal logarithm, of its terms, and of the logarithms of the radii.
+        young, poisson: Initial values of the two linear terms [Pa], [-].
+        yields: Whether there is a yield surface; `auto` follows the declared model.
+        cohesion: Initial radius of the yield surface in Hencky strain [-].
+        friction: Initial growth of the radius with compression [-].
+        expansion: Initial limit of the expansion [-].
+        threshold: Fraction of the RMS stress below which a stress term is removed, and fraction of the radius for a yield term.
+        interval: Steps before the first round and between rounds.
+        rounds: Number of rounds; after the last one the remaining terms are fitted until the end.
+        sparsity: Weight of the L1 norm of all terms except the two linear ones.
+        plausibility_weight: Weight of the penalty on stresses that a rollout would not survive (`law_properties.implausible_stress`).
+        stiffness_rate, shape_rate, yield_rate: Learning rates of the decimal logarithm of the stress, of its terms, and of the logarithms
+            of the radii.
 
     Raises:
-        UserError: A number outside its range.
+        UserError: A number is out of range.
     """
 
     steps = 300
@@ -80,12 +81,12 @@ class SparseLaw(Method):
         super().__init__()
         radii = {"cohesion": cohesion, "friction": friction, "expansion": expansion}
         require_positive(young=young, **radii, stiffness_rate=stiffness_rate, shape_rate=shape_rate, yield_rate=yield_rate)
-        for name, value, most in (("poisson", poisson, 0.5), ("threshold", threshold, 1.0)):
-            if not 0 < value < most:
-                raise UserError(f"model.method.{name} = {value}: it must lie between 0 and {most:g}")
+        for name, value, upper in (("poisson", poisson, 0.5), ("threshold", threshold, 1.0)):
+            if not 0 < value < upper:
+                raise UserError(f"model.method.{name} = {value}: it must lie between 0 and {upper:g}")
         if interval < 1 or min(rounds, sparsity, plausibility_weight) < 0:
             raise UserError(
-                f"model.method: interval = {interval} must be 1 or more, rounds = {rounds} and sparsity = {sparsity} not negative"
+                f"model.method: interval = {interval} must be at least 1, rounds = {rounds} and sparsity = {sparsity} not negative"
             )
         self.young, self.poisson, self.yields, self.radii = young, poisson, yields, tuple(radii.values())
         self.threshold, self.interval, self.rounds, self.sparsity = threshold, interval, rounds, sparsity
@@ -108,15 +109,16 @@ class SparseLaw(Method):
         self.register_buffer("becomes", torch.full((3,), math.nan))
 
     def coefficients(self) -> Tensor:
-        """Return the coefficients of the stress terms, (4, 7); zero where a term was dropped."""
+        """Return the coefficients of the stress terms, (4, 7); zero for removed terms."""
         return 10**self.level * self.active * self.shape * self.gain
 
     def laws(self, scene: PreparedScene) -> Laws:
         return SymbolicElastic(self.coefficients()[None]), SymbolicPlastic(10 ** self.surface[None, :, None])
 
     def rollout(self, scene: PreparedScene, frames: int, **options) -> ParticleState:
-        """Simulate as `Method.rollout`; after each `interval` rollouts with gradients, select terms and drop the others before the next
-        rollout.
+        """Simulate as `Method.rollout`, with a round of term selection.
+
+        After every `interval` rollouts with gradients the terms are selected; the others are removed before the next rollout.
         """
         fitting = torch.is_grad_enabled()
         if fitting:
@@ -135,7 +137,7 @@ class SparseLaw(Method):
 
     @torch.no_grad()
     def select_terms(self, F: Tensor) -> None:
-        """Select the terms that matter at deformation gradients (n, 3, 3) of a motion under the present law."""
+        """Select the terms that matter at the deformation gradients (n, 3, 3) of a motion with the current law."""
         parts = torch.einsum("nk,ngij,gk->ngkij", polynomial(F), generators(F), self.coefficients())
         total = parts.sum((1, 2)).square().mean().sqrt()
         shares = parts.square().mean((0, 3, 4)).sqrt() / total.clamp(min=1e-30)
@@ -144,8 +146,8 @@ class SparseLaw(Method):
         l, _, q = hencky_strain(F)
         c0, c1, c2 = (10**self.surface).unbind()
         cohesion, friction = STRAIN_SCALE * c0, c1 * (-l).clamp(min=0)
-        flowed = q >= 0.98 * (cohesion + friction)  # a particle that flows is left at the surface
-        share = (cohesion / (cohesion + friction))[flowed].mean()  # NaN where none flows: both comparisons are false
+        flowed = q >= 0.98 * (cohesion + friction)  # plastic flow leaves a particle at the surface
+        share = (cohesion / (cohesion + friction))[flowed].mean()  # NaN without flow, so that both comparisons are false
         never, expands = flowed.float().mean() < REACHED, (l >= 0.98 * STRAIN_SCALE * c2).float().mean() >= REACHED
         becomes = [torch.full_like(share, math.nan) for _ in range(3)]
         becomes[0] = becomes[0].masked_fill(share < self.threshold, ZERO_RADIUS).masked_fill(never, UNREACHABLE)
@@ -169,14 +171,14 @@ class SparseLaw(Method):
         return self.sparsity * (size.sum() - size[:2, 0].sum()) + self.plausibility_weight * implausible_stress(law, law.modulus()[0])
 
     def recovery_loss(self) -> Tensor:
-        """Return the absolute distance of the remaining parameters from their start."""
+        """Return the L1 distance of the remaining parameters from their initial values."""
         alive = (torch.ones_like(self.level), self.active, (self.surface.abs() < UNREACHABLE - 1).detach())
         ways = [(p - start.to(p)).mul(part).abs().sum() for p, start, part in zip(self.trainable().values(), self._start, alive)]
         return torch.stack(ways).sum()
 
     def save(self, folder: Path) -> None:
         with torch.no_grad():
-            self.shape.mul_(self.active)  # zeros say what was dropped
+            self.shape.mul_(self.active)  # zeros mark the removed terms
         super().save(folder)
 
     def load(self, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Spring-Gaus: the body as masses and springs whose stiffness is fitted to the images (Zhong et al. 2024), as a `Method`."""
+"""Spring-Gaus (Zhong et al. 2024): a mass-spring body whose stiffness is fitted to images, as a `Method`."""
 
 import math
 from typing import Any, Literal
@@ -17,28 +17,30 @@ from neuido.types import ParticleState
 
 @renamed_options(per="stiffness_per", firm="full_stiffness_neighbours")
 class SpringMass(Method):
-    """Anchors among the particles carry the mass, springs join them, and all other particles follow the anchors near them.
+    """Fit a mass-spring network: anchor particles carry the mass, springs connect them, and the other particles follow nearby anchors.
 
-    Spring-Gaus's parameters: k = 10^a / L with an a for each anchor (a spring has the mean of its ends), for each spring, or one for
-    all; the springs beyond a mass's nearest `firm` ones weaken with their rank, by how much is learned; damping 10^b m / L; and the share
-    of the tangential velocity that the ground leaves. Gaussians move with the particles and keep their shape. What differs: springs act
-    on both ends, the stiffness starts from a modulus, and particles follow by their anchors' displacement, so that the first frame is
-    exact.
+    The parameters are those of Spring-Gaus. The stiffness of a spring of rest length L is k = 10^a / L, with a per anchor (a spring has the
+    mean of its two ends), per spring, or for the whole body. Springs beyond the `full_stiffness_neighbours` nearest ones of a mass weaken
+    with their rank by a learned amount. The damping is 10^b m / L. The last parameter is the share of the tangential velocity that remains
+    after contact with the ground. Gaussians move with the particles and keep their shape.
+
+    Differences from Spring-Gaus: springs act on both ends, the initial stiffness follows from a modulus, and particles follow
+    the displacement of their anchors, so the first frame is exact.
 
     Args:
-        anchors: Masses, picked among the particles by farthest points; at most as many as there are.
-        neighbours: Springs from each.
-        binding: Anchors that a particle follows, weighted by one over the square root of the distance.
-        per: What has a stiffness of its own: `anchor`, `spring`, or `body`.
-        firm: Nearest neighbours whose springs do not weaken.
-        power: p of the force (`spring_kernels`).
-        young: Young's modulus [Pa] that the body starts with (`modulus`).
-        damping: 10^b at the start, for a mass m of one anchor [m/s]; 0: none.
-        fit_damping: Whether b is fitted.
-        stiffness_rate, other_rate: Rates of a, and of all others.
+        anchors: Number of masses, selected among the particles by farthest-point sampling; at most the number of particles.
+        neighbours: Number of springs from each anchor.
+        binding: Number of anchors that a particle follows, weighted by the inverse square root of the distance.
+        stiffness_per: Granularity of the stiffness: `anchor`, `spring`, or `body`.
+        full_stiffness_neighbours: Number of nearest neighbours whose springs do not weaken.
+        power: Exponent p of the force (`spring_kernels`).
+        young: Initial Young's modulus [Pa] of the body (`modulus`).
+        damping: Initial 10^b for the mass m of one anchor [m/s]; 0: no damping.
+        fit_damping: Whether to fit b.
+        stiffness_rate, other_rate: Learning rates of a, and of all other parameters.
 
     Raises:
-        UserError: A size below one, a number that is not positive.
+        UserError: A size is below one, or a number is not positive.
     """
 
     steps = 300
@@ -86,11 +88,11 @@ class SpringMass(Method):
         self.soft, self.slide = nn.Parameter(0.0 * one), nn.Parameter(-one)
         self.damping = nn.Parameter(start * one, requires_grad=self.fit_damping and self.damping_start > 0)
         self.stiffness = nn.Parameter(torch.zeros(size, device=device))
-        with torch.no_grad():  # the modulus is linear in the stiffness
+        with torch.no_grad():  # the modulus is proportional to the stiffness
             self.stiffness += math.log10(self.young / float(self.modulus(self.springs()[0])))
 
     def springs(self) -> tuple[Tensor, Tensor]:
-        """Return stiffness [N/m] and damping [N s/m] of each spring, (N,)."""
+        """Return the stiffness [N/m] and damping [N s/m] of each spring, (N,) each."""
         level = self.stiffness
         if self.stiffness_per == "anchor":
             level = level[self.network.pairs].mean(1)
@@ -102,7 +104,7 @@ class SpringMass(Method):
         return 10**level * weak / rest, damping
 
     def modulus(self, stiffness: Tensor) -> Tensor:
-        """Return Young's modulus [Pa] of springs in all directions alike, E = sum k L^2 / (6 V), with Poisson's ratio 1/4 (Cauchy), ()."""
+        """Return Young's modulus [Pa] of isotropically oriented springs, E = sum k L^2 / (6 V); Poisson's ratio is 1/4 (Cauchy), ()."""
         return (stiffness * self.body.rest.square()).sum() / (6 * self.volume)
 
     def tangential_retention(self) -> Tensor:
@@ -110,7 +112,7 @@ class SpringMass(Method):
         return (1.2 * self.slide.sigmoid() - 0.1).clamp(0, 1)
 
     def laws(self, scene: PreparedScene) -> Laws:
-        raise UserError("model.method = SpringMass has no law of F: leave condition_files out")
+        raise UserError("model.method = SpringMass has no law of F: do not use condition_files")
 
     def rollout(
         self,
@@ -121,13 +123,13 @@ class SpringMass(Method):
         effects: Effects | None = None,
         segment: int = 0,
     ) -> ParticleState:
-        """Simulate as `Method.rollout`; F stays the identity, and `segment` is ignored because a state is small.
+        """Simulate as `Method.rollout`; F stays the identity, and `segment` is ignored because the state is small.
 
         Raises:
-            UserError: Effects are given; the motion is not finite.
+            UserError: Effects are given, or the motion is not finite.
         """
         if effects is not None and effects != Effects():
-            raise UserError("model.effects, estimate_density: SpringMass takes no effects and no density, they act on an MPM law")
+            raise UserError("model.effects, estimate_density: SpringMass takes no effects and no density, which act on an MPM law")
         state = scene.simulator.state if state is None else state
         stiffness, damping = self.springs()
         dt = scene.simulator.scenes[0].dt
@@ -157,7 +159,7 @@ class SpringMass(Method):
 
 
 def farthest_points(x: Tensor, count: int) -> Tensor:
-    """Pick points (P, 3) by farthest-point sampling, from the one nearest to their mean; return indices (min(count, P),)."""
+    """Return indices (min(count, P),) of points (P, 3) by farthest-point sampling, starting at the point nearest to the mean."""
     count = min(count, len(x))
     distance = (x - x.mean(0)).square().sum(1)
     found = torch.empty(count, dtype=torch.int64, device=x.device)

@@ -1,4 +1,4 @@
-"""Latents of the frozen operator without an encoder: the mean of Stage I, a random one, and one fitted to the images (UniPhy)."""
+"""Latents of the frozen operator without an encoder: the mean of Stage I, a random latent, and a latent fitted to images (UniPhy)."""
 
 from typing import Any, Literal
 
@@ -14,7 +14,7 @@ from neuido.models.operator.law_properties import p_wave_modulus
 
 
 class LatentMethod(Method):
-    """A latent z of the frozen operator; not a method by itself.
+    """Base class of methods that choose a latent z of the frozen operator.
 
     Args:
         operator: File of the operator, or `pretrained`.
@@ -36,7 +36,7 @@ class LatentMethod(Method):
 
 
 class MeanLatent(LatentMethod):
-    """The mean of Stage I's latents for every scene; nothing is learned."""
+    """Use the mean latent of Stage I for every scene; nothing is learned."""
 
     steps = 0
 
@@ -46,7 +46,7 @@ class MeanLatent(LatentMethod):
 
 @renamed_options(of="distribution")
 class RandomLatent(LatentMethod):
-    """A random latent; nothing is learned.
+    """Use a random latent; nothing is learned.
 
     Args:
         operator: File of the operator, or `pretrained`.
@@ -70,13 +70,13 @@ class RandomLatent(LatentMethod):
 
 
 class UniPhy(LatentMethod):
-    """The latent alone, from the mean latent, by gradient through simulator and renderer; trunks and heads are frozen (Mittal et al. 2025).
+    """Fit only the latent, starting at the mean latent, by gradients through simulator and renderer (UniPhy, Mittal et al. 2025).
 
-    UniPhy's own operator is published without weights, so that ours, which is trained in the same way, takes its place.
+    Trunks and heads are frozen. The weights of UniPhy's operator are not published, so ours, which is trained in the same way, is used.
 
     Args:
         operator: File of the operator, or `pretrained`.
-        lr: Rate of the latent.
+        lr: Learning rate of the latent.
     """
 
     steps = 100

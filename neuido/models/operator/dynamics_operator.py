@@ -1,8 +1,8 @@
 """The neural intrinsic dynamics operator: branch heads and trunks, without the video encoder (paper, "Intrinsic Dynamics Operator").
 
-A latent z in R^d indexes a material. Two heads turn it into coefficients lambda in R^D, two trunks turn a deformation gradient into
-D basis functions, and the law is their linear combination. Since lambda is constant for a material, the combination is made of the
-trunk's last layer once (exact), and what a rollout runs is a small effective network (`neuido.physics.laws.neural.networks`).
+A latent z in R^d represents a material. Two heads map it to coefficients lambda in R^D, two trunks map a deformation gradient to D basis
+functions, and the law is their linear combination. As lambda is constant for a material, it is contracted with the last layer of the
+trunk once, which is exact; a rollout then evaluates a small effective network (`neuido.physics.laws.neural.networks`).
 """
 
 import json
@@ -37,7 +37,7 @@ class Trunk(nn.Module):
     Args:
         basis_dim: Number of basis functions D.
         hidden_dim: Width of the two hidden layers.
-        outputs: n; nine components (raw), or the coefficients of the objective read-outs.
+        outputs: Number of outputs n: nine components (raw), or the coefficients of the objective readouts.
     """
 
     def __init__(self, basis_dim: int, hidden_dim: int, outputs: int):
@@ -48,7 +48,7 @@ class Trunk(nn.Module):
         self.out = nn.Linear(hidden_dim, basis_dim * outputs)
 
     def hidden(self, features: Tensor) -> Tensor:
-        """Return the last hidden layer, (..., 9) -> (..., hidden_dim)."""
+        """Return the activations of the last hidden layer, (..., 9) -> (..., hidden_dim)."""
         return functional.silu(self.fc2(functional.silu(self.fc1(features))))
 
     def forward(self, features: Tensor) -> Tensor:
@@ -63,14 +63,14 @@ class Trunk(nn.Module):
 
 
 class Head(nn.Sequential):
-    """Lightweight MLP from a latent z (S, d) to the coefficients lambda (S, D)."""
+    """Two-layer MLP from a latent z (S, d) to the coefficients lambda (S, D)."""
 
     def __init__(self, latent_dim: int, head_dim: int, basis_dim: int):
         super().__init__(nn.Linear(latent_dim, head_dim), nn.SiLU(), nn.Linear(head_dim, basis_dim))
 
 
 def affine(layer: nn.Module) -> tuple[Tensor, Tensor]:
-    """Return weight and bias of a linear layer, also of one that an adapter wraps (found by applying it to the unit vectors)."""
+    """Return weight and bias of a linear layer; for a layer wrapped by an adapter they follow from its response to unit vectors."""
     if type(layer) is nn.Linear:
         return layer.weight, layer.bias
     like = next(layer.parameters())
@@ -80,23 +80,23 @@ def affine(layer: nn.Module) -> tuple[Tensor, Tensor]:
 
 
 class IntrinsicDynamicsOperator(nn.Module):
-    """Latent z -> (elastic law, plastic law).
+    """Neural operator that maps a latent z to an elastic and a plastic law.
 
     Args:
-        trunk: `raw` (the paper's: F in, nine components out) or `objective` (invariants in, coefficients of an isotropic,
-            frame-indifferent law out).
-        latent_dim: d (paper: 128).
-        basis_dim: D (the paper does not say).
+        trunk: `raw` (as in the paper: from F to nine components) or `objective` (from invariants to the coefficients of an isotropic,
+            frame-indifferent law).
+        latent_dim: Latent dimension d (paper: 128).
+        basis_dim: Number of basis functions D (the paper does not say).
         hidden_dim: Width of the trunks (the paper does not say; 64 suits a fused kernel).
         head_dim: Width of the heads.
 
     Attributes:
-        latents: (M, d), the latents of the training trajectories; empty until `set_latents` or `load`.
-        latent_names, latent_families: M names and families; NCLaw's materials are `jelly`, `plasticine` and `sand`.
-        card: What the weights file says about their making.
+        latents: Latents of the training trajectories, (M, d); empty until `set_latents` or `load`.
+        latent_names, latent_families: Their M names and families; the materials of NCLaw are `jelly`, `plasticine` and `sand`.
+        card: Information on the training from the weights file.
 
     Raises:
-        UserError: an unknown trunk, or a size below one.
+        UserError: The trunk is unknown, or a size is below one.
     """
 
     def __init__(
@@ -136,21 +136,21 @@ class IntrinsicDynamicsOperator(nn.Module):
         return f"{type(self).__name__}({sizes}; {f'latents: {known}' if known else 'no latents'})"
 
     def set_latents(self, latents: Tensor, names: list[str], families: list[str]) -> None:
-        """Keep the latents of the training trajectories, for `save` and `latent`."""
+        """Store the latents of the training trajectories, for `save` and `latent`."""
         self.latents, self.latent_names, self.latent_families = latents.detach().clone(), list(names), list(families)
 
     def latent(self, name: str) -> Tensor:
         """Return the latent (d,) of a training trajectory.
 
         Raises:
-            UserError: no trajectory has this name.
+            UserError: No trajectory has this name.
         """
         if name not in self.latent_names:
             raise UserError(f"no latent is named {name!r}; there are {', '.join(self.latent_names) or 'none'}")
         return self.latents[self.latent_names.index(name)].to(self.elastic_trunk.fc1.weight)
 
     def random_latents(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw latents (count, d) from a normal distribution with the mean and componentwise deviation of the trained ones."""
+        """Sample latents (count, d) from a normal distribution with the mean and componentwise standard deviation of the trained ones."""
         mean, deviation = self.latents.mean(0), self.latents.std(0)
         return mean + deviation * torch.randn(count, self.latent_dim, generator=generator).to(mean)
 
@@ -159,7 +159,7 @@ class IntrinsicDynamicsOperator(nn.Module):
         return self.elastic_head(z), self.plastic_head(z)
 
     def features(self, F: Tensor) -> Tensor:
-        """Return the input of the trunks, (..., 9), of F (..., 3, 3)."""
+        """Return the input features of the trunks for F, (..., 3, 3) -> (..., 9)."""
         if self.trunk == "raw":
             return networks.raw_features(F)
         if F.requires_grad:
@@ -181,7 +181,7 @@ class IntrinsicDynamicsOperator(nn.Module):
         return networks.StressReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRESS_SCALE).view(F.shape)
 
     def plastic(self, z: Tensor, F: Tensor) -> Tensor:
-        """Correct trial deformation gradients F (S, n, 3, 3) for S latents z (S, d); returns (S, n, 3, 3)."""
+        """Return the plastically corrected trial deformation gradients (S, n, 3, 3) for S latents z (S, d)."""
         y = self._outputs(self.plastic_trunk, self.plastic_head(z), F)
         if self.trunk == "raw":
             return F + networks.STRAIN_SCALE * y.unflatten(-1, (3, 3))
@@ -194,7 +194,7 @@ class IntrinsicDynamicsOperator(nn.Module):
         return torch.baddbmm(bias.unsqueeze(1), trunk.hidden(self.features(F)), weight.mT)
 
     def laws(self, z: Tensor) -> tuple[RawElastic | ObjectiveElastic, RawPlastic | ObjectivePlastic]:
-        """Return the laws of S scenes for a rollout, from z (S, d) or (d,); their tensors are graph nodes of z and of all weights."""
+        """Return the elastic and plastic law of z (S, d) or (d,) for a rollout of S scenes, differentiable in z and all weights."""
         elastic, plastic = self.coefficients(z.reshape(-1, self.latent_dim))
         return self._elastic_law(*_effective(self.elastic_trunk, elastic)), self._plastic_law(*_effective(self.plastic_trunk, plastic))
 
@@ -202,8 +202,8 @@ class IntrinsicDynamicsOperator(nn.Module):
         """Write weights, latents and card to a safetensors file.
 
         Args:
-            path: File to write, all at once.
-            card: What a reader should know: data, figures; today's date is added.
+            path: File to write; it is written atomically.
+            card: Information on the training, such as data and metrics; the date is added.
         """
         tensors = {name: tensor.detach().contiguous().cpu() for name, tensor in self.state_dict().items()}
         tensors["latents"] = self.latents.detach().contiguous().cpu()
@@ -218,20 +218,21 @@ class IntrinsicDynamicsOperator(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "pretrained") -> Self:
-        """Load an operator that comes with neuido (`pretrained`, `pretrained-family`) or a file of `save`.
+        """Load an operator that ships with neuido (`pretrained`, `pretrained-family`), or a file of `save`.
 
         Raises:
-            UserError: As `load`.
+            UserError: As in `load`.
         """
         return cls.load(name)
 
     @classmethod
     def load(cls, path: str | Path = "pretrained") -> Self:
-        """Read a file of `save`. `pretrained` comes with the package, and the encoders are made for it; so does `pretrained-family`, fitted
-        with a prior that gathers the latents of each family.
+        """Load a file of `save`, or an operator that ships with the package.
+
+        The encoders are trained for `pretrained`. `pretrained-family` was trained with a prior that pulls the latents of a family together.
 
         Raises:
-            UserError: the file is missing or is not one of `save`.
+            UserError: The file is missing, or it is not an operator.
         """
         named = PRETRAINED.get(str(path))
         path = named or Path(path)

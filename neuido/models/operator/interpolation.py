@@ -1,4 +1,4 @@
-"""Laws between two latents of Stage I: a drop test on the line between them, and how steadily it changes (paper, analysis)."""
+"""Interpolation between two latents of Stage I: drop tests along the line, and the monotonicity of their results (paper, analysis)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,19 +16,20 @@ from neuido.physics.runtime.device import choose_device
 from neuido.types import Scene, Walls
 
 CELLS, DT, EVERY, FRAMES = 16, 5e-4, 4, 151
-"""The drop test: 0.3 s, a frame each 2 ms."""
+"""Grid, time step [s], substeps per frame and number of frames of the drop test: 0.3 s with a frame every 2 ms."""
 
 
 class Interpolation(NamedTuple):
-    """Laws between two latents, rolled out."""
+    """Drop tests with the laws between two latents."""
 
     names: tuple[str, str]
+    """Names of the two latents."""
     shares: Tensor
-    """Of the second latent, (N,)."""
+    """Weight of the second latent in each law, (N,)."""
     rows: list[dict[str, float]]
-    """share, modulus [Pa], compression [-], contact time [s] of each."""
+    """share, modulus [Pa], compression [-] and contact [s] of each law."""
     motion: Tensor
-    """Positions of the drop test [m], (K, N, P, 3)."""
+    """Particle positions [m], (K, N, P, 3)."""
 
     def __repr__(self) -> str:
         return f"Interpolation({self.names[0]!r} to {self.names[1]!r}, {len(self.rows)} laws, {len(self.motion)} frames)"
@@ -37,23 +38,23 @@ class Interpolation(NamedTuple):
 def interpolate(
     operator: IntrinsicDynamicsOperator, ends: tuple[str, str], *, count: int = 9, height: float = 0.3, device: str = "auto"
 ) -> Interpolation:
-    """Roll out the laws of latents on the line between two, all in one launch.
+    """Simulate a drop test for each of several latents on the line between two, all in one launch.
 
-    The drop test: a ball of 0.24 m falls with 2 m/s onto a frictionless floor. `compression` is the largest loss of its height over the
-    height at the start; `contact` how long the floor carries more than half of its weight.
+    A ball of diameter 0.24 m hits a frictionless floor with an initial velocity of 2 m/s. `compression` is the largest decrease of its
+    height relative to the initial height. `contact` is the time during which the floor carries more than half of its weight.
 
     Args:
         operator: The operator.
         ends: Names of two latents.
-        count: Latents, the ends included.
-        height: Of the ball's centre at the start [m].
-        device: `auto` (CUDA where there is one), `cpu` or `cuda`.
+        count: Number of latents, including the ends.
+        height: Initial height of the centre of the ball [m].
+        device: `auto` (CUDA where available), `cpu` or `cuda`.
 
     Raises:
-        UserError: A name that there is not, fewer than three latents, a law that cannot run.
+        UserError: A name is unknown, there are fewer than three latents, or a simulation fails.
     """
     if count < 3:
-        raise UserError(f"count = {count}: at least 3 latents, the ends included, are needed")
+        raise UserError(f"count = {count}: at least 3 latents are needed, including the ends")
     chosen = choose_device(device)
     operator = operator.to(chosen)
     a, b = (operator.latent(name) for name in ends)
@@ -78,7 +79,7 @@ def softest_and_stiffest(operator: IntrinsicDynamicsOperator, family: str = "ela
     """Return the names of a family's latents with the smallest and the largest small-strain modulus.
 
     Raises:
-        UserError: A family of fewer than two latents.
+        UserError: The family has fewer than two latents.
     """
     own = [i for i, each in enumerate(operator.latent_families) if each == family]
     if len(own) < 2:
@@ -90,11 +91,11 @@ def softest_and_stiffest(operator: IntrinsicDynamicsOperator, family: str = "ela
 
 
 def monotonicity(values: Sequence[float]) -> dict[str, float]:
-    """Measure how steadily values go from the first to the last one.
+    """Measure how monotonically a sequence of values changes from the first to the last one.
 
     Returns:
-        `steps`: the share of steps that go the way of the ends; `spearman`: the rank correlation with the order, its sign that of the ends
-        (one for a monotone row); `back`: the largest step back over the whole way.
+        `steps`: fraction of steps in the overall direction. `spearman`: rank correlation with the index, times the sign of the overall
+        change (one for a monotone sequence). `back`: largest step against the overall direction, relative to the overall change.
     """
     from scipy.stats import spearmanr
 
@@ -108,11 +109,12 @@ def monotonicity(values: Sequence[float]) -> dict[str, float]:
 
 @torch.no_grad()
 def pairwise_monotonicity(operator: IntrinsicDynamicsOperator, family: str, *, count: int = 9) -> dict[str, float]:
-    """Measure the monotonicity of the small-strain modulus between any two latents of a family.
+    """Measure the monotonicity of the small-strain modulus between all pairs of latents of a family.
+
+    Pairs whose moduli differ by less than about 10 % are left out, because their direction is not significant.
 
     Returns:
-        `pairs`; `monotone`: the share of pairs that are monotone in every step; `steps` and `spearman`: means over the pairs. Pairs whose
-        moduli differ by less than a tenth have no way to go and are left out.
+        `pairs`: number of pairs. `monotone`: fraction of pairs that are monotone in every step. `steps`, `spearman`: means over the pairs.
     """
     z = operator.latents[[i for i, each in enumerate(operator.latent_families) if each == family]].to(operator.elastic_trunk.fc1.weight)
     first, second = torch.triu_indices(len(z), len(z), 1)

@@ -1,6 +1,6 @@
-"""How the latents of Stage I lie, and what lies between two of them (paper, "Representation Analysis").
+"""Structure of the latent space of Stage I: silhouettes, t-SNE, and the directions that matter (paper, "Representation Analysis").
 
-Silhouettes and t-SNE come from scikit-learn, which is no dependency of the package.
+Silhouettes and t-SNE use scikit-learn, which is not a dependency of the package.
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus
 
 SPACES = {
-    "raw": "z as Stage I left it, Euclidean",
+    "raw": "z of Stage I, Euclidean distance",
     "cosine": "z, cosine distance",
     "standardised": "z, each component with unit variance",
     "pca": "z on its first two principal components",
     "elastic coefficients": "lambda of the elastic head",
     "plastic coefficients": "lambda of the plastic head",
-    "laws": "what the laws answer to fixed deformations: direction of the stress, and plastic correction",
-    "t-sne": "the plane of t-SNE, which is no metric space",
+    "laws": "response of the laws to fixed deformations: direction of the stress, and plastic correction",
+    "t-sne": "t-SNE plane, whose distances are not meaningful",
 }
 
 
@@ -30,7 +30,7 @@ def require_sklearn(what: str) -> Any:
     """Import scikit-learn.
 
     Raises:
-        UserError: It is not installed.
+        UserError: scikit-learn is not installed.
     """
     try:
         import sklearn
@@ -40,7 +40,7 @@ def require_sklearn(what: str) -> Any:
 
 
 def strains(count: int = 48, *, seed: int = 0) -> Tensor:
-    """Return deformation gradients (n, 3, 3) on which laws are compared: I plus normal noise of 0.02 to 0.2, those with a sound volume."""
+    """Return deformation gradients (n, 3, 3) for comparing laws: I plus normal noise of 0.02 to 0.2, restricted to det F > 0.3."""
     generator = torch.Generator().manual_seed(seed)
     spread = torch.tensor([0.02, 0.05, 0.1, 0.2]).repeat_interleave(-(-count // 4))[:, None, None]
     F = torch.eye(3) + spread * torch.randn(len(spread), 3, 3, generator=generator)
@@ -49,8 +49,9 @@ def strains(count: int = 48, *, seed: int = 0) -> Tensor:
 
 @torch.no_grad()
 def law_responses(operator: IntrinsicDynamicsOperator, z: Tensor) -> Tensor:
-    """Return the response of the laws of z (S, d) on `strains`, (S, 18 n): normalised stress, and plastic correction over the largest
-    norm of a training trajectory's.
+    """Return the responses of the laws of z (S, d) to the n deformations of `strains`, (S, 18 n).
+
+    A response consists of the normalised stress, and the plastic correction relative to the largest norm among the training trajectories.
     """
     stress, plastic = _evaluate_laws(operator, z)
     scale = _evaluate_laws(operator, operator.latents.to(z))[1].norm(dim=1).max().clamp(min=1e-12)
@@ -65,7 +66,7 @@ def _evaluate_laws(operator: IntrinsicDynamicsOperator, z: Tensor) -> tuple[Tens
 
 @torch.no_grad()
 def latent_spaces(operator: IntrinsicDynamicsOperator) -> dict[str, np.ndarray]:
-    """Return the latents of an operator in each of `SPACES`, (M, ...)."""
+    """Return the latents of an operator in each space of `SPACES` except t-SNE, (M, ...)."""
     from sklearn.decomposition import PCA
 
     z = operator.latents.to(operator.elastic_trunk.fc1.weight)
@@ -83,16 +84,16 @@ def latent_spaces(operator: IntrinsicDynamicsOperator) -> dict[str, np.ndarray]:
 
 
 def silhouettes(operator: IntrinsicDynamicsOperator, plane: np.ndarray | None = None) -> list[dict[str, Any]]:
-    """Compute the mean silhouette by family in each space, over all latents and over each family's own; the first row is of z itself.
+    """Compute the mean silhouette with respect to the families in each space, over all latents and over each family.
 
-    `neighbours` is the share of the latents whose nearest other one is of their family.
+    The first row is z itself. `neighbours` is the fraction of latents whose nearest neighbour belongs to the same family.
 
     Args:
         operator: The operator.
-        plane: The latents in the plane of t-SNE, (M, 2), for a row of their own.
+        plane: Coordinates of the latents in the t-SNE plane, (M, 2), which add a row.
 
     Raises:
-        UserError: No scikit-learn, or latents of fewer than two families.
+        UserError: scikit-learn is not installed, or the latents have fewer than two families.
     """
     require_sklearn("a silhouette")
     from sklearn.metrics import pairwise_distances, silhouette_samples
@@ -118,10 +119,10 @@ def _families(operator: IntrinsicDynamicsOperator) -> np.ndarray:
 
 
 def tsne(operator: IntrinsicDynamicsOperator, *, perplexity: float = 10.0, seed: int = 0) -> list[dict[str, Any]]:
-    """Embed the latents in the plane by t-SNE: a row each with name, family, x, y, and the small-strain P-wave modulus [Pa].
+    """Embed the latents in the plane by t-SNE; return rows with name, family, x, y, and small-strain P-wave modulus [Pa].
 
     Raises:
-        UserError: No scikit-learn, or a perplexity that is not below the number of latents.
+        UserError: scikit-learn is not installed, or the perplexity is not below the number of latents.
     """
     require_sklearn("t-SNE")
     from sklearn.manifold import TSNE
@@ -137,18 +138,18 @@ def tsne(operator: IntrinsicDynamicsOperator, *, perplexity: float = 10.0, seed:
 
 
 def active_directions(operator: IntrinsicDynamicsOperator, *, kept: Sequence[int] = (2, 5, 10, 20, 40)) -> list[dict[str, Any]]:
-    """Measure how few directions of the latent space the laws depend on; the others keep the random start of Stage I.
+    """Measure how many directions of the latent space the laws depend on; the others keep the random initial values of Stage I.
 
-    The directions are those along which the answers of the laws change most: the leading eigenvectors of the mean of J^T J, J the
-    derivative of `law_responses` by z, by central differences at each latent.
+    The directions along which the responses of the laws change most are the leading eigenvectors of the mean of J^T J. J is the Jacobian of
+    `law_responses` with respect to z, computed by central differences at each latent.
 
     Args:
         operator: The operator.
-        kept: Numbers of directions.
+        kept: Numbers of directions to keep.
 
     Returns:
-        A row for each number: share of the latents' variance along these directions, silhouette on them alone, and the median change
-        of a law's answers (relative norm) when the rest of z is replaced by its mean.
+        A row for each number: the fraction of the variance of the latents along these directions, the silhouette on them alone, and the
+        median relative change of the responses of a law when the other components of z are replaced by their mean.
     """
     require_sklearn("a silhouette")
     from sklearn.metrics import silhouette_score
@@ -172,7 +173,7 @@ def active_directions(operator: IntrinsicDynamicsOperator, *, kept: Sequence[int
 
 
 def _sensitive_directions(operator: IntrinsicDynamicsOperator, z: Tensor, step: float = 0.05) -> Tensor:
-    """Return orthonormal directions (d, d), ordered by how much the laws depend on them, most first."""
+    """Return orthonormal directions (d, d) as columns, in descending order of their influence on the laws."""
     steps = step * torch.eye(z.shape[1]).to(z)
     gram = torch.zeros(z.shape[1], z.shape[1], dtype=torch.float64)
     for own in z:

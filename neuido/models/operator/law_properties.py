@@ -1,4 +1,4 @@
-"""Properties of a learned law: its small-strain moduli, and how far it is from a law that a rollout survives."""
+"""Properties of a learned law: its small-strain moduli, and a penalty on laws that a rollout would not survive."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class Moduli(NamedTuple):
 
 
 def with_prefix(value: float, unit: str) -> str:
-    """Return a number with three digits and the prefix of its unit, such as `98.3 kPa`."""
+    """Format a number with three significant digits and an SI prefix, such as `98.3 kPa`."""
     size = abs(value)
     factor, prefix = next(((f, p) for f, p in ((1e9, "G"), (1e6, "M"), (1e3, "k")) if size >= f), (1.0, ""))
     return f"{value / factor:.3g} {prefix}{unit}"
@@ -32,8 +32,8 @@ def with_prefix(value: float, unit: str) -> str:
 def small_strain_moduli(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = 3e-3) -> tuple[Tensor, Tensor]:
     """Return Young's modulus [Pa] (S,) and Poisson's ratio [-] (S,) of the elastic laws of z (S, d).
 
-    The Lame parameters are secants over F = I +- strain e_a e_a^T, averaged over the three axes a, so that they are those of an isotropic
-    law exactly and a mean for a law that is not isotropic (the trunk `raw`).
+    The Lame parameters are secants over F = I +- strain e_a e_a^T, averaged over the three axes a. For an anisotropic law (the trunk `raw`)
+    they are therefore averages.
     """
     axes = strain * torch.diag_embed(torch.eye(3, dtype=z.dtype, device=z.device))
     F = torch.eye(3, dtype=z.dtype, device=z.device) + torch.cat([axes, -axes])
@@ -55,21 +55,21 @@ def p_wave_modulus(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float
 
 
 def implausibility(operator: IntrinsicDynamicsOperator, z: Tensor) -> Tensor:
-    """Return `implausible_stress` of the elastic law of z (d,); zero for all laws of Stage I's kind."""
+    """Return `implausible_stress` of the elastic law of z (d,); it vanishes for laws like those of Stage I."""
     modulus = p_wave_modulus(operator, z[None])[0]
     return implausible_stress(lambda F: operator.elastic(z[None], F[None])[0], modulus)
 
 
 def implausible_stress(stress: Callable[[Tensor], Tensor], modulus: Tensor, samples: int = 48) -> Tensor:
-    """Penalise an elastic law that a rollout would not survive, at strains up to 0.4.
+    """Return a penalty on elastic laws that a rollout would not survive, evaluated at strains up to 0.4.
 
-    A stress that points against its strain, or one more than three times the small-strain modulus times the strain, makes a body explode
-    in some later contact, and images say so too late.
+    A body becomes unstable in a later contact if the stress opposes the strain, or if it exceeds three times the product of small-strain
+    modulus and strain. The images show this too late.
 
     Args:
-        stress: F (n, 3, 3) -> tau (n, 3, 3) [Pa], differentiable in the law's parameters.
+        stress: Function from F (n, 3, 3) to tau (n, 3, 3) [Pa], differentiable in the parameters of the law.
         modulus: P-wave modulus [Pa], ().
-        samples: Deformation gradients, a third each of small, middle and large strains.
+        samples: Number of deformation gradients, a third each at small, medium and large strains.
     """
     generator = torch.Generator().manual_seed(0)
     spread = torch.tensor([0.03, 0.1, 0.2]).repeat_interleave(samples // 3)[:, None, None]

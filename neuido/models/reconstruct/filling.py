@@ -1,8 +1,8 @@
-"""From the surface that images show to a body full of particles: visual hulls, opacity volumes, and their filling.
+"""Filling of a reconstructed surface with particles: visual hulls, opacity volumes, and particle sampling.
 
-A volume is a field in 0..1 on a regular grid, whose body is where it exceeds a level. That of masks is the visual hull
-(Laurentini 1994); that of Gaussians is their opacity, with every enclosed place filled (rays, as in PhysGaussian's filling, but 26
-of them, of which two may miss: a small hole in the shell does not leak).
+A volume is a field in 0..1 on a regular grid; the body is the region where it exceeds a level. Masks give the visual hull (Laurentini
+1994). Gaussians give their opacity, with enclosed regions filled by ray casting as in PhysGaussian. A cell is enclosed if 24 of 26 rays
+hit the shell, so small holes in the shell do not leak.
 """
 
 import itertools
@@ -18,21 +18,21 @@ from neuido.types import Cameras, Gaussians, Vector
 
 METHODS = ("voxel", "poisson")
 REACH = 6
-"""A Gaussian reaches at most this many grid cells to each side."""
+"""Maximum extent of a Gaussian to each side, in grid cells."""
 
 LEVEL = 0.5
 STOPPING_OPACITY = 0.2
-"""Opacity that stops a ray: a shell of Gaussians is thin in places."""
+"""Opacity that stops a ray; it is low because a shell of Gaussians is thin in places."""
 
 JITTER = 0.5
-"""Of the particles of a voxel filling, in spacings."""
+"""Jitter of the particles of a voxel filling, in spacings."""
 
 
 class Volume(NamedTuple):
-    """A field on the centres of cubic cells."""
+    """Field sampled at the centres of cubic cells."""
 
     values: Tensor
-    """In 0..1, (X, Y, Z)."""
+    """Values in 0..1, (X, Y, Z)."""
     lower: Tensor
     """Lower corner of the grid [m], (3,)."""
     spacing: float
@@ -42,15 +42,15 @@ class Volume(NamedTuple):
         return f"Volume({' x '.join(map(str, self.values.shape))} cells of {self.spacing:.3g} m)"
 
     def centres(self) -> Tensor:
-        """Return centres of the cells [m], (X, Y, Z, 3)."""
+        """Return the centres of the cells [m], (X, Y, Z, 3)."""
         axes = [torch.arange(n, device=self.lower.device) + 0.5 for n in self.values.shape]
         return self.lower + self.spacing * torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
 
     def at(self, x: Tensor) -> Tensor:
-        """Interpolate the field at points x [m] (N, 3), linearly between centres and zero outside, (N,)."""
+        """Return the field at points x [m] (N, 3) by trilinear interpolation, zero outside, (N,)."""
         size = torch.tensor(self.values.shape, device=x.device) * self.spacing
         unit = 2 * (x - self.lower) / size - 1
-        grid = unit[:, [2, 1, 0]].view(1, -1, 1, 1, 3).to(self.values)  # grid_sample wants the last axis first
+        grid = unit[:, [2, 1, 0]].view(1, -1, 1, 1, 3).to(self.values)  # grid_sample expects the last axis first
         return torch.nn.functional.grid_sample(self.values[None, None], grid, align_corners=False).view(-1)
 
     def measure_volume(self, level: float = LEVEL, finer: int = 3) -> float:
@@ -66,21 +66,21 @@ class Volume(NamedTuple):
 
 
 def visual_hull(masks: Tensor, cameras: Cameras, lower: Vector, upper: Vector, *, resolution: int = 96) -> Volume:
-    """Carve the visual hull: the largest body that all masks allow.
+    """Carve the visual hull: the largest body consistent with all masks.
 
-    A point counts as the least of what the masks say where it is seen; a camera that does not see it says nothing.
+    The value of a point is the minimum of the masks over the cameras that see it.
 
     Args:
-        masks: Share of the object in each pixel, (V, H, W).
-        cameras: Of the V views.
-        lower, upper: Corners of the box in which the body lies [m].
+        masks: Coverage of each pixel by the object, (V, H, W).
+        cameras: Cameras of the V views.
+        lower, upper: Corners of a box that contains the body [m].
         resolution: Cells along the longest side of the body.
 
     Raises:
-        UserError: Masks of another shape than the cameras', or no point that all of them allow.
+        UserError: Masks and cameras differ in shape, or no point is consistent with all masks.
     """
     if tuple(masks.shape) != (len(cameras.viewmats), cameras.height, cameras.width):
-        raise UserError(f"masks have shape {tuple(masks.shape)}; the cameras want {(len(cameras.viewmats), cameras.height, cameras.width)}")
+        raise UserError(f"masks have shape {tuple(masks.shape)}; the cameras need {(len(cameras.viewmats), cameras.height, cameras.width)}")
     low, high = masks.new_tensor(lower), masks.new_tensor(upper)
     coarse = _carve(masks, cameras, low, high, 48, widen=True)
     inside = (coarse.values > LEVEL).nonzero()
@@ -95,12 +95,12 @@ def visual_hull(masks: Tensor, cameras: Cameras, lower: Vector, upper: Vector, *
 
 
 def opacity_volume(gaussians: Gaussians, *, spacing: float, hull: Volume | None = None) -> Volume:
-    """Return the opacity of Gaussians, 1 - prod(1 - o exp(-d^2 / 2)), one in all enclosed cells, and at most that of the hull.
+    """Return the opacity of Gaussians, 1 - prod(1 - o exp(-d^2 / 2)), set to one in enclosed cells and limited by the hull.
 
     Args:
-        gaussians: At t = 0.
+        gaussians: Gaussians at t = 0.
         spacing: Edge of a cell [m].
-        hull: From `visual_hull`: what it denies is empty.
+        hull: Result of `visual_hull`, an upper bound of the field.
     """
     from scipy import ndimage
 
@@ -126,19 +126,19 @@ def fill(
     """Fill a volume with particles.
 
     Args:
-        volume: Where the body is.
-        count: About how many; or
-        spacing: Their distance [m].
-        method: `voxel`: one in each cube of this edge, jittered; `poisson`: at random, none closer to another than a
-            distance that gives the same number (Poisson disks).
-        level: Of the volume.
-        seed: Of the places.
+        volume: Volume of the body.
+        count: Approximate number of particles; alternatively
+        spacing: Particle spacing [m].
+        method: `voxel`: one jittered particle per cube of a lattice; `poisson`: Poisson-disk sampling with a minimum distance that gives
+            about the same number of particles.
+        level: Level of the field above which the body lies.
+        seed: Seed of the positions.
 
     Returns:
-        Positions (P, 3) [m] and volumes (P,) [m^3], which are equal and add up to that of the body. Both on the CPU, float32.
+        Positions (P, 3) [m], and equal volumes (P,) [m^3] whose sum is the volume of the body. Both on the CPU, float32.
 
     Raises:
-        UserError: Neither or both of count and spacing, an unknown method, or a spacing too coarse for a particle.
+        UserError: Not exactly one of count and spacing is given, the method is unknown, or the spacing is too coarse for a single particle.
     """
     if (count is None) == (spacing is None):
         raise UserError("give either the number of particles or their spacing")
@@ -167,7 +167,7 @@ def _carve(masks: Tensor, cameras: Cameras, lower: Tensor, upper: Tensor, resolu
         seen = x @ viewmat[:3, :3].T + viewmat[:3, 3]
         depth = seen[:, 2].clamp(min=1e-6)
         pixel = seen[:, :2] / depth[:, None] * torch.stack([K[0, 0], K[1, 1]]) + K[:2, 2]
-        if widen:  # nothing may slip between the centres of coarse cells
+        if widen:  # no thin part may fall between the centres of coarse cells
             near = max(0, math.ceil(0.87 * spacing * float(K[0, 0]) / float(depth.median())))
             mask = torch.nn.functional.max_pool2d(mask[None, None], 2 * near + 1, 1, near)[0, 0]
         size = pixel.new_tensor([cameras.width, cameras.height])
@@ -181,9 +181,9 @@ def _carve(masks: Tensor, cameras: Cameras, lower: Tensor, upper: Tensor, resolu
 
 
 def _transmittance(gaussians: Gaussians, lower: Tensor, spacing: float, shape: list[int]) -> Tensor:
-    """Return prod(1 - o exp(-d^2 / 2)) at the cells' centres, (X, Y, Z).
+    """Return the transmittance prod(1 - o exp(-d^2 / 2)) at the cell centres, (X, Y, Z).
 
-    Gaussians are at least a third of a cell wide, so that none slips through.
+    Gaussians are widened by a third of a cell, so that none falls between the centres.
     """
     means, covariances = gaussians.means.detach(), gaussians.covariances.detach()
     covariances = covariances + (spacing / 3) ** 2 * torch.eye(3, device=means.device, dtype=means.dtype)
@@ -204,7 +204,7 @@ def _transmittance(gaussians: Gaussians, lower: Tensor, spacing: float, shape: l
 
 
 def _fill_enclosed(solid: np.ndarray, share: int = 24) -> np.ndarray:
-    """Return cells from which at least `share` of the 26 rays to the sides, edges and corners of a cube meet another that is solid."""
+    """Return the cells from which at least `share` of the 26 rays to the faces, edges and corners of a cube hit a solid cell."""
     hits = np.zeros(solid.shape, dtype=np.int8)
     for direction in itertools.product((-1, 0, 1), repeat=3):
         axis = next((a for a, step in enumerate(direction) if step), None)
@@ -212,7 +212,7 @@ def _fill_enclosed(solid: np.ndarray, share: int = 24) -> np.ndarray:
             continue
         step, across = direction[axis], [direction[a] for a in range(3) if a != axis]
         slices, counts = np.moveaxis(solid, axis, 0), np.moveaxis(hits, axis, 0)
-        carried = np.zeros_like(slices[0])  # whether the ray against the order of slices has met something
+        carried = np.zeros_like(slices[0])  # whether the ray has hit a solid cell in the slices before
         for i in range(len(slices))[::-step]:
             carried = _shift(carried, across)
             counts[i] += carried
@@ -221,13 +221,13 @@ def _fill_enclosed(solid: np.ndarray, share: int = 24) -> np.ndarray:
 
 
 def _shift(plane: np.ndarray, by: list[int]) -> np.ndarray:
-    """Return plane[i + by[0], j + by[1]], False outside."""
+    """Return the plane shifted by an offset, plane[i + by[0], j + by[1]], False outside."""
     padded = np.pad(plane, 1)
     return padded[1 + by[0] : 1 + by[0] + plane.shape[0], 1 + by[1] : 1 + by[1] + plane.shape[1]]
 
 
 def _lattice(volume: Volume, edge: float, level: float, generator: np.random.Generator) -> Tensor:
-    """Return One jittered point in each cube of a lattice whose middle lies in the volume."""
+    """Return one jittered point for each cube of a lattice, where the point lies in the volume."""
     counts = [math.ceil(n * volume.spacing / edge) for n in volume.values.shape]
     axes = [torch.arange(n, dtype=torch.float32) + 0.5 for n in counts]
     cell = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -237,9 +237,9 @@ def _lattice(volume: Volume, edge: float, level: float, generator: np.random.Gen
 
 
 def _poisson(volume: Volume, edge: float, level: float, generator: np.random.Generator) -> Tensor:
-    """Sample Poisson disks: candidates in random order, each taken unless a taken one lies closer than the distance.
+    """Sample Poisson disks: visit candidates in random order and accept each unless an accepted one is closer than the distance.
 
-    All candidates that come first among their neighbours are taken at once, which gives the same as one by one.
+    All candidates that precede their neighbours are accepted at once, which gives the same result as one at a time.
     """
     from scipy.spatial import cKDTree
 
@@ -248,7 +248,7 @@ def _poisson(volume: Volume, edge: float, level: float, generator: np.random.Gen
     lower = volume.lower.cpu().double().numpy()
     many = max(1, math.ceil(12 * volume.spacing**3 / edge**3))
     corner = np.repeat(cells, many, axis=0) + generator.uniform(0, 1, (len(cells) * many, 3))
-    if many == 1:  # candidates are cheap; thin them to about twelve a particle
+    if many == 1:  # thin the candidates to about twelve per particle
         keep = generator.uniform(0, 1, len(corner)) < 12 * volume.spacing**3 / edge**3
         corner = corner[keep]
     x = lower + volume.spacing * corner
@@ -256,7 +256,7 @@ def _poisson(volume: Volume, edge: float, level: float, generator: np.random.Gen
     generator.shuffle(x)
     distance = 0.825 * edge  # so that about one particle falls on edge^3
     pairs = cKDTree(x).query_pairs(distance, output_type="ndarray") if len(x) else np.empty((0, 2), int)
-    first, second = pairs.min(1), pairs.max(1)  # the index is the rank
+    first, second = pairs.min(1), pairs.max(1)  # the index is the order of the visits
     open_, taken = np.ones(len(x), bool), np.zeros(len(x), bool)
     while open_.any():
         live = open_[first] & open_[second]

@@ -1,7 +1,7 @@
-"""The first frame of several views as 3D Gaussians, optimised by gradient descent on the images (Kerbl et al. 2023).
+"""Reconstruction of the first frame as 3D Gaussians, optimised on images of several views (Kerbl et al. 2023).
 
-They start on the visual hull of the masks, are rendered by `splatting.rasterize`, and are cloned, split and pruned as in 3DGS.
-Colours do not depend on the direction of view (harmonics of degree 0).
+The Gaussians are initialised on the visual hull of the masks, rendered by `splatting.rasterize`, and cloned, split and pruned as in 3DGS.
+Colours are independent of the viewing direction (spherical harmonics of degree 0).
 """
 
 import math
@@ -21,31 +21,32 @@ from neuido.types import Cameras, Gaussians, MultiViewBatch, Vector
 
 PARTS = ("means", "log_scales", "quaternions", "logits", "harmonics")
 RATES = {"means": 1e-3, "log_scales": 1e-2, "quaternions": 3e-3, "logits": 5e-2, "harmonics": 2e-2}
-"""Adam's rates; that of the means is in sizes of the body, and falls to a hundredth."""
+"""Learning rates of Adam; that of the means is relative to the size of the body, and decays to a hundredth."""
 
 
 @renamed_options(start="initial_gaussians", limit="max_gaussians", largest="max_scale")
 class ReconstructModule(LightningModule):
-    """Gaussians of one frame.
+    """Fit Gaussians to the first frame.
 
-    The data module's `batch` holds the views that are trained on (`MultiViewBatch`, of which the first frame counts). What its loader
-    yields does not matter: a step's views follow from its number, so that a resumed run goes on as the interrupted one would have.
+    The attribute `batch` of the data module holds the training views (`MultiViewBatch`; only the first frame is used). The items of its
+    loader are ignored: the views of a step are derived from the step number, so a resumed run continues exactly as an uninterrupted one.
 
     Args:
-        lower, upper: Corners of the box in which the body lies [m].
-        steps: Optimiser steps, for the schedules.
-        start: Gaussians at the start.
-        limit: Most Gaussians.
-        views: Views of a step.
+        lower, upper: Corners of a box that contains the body [m].
+        steps: Optimiser steps, which determine the schedules.
+        initial_gaussians: Initial number of Gaussians.
+        max_gaussians: Maximum number of Gaussians.
+        views: Views in each step.
         lr: Factor on all learning rates.
-        ssim: Weight of 1 - SSIM against L1 (3DGS: 0.2).
-        silhouette: Weight of the difference of opacity and mask.
-        densify_gradient: Mean gradient of the projected centre above which a Gaussian is cloned or split, per half image (3DGS: 2e-4).
-        densify_every: Steps between two densifications, which end after three fifths of all.
-        prune_opacity: Gaussians below are dropped.
-        largest: Largest standard deviation, in sizes of the body: large ones cannot follow a deformation.
-        resolution: Cells of the hull along the body's longest side.
-        seed: Of all that is drawn.
+        ssim: Weight of 1 - SSIM relative to L1 (3DGS: 0.2).
+        silhouette: Weight of the L1 error between opacity and mask.
+        densify_gradient: Mean gradient with respect to the projected centre, per half image, above which a Gaussian is cloned or split
+            (3DGS: 2e-4).
+        densify_every: Steps between densifications, which stop after three fifths of all steps.
+        prune_opacity: Opacity below which a Gaussian is removed.
+        max_scale: Maximum standard deviation relative to the size of the body; large Gaussians cannot follow a deformation.
+        resolution: Cells of the hull along the longest side of the body.
+        seed: Random seed.
     """
 
     def __init__(
@@ -83,26 +84,26 @@ class ReconstructModule(LightningModule):
         self.hull: Volume | None = None
 
     def gaussians(self) -> Gaussians:
-        """Return the Gaussians, differentiable in the parameters."""
+        """Return the current Gaussians, differentiable in the parameters."""
         covariances = covariances_of(self.log_scales.exp(), self.quaternions)
         return Gaussians(self.means, covariances, self.logits.sigmoid(), self.harmonics)
 
     def render(self, cameras: Cameras, background: Tensor) -> tuple[Tensor, Tensor]:
-        """Render images (V, H, W, 3) over the background (3,), and alphas (V, H, W)."""
+        """Return images (V, H, W, 3) over the background (3,), and alphas (V, H, W)."""
         g = self.gaussians()
         return rasterize(g.means, g.covariances, g.opacities, g.harmonics, *cameras, sh_degree=0, background=background)
 
     def setup(self, stage: str) -> None:
-        """Find the hull, and put the first Gaussians on it."""
+        """Carve the hull, and initialise the Gaussians on it."""
         batch = self.trainer.datamodule.batch
-        self.batch = _first_frame(batch, self.trainer.strategy.root_device)  # where the module itself goes only after this
+        self.batch = _first_frame(batch, self.trainer.strategy.root_device)  # the module itself is moved to it only after `setup`
         masks, cameras = self.batch.masks[:, 0], self.batch.cameras
         self.hull = visual_hull(masks, cameras, self.hparams.lower, self.hparams.upper, resolution=self.hparams.resolution)
         if not len(self.means):
-            self._start()
+            self._initialise()
 
     @torch.no_grad()
-    def _start(self) -> None:
+    def _initialise(self) -> None:
         assert self.hull is not None
         generator = torch.Generator().manual_seed(self.hparams.seed)
         hull = self.hull
@@ -112,21 +113,21 @@ class ReconstructModule(LightningModule):
         picked = torch.randint(len(surface), (self.hparams.initial_gaussians,), generator=generator).to(surface.device)
         jitter = torch.rand(len(picked), 3, generator=generator).to(surface.device)
         x = hull.lower + hull.spacing * (surface[picked] + jitter)
-        near = math.sqrt(len(surface) * hull.spacing**2 / len(x))  # the surface's share of one
+        near = math.sqrt(len(surface) * hull.spacing**2 / len(x))  # spacing of the Gaussians on the surface
         self.size.copy_((hull.centres()[inside].amax(0) - hull.centres()[inside].amin(0)).norm())
         new = {
             "means": x,
             "log_scales": torch.full_like(x, math.log(0.6 * near)),
             "quaternions": torch.nn.functional.normalize(torch.randn(len(x), 4, generator=generator)).to(x),
             "logits": torch.full_like(x[:, 0], 1.0),
-            "harmonics": harmonics_of(self._seen(x, hull)),
+            "harmonics": harmonics_of(self._colours_on(x, hull)),
         }
         for name in PARTS:
             setattr(self, name, nn.Parameter(new[name].contiguous()))
         self.gradient = torch.zeros(len(x), device=x.device)
 
-    def _seen(self, x: Tensor, hull: Volume) -> Tensor:
-        """Return colours of points on the hull (N, 3), from the views that look at their side of it."""
+    def _colours_on(self, x: Tensor, hull: Volume) -> Tensor:
+        """Return the colours of points on the hull (N, 3), as a mean over the views that face them."""
         step = hull.spacing
         normal = torch.stack([hull.at(x - step * e) - hull.at(x + step * e) for e in torch.eye(3, device=x.device)], 1)
         total, weights = torch.full_like(x, 1e-6), torch.full_like(x[:, :1], 2e-6)
@@ -165,12 +166,12 @@ class ReconstructModule(LightningModule):
         return loss
 
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
-        """Take a step and densify; Lightning saves checkpoints before `on_train_batch_end`, which would be too late for this."""
+        """Take a step and densify; not in `on_train_batch_end`, because Lightning saves checkpoints before it."""
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
-        self._after(self.global_step + 1)
+        self._after_step(self.global_step + 1)
 
     @torch.no_grad()
-    def _after(self, done: int) -> None:
+    def _after_step(self, done: int) -> None:
         self._accumulate_gradient()
         low, high = math.log(1e-4 * float(self.size)), math.log(self.hparams.max_scale * float(self.size))
         self.log_scales.clamp_(low, high)
@@ -181,7 +182,7 @@ class ReconstructModule(LightningModule):
                 group["lr"] = RATES["means"] * self.hparams.lr * float(self.size) * 0.01 ** min(1.0, done / self.hparams.steps)
 
     def _accumulate_gradient(self) -> None:
-        """Accumulate the gradient of the loss by the projected centre of each Gaussian, per half image."""
+        """Accumulate the gradient of the loss with respect to the projected centre of each Gaussian, per half image."""
         cameras = self.batch.cameras
         depth = (self.means @ cameras.viewmats[:, 2, :3].T + cameras.viewmats[:, 2, 3]).mean(1).abs()
         scale = 0.5 * cameras.width / float(cameras.Ks[:, 0, 0].mean())
@@ -189,14 +190,14 @@ class ReconstructModule(LightningModule):
         self.count += 1
 
     def _densify(self, done: int) -> None:
-        """Clone small Gaussians that are pulled about, split large ones in two, drop transparent ones (3DGS, section 5)."""
+        """Clone small and split large Gaussians with a large gradient, and prune transparent ones (3DGS, section 5)."""
         generator = torch.Generator().manual_seed(7_000_003 * self.hparams.seed + done)
         mean = self.gradient / self.count.clamp(min=1)
         spread = self.log_scales.exp().amax(1)
         kept = self.logits.sigmoid() > self.hparams.prune_opacity
         wanted = (mean > self.hparams.densify_gradient) & kept
         room = self.hparams.max_gaussians - int(kept.sum())
-        if int(wanted.sum()) > room:  # those that are pulled most
+        if int(wanted.sum()) > room:  # those with the largest gradients
             order = torch.where(wanted, mean, -1.0).argsort(descending=True)
             wanted = torch.zeros_like(wanted).index_fill(0, order[: max(room, 0)], True)
         split = wanted & (spread > 0.5 * self.hparams.max_scale * self.size)
@@ -227,7 +228,7 @@ class ReconstructModule(LightningModule):
         self.count.zero_()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take as many Gaussians as the checkpoint has."""
+        """Resize the parameters to the number of Gaussians in the checkpoint."""
         state = checkpoint["state_dict"]
         for name in PARTS:
             setattr(self, name, nn.Parameter(torch.empty_like(state[name], device=self.device)))
