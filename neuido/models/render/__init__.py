@@ -1,1 +1,1 @@
-"""Gaussian splatting: rasterizer, and Gaussians that move with particles."""
+"""Gaussian splatting: the rasterizer, and Gaussians that move with particles."""

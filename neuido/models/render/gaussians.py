@@ -1,4 +1,4 @@
-"""Gaussians as a body wears them: harmonics, 3DGS PLY files, and motion with the particles that carry them."""
+"""Gaussians of a body: spherical harmonics, 3DGS PLY files, and deformation with the particles."""
 
 import functools
 from os import PathLike
@@ -16,14 +16,14 @@ from neuido.physics.runtime.device import as_device
 from neuido.types import Gaussians
 
 C0 = 0.28209479177387814
-"""The constant harmonic, 1 / sqrt(4 pi)."""
+"""Constant spherical harmonic, 1 / sqrt(4 pi)."""
 
 REACH = 7.815
 """Squared Mahalanobis distance within which a Gaussian holds 95 % of its mass (chi squared, three degrees of freedom; NeuMA)."""
 
 
 def degree_of(harmonics: Tensor) -> int:
-    """Return degree of harmonics (N, K, 3)."""
+    """Return the degree of spherical harmonics (N, K, 3)."""
     degree = {1: 0, 4: 1, 9: 2, 16: 3}.get(harmonics.shape[-2])
     if degree is None:
         raise UserError(f"harmonics have {harmonics.shape[-2]} coefficients; needed 1, 4, 9 or 16")
@@ -55,12 +55,12 @@ def colours_of(harmonics: Tensor, directions: Tensor | None, *, degree: int) -> 
     """Evaluate the RGB of Gaussians seen from a direction, max(0, 1/2 + harmonics).
 
     Args:
-        harmonics: (N, K, 3), of which the first (degree + 1)^2 count.
-        directions: From the camera to the Gaussian, of any length, (..., N, 3); not needed at degree 0.
-        degree: 0 to 3.
+        harmonics: Coefficients (N, K, 3), of which the first (degree + 1)^2 are used.
+        directions: Vectors from the camera to the Gaussian, of any length, (..., N, 3); not needed for degree 0.
+        degree: Degree, 0 to 3.
 
     Returns:
-        (..., N, 3), or (N, 3) at degree 0.
+        RGB (..., N, 3), or (N, 3) for degree 0.
     """
     used = (degree + 1) ** 2
     if harmonics.shape[-2] < used:
@@ -72,7 +72,7 @@ def colours_of(harmonics: Tensor, directions: Tensor | None, *, degree: int) -> 
 
 
 def harmonics_of(colours: Tensor) -> Tensor:
-    """Return harmonics of degree 0, (N, 1, 3), of RGB (N, 3)."""
+    """Return spherical harmonics of degree 0, (N, 1, 3), that give the RGB (N, 3)."""
     return ((colours - 0.5) / C0).unsqueeze(-2)
 
 
@@ -80,12 +80,12 @@ def attach_gaussians(x: Tensor, volume: Tensor, colours: Tensor | None = None, *
     """Attach one Gaussian to each particle of a body.
 
     Args:
-        x: Positions [m], (P, 3).
-        volume: Volumes [m^3], (P,).
+        x: Particle positions [m], (P, 3).
+        volume: Particle volumes [m^3], (P,).
         colours: RGB, (P, 3); black where absent.
-        spread: Standard deviation in units of the cube root of the mean volume; at 0.3 the outline of a body that is some particles thick
-            lies 0.15 of that root outside its surface, and no hole shows.
-        opacity: Of each.
+        spread: Standard deviation relative to the cube root of the mean volume. With 0.3 a body that is several particles thick shows no
+            holes, and its silhouette lies 0.15 of that length outside its surface.
+        opacity: Opacity of each Gaussian.
     """
     side = float(volume.mean()) ** (1 / 3)
     covariances = ((spread * side) ** 2 * torch.eye(3).to(x)).expand(len(x), 3, 3).contiguous()
@@ -94,30 +94,32 @@ def attach_gaussians(x: Tensor, volume: Tensor, colours: Tensor | None = None, *
 
 
 class Binding(NamedTuple):
-    """Which particles carry each Gaussian."""
+    """Particles that carry each Gaussian, and their weights."""
 
     index: Tensor
-    """Particles, (N, k) int64."""
+    """Indices of the particles, (N, k) int64."""
     weight: Tensor
-    """Their weights, which sum to one; zero where there are fewer than k, (N, k)."""
+    """Weights of the particles, which sum to one, (N, k); zero for unused entries."""
     rest: Tensor
-    """Weighted mean of their positions at t = 0 [m], (N, 3)."""
+    """Weighted mean of the particle positions at t = 0 [m], (N, 3)."""
 
     def average(self, values: Tensor) -> Tensor:
-        """Return weighted mean over the particles of each Gaussian: (..., P, m) -> (..., N, m)."""
+        """Return the weighted mean over the particles of each Gaussian, (..., P, m) -> (..., N, m)."""
         index = self.index.to(values.device)
         parts = (values.index_select(-2, index[:, j]) * w[:, None] for j, w in enumerate(self.weight.to(values).unbind(1)))
         return functools.reduce(torch.add, parts)
 
 
 def bind(gaussians: Gaussians, x: Tensor, *, nearest: int = 10, reach: float = REACH) -> Binding:
-    """Bind Gaussians to particles: the uniform mean of at most `nearest` within the 95 % ellipsoid (NeuMA), or the nearest particle alone.
+    """Bind each Gaussian to particles, with uniform weights (NeuMA).
+
+    A Gaussian is bound to at most `nearest` particles within its 95 % ellipsoid, or to the nearest particle if there is none.
 
     Args:
-        gaussians: At t = 0.
-        x: Particles at t = 0 [m], (P, 3).
-        nearest: Most particles of one Gaussian.
-        reach: Largest squared Mahalanobis distance [-].
+        gaussians: Gaussians at t = 0.
+        x: Particle positions at t = 0 [m], (P, 3).
+        nearest: Maximum number of particles of a Gaussian.
+        reach: Maximum squared Mahalanobis distance [-].
     """
     from scipy.spatial import cKDTree
 
@@ -141,16 +143,16 @@ def bind(gaussians: Gaussians, x: Tensor, *, nearest: int = 10, reach: float = R
 
 
 def deform(gaussians: Gaussians, F: Tensor, x: Tensor, binding: Binding | None = None) -> Gaussians:
-    """Move Gaussians with particles: means with x, covariance F A F^T with the first frame's A, harmonics with the polar part of F.
+    """Deform Gaussians with particles: means follow x, covariances A become F A F^T, harmonics rotate with the polar part R of F.
 
-    The gradient reaches F and x through means, covariances and the direction of view. Colours turn as in PhysGaussian: not the
-    harmonics but the direction of view is rotated, by R^T.
+    The result is differentiable in F and x through means, covariances and viewing directions. As in PhysGaussian, the viewing direction is
+    rotated by R^T in place of the harmonics.
 
     Args:
-        gaussians: At t = 0.
-        F: Deformation gradient of the particles [-], (..., P, 3, 3).
-        x: Their positions [m], (..., P, 3).
-        binding: See `bind`; absent: Gaussian i is particle i.
+        gaussians: Gaussians at t = 0.
+        F: Deformation gradients of the particles [-], (..., P, 3, 3).
+        x: Particle positions [m], (..., P, 3).
+        binding: Result of `bind`; where absent, Gaussian i is particle i.
     """
     if binding is None:
         if F.shape[-3] != len(gaussians.means):
@@ -168,7 +170,7 @@ def deform(gaussians: Gaussians, F: Tensor, x: Tensor, binding: Binding | None =
 
 
 def covariances_of(scales: Tensor, quaternions: Tensor) -> Tensor:
-    """Return R diag(s^2) R^T [m^2] (..., 3, 3) from standard deviations [m] (..., 3) and quaternions w, x, y, z (..., 4) of any length."""
+    """Return covariances R diag(s^2) R^T [m^2] (..., 3, 3) for standard deviations [m] (..., 3) and quaternions wxyz (..., 4), any norm."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
     entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
     entries += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
@@ -178,7 +180,7 @@ def covariances_of(scales: Tensor, quaternions: Tensor) -> Tensor:
 
 
 def scales_and_quaternions(covariances: Tensor) -> tuple[Tensor, Tensor]:
-    """Invert `covariances_of`: standard deviations (N, 3), smallest first, and unit quaternions (N, 4)."""
+    """Invert `covariances_of`: return standard deviations (N, 3), smallest first, and unit quaternions (N, 4)."""
     from scipy.spatial.transform import Rotation
 
     values, vectors = torch.linalg.eigh(covariances.detach().double().cpu())
@@ -188,10 +190,10 @@ def scales_and_quaternions(covariances: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
-    """Write a 3DGS PLY file (`point_cloud.ply`): logit of opacity, log of scale, quaternion w, x, y, z, harmonics channel by channel.
+    """Write a 3DGS PLY file (`point_cloud.ply`): logit opacities, log scales, quaternions wxyz, and harmonics by channel.
 
     Raises:
-        UserError: Several frames, or Gaussians that are rotated against their harmonics, which the format cannot hold.
+        UserError: There are several frames, or rotations relative to the harmonics, neither of which the format can hold.
     """
     from plyfile import PlyData, PlyElement
 
@@ -212,11 +214,15 @@ def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
 
 
 def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device: str | torch.device = "auto") -> Gaussians:
-    """Read a 3DGS PLY file.
+    """Read a 3DGS PLY file; rows that are not finite are skipped with a warning.
+
+    Args:
+        path: The file.
+        dtype: Type of the tensors.
+        device: `auto` (CUDA where available), `cpu`, `cuda`, or a torch device.
 
     Raises:
-        UserError: No such file, not a PLY file, or one whose vertices lack what a Gaussian needs. Rows that are not finite are left out
-            with a warning.
+        UserError: The file is missing, is not a PLY file, or its vertices lack properties of a Gaussian.
     """
     vertices = read_gaussian_vertices(Path(path))
     rest = sum(name.startswith("f_rest_") for name in vertices.dtype.names)

@@ -1,4 +1,4 @@
-"""The slow twin of the splatting kernels: plain torch, every pixel over every Gaussian, differentiable by autograd, any float type."""
+"""Slow reference of the splatting kernels in plain torch: all pixels times all Gaussians, any float type, differentiable by autograd."""
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ def project(means: Tensor, covariances: Tensor, viewmat: Tensor, K: Tensor, widt
     """Project Gaussians into the image of one camera.
 
     Returns:
-        Centre [pixels] (N, 2), covariance [pixels^2] (N, 2, 2) with `eps2d` added, depth [m] (N,). The Jacobian is taken with x/z and y/z
+        Centre [pixels] (N, 2), covariance [pixels^2] (N, 2, 2) including `eps2d`, depth [m] (N,). The Jacobian uses x/z and y/z
         clamped to 1.3 times the image (gsplat).
     """
     R, t = viewmat[:3, :3], viewmat[:3, 3]
@@ -28,12 +28,12 @@ def project(means: Tensor, covariances: Tensor, viewmat: Tensor, K: Tensor, widt
 
 
 def compose(centre: Tensor, spread: Tensor, depth: Tensor, opacities: Tensor, colours: Tensor, width: int, height: int):
-    """Blend Gaussians front to back: colour (H, W, 3) and alpha (H, W)."""
+    """Blend Gaussians front to back; return colours (H, W, 3) and alphas (H, W)."""
     order = depth.argsort(stable=True)
     centre, conic, opacities, colours = centre[order], torch.linalg.inv(spread[order]), opacities[order], colours[order]
     like = {"dtype": centre.dtype, "device": centre.device}
     lines = []
-    for line in range(height):  # a line at a time bounds the memory
+    for line in range(height):  # row by row, to bound the memory
         pixels = torch.stack(torch.broadcast_tensors(torch.arange(width, **like) + 0.5, torch.tensor(line + 0.5, **like)), -1)
         d = centre - pixels[:, None]
         density = torch.exp(-0.5 * torch.einsum("wni,nij,wnj->wn", d, conic, d))
@@ -48,7 +48,7 @@ def compose(centre: Tensor, spread: Tensor, depth: Tensor, opacities: Tensor, co
 
 
 def rasterize(means, covariances, opacities, colours, viewmats, Ks, width, height, near, far, eps2d) -> tuple[Tensor, Tensor]:
-    """Render images (F, V, H, W, 3) and alphas (F, V, H, W); shapes of the arguments as in `splatting._Splat`."""
+    """Return images (F, V, H, W, 3) and alphas (F, V, H, W); the arguments have the shapes of `splatting._Splat`."""
     images, alphas = [], []
     for f in range(len(means)):
         for v in range(len(viewmats)):

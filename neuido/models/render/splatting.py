@@ -1,10 +1,10 @@
-"""Differentiable Gaussian splatting with gsplat's conventions, frames and views in one call.
+"""Differentiable Gaussian splatting with the conventions of gsplat, for all frames and views in one call.
 
-Images of 3D Gaussians (Kerbl et al. 2023) by gsplat's rules: OpenCV cameras, pixel centres at +0.5, `eps2d` added to the covariance in
-pixels, alpha between 1/255 and 0.999, a pixel finished at a transmittance of 1e-4, no antialiasing. Gaussians are drawn in the order of
-the depth of their centres; their tiles hold every pixel where they count, so tiles leave no trace.
+Images of 3D Gaussians (Kerbl et al. 2023) follow the rules of gsplat: OpenCV cameras, pixel centres at +0.5, `eps2d` added to the
+covariance in pixels, alpha between 1/255 and 0.999, early termination at a transmittance of 1e-4, no antialiasing. Gaussians are sorted by
+the depth of their centres. The tiles of a Gaussian cover every pixel to which it contributes, so the tiling does not affect the image.
 
-Three back ends behind one call: `warp` (own kernels, CPU and CUDA), `torch` (the slow twin), and `gsplat`, where it is installed.
+There are three back ends: `warp` (own kernels for CPU and CUDA), `torch` (the slow reference), and `gsplat`, if it is installed.
 """
 
 import math
@@ -23,14 +23,14 @@ from neuido.types import Cameras, Gaussians
 
 BACKENDS = ("auto", "warp", "torch", "gsplat")
 TILE = {"cpu": 8, "cuda": 16}
-"""Side of a tile: small ones cost least where there is no shared memory to fill."""
+"""Side of a tile [pixels]: small tiles are faster on the CPU, which has no shared memory to fill."""
 
 INDEX_LIMIT = 2**31 - 1
-"""Indices in the kernels are 32 bits."""
+"""Largest index of the kernels, which use 32-bit integers."""
 
 
 def one_thread_per_tile(device: torch.device) -> bool:
-    """Say whether a thread does a whole tile, splat by splat (CPU), or one pixel (CUDA)."""
+    """Return whether one thread composes a whole tile, splat by splat (CPU), rather than one pixel (CUDA)."""
     return device.type == "cpu"
 
 
@@ -55,33 +55,33 @@ def rasterize(
 ) -> tuple[Tensor, Tensor]:
     """Render Gaussians for all frames (the leading dimensions) and all views at once.
 
-    Differentiable with respect to means, covariances, opacities, colours, rotations and background; not to cameras. Gradients of
-    opacities and colours are computed where they are wanted, those of means and covariances always.
+    The images are differentiable with respect to means, covariances, opacities, colours, rotations and background, but not cameras. The
+    gradients of opacities and colours are only computed if needed, those of means and covariances always.
 
     Args:
         means: Centres [m].
-        covariances: [m^2]; the symmetric part counts.
-        opacities: In 0..1.
-        colours: RGB, or harmonics where `sh_degree` is given: then RGB = max(0, 1/2 + harmonics in the direction of view).
-        viewmats: World to camera, OpenCV.
+        covariances: Covariances [m^2]; only the symmetric part is used.
+        opacities: Opacities in 0..1.
+        colours: RGB, or spherical harmonics if `sh_degree` is given; then RGB = max(0, 1/2 + harmonics in the viewing direction).
+        viewmats: World-to-camera matrices, OpenCV convention.
         Ks: Intrinsics [pixels]; skew is ignored.
-        width: Of the images [pixels].
-        height: Of the images [pixels].
-        sh_degree: 0 to 3.
-        rotations: Rotation of each Gaussian since its harmonics were fitted: the direction of view is rotated back.
+        width: Image width [pixels].
+        height: Image height [pixels].
+        sh_degree: Degree of the spherical harmonics, 0 to 3.
+        rotations: Rotation of each Gaussian relative to its harmonics; the viewing direction is rotated back by it.
         background: RGB behind the Gaussians; black where absent.
-        near: Gaussians with centres closer than this [m] are not drawn.
-        far: Nor are those beyond this [m].
-        eps2d: Added to the diagonal of the covariance in pixels [pixels^2].
-        backend: `warp`, `torch`, `gsplat`, or `auto`: warp.
-        capacity: Most entries in the lists of all tiles together, for CUDA. Where it is given nothing waits for the device, so that the
-            call can be captured in a graph; images are NaN where it was too small. Otherwise the call reads one number back.
+        near: Near plane [m]; Gaussians with closer centres are not drawn.
+        far: Far plane [m]; Gaussians with centres beyond it are not drawn.
+        eps2d: Number added to the diagonal of the covariance in pixels [pixels^2].
+        backend: `warp`, `torch`, `gsplat`, or `auto` (warp).
+        capacity: Maximum total length of the tile lists on CUDA. With it, the call never synchronises with the device and can be captured
+            in a CUDA graph; images are NaN if it is too small. Without it, the call reads one number back.
 
     Returns:
-        Images (..., V, H, W, 3) and alphas (..., V, H, W), the share of each pixel that Gaussians cover.
+        Images (..., V, H, W, 3), and alphas (..., V, H, W): the coverage of each pixel by Gaussians.
 
     Raises:
-        UserError: Shapes that do not fit, a number that is not finite, a back end that is not there.
+        UserError: Shapes do not match, a number is not finite, or the back end is not available.
     """
     frames, means, covariances, opacities = _frames(means, covariances, opacities, viewmats, Ks)
     if backend not in BACKENDS:
@@ -104,14 +104,14 @@ def rasterize(
 
 
 def render(gaussians: Gaussians, cameras: Cameras, **options) -> tuple[Tensor, Tensor]:
-    """Render Gaussians with cameras by `rasterize`, whose keywords `options` are."""
+    """Render Gaussians with cameras; `options` are keyword arguments of `rasterize`."""
     degree = degree_of(gaussians.harmonics)
     means, covariances, opacities, harmonics, rotations = gaussians
     return rasterize(means, covariances, opacities, harmonics, *cameras, sh_degree=degree, rotations=rotations, **options)
 
 
 class Splatting(nn.Module):
-    """`render` as a module that keeps its options; arguments as in `rasterize`."""
+    """Module that calls `render` with stored options; the arguments are those of `rasterize`."""
 
     def __init__(
         self,
@@ -127,12 +127,12 @@ class Splatting(nn.Module):
         self.options = {"near": near, "far": far, "eps2d": eps2d, "backend": backend, "capacity": capacity}
 
     def forward(self, gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
-        """Render images (..., V, H, W, 3) and alphas (..., V, H, W)."""
+        """Return images (..., V, H, W, 3) and alphas (..., V, H, W)."""
         return render(gaussians, cameras, background=self.background, **self.options)
 
 
 def _frames(means: Tensor, covariances: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor):
-    """Return leading dimensions, and means (F, N, 3), covariances (F, N, 3, 3), opacities (1 or F, N)."""
+    """Return the leading dimensions, and means (F, N, 3), covariances (F, N, 3, 3) and opacities (1 or F, N)."""
     if means.dim() < 2 or means.shape[-1] != 3:
         raise UserError(f"means have shape {tuple(means.shape)}; needed (..., N, 3)")
     if means.dtype not in (torch.float32, torch.float64):
@@ -156,7 +156,7 @@ def _frames(means: Tensor, covariances: Tensor, opacities: Tensor, viewmats: Ten
 
 
 def _view_colours(colours: Tensor, means: Tensor, viewmats: Tensor, sh_degree: int | None, rotations: Tensor | None, frames) -> Tensor:
-    """Return RGB of each Gaussian, (1 or F, 1 or V, N, 3)."""
+    """Return the RGB of each Gaussian, (1 or F, 1 or V, N, 3)."""
     count = means.shape[1]
     if colours.device != means.device:
         raise UserError(f"colours are on {colours.device} and means on {means.device}; needed on one device")
@@ -181,9 +181,9 @@ def _gsplat(means, covariances, opacities, colours, viewmats, Ks, width, height,
     try:
         from gsplat import rasterization  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise UserError("backend 'gsplat' is not installed: pip install 'neuido[gpu]', or take backend 'warp'") from error
+        raise UserError("backend 'gsplat' is not installed: pip install 'neuido[gpu]', or use backend 'warp'") from error
     if not means.is_cuda:
-        raise UserError(f"backend 'gsplat' needs CUDA tensors, got {means.device}; take backend 'warp'")
+        raise UserError(f"backend 'gsplat' needs CUDA tensors, got {means.device}; use backend 'warp'")
     frames, views, count = len(means), len(viewmats), means.shape[1]
     images, alphas, _ = rasterization(
         means,
@@ -205,16 +205,16 @@ def _gsplat(means, covariances, opacities, colours, viewmats, Ks, width, height,
 
 
 class _TileLists:
-    """Which splats each tile shows, front to back: `splats`, and `ranges` of it (C tiles, 2)."""
+    """Splats of each tile, front to back: a flat list `splats`, and the `ranges` of the tiles in it (C tiles, 2)."""
 
     splats: Tensor
     ranges: Tensor
     broken: Tensor | None = None
-    """One bool on the device where nothing was read back: the capacity was too small, or a number not finite."""
+    """With a capacity, a bool on the device: whether the capacity was too small or a number was not finite."""
 
 
 def _lists_by_counting(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int) -> _TileLists:
-    """Build the tile lists on the CPU: Gaussians in the order of depth, then a counting sort by tile."""
+    """Build the tile lists on the CPU: sort the Gaussians by depth, then apply a counting sort by tile."""
     images, count = depth.shape
     lists = _TileLists()
     length = torch.zeros(images * tiles, dtype=torch.int32)
@@ -224,7 +224,7 @@ def _lists_by_counting(kernels, splat, depth: Tensor, status: Tensor, columns: i
     slot = (ends - length).int()
     lists.ranges = torch.stack([slot, ends.int()], 1)
     lists.splats = torch.empty(max(total, 1), dtype=torch.int32)
-    keys = torch.stack([depth, depth], 1)  # the sort needs room for as many again
+    keys = torch.stack([depth, depth], 1)  # the radix sort needs twice the space
     order = torch.arange(count, dtype=torch.int32).repeat(images, 2, 1)
     for k, o in zip(keys.flatten(1), order.flatten(1)):
         wp.utils.radix_sort_pairs(wp.from_torch(k), wp.from_torch(o), count)
@@ -233,7 +233,7 @@ def _lists_by_counting(kernels, splat, depth: Tensor, status: Tensor, columns: i
 
 
 def _lists_by_key(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int, capacity: int | None) -> _TileLists:
-    """Build the tile lists on CUDA: one sort of keys of tile and depth."""
+    """Build the tile lists on CUDA by one sort of keys that combine tile and depth."""
     images, count = depth.shape
     device = depth.device
     lists = _TileLists()
@@ -241,7 +241,7 @@ def _lists_by_key(kernels, splat, depth: Tensor, status: Tensor, columns: int, t
     launch(kernels.count, images * count, [*splat, found], device)
     ends = found.cumsum(0)
     if capacity is None:
-        bad, total = torch.stack([status[0].long(), ends[-1]]).tolist()  # the one round trip
+        bad, total = torch.stack([status[0].long(), ends[-1]]).tolist()  # the only synchronisation with the device
         _check(bad, total)
     else:
         total = capacity
@@ -264,7 +264,7 @@ def _check(bad: int, total: int) -> None:
 
 
 class _Splat(torch.autograd.Function):
-    """means (F, N, 3), covariances (F, N, 3, 3), opacities (1 or F, N), colours (1 or F, 1 or V, N, 3) -> images, alphas."""
+    """Map means (F, N, 3), covariances (F, N, 3, 3), opacities (1 or F, N) and colours (1 or F, 1 or V, N, 3) to images and alphas."""
 
     @staticmethod
     def forward(ctx, means, covariances, opacities, colours, viewmats, Ks, width, height, near, far, eps2d, capacity):

@@ -1,6 +1,6 @@
-"""How `neuido film` makes its clips: random bodies, a rollout under classical laws, images, optical flow, samples of the law.
+"""Generation of the clips of `neuido film`: random bodies, rollouts with classical laws, images, optical flow, samples of the law.
 
-`neuido.data.scenes.clips` says what the folder holds, and reads it.
+`neuido.data.scenes.clips` documents and reads the folder.
 """
 
 import json
@@ -32,12 +32,12 @@ from neuido.physics.runtime.device import choose_device
 from neuido.types import Body, Cameras, Gaussians, ParticleState, Scene, Walls
 
 FLOORS = (0.0, 0.5, math.inf)
-"""Coefficients of friction of the floor, drawn at random."""
+"""Friction coefficients of the floor, one of which is sampled for each clip."""
 
 
 @dataclass(frozen=True)
 class ClipPlan:
-    """What decides the content of the files; `neuido film` documents each figure."""
+    """Options that determine the content of the files; `neuido film` documents each of them."""
 
     count: int
     families: dict[str, dict[str, tuple[float, float]]]
@@ -68,11 +68,11 @@ class ClipPlan:
 
 
 HALVINGS = 2
-"""Of the step of a clip that is unstable."""
+"""Maximum number of halvings of the time step of an unstable clip."""
 
 
 class ClipSetup(NamedTuple):
-    """One clip before it is simulated."""
+    """Set-up of a clip before its simulation."""
 
     name: str
     family: str
@@ -86,7 +86,7 @@ class ClipSetup(NamedTuple):
 def generate_clips(
     plan: ClipPlan, out: str | os.PathLike, *, device: str = "auto", batch: int = 0, shard: int = 0, shards: int = 1, progress: bool = True
 ) -> None:
-    """Generate the missing clips of a shard; the process that completes the set writes the index."""
+    """Generate the missing clips of a shard; the process that completes the set writes the index file."""
     folder, chosen = Path(out), choose_device(device)
     if not 0 <= shard < shards:
         raise UserError(f"shard = {shard} must be from 0 to shards - 1 = {shards - 1}")
@@ -117,7 +117,7 @@ def generate_clips(
 
 
 def sample_clip(plan: ClipPlan, number: int) -> ClipSetup:
-    """Sample the set-up of a clip by its number: material, floor, body, texture and cameras."""
+    """Sample the set-up of the clip of a given number: material, floor, body, texture and cameras."""
     random = np.random.default_rng([plan.seed, number])
     family, parameters = _material(plan, random, number)
     dt = float(random.choice(plan.dts))
@@ -126,9 +126,9 @@ def sample_clip(plan: ClipPlan, number: int) -> ClipSetup:
         dt = min(plan.dts)
     scene = Scene(cells=plan.cells, dt=dt, walls=Walls(friction=float(random.choice(FLOORS))))
     x, volume = _shape(random, plan.particles)
-    drop = random.uniform(0.01, 0.06)
-    # aside by less than what the walls allow
-    x = x + np.array([0.5 + random.uniform(-0.05, 0.05), drop - x[:, 1].min(), 0.5 + random.uniform(-0.05, 0.05)])
+    height = random.uniform(0.01, 0.06)
+    # the horizontal offset is small enough for the walls
+    x = x + np.array([0.5 + random.uniform(-0.05, 0.05), height - x[:, 1].min(), 0.5 + random.uniform(-0.05, 0.05)])
     x = torch.from_numpy(x)
     centre = tuple(x.mean(0).tolist())
     velocity = (random.uniform(-0.5, 0.5), random.uniform(-3.0, -0.5), random.uniform(-0.5, 0.5))
@@ -146,7 +146,7 @@ def sample_clip(plan: ClipPlan, number: int) -> ClipSetup:
 
 
 def film_clips(plan: ClipPlan, group: list[ClipSetup], device: torch.device) -> Iterator[dict[str, Tensor]]:
-    """Simulate and render clips of one family: images, masks, and samples of the law of each, on the CPU."""
+    """Simulate and render clips of one family; yield images, masks and samples of the law of each, on the CPU."""
     for clip, motion in zip(group, _simulate(plan, group, device), strict=True):
         gaussians = Gaussians(*(None if t is None else t.to(device) for t in clip.gaussians))
         cameras = clip.cameras._replace(viewmats=clip.cameras.viewmats.to(device), Ks=clip.cameras.Ks.to(device))
@@ -157,7 +157,7 @@ def film_clips(plan: ClipPlan, group: list[ClipSetup], device: torch.device) -> 
 
 
 def _simulate(plan: ClipPlan, group: list[ClipSetup], device: torch.device, halvings: int = 0) -> list[ParticleState]:
-    """Simulate each clip; retry an unstable one alone with half and a quarter of the time step."""
+    """Simulate the clips together; an unstable clip is repeated alone with half and a quarter of the time step."""
     share = 2**halvings
     scenes = [replace(c.scene, dt=c.scene.dt / share) for c in group]
     try:
@@ -178,7 +178,7 @@ def _simulate(plan: ClipPlan, group: list[ClipSetup], device: torch.device, halv
 
 
 def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str, Tensor]) -> None:
-    """Measure the flow of a clip and write its file."""
+    """Measure the optical flow of a clip and write its file."""
     times = torch.arange(plan.frames) * clip.scene.dt * plan.frame_steps
     options = {"size": plan.flow_size, "preset": plan.flow_preset}
     seen = measure_velocities(filmed.pop("images"), filmed.pop("masks"), times, clip.cameras, clip.body.x.mean(0), **options)
@@ -188,7 +188,7 @@ def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str,
 
 
 def _samples(motion: ParticleState, clip: ClipSetup, count: int, seed: int) -> dict[str, Tensor]:
-    """Sample the law at deformations that the motion reaches: trial, corrected, stress (n, 3, 3)."""
+    """Sample the law at deformations of the motion: trial and corrected F, and stress, (n, 3, 3) each."""
     elastic, plastic = laws(clip.family, [clip.parameters])
     F, C = motion.F[1:].flatten(0, 1).double(), motion.C[1:].flatten(0, 1).double()
     pick = torch.randint(len(F), (count,), generator=torch.Generator().manual_seed(seed)).to(F.device)
@@ -203,9 +203,9 @@ def _material(plan: ClipPlan, random: np.random.Generator, number: int) -> tuple
 
 
 def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, float]:
-    """Sample points (P, 3) of a ball, box, cylinder or a union of ellipsoids about the origin, turned at random, and their volume [m^3].
+    """Sample the points (P, 3) and the volume [m^3] of a randomly rotated ball, box, cylinder or union of ellipsoids about the origin.
 
-    Half of all bodies are unions: three thick ellipsoids, or a trunk with four thin limbs, since those bend long before the trunk yields.
+    Half of the bodies are unions: three thick ellipsoids, or a trunk with four thin limbs, which bend long before the trunk yields.
     """
     kind = random.choice(["ball", "box", "cylinder", "blob", "limbs", "limbs"])
     half = random.uniform(0.09, 0.24, 3)
@@ -224,7 +224,7 @@ def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, flo
         inside = ((((points - centres[:, None]) / radii) ** 2).sum(2) < 1).any(0)
     volume = float(8 * half.prod() * inside.mean())
     filled = points[inside] * half
-    # one point a cell of a jittered grid: even, without the rows of a lattice
+    # one point per cell of a jittered grid: even, without the rows of a lattice
     spacing = (volume / particles) ** (1 / 3)
     place = np.floor(filled / spacing).astype(np.int64) + 10_000
     cell = np.unique(place @ np.array([10**10, 10**5, 1]), return_index=True)[1]
@@ -233,7 +233,7 @@ def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, flo
 
 
 def _limbs(random: np.random.Generator, points: np.ndarray) -> np.ndarray:
-    """Return which points lie in one of four capsules that stick out of the origin."""
+    """Return a mask of the points in one of four capsules that start at the origin."""
     tips = random.standard_normal((4, 3))
     tips *= random.uniform(0.5, 0.95, (4, 1)) / np.linalg.norm(tips, axis=1, keepdims=True)
     along = np.clip(points @ tips.T / (tips**2).sum(1), 0, 1)
@@ -242,7 +242,7 @@ def _limbs(random: np.random.Generator, points: np.ndarray) -> np.ndarray:
 
 
 def _textured_gaussians(random: np.random.Generator, body: Body, volume: float) -> Gaussians:
-    """Attach a Gaussian to each particle, coloured by waves through the body."""
+    """Attach a Gaussian to each particle, coloured by a random sum of waves."""
     x = body.x.double().numpy()
     waves = random.standard_normal((3, 3, 3)) * random.uniform(12, 60, (3, 3, 1))
     phases = random.uniform(0, 2 * math.pi, (3, 3))

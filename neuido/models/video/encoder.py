@@ -1,7 +1,7 @@
-"""The dynamics encoder: flow latents of a video -> latent z of a material (paper, "Model Architecture Details", branch network).
+"""The dynamics encoder: from a video to the latent z of its material (paper, "Model Architecture Details", branch network).
 
-The frozen 3D VAE (`video_vae.py`) turns flow videos into a volume; a 3D convolution, an MLP, attention pooling and a last MLP, together
-the projector, turn that into z. The projector alone is trained. Several views are encoded each, and their z averaged.
+The frozen 3D VAE (`video_vae.py`) encodes flow videos as a volume of latents. The projector (a 3D convolution, an MLP, attention pooling
+and a final MLP) maps the volume to z; only the projector is trained. Views are encoded separately, and their z are averaged.
 """
 
 import math
@@ -26,11 +26,11 @@ PRETRAINED = {
     "pretrained-small": Path(__file__).parents[1] / "weights" / "stage2_small.safetensors",
 }
 REFERENCE_INTERVAL, REFERENCE_CELL = 5e-3, 1e-2
-"""The frame interval [s] and the side of a cell [m] at which the projector's two conditions are zero."""
+"""Frame interval [s] and cell size [m] at which the two conditions of the projector are zero."""
 
 
 class AttentionPool(nn.Module):
-    """Tokens (B, N, width) -> (B, width): learned queries, one for each head's share, attend to all tokens."""
+    """Attention pooling of tokens, (B, N, width) -> (B, width), with one learned query for each head."""
 
     def __init__(self, width: int, heads: int):
         super().__init__()
@@ -45,19 +45,19 @@ class AttentionPool(nn.Module):
 
 
 class Projector(nn.Module):
-    """Flow latents -> z; the trained part of the branch.
+    """Network that maps flow latents to z; the trained part of the branch.
 
     Args:
-        channels: Channels of the flow latents.
-        latent_dim: d of z.
-        width: Of the convolution, the tokens and the MLPs (the paper does not say).
-        heads: Of the attention pooling.
-        conditions: Whether frame interval and size of a cell are told too. A video alone does not hold the units of time and length, so
-            that without them one stiffness looks like another; the paper leaves them out.
-        dropout: Of tokens, in training.
+        channels: Number of channels of the flow latents.
+        latent_dim: Dimension d of z.
+        width: Width of the convolution, the tokens and the MLPs (the paper does not say).
+        heads: Number of heads of the attention pooling.
+        conditions: Condition on the frame interval and the cell size. A video has no units of time and length, without which different
+            stiffnesses look the same; the paper does not condition on them.
+        dropout: Dropout rate of the tokens.
 
     Raises:
-        UserError: A size below one, or a width that heads or 6 do not divide.
+        UserError: A size is below one, or the width is not a multiple of heads and of 6.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Projector(nn.Module):
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, latent_dim))
 
     def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
-        """Return z of each view (V, d), of flow latents (V, channels, T', h, w) and conditions (V, 2) of `scale_conditions`."""
+        """Return z of each view (V, d) from flow latents (V, channels, T', h, w) and conditions (V, 2) of `scale_conditions`."""
         x = self.conv(volume)
         x = (x + _positions(x)).flatten(2).transpose(1, 2)
         x = x + self.tokens(x)
@@ -93,11 +93,11 @@ class Projector(nn.Module):
 
     @torch.no_grad()
     def start_near(self, latents: Tensor, spread: float = 0.1) -> None:
-        """Initialise the output near the mean of latents (M, d), varying in the directions in which they vary.
+        """Initialise the output near the mean of latents, varying along the directions in which they vary.
 
         Args:
-            latents: Those of Stage I.
-            spread: Standard deviation of z at the start, in units of theirs.
+            latents: Latents of Stage I, (M, d).
+            spread: Initial standard deviation of z relative to that of the latents.
         """
         last = self.head[-1]
         centred = latents - latents.mean(0)
@@ -107,7 +107,7 @@ class Projector(nn.Module):
 
 
 def _positions(x: Tensor) -> Tensor:
-    """Return sines and cosines of place and time, (1, C, T, H, W): place in parts of the image, time in latent frames."""
+    """Return sinusoidal position encodings (1, C, T, H, W): space relative to the image, time in latent frames."""
     _, channels, T, H, W = x.shape
     axes = (torch.arange(T) / 8.0, (torch.arange(H) + 0.5) / H, (torch.arange(W) + 0.5) / W)
     share = channels // 6
@@ -126,27 +126,27 @@ def scale_conditions(frame_interval: Tensor | float, cell: Tensor) -> Tensor:
     """Return the conditions of the projector, (V, 2): logarithms of frame interval and cell size over their reference values.
 
     Args:
-        frame_interval: [s], a number or (V,).
-        cell: Side of a cell of the flow at the body [m], (V,).
+        frame_interval: Frame interval [s], a number or (V,).
+        cell: Side of a flow cell at the depth of the body [m], (V,).
     """
     interval = torch.as_tensor(frame_interval).to(cell).expand(len(cell))
     return torch.stack([(interval / REFERENCE_INTERVAL).log(), (cell / REFERENCE_CELL).log()], -1)
 
 
 class DynamicsEncoder(nn.Module):
-    """A video of a body -> the latent z of its material.
+    """Encoder that infers the latent z of a material from videos of a body.
 
     Args:
-        vae: A file of `FlowVAE.save`, `cogvideox:` and a folder or repository (`video_vae.open_vae`), or a VAE itself; it is frozen.
-        latent_dim: d of z.
+        vae: Frozen VAE: a file of `FlowVAE.save`, `cogvideox:` and a folder or repository (`video_vae.open_vae`), or a module.
+        latent_dim: Dimension d of z.
         flow_size: Side of the flow videos [px], a multiple of 8.
-        flow_encoding: `velocity` (magnitude kept) or `wheel` (the paper's, normalised frame by frame).
-        speed_scale: The speed that counts as one [m/s].
-        flow_preset: Of DIS: `ultrafast`, `fast`, `medium`.
-        width, heads, conditions, dropout: Of the `Projector`.
+        flow_encoding: `velocity` (preserves the magnitude) or `wheel` (as in the paper, normalised frame by frame).
+        speed_scale: Speed that is encoded as one [m/s].
+        flow_preset: Preset of DIS: `ultrafast`, `fast` or `medium`.
+        width, heads, conditions, dropout: Options of the `Projector`.
 
     Attributes:
-        card: What the weights file says about their making.
+        card: Information on the training from the weights file.
     """
 
     def __init__(
@@ -181,28 +181,28 @@ class DynamicsEncoder(nn.Module):
         return f"{type(self).__name__}(latent_dim={sizes['latent_dim']}, width={sizes['width']}, vae={vae}, {size})"
 
     def check_latents(self, latent_dim: int, option: str) -> None:
-        """Refuse an operator whose latents have another length.
+        """Check that the latents have the length that the operator needs.
 
         Args:
-            latent_dim: Of the operator.
-            option: What the error names.
+            latent_dim: Latent dimension of the operator.
+            option: Name of the option that the error mentions.
 
         Raises:
             UserError: The lengths differ.
         """
         given = self.projector.config["latent_dim"]
         if given != latent_dim:
-            raise UserError(f"{option} gives latents of {given} numbers, the operator takes {latent_dim}: use an encoder made for it")
+            raise UserError(f"{option} gives latents of length {given}, but the operator takes {latent_dim}: use an encoder trained for it")
 
     def train(self, mode: bool = True) -> Self:
-        """Set the training mode of all but the frozen VAE."""
+        """Set the training mode of all modules except the frozen VAE."""
         super().train(mode)
         self.vae.eval()
         return self
 
     @torch.no_grad()
     def embed(self, seen: Velocities) -> tuple[Tensor, Tensor]:
-        """Compute what stays constant while the projector learns: flow latents (V, channels, T', S/8, S/8) and conditions (V, 2)."""
+        """Return flow latents (V, channels, T', S/8, S/8) and conditions (V, 2), which stay constant while the projector is trained."""
         like = next(self.projector.parameters())
         flow, cell = seen.flow.to(like.device, torch.float32), seen.cell.to(like.device)
         options = {"encoding": self.flow["flow_encoding"], "speed_scale": self.flow["speed_scale"]}
@@ -212,13 +212,13 @@ class DynamicsEncoder(nn.Module):
     def measure_flow(
         self, batch: MultiViewBatch, views: Sequence[int], centre: Tensor, *, cache: str | os.PathLike | None = None
     ) -> Velocities:
-        """Measure the velocities in some views of a scene.
+        """Measure the velocities in the given views of a scene.
 
         Args:
             batch: The scene.
-            views: Which of its views.
-            centre: The middle of the body [m], (3,).
-            cache: Folder in which flows are kept.
+            views: Indices of the views.
+            centre: Centre of the body [m], (3,).
+            cache: Folder for cached optical flow.
         """
         views = list(views)
         cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats[views], Ks=batch.cameras.Ks[views])
@@ -226,11 +226,11 @@ class DynamicsEncoder(nn.Module):
         return measure_velocities(batch.images[views], batch.masks[views], batch.times, cameras, centre, **options)
 
     def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
-        """Return z (d,): the mean over the views of the projector's, of flow latents and conditions."""
+        """Return z (d,) from flow latents and conditions: the mean of the projector output over the views."""
         return self.projector(volume, conditions).mean(0)
 
     def save(self, path: str | os.PathLike, card: Mapping[str, Any] | None = None) -> None:
-        """Write projector and VAE (of CogVideoX: its name alone) to a safetensors file, all at once."""
+        """Write the projector and the VAE (only the name for CogVideoX) to a safetensors file atomically."""
         tensors = {f"projector.{name}": t.detach().contiguous().cpu() for name, t in self.projector.state_dict().items()}
         if isinstance(self.vae, FlowVAE):
             tensors |= {f"vae.{name}": t.detach().contiguous().cpu() for name, t in self.vae.state_dict().items()}
@@ -241,19 +241,19 @@ class DynamicsEncoder(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name: str | os.PathLike = "pretrained") -> Self:
-        """Load an encoder that comes with neuido (`pretrained`, `pretrained-small`) or a file of `save`.
+        """Load an encoder that ships with neuido (`pretrained`, `pretrained-small`), or a file of `save`.
 
         Raises:
-            UserError: As `load`.
+            UserError: As in `load`.
         """
         return cls.load(name)
 
     @classmethod
     def load(cls, path: str | os.PathLike = "pretrained") -> Self:
-        """Read what `save` wrote. `pretrained` comes with neuido; so does `pretrained-small`, for few, coarse frames on a CPU.
+        """Load a file of `save`, or an encoder that ships with neuido: `pretrained`, or `pretrained-small` for few, coarse frames on a CPU.
 
         Raises:
-            UserError: No such file, or not one of this kind.
+            UserError: The file is missing, or it is not an encoder.
         """
         file = PRETRAINED.get(str(path)) or Path(path)
         config, tensors, card = read_weights(file, (ENCODER_FORMAT,), "encoder")

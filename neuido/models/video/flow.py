@@ -1,7 +1,7 @@
-"""Optical flow, and the three-channel image of it that the video encoder sees (paper, "Branch Network").
+"""Optical flow, and its encoding as three-channel images for the video encoder (paper, "Branch Network").
 
-The flow is OpenCV's dense inverse search (DIS). Its image keeps the magnitude: speed is the cue for stiffness, and a colour wheel
-that is normalised frame by frame, as Tora's, hides it. That variant is here as an option.
+The flow is computed by dense inverse search (DIS) of OpenCV. The default encoding preserves the magnitude, because speed is the cue for
+stiffness. The colour wheel of Tora, which is normalised frame by frame and loses the magnitude, is an option.
 """
 
 import hashlib
@@ -28,25 +28,25 @@ PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 ENCODINGS = ("velocity", "wheel")
-cv2.setNumThreads(1)  # videos run side by side: threads within an image would be in each other's way
+cv2.setNumThreads(1)  # videos are processed in parallel; threads within an image would compete
 
 SECTORS = (15, 6, 4, 11, 13, 6)
-"""Steps of the Middlebury colour wheel from red to yellow, green, cyan, blue, magenta and back (Baker et al. 2011)."""
+"""Number of hues of the Middlebury colour wheel from red to yellow, green, cyan, blue, magenta and back (Baker et al. 2011)."""
 
 
 def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None = None) -> Tensor:
-    """Compute dense flow from each frame to the next [px per frame], by DIS.
+    """Compute the dense flow from each frame to the next [px per frame] by DIS.
 
     Args:
         images: RGB in [0, 1], (..., T, H, W, 3), T >= 2.
         preset: `ultrafast`, `fast` or `medium`.
-        threads: Videos that are worked on at a time; the number of cores where absent.
+        threads: Number of videos to process in parallel; the number of cores where absent.
 
     Returns:
-        (..., T - 1, H, W, 2) float32 on the CPU; x to the right, y down.
+        Flow (..., T - 1, H, W, 2), float32 on the CPU; x points right, y down.
 
     Raises:
-        UserError: Fewer than two frames, images under 16 pixels, an unknown preset.
+        UserError: There are fewer than two frames, images are smaller than 16 pixels, or the preset is unknown.
     """
     if preset not in PRESETS:
         raise UserError(f"flow preset = {preset!r}; one of {', '.join(PRESETS)}")
@@ -62,20 +62,20 @@ def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None 
         search = cv2.DISOpticalFlow_create(PRESETS[preset])
         return np.stack([search.calc(a, b, None) for a, b in zip(grey, grey[1:])])
 
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:  # OpenCV lets go of Python meanwhile
+    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:  # OpenCV releases the GIL
         flows = np.stack(list(pool.map(video, videos)))
     return torch.from_numpy(flows).view(*images.shape[:-4], *flows.shape[1:])
 
 
 class Velocities(NamedTuple):
-    """What V videos show of a body's motion."""
+    """Velocities of a body measured in V videos."""
 
     flow: Tensor
-    """Velocity in the image plane (x right, y down), at the depth of the body [m/s], (V, T - 1, S, S, 2); zero beside the body."""
+    """Velocity in the image plane (x right, y down) at the depth of the body [m/s], (V, T - 1, S, S, 2); zero outside the body."""
     cell: Tensor
-    """Side of one of the S x S cells at the depth of the body [m], (V,)."""
+    """Side of each of the S x S cells at the depth of the body [m], (V,)."""
     frame_interval: float
-    """[s]"""
+    """Time between two frames [s]."""
 
     def __repr__(self) -> str:
         views, steps, side = self.flow.shape[:3]
@@ -83,11 +83,11 @@ class Velocities(NamedTuple):
 
 
 def body_window(masks: Tensor, margin: float = 0.1) -> tuple[int, int, int]:
-    """Return top, left and side [px] of the square, within the image, that holds a body in all frames of a video.
+    """Return top, left and side [px] of a square in the image that contains the body in all frames of a video.
 
     Args:
-        masks: (T, H, W); a body is where they exceed one half.
-        margin: Added all around, as a share of the side.
+        masks: Masks (T, H, W); the body is where they exceed one half.
+        margin: Margin on each side, as a fraction of the side of the body.
     """
     height, width = masks.shape[-2:]
     seen = (masks > 0.5).any(0)
@@ -111,20 +111,20 @@ def measure_velocities(
     preset: str = "medium",
     cache: str | os.PathLike | None = None,
 ) -> Velocities:
-    """Measure velocities in videos, in a square around the body, masked by its silhouette.
+    """Measure the velocities in videos within a square around the body, masked by its silhouette.
 
     Args:
         images: RGB in [0, 1], (V, T, H, W, 3).
-        masks: Share of the body in a pixel, (V, T, H, W); ones where it is not known.
-        times: (T,) [s], evenly spaced.
-        cameras: Those of the V views.
-        centre: The middle of the body [m], (3,).
-        size: S.
-        preset: See `optical_flow`.
-        cache: Folder in which results are kept, under a key of everything that decides them; none: nowhere.
+        masks: Coverage of each pixel by the body, (V, T, H, W); ones if unknown.
+        times: Evenly spaced times [s], (T,).
+        cameras: Cameras of the V views.
+        centre: Centre of the body [m], (3,).
+        size: Number of cells S along each side.
+        preset: As in `optical_flow`.
+        cache: Folder for cached flow, under a key of all inputs that affect it; no cache where absent.
 
     Raises:
-        UserError: See `optical_flow`, `pixel_length` and `frame_interval_of`.
+        UserError: As in `optical_flow`, `pixel_length` and `frame_interval_of`.
     """
     interval, pixel = frame_interval_of(times), pixel_length(cameras, centre)
     path = None
@@ -153,7 +153,7 @@ def as_bytes(images: Tensor) -> Tensor:
 
 
 def _crop_flow(flow: Tensor, masks: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Return masked flow (V, T - 1, S, S, 2) in pixels of the full image, and the sides of the windows [px], (V,)."""
+    """Return the masked flow (V, T - 1, S, S, 2) in pixels of the full image, and the sides of the windows [px], (V,)."""
     out, sides = [], []
     for each, mask in zip(flow, masks):
         top, left, side = body_window(mask)
@@ -171,7 +171,7 @@ def _read_cache(path: Path | None) -> tuple[Tensor, Tensor] | None:
         with np.load(path, allow_pickle=False) as arrays:
             return torch.from_numpy(arrays["flow"]), torch.from_numpy(arrays["side"])
     except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile):
-        path.unlink()  # cut short; it is made again
+        path.unlink()  # truncated; it is computed again
         return None
 
 
@@ -180,7 +180,10 @@ def pixel_length(cameras: Cameras, centre: Tensor) -> Tensor:
 
     Args:
         cameras: V cameras.
-        centre: The point, such as the middle of the body [m], (3,).
+        centre: The point, such as the centre of the body [m], (3,).
+
+    Raises:
+        UserError: The point lies behind a camera.
     """
     view = cameras.viewmats.double()
     depth = (view[:, 2, :3] @ centre.to(view)) + view[:, 2, 3]
@@ -190,27 +193,27 @@ def pixel_length(cameras: Cameras, centre: Tensor) -> Tensor:
 
 
 def flow_image(flow: Tensor, scale: float) -> Tensor:
-    """Encode velocity as three channels in [-1, 1]: its two components and its magnitude, over a fixed scale.
+    """Encode velocities as three channels in [-1, 1]: the two components and the magnitude, divided by a fixed scale.
 
     Args:
-        flow: (..., H, W, 2) [m/s].
-        scale: What counts as one [m/s], the same for all videos of a data set.
+        flow: Velocities [m/s], (..., H, W, 2).
+        scale: Speed that is encoded as one [m/s], the same for all videos of a data set.
 
     Returns:
-        (..., H, W, 3).
+        Images (..., H, W, 3).
     """
     scaled = flow / scale
     return torch.cat([scaled, scaled.norm(dim=-1, keepdim=True)], -1).clamp(-1, 1)
 
 
 def colour_wheel(flow: Tensor) -> Tensor:
-    """Encode flow as a Middlebury colour image in [-1, 1], normalised frame by frame (the paper's input, after Tora).
+    """Encode flow as Middlebury colour images in [-1, 1], normalised frame by frame (the input of the paper, after Tora).
 
     Args:
-        flow: (..., H, W, 2).
+        flow: Flow in any unit, (..., H, W, 2).
 
     Returns:
-        RGB (..., H, W, 3); no motion is white.
+        RGB (..., H, W, 3); pixels at rest are white.
     """
     largest = flow.norm(dim=-1).amax((-2, -1))[..., None, None, None].clamp(min=1e-12)
     u, v = (flow / largest).unbind(-1)
@@ -224,7 +227,7 @@ def colour_wheel(flow: Tensor) -> Tensor:
 
 
 def _wheel() -> Tensor:
-    """Return RGB of the wheel, (55, 3)."""
+    """Return the RGB values of the colour wheel, (55, 3)."""
     rows = []
     for sector, steps in enumerate(SECTORS):
         rise = torch.arange(steps) / steps
@@ -237,18 +240,18 @@ def _wheel() -> Tensor:
 
 
 def encode_flow(flow: Tensor, *, encoding: str = "velocity", speed_scale: float = 2.0) -> Tensor:
-    """Encode flow as videos for a 3D VAE, with an empty first frame so that there is one for each image (Tora).
+    """Encode flow as videos for a 3D VAE, with a first frame at rest so that there is one frame per image (Tora).
 
     Args:
-        flow: V videos (V, T - 1, H, W, 2) [m/s].
-        encoding: `velocity`: see `flow_image`; `wheel`: see `colour_wheel`.
-        speed_scale: The speed that counts as one [m/s].
+        flow: Flow of V videos [m/s], (V, T - 1, H, W, 2).
+        encoding: `velocity` (`flow_image`) or `wheel` (`colour_wheel`).
+        speed_scale: Speed that is encoded as one [m/s].
 
     Returns:
-        (V, 3, T, H, W) in [-1, 1].
+        Videos (V, 3, T, H, W) in [-1, 1].
 
     Raises:
-        UserError: An unknown encoding, or a scale that is not positive.
+        UserError: The encoding is unknown, or the scale is not positive.
     """
     if encoding not in ENCODINGS:
         raise UserError(f"flow encoding = {encoding!r}; one of {', '.join(ENCODINGS)}")
@@ -260,10 +263,10 @@ def encode_flow(flow: Tensor, *, encoding: str = "velocity", speed_scale: float 
 
 
 def frame_interval_of(times: Tensor | Sequence[float]) -> float:
-    """Return the time between the frames [s], which must be even to 1 %.
+    """Return the time between two frames [s]; the times must be even to 1 %.
 
     Raises:
-        UserError: One frame alone, or uneven times.
+        UserError: There is only one frame, or the times are uneven.
     """
     times = torch.as_tensor(times, dtype=torch.float64)
     if len(times) < 2:

@@ -1,7 +1,7 @@
-"""A small causal 3D-convolutional VAE for flow videos, with the contract of CogVideoX's (which Tora uses).
+"""A small causal 3D-convolutional VAE for flow videos, with the interface of the CogVideoX VAE (which Tora uses).
 
-Three channels in, 16 latent channels out, T' = floor((T - 1) / 4) + 1 frames of H/8 x W/8. Every convolution sees past and present
-frames alone, so the latent of the first frames does not change when more follow.
+Videos have three channels; latents have 16 channels and T' = floor((T - 1) / 4) + 1 frames of H/8 x W/8. Every convolution uses only past
+and present frames, so later frames do not change the latents of earlier ones.
 """
 
 import json
@@ -23,13 +23,13 @@ from neuido.errors import UserError
 
 FORMAT = "neuido-flow-vae/1"
 ENCODER_FORMAT = "neuido-encoder/1"
-"""Of `encoder.DynamicsEncoder`, whose files hold a VAE beside the projector."""
+"""Format of `encoder.DynamicsEncoder`, whose files hold a VAE in addition to the projector."""
 CHANNELS = 16
-"""Latent channels, as CogVideoX's."""
+"""Number of latent channels, as in CogVideoX."""
 
 
 class CausalConv3d(nn.Module):
-    """Convolution of (B, C, T, H, W) that pads with the first frame before it, and with zeros at the edges of the image."""
+    """Causal convolution of (B, C, T, H, W), padded in time by copies of the first frame and in space by zeros."""
 
     def __init__(self, inputs: int, outputs: int, *, stride: tuple[int, int, int] = (1, 1, 1)):
         super().__init__()
@@ -40,7 +40,7 @@ class CausalConv3d(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two causal convolutions around a skip; normalised frame by frame, so that nothing looks ahead."""
+    """Residual block of two causal convolutions, normalised frame by frame to preserve causality."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -53,7 +53,7 @@ class Residual(nn.Module):
 
 
 class Activation(nn.Module):
-    """SiLU of a normalised input: without the norm one bad step can leave all channels where SiLU is flat, and they stay there."""
+    """SiLU of a normalised input; without the norm a bad step can leave all channels in the flat part of SiLU for good."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -64,22 +64,22 @@ class Activation(nn.Module):
 
 
 def frame_by_frame(layer: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """Apply a layer for images to each frame of (B, C, T, H, W)."""
+    """Apply an image layer to each frame of (B, C, T, H, W)."""
     flat = x.transpose(1, 2).flatten(0, 1)
     return layer(flat).unflatten(0, (x.shape[0], x.shape[2])).transpose(1, 2)
 
 
 class FlowVAE(nn.Module):
-    """The VAE.
+    """Causal VAE for flow videos.
 
     Args:
-        width: Channels of the inner layers, a multiple of 8.
-        latent_channels: Channels of the latent (CogVideoX: 16).
+        width: Number of channels of the inner layers, a multiple of 8.
+        latent_channels: Number of latent channels (CogVideoX: 16).
         last_norm: Normalise before the last convolutions of encoder and decoder.
 
     Attributes:
-        scale: Factor that brings latents to unit variance, as CogVideoX's `scaling_factor`; set by `normalise`.
-        card: What the weights file says about their making.
+        scale: Factor that scales latents to unit variance, like `scaling_factor` of CogVideoX; set by `normalise`.
+        card: Information on the training from the weights file.
     """
 
     def __init__(self, width: int = 32, latent_channels: int = CHANNELS, last_norm: bool = True):
@@ -110,36 +110,36 @@ class FlowVAE(nn.Module):
                 CausalConv3d(width, 12),
             ]
         )
-        with torch.no_grad():  # little noise at first, or the decoder learns to do without the latent
+        with torch.no_grad():  # little noise at first; otherwise the decoder learns to ignore the latent
             self.encoder[-1].conv.bias[latent_channels:] = -6.0
             self.encoder[-1].conv.weight[latent_channels:] *= 0.1
         self.register_buffer("scale", torch.ones(()))
         self.card: dict[str, Any] = {}
 
     def posterior(self, video: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and log variance of the latent, before `scale`, (B, 16, T', H/8, W/8) each, of (B, 3, T, H, W) in [-1, 1].
+        """Return mean and log variance of the unscaled latents, (B, 16, T', H/8, W/8) each, of videos (B, 3, T, H, W) in [-1, 1].
 
         Raises:
-            UserError: A shape of another kind, or height and width that 8 does not divide.
+            UserError: The shape is wrong, or height or width is not a multiple of 8.
         """
         if video.ndim != 5 or video.shape[1] != 3 or video.shape[-1] % 8 or video.shape[-2] % 8:
             raise UserError(f"a flow video must be (B, 3, T, H, W) with H and W multiples of 8, got {tuple(video.shape)}; change flow_size")
         squares = frame_by_frame(
             lambda frame: functional.pixel_unshuffle(frame, 2), video
-        )  # full size costs the most and tells little more
+        )  # full resolution is the most expensive and adds little
         mean, variance = self.encoder(squares).chunk(2, 1)
         return mean, variance.clamp(-20, 2)
 
     def encode(self, video: Tensor) -> Tensor:
-        """Encode videos (B, 3, T, H, W) in [-1, 1] to mean latents times `scale`, (B, 16, T', H/8, W/8); T' = floor((T - 1) / 4) + 1."""
+        """Encode videos (B, 3, T, H, W) in [-1, 1] to scaled mean latents (B, 16, T', H/8, W/8), T' = floor((T - 1) / 4) + 1."""
         return self.scale * self.posterior(video)[0]
 
     def decode(self, latent: Tensor) -> Tensor:
-        """Decode latents times `scale` to videos (B, 3, 4 T' - 3, H, W)."""
+        """Decode scaled latents to videos (B, 3, 4 T' - 3, H, W)."""
         return self.reconstruct(latent / self.scale)
 
     def reconstruct(self, latent: Tensor) -> Tensor:
-        """Decode latents before `scale`."""
+        """Decode unscaled latents to videos."""
         first, before, middle, after, narrow, last, active, out = self.decoder
         h = before(first(latent))
         h = after(middle(_upsample(h)))
@@ -148,21 +148,21 @@ class FlowVAE(nn.Module):
 
     @torch.no_grad()
     def normalise(self, latents: Tensor) -> None:
-        """Set `scale` from mean latents before it."""
+        """Set `scale` from unscaled mean latents."""
         self.scale.copy_(1 / latents.std().clamp(min=1e-6))
 
     def save(self, path: str | os.PathLike, card: Mapping[str, Any] | None = None) -> None:
-        """Write weights and card to a safetensors file, all at once."""
+        """Write weights and card to a safetensors file atomically."""
         tensors = {name: t.detach().contiguous().cpu() for name, t in self.state_dict().items()}
         card = {"date": date.today().isoformat(), **(card or {})}
         write_weights(path, FORMAT, self.config, tensors, card)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Self:
-        """Read what `save` wrote, or the VAE inside an encoder's file.
+        """Load a file of `save`, or the VAE from the file of an encoder.
 
         Raises:
-            UserError: No such file, or not one of these kinds.
+            UserError: The file is missing or has another format.
         """
         config, tensors, card = read_weights(path, (FORMAT, ENCODER_FORMAT), "vae")
         if "projector" in config:
@@ -177,23 +177,28 @@ class FlowVAE(nn.Module):
 
 
 def _upsample(x: Tensor) -> Tensor:
-    """Double the size and the length but for one frame: T' -> 2 T' - 1, the inverse of a causal stride of two."""
+    """Upsample by two in space, and in time from T' to 2 T' - 1 frames, the inverse of a causal stride of two."""
     return functional.interpolate(x, scale_factor=(2, 2, 2))[:, :, 1:]
 
 
 def write_weights(
     path: str | os.PathLike, kind: str, config: Mapping[str, Any], tensors: dict[str, Tensor], card: Mapping[str, Any]
 ) -> None:
-    """Write a safetensors file with its format, configuration and card, all at once."""
+    """Write a safetensors file with its format, configuration and card atomically."""
     with replacing(path) as hidden:
         save_file(tensors, hidden, metadata={"format": kind, "config": json.dumps(dict(config)), "card": json.dumps(dict(card))})
 
 
 def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:
-    """Read configuration, tensors and card of a file of `write_weights`.
+    """Read configuration, tensors and card from a file of `write_weights`.
+
+    Args:
+        path: The file.
+        kinds: Accepted formats.
+        option: Name of the option that errors mention.
 
     Raises:
-        UserError: No such file, or one of a format that is not in `kinds`; it names `option`.
+        UserError: The file is missing or has another format.
     """
     path = Path(path)
     if not path.is_file():
@@ -206,11 +211,15 @@ def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -
             raise UserError(f"{option}: {path} has format {metadata.get('format')!r}, not {' or '.join(map(repr, kinds))}")
         return json.loads(metadata["config"]), tensors, json.loads(metadata["card"])
     except (SafetensorError, KeyError, json.JSONDecodeError) as error:
-        raise UserError(f"{option}: {path} is no weights file of neuido: {error}") from error
+        raise UserError(f"{option}: {path} is not a weights file of neuido: {error}") from error
 
 
 def load_state(module: nn.Module, tensors: dict[str, Tensor], path: str | os.PathLike) -> None:
-    """Load a state dict; a mismatch is a one-line error."""
+    """Load a state dict.
+
+    Raises:
+        UserError: The tensors do not fit the module.
+    """
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""The 3D VAE of a flow encoder: neuido's own small one, or CogVideoX's (Tora's) through diffusers, behind one interface."""
+"""3D VAEs for flow videos behind one interface: a small VAE that ships with neuido, or that of CogVideoX (as in Tora) from diffusers."""
 
 import os
 from pathlib import Path
@@ -15,10 +15,10 @@ PRETRAINED = Path(__file__).parents[1] / "weights" / "stage2.safetensors"
 
 
 class VideoVAE(Protocol):
-    """What turns a video into latents; frozen."""
+    """Frozen encoder of videos into latents."""
 
     channels: int
-    """Latent channels."""
+    """Number of latent channels."""
 
     def encode(self, video: Tensor) -> Tensor:
         """Encode videos, (B, 3, T, H, W) in [-1, 1] -> (B, channels, T', H/8, W/8), T' = floor((T - 1) / 4) + 1."""
@@ -26,15 +26,15 @@ class VideoVAE(Protocol):
 
 
 class CogVideoXVAE(nn.Module):
-    """CogVideoX's encoder, the one that Tora encodes flow with; nothing of its decoder is kept.
+    """Encoder of the CogVideoX VAE, with which Tora encodes flow; the decoder is discarded.
 
     Args:
-        source: A folder in diffusers' layout (config.json, *.safetensors), or a name on the Hugging Face hub such as
+        source: Folder in the layout of diffusers (config.json, *.safetensors), or a name on the Hugging Face hub such as
             `THUDM/CogVideoX-5b`, whose licence applies.
-        subfolder: Where it lies in there; `vae` for a whole pipeline.
+        subfolder: Subfolder of the VAE; `vae` for a whole pipeline.
 
     Raises:
-        UserError: diffusers is not installed, or there are no such weights.
+        UserError: diffusers is not installed, or the weights are missing.
     """
 
     def __init__(self, source: str, subfolder: str | None = None):
@@ -51,27 +51,27 @@ class CogVideoXVAE(nn.Module):
         except (OSError, ValueError) as error:
             raise UserError(f"vae = {PREFIX}{source}: there is no CogVideoX VAE: {error}") from error
         self.inner = whole
-        self.inner.decoder = nn.Identity()  # half of the memory
+        self.inner.decoder = nn.Identity()  # saves half of the memory
         self.channels = int(whole.config.latent_channels)
         self.factor = float(whole.config.scaling_factor)
 
     @torch.no_grad()
     def encode(self, video: Tensor) -> Tensor:
-        """Return mean latents times the file's scaling factor, one video at a time."""
+        """Return the mean latents times the scaling factor of the weights, encoding one video at a time."""
         like = next(self.inner.parameters())
         rows = [self.inner.encode(clip[None].to(like)).latent_dist.mean for clip in video]
         return self.factor * torch.cat(rows).to(video.dtype)
 
 
 def open_vae(source: str | os.PathLike) -> FlowVAE | CogVideoXVAE:
-    """Open a VAE, frozen.
+    """Open a frozen VAE.
 
     Args:
-        source: A file of `FlowVAE.save`; `pretrained`, the one that comes with neuido; or `cogvideox:` and a folder or the name of
-            a repository on the hub.
+        source: A file of `FlowVAE.save`; `pretrained`, which ships with neuido; or `cogvideox:` followed by a folder or the name of a
+            repository on the Hugging Face hub.
 
     Raises:
-        UserError: Neither is there.
+        UserError: The VAE is missing.
     """
     name = str(source)
     vae = (
