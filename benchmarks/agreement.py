@@ -1,11 +1,11 @@
-"""The fast path (captured graph, fused networks) beside its slow twin over 400 substeps of the BouncyBall state.
+"""Compare the fast path (captured CUDA graph, fused networks) with its slow reference over 400 substeps of BouncyBall.
 
     python benchmarks/agreement.py [--device cuda] [--steps 400] [--data FOLDER]
 
-The twin is the same rollout run eagerly, with the networks through torch's BLAS and nothing kept but the states. Two float32
-runs of a body in contact part by more than rounding, so the table also has the twin against itself with its start moved by
-one unit in the last place, and both against the twin in float64. Differences are norms over all frames, relative to the norm
-of the motion (x - x0) and of the gradient.
+The reference is the same rollout run eagerly: networks use the BLAS of torch, and only the states are stored. Two float32 runs of a
+body in contact diverge by more than rounding. The table therefore also compares the reference with itself after a perturbation of the
+initial state by one ulp, and both with the reference in float64. Differences are norms over all frames, relative to the norm of the
+motion (x - x0) and of the gradient.
 """
 
 import argparse

@@ -1,15 +1,16 @@
-"""Blind cases: experiments with an undeclared effect, or none, diagnosed without their keys and then scored against them.
+"""Blind test of diagnoses: experiments with or without an undeclared effect, diagnosed without their keys and then scored against them.
 
     python benchmarks/blind.py --out runs/blind [--cases 60] [--curves 0] [--workers N] [--device cpu]
                                [--minutes 0] [--ablation single-recording no-discretisation] [--only make|diagnose|score]
                                [--folders FOLDER ...]
 
-A third of the cases are nulls, half of them with wrong nuisances; the others spread evenly over the library's effects, with some of two
-effects and some outside the library, made by three solvers in turn. Whatever is there already is kept, so the command goes on where it was
-stopped. The keys are opened by the scoring alone, after the answers' digests are in results.csv. Ablations `plain-bic`, `no-unknown` and
-`take-smallest-error` follow from the figures of the full run and are always scored; `single-recording` and `no-discretisation` run again.
-`--folders` scores given folders instead (each with a truth.yaml, or a key in ../keys). A GPU takes the cases one after the other unless
-`--workers` says more; under NVIDIA's MPS it does about three times as many in a time with twenty.
+A third of the cases are nulls, half of them with wrong nuisance parameters. The others are spread evenly over the effects of the library;
+some have two effects, and some an effect outside the library. Three solvers generate the cases in turn. Existing results are kept, so the
+command resumes where it was stopped. Only the scoring opens the keys, after the digests of the answers are in results.csv.
+
+The ablations `plain-bic`, `no-unknown` and `take-smallest-error` are computed from the full run and are always scored; `single-recording`
+and `no-discretisation` need runs of their own. `--folders` scores the given folders instead, each with a truth.yaml or a key in ../keys.
+A GPU runs one case at a time unless `--workers` is given; with NVIDIA's MPS and twenty workers the throughput is about three times higher.
 """
 
 import argparse
@@ -52,13 +53,13 @@ PAIRS = (
 
 
 def plan(cases: int, curves: int, seed: int, *, particles: int = 0, seconds: float = 0.0) -> list[tuple[str, int, Case]]:
-    """Names, seeds and options of the cases, in an order that says nothing."""
+    """Return names, seeds and options of the cases in random order."""
     rng = np.random.default_rng(seed)
     nulls, two, outside = round(cases / 3), round(cases * 5 / 60), round(cases * 7 / 60)
     kinds: list[tuple[str, bool]] = [("none", i < nulls // 2) for i in range(nulls)]
 
     def deal(names: tuple[str, ...], count: int) -> list[str]:
-        """So many names, each as often as the others to one."""
+        """Return `count` names in which the numbers of occurrences differ by at most one."""
         order = [str(name) for _ in range(count // len(names) + 1) for name in rng.permutation(names)]
         return order[:count]
 
@@ -75,9 +76,10 @@ def plan(cases: int, curves: int, seed: int, *, particles: int = 0, seconds: flo
 
 
 def make_one(name: str, seed: int, case: Case, folder: str, device: str) -> str:
-    """One case, or what failed; a seed that gives none is followed by others, and from half the attempts on by the suggested solver.
+    """Generate a case and return an empty string, or the reason of the failure.
 
-    What another solver does to some bodies is more than their effects can be.
+    If a seed fails, others are tried; the second half of the attempts uses the suggested solver, because for some bodies the difference
+    between solvers exceeds any effect.
     """
     for attempt in range(ATTEMPTS):
         if 2 * attempt == ATTEMPTS:
@@ -87,15 +89,15 @@ def make_one(name: str, seed: int, case: Case, folder: str, device: str) -> str:
             return ""
         except UserError as error:
             reason = str(error)
-        except Exception as error:  # a GPU without memory, say: the other cases are made, and the same command makes this one
+        except Exception as error:  # such as a GPU out of memory: go on with the other cases; the same command retries this one
             return f"{type(error).__name__}: {error}"
         finally:
-            give_memory_back(device)
+            free_memory(device)
     return reason
 
 
-def give_memory_back(device: str) -> None:
-    """What a worker's last case left on a GPU: it would grow from case to case, and twenty workers fill a GPU."""
+def free_memory(device: str) -> None:
+    """Free the GPU memory that the last case of a worker still holds; otherwise twenty workers would fill a GPU."""
     if device != "cpu":
         import torch
 
@@ -104,7 +106,7 @@ def give_memory_back(device: str) -> None:
 
 
 def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: float = 0.0) -> str:
-    """Diagnose a folder into `out`, which appears when it is whole, in so many minutes (0: no limit); returns what failed."""
+    """Diagnose a folder into `out` within a time limit [min] (0: none); return an empty string, or the reason of the failure."""
     from neuido.discrepancy import answer, attribution, workflow
 
     target = Path(out)
@@ -124,18 +126,18 @@ def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: flo
             if ablation == "single-recording":
                 given = str(_with_one_recording(Path(folder), target.parent / ".inputs" / target.name))
             workflow.diagnose(given, out=out, device=device, minutes=minutes, progress=False)
-    except Exception as error:  # a case that fails is scored as failed, and the others go on
+    except Exception as error:  # the case is scored as failed; go on with the others
         target.mkdir(parents=True, exist_ok=True)
         (target / "failed.txt").write_text(f"{type(error).__name__}: {error}\n")
         return f"{type(error).__name__}: {error}"
     finally:
-        give_memory_back(device)
+        free_memory(device)
     (target / "failed.txt").unlink(missing_ok=True)
     return ""
 
 
 def _with_one_recording(folder: Path, target: Path) -> Path:
-    """A copy of a measured folder without what is held out."""
+    """Copy a measured folder without its held-out recordings; return the copy."""
     shutil.rmtree(target, ignore_errors=True)
     shutil.copytree(folder, target, ignore=shutil.ignore_patterns("truth.yaml", "README.md"))
     for file in ("experiment.yaml", "test.yaml", "track.yaml"):
@@ -148,12 +150,12 @@ def _with_one_recording(folder: Path, target: Path) -> Path:
 
 
 def in_parallel(work, tasks: list[tuple], workers: int) -> Iterator[tuple[tuple, Any]]:
-    """(task, result) as they finish, in processes of their own."""
+    """Run tasks in separate processes; yield (task, result) as they finish."""
     os.environ["OMP_NUM_THREADS"] = "1"
     context = multiprocessing.get_context("spawn")
     cores = context.SimpleQueue()
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    for n in range(workers):  # workers whose threads share all cores would be in each other's way
+    for n in range(workers):  # give each worker its own cores, so that their threads do not compete
         cores.put(available[n::workers] or available)
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_keep_to, initargs=(cores,)) as pool:
         waiting = {pool.submit(work, *task): task for task in tasks}
@@ -162,14 +164,14 @@ def in_parallel(work, tasks: list[tuple], workers: int) -> Iterator[tuple[tuple,
 
 
 def _keep_to(cores) -> None:
-    """Run this process on the next share of the cores."""
+    """Pin this process to the next share of the cores."""
     share = cores.get()
     if share:
         os.sched_setaffinity(0, share)
 
 
 def record(path: Path, row: dict[str, Any]) -> None:
-    """Add a row to a CSV file."""
+    """Append a row to a CSV file."""
     fresh = not path.exists()
     with path.open("a", newline="") as stream:
         writer = csv.DictWriter(stream, list(row))
@@ -179,7 +181,7 @@ def record(path: Path, row: dict[str, Any]) -> None:
 
 
 def key_of(folder: Path) -> dict[str, Any]:
-    """The key of a case, once its digest agrees with the one in the case's README; or the folder's truth.yaml."""
+    """Return the key of a case after checking its digest against the README of the case; without a key, the truth.yaml of the folder."""
     path = folder.parent / "keys" / f"{folder.name}.yaml"
     if not path.is_file():
         return read_yaml(folder / "truth.yaml")
@@ -190,7 +192,7 @@ def key_of(folder: Path) -> dict[str, Any]:
 
 
 def answers(folder: Path) -> list[dict[str, Any]] | None:
-    """The diagnoses of a folder (one for each body), or none where there are none yet."""
+    """Return the diagnoses of a folder, one for each body, or None if there is none yet."""
     if (folder / "failed.txt").is_file():
         none = {"held_out": float("nan")}
         error = {"noise_floor": float("nan"), "discretisation_floor": 0.0, "before": none, "after": none}
@@ -202,7 +204,7 @@ def answers(folder: Path) -> list[dict[str, Any]] | None:
 
 
 def score_all(folders: list[Path], out: Path, ablations: list[str]) -> str:
-    """Score what is there; writes scores.csv, returns the table."""
+    """Score all existing answers, write scores.csv, and return the table."""
     columns, everything = {}, []
     for how in ("none", *ablations, *blind_scores.FROM_TRACE):
         rows = []
@@ -233,16 +235,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/blind"))
     parser.add_argument("--cases", type=int, default=60)
-    parser.add_argument("--curves", type=int, default=0, help="further cases that are material tests and tracks, in turn")
+    parser.add_argument("--curves", type=int, default=0, help="additional cases that are alternately material tests and tracks")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, help="processes at a time; 2 on the CPU, 1 on a GPU")
+    parser.add_argument("--workers", type=int, help="number of parallel processes; default: 2 on the CPU, 1 on a GPU")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--minutes", type=float, default=0.0, help="of a diagnosis, as its own option; 0: as long as it takes")
+    parser.add_argument("--minutes", type=float, default=0.0, help="time limit of a diagnosis [min]; 0: none")
     parser.add_argument("--ablation", nargs="*", choices=RERUN, default=[])
     parser.add_argument("--only", choices=("make", "diagnose", "score"))
-    parser.add_argument("--folders", nargs="+", type=Path, help="score these instead of made ones")
-    parser.add_argument("--particles", type=int, default=0, help="of a body; 0: 1500 to 3000")
-    parser.add_argument("--seconds", type=float, default=0.0, help="of a body's recordings; 0: 0.4 to 0.6")
+    parser.add_argument("--folders", nargs="+", type=Path, help="diagnose and score these folders instead of generated ones")
+    parser.add_argument("--particles", type=int, default=0, help="particles of a body; 0: 1500 to 3000")
+    parser.add_argument("--seconds", type=float, default=0.0, help="duration of the recordings of a body [s]; 0: 0.4 to 0.6")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     workers = options.workers or (2 if options.device == "cpu" else 1)

@@ -1,7 +1,7 @@
-"""Scores of diagnoses against the sealed keys of `neuido simulate --undeclared`, and the answers that a lesser machinery would give.
+"""Scores of diagnoses against the sealed keys of `neuido simulate --undeclared`, and the answers of ablations.
 
-A key is a mapping as `neuido.data.undeclared` writes it (a truth.yaml of the same form will do), a diagnosis the content of
-diagnosis.json, a trace that of trace.json.
+A key is a mapping written by `neuido.data.undeclared`, or a truth.yaml of the same form. A diagnosis is the content of diagnosis.json, and
+a trace is the content of trace.json.
 """
 
 import itertools
@@ -14,14 +14,14 @@ from scipy.stats import beta
 
 NAMED = ("effect", "class")
 FROM_TRACE = ("plain-bic", "no-unknown", "take-smallest-error")
-"""Ablations that follow from the figures of a full diagnosis."""
+"""Ablations that can be computed from the results of a full diagnosis."""
 
 
 def score(key: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
-    """One case.
+    """Return the scores of one case.
 
-    Attribution: `exact` where the named effects are the true ones by name, `in_class` where each true one is in the class of another of the
-    named ones; both only where as many are named as there are. `found` counts the true effects that are in a class.
+    `exact` means that the named effects are the true ones. `in_class` means that each true effect is in the class of a different named
+    effect. Both require the right number of named effects. `found` is the number of true effects that are in a class.
     """
     true = key.get("undeclared") or []
     outside = any(one.get("outside_library") for one in true)
@@ -80,7 +80,7 @@ def score(key: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any
 
 
 def group_of(key: Mapping[str, Any]) -> str:
-    """null, nuisance (a null with wrong nuisances), one, two or outside."""
+    """Return the group of a case: null, nuisance (a null with wrong nuisance parameters), one, two or outside."""
     true = key.get("undeclared") or []
     if not true:
         return "nuisance" if key.get("nuisances") else "null"
@@ -90,7 +90,7 @@ def group_of(key: Mapping[str, Any]) -> str:
 
 
 def _pairs(wanted: Sequence[set[str]], classes: Sequence[set[str]]) -> list[tuple[int, int]]:
-    """The largest matching of true effects with classes that hold them."""
+    """Return a maximum matching between true effects and classes that contain them."""
     best: list[tuple[int, int]] = []
     slots = [*range(len(classes)), *[-1] * len(wanted)]
     for order in set(itertools.permutations(slots, len(wanted))):
@@ -100,7 +100,7 @@ def _pairs(wanted: Sequence[set[str]], classes: Sequence[set[str]]) -> list[tupl
 
 
 def _sizes(one: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, float]:
-    """The true sizes that a diagnosis gives a figure for, by its names; vectors by component."""
+    """Return the true values of the parameters that a diagnosis estimates, by its names; vectors by component."""
     flat: dict[str, float] = {}
     for name, value in one["parameters"].items():
         if name in one.get("sizes", (name,)) and name not in ("centre", "radius"):
@@ -114,12 +114,12 @@ def _inside(value: float, interval: Sequence[float]) -> bool:
 
 
 def upper_bound(count: int, of: int, level: float = 0.95) -> float:
-    """One-sided upper bound of a share by Clopper and Pearson, at `level`."""
+    """Return the one-sided Clopper-Pearson upper bound of a proportion at `level`."""
     return 1.0 if count >= of else float(beta.ppf(level, count + 1, of - count))
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """The figures of a table's column, in words."""
+    """Return the entries of a column of the table as text."""
 
     def of(*groups: str) -> list[Mapping[str, Any]]:
         return [r for r in rows if r["group"] in groups]
@@ -165,7 +165,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def table(columns: Mapping[str, Mapping[str, str]]) -> str:
-    """Markdown, a column for each ablation."""
+    """Return a table in Markdown with a column for each ablation."""
     lines = ["| " + " | ".join(["", *columns]) + " |", "| " + " | ".join(["---"] * (len(columns) + 1)) + " |"]
     for name in next(iter(columns.values())):
         lines.append("| " + " | ".join([name, *(column[name] for column in columns.values())]) + " |")
@@ -173,11 +173,13 @@ def table(columns: Mapping[str, Mapping[str, str]]) -> str:
 
 
 def ablated(how: str, diagnosis: Mapping[str, Any], trace: Mapping[str, Any]) -> dict[str, Any]:
-    """The answer that a part of the machinery alone would give, from the fits that the whole made.
+    """Return the answer of an ablation, computed from the fits of the full diagnosis.
 
-    plain-bic: the Bayesian information criterion with independent noise on the fitted recordings, for as many effects as lower it.
-    take-smallest-error: the candidate of the first round with the smallest fitted error, always. no-unknown: where the answer is
-    `unknown` the best candidate. Where no candidate was fitted (the declared model is at the noise already) the answer stays.
+    * `plain-bic` adds effects as long as they lower the Bayesian information criterion of the fitted recordings with independent noise.
+    * `take-smallest-error` always names the candidate of the first round with the smallest fitted error.
+    * `no-unknown` names the best candidate if the answer is `unknown`.
+
+    If no candidate was fitted, because the declared model already reaches the noise, the answer is unchanged.
     """
     out = dict(diagnosis)
     rounds = [r for r in trace["rounds"] if r["trials"]]
@@ -207,7 +209,7 @@ def ablated(how: str, diagnosis: Mapping[str, Any], trace: Mapping[str, Any]) ->
                 break
             chosen.append(r["trials"][best])
             if r["chosen"] != chosen[-1]["key"]:
-                break  # the next round was made beside another effect
+                break  # the next round started from another effect
     else:
         raise ValueError(f"{how} does not follow from a trace")
     out["answer"] = "effect" if chosen else "none"

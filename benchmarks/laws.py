@@ -1,11 +1,11 @@
-"""How far the learned laws drive real bodies from where the classical law drives them, beside NCLaw's own trained networks.
+"""Compare the motion of real bodies under learned laws with the motion under the classical law, also for the networks of NCLaw.
 
     python benchmarks/laws.py --data FOLDER [--weights pretrained] [--steps 400] [--device cuda] [--out laws.csv]
 
-For each of the ten real bodies and each of NCLaw's three materials: 400 substeps with the classical law, with the operator's
-law of that material (the latent of its training trajectory), and with NCLaw's networks. The figure is the matched-particle
-RMSE to the classical motion, the root of the mean over frames and particles, in 1e-3 of the unit cube. The step is the
-scene's own, halved until the stiffest law is well inside the stability limit; all three laws use the same.
+Each of the ten real bodies is simulated for 400 substeps with each of NCLaw's three materials: with the classical law, with the law of
+the operator (the latent of the training trajectory of the material), and with the networks of NCLaw. The table shows the
+matched-particle RMSE with respect to the classical motion over frames and particles, in 1e-3 of the unit cube. All three laws use the
+same time step: that of the scene, halved until the classical law is well within the stability limit.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def main() -> None:
     operator = IntrinsicDynamicsOperator.load(options.weights).to(options.device)
     rows = []
     print("| body | material | dt [s] | ours | NCLaw | ours / NCLaw |\n| --- | --- | --- | --- | --- | --- |")
-    # bodies that share a grid run in one launch
+    # bodies with equal grids are simulated in one launch
     setups = [load_scene(name, options.data) for name in options.bodies]
     for cells in sorted({setup.scene.cells for setup in setups}):
         group = [(name, setup) for name, setup in zip(options.bodies, setups) if setup.scene.cells == cells]

@@ -1,10 +1,10 @@
-"""Speed of differentiable splatting, case by case, beside the goals of the project.
+"""Measure the speed of differentiable splatting, and compare it with the goals of the project.
 
     python benchmarks/render.py [--device cuda] [--repeat 20] [--backend warp] [--out render.csv]
 
-The body is a ball of Gaussians that touch, near its surface and inside, with opacities of 0.3 to 1: every pixel of it is finished by
-the front ones. Gradients are those of Stage II, of means and covariances alone, unless the case says so. Times are for a whole call,
-listing of the tiles included, over the images in it.
+The body is a ball filled with touching Gaussians of opacity 0.3 to 1, so the front ones saturate every pixel. Unless stated otherwise,
+gradients are those of Stage II: means and covariances only. The time of a whole call, including the tile lists, is divided by the number
+of its images.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from neuido.models.render.splatting import rasterize
 
 @dataclass
 class Case:
-    """One row of the table; `goal` in ms an image, forward and backward."""
+    """One row of the table; `goal` is the time of forward and backward pass [ms per image]."""
 
     gaussians: int
     pixels: int
@@ -52,7 +52,7 @@ CASES = [
 
 
 def scene(case: Case, device: torch.device) -> list[torch.Tensor]:
-    """Means (F, N, 3), covariances (F, N, 3, 3), opacities, colours, viewmats, Ks; the ball covers the share `fill` of the image."""
+    """Return the arguments of `rasterize` for F frames; the ball covers the fraction `fill` of each image."""
     g = torch.Generator().manual_seed(0)
     n = case.gaussians
     directions = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
@@ -72,7 +72,7 @@ def scene(case: Case, device: torch.device) -> list[torch.Tensor]:
 
 
 def measure(case: Case, device: torch.device, backend: str, repeat: int) -> dict:
-    """Median ms an image of the forward call and of both, and the peak of device memory."""
+    """Return the row of a case: median times of the forward pass and of both passes [ms per image], and peak device memory."""
     tensors = scene(case, device)
     leaves = tensors[: 4 if case.appearance else 2]
     images = case.frames * case.views

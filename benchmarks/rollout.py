@@ -1,12 +1,12 @@
-"""Speed and memory of the differentiable rollout, case by case, beside the goals of the project.
+"""Measure speed and memory of the differentiable rollout, and compare them with the goals of the project.
 
     python benchmarks/rollout.py [--device cuda] [--repeat 20] [--data FOLDER] [--out rollout.csv]
 
-Real bodies come from the data folder (option --data or NEUIDO_DATA); without it balls of as many particles take their
-place, and the table says so. Weights of the neural law are random: their values do not change the work.
+Real bodies are read from the data folder (option --data or NEUIDO_DATA). Without it, they are replaced by balls of the same number of
+particles, which the table states. The weights of the neural law are random, as their values do not affect the cost.
 
-Beside each case stands its floor, the larger of two times from rates measured in the same run (`floor`), and beside the neural
-BouncyBall cases a plain re-implementation of the published loops (`plain.py`), on fewer substeps, scaled.
+Each case is compared with a lower bound from rates measured in the same run (`floor`). The neural BouncyBall cases are also compared with a
+plain re-implementation of the published loops (`plain.py`), measured on fewer substeps and scaled.
 """
 
 import argparse
@@ -34,21 +34,21 @@ from neuido.types import Body, Scene, Walls
 
 SIX = {"bouncy-ball": 25744, "clay-cat": 23554, "honey-bottle": 20777, "jelly-duck": 23419, "rubber-pawn": 15907, "sand-fish": 24894}
 NEUMA = {"forward": 2.1, "both": 4.2, "bytes": 45e9}
-"""NeuMA's own loop on one H200, BouncyBall, 400 substeps (measured 2026-11-20) [s], [s], [B]."""
+"""The original loop of NeuMA on one H200: BouncyBall, 400 substeps (measured 2026-11-20) [s], [s], [B]."""
 
 STATE = 24 * 4
-"""Bytes of x, v, C and F of a particle in float32."""
+"""Size of x, v, C and F of a particle in float32 [B]."""
 
 KEPT = 2 * 9 * 4
-"""Bytes of stress and trial gradient of a particle, where the tape keeps them."""
+"""Size of stress and trial deformation gradient of a particle, if the tape stores them [B]."""
 
 PLAIN_REPEAT = 5
-"""Repeats of the plain rollout, at most; the spread of a loop of milliseconds is small."""
+"""Maximum number of repetitions of the plain rollout, whose times spread little."""
 
 
 @dataclass
 class Case:
-    """One row of the table: `goal` in seconds, particle-substeps a second or a ratio, as `unit` says."""
+    """One row of the table; `unit` tells whether `goal` is in seconds, particle-substeps per second, or a ratio."""
 
     name: str
     make: Callable[[torch.device, Path | None], tuple[Simulator, tuple, int]]
@@ -58,26 +58,26 @@ class Case:
     peer: float | None = None
     devices: tuple[str, ...] = ("cuda",)
     plain: int = 0
-    """Substeps of the plain rollout measured beside it; none: 0."""
+    """Number of substeps of the plain rollout to compare with; 0: no comparison."""
 
 
 @dataclass
 class Rates:
-    """What the device does at best, measured: bytes a second of a copy (read and written), and FLOPs a second of matrix products."""
+    """Measured peak rates of the device: copies (bytes read and written per second) and matrix products (FLOPs per second)."""
 
     copy: float
     fp32: float
     tf32x3: float = 0.0
-    """A third of the TF32 rate (CUDA): three such products make one to fp32's accuracy, as the fused networks do."""
+    """A third of the TF32 rate on CUDA: like the fused networks, three TF32 products give one of fp32 accuracy."""
 
 
 def best(run: Callable[[], object], device: torch.device, repeat: int = 10) -> float:
-    """The shortest time of a call after a first one [s]."""
+    """Return the minimum time of a call after a warm-up call [s]."""
     return min(timed(run, device, repeat))
 
 
 def timed(run: Callable[[], object], device: torch.device, repeat: int) -> list[float]:
-    """Times of `repeat` calls after a first one, which compiles, captures and touches the memory [s]."""
+    """Return the times of `repeat` calls [s], after a warm-up call that compiles, captures and allocates."""
     cuda = device.type == "cuda"
     times = []
     for _ in range(repeat + 1):
@@ -92,7 +92,7 @@ def timed(run: Callable[[], object], device: torch.device, repeat: int) -> list[
 
 
 def measure_rates(device: torch.device) -> Rates:
-    """Of a copy too large for any cache, and of square matrix products."""
+    """Measure the rates of a copy that exceeds all caches, and of square matrix products."""
     cuda = device.type == "cuda"
     source = torch.ones((1 << 28) if cuda else (1 << 25), device=device)  # 1 GiB, 128 MiB
     target = torch.empty_like(source)
@@ -109,10 +109,10 @@ def measure_rates(device: torch.device) -> Rates:
 
 
 def network_flops(weights: tuple, gradient: bool) -> int:
-    """FLOPs of the three layers for a particle and substep, a product and its sum as two; `weights` as `tensors()` has them.
+    """Return the FLOPs of the three layers for one particle and substep (a multiply-add counts as two); `weights` as in `tensors()`.
 
-    A backward pass adds the layers again (recomputed: reading activations back would take longer), the same for the gradient
-    of the input, and the last layer once more for the gradient of its weights.
+    A backward pass recomputes the layers, as reading stored activations would take longer. It needs the same FLOPs again for the gradient
+    of the input, and those of the last layer for the gradient of its weights.
     """
     first, second, last = (2 * W.shape[-2] * W.shape[-1] for W in weights if W.ndim == 3)
     layers = first + second + last
@@ -120,11 +120,12 @@ def network_flops(weights: tuple, gradient: bool) -> int:
 
 
 def floor(particles: int, flops: int, gradient: bool, kept: int, rates: Rates) -> tuple[float, str]:
-    """The least time of a substep [s], and what binds it: `bytes` or `FLOPs`.
+    """Return a lower bound of the time of a substep [s], and the limiting resource: `bytes` or `FLOPs`.
 
-    Bytes: each particle's state read and written once a substep, by the backward pass the state read and its adjoint read and
-    written; what the tape keeps besides (`kept` bytes a substep) written and read. FLOPs: of the two networks, at the better of the
-    measured rates. The work of the transfers and the grid's traffic come on top; a body that fits a cache may beat the bytes.
+    The bytes comprise the state of each particle, read and written once in a substep. The backward pass reads the state, and reads and
+    writes its adjoint; it also writes and reads what the tape stores in addition (`kept` bytes per substep). The FLOPs are those of the two
+    networks at the higher of the measured rates. The work of the transfers and the memory traffic of the grid are not included. A body that
+    fits into a cache may be faster than the bound of the bytes.
     """
     moved = particles * STATE * (5 if gradient else 2) + (2 * kept if gradient else 0)
     times = {"bytes": moved / rates.copy, "FLOPs": particles * flops / max(rates.fp32, rates.tf32x3)}
@@ -133,7 +134,7 @@ def floor(particles: int, flops: int, gradient: bool, kept: int, rates: Rates) -
 
 
 def bodies(names: list[str], data: Path | None) -> tuple[list[Scene], list[Body]]:
-    """The scenes and their bodies, or balls of as many particles where the data folder is missing."""
+    """Return the scenes and their bodies; without the data folder, the bodies are balls of the same number of particles."""
     if data is not None:
         setups = [load_scene(name, data) for name in names]
         return [s.scene for s in setups], [s.body for s in setups]
@@ -145,9 +146,9 @@ def bodies(names: list[str], data: Path | None) -> tuple[list[Scene], list[Body]
 
 
 def neural(count: int, device: torch.device) -> tuple:
-    """Effective networks of `count` materials with random weights about Hencky elasticity and a yield strain of 5 %.
+    """Return effective networks of `count` materials, with random weights around Hencky elasticity and a yield strain of 5 %.
 
-    The last layers are the leaves: they are what Stage II and a latent z reach (the trunks are frozen there).
+    Only the last layers are leaves, as in Stage II, whose gradients reach z through the last layers while the trunks are frozen.
     """
     g = torch.Generator().manual_seed(0)
 
@@ -167,7 +168,7 @@ def neural(count: int, device: torch.device) -> tuple:
 
 
 def invariant(count: int, device: torch.device) -> tuple:
-    """Networks of NCLaw's shapes with small random weights, all of them leaves, as LoRA on every layer reaches them."""
+    """Return networks of the shapes of NCLaw with small random weights, all of which are leaves, as for LoRA on every layer."""
     g = torch.Generator().manual_seed(0)
     shapes = ((64, 13, 0.3), (64, 64, 0.1), (9, 64, 1.0), (64, 13, 0.3), (64, 64, 0.1), (9, 64, 0.1))
     leaves = [(scale * torch.randn(1, m, n, generator=g)).to(device).requires_grad_() for m, n, scale in shapes]
@@ -216,8 +217,8 @@ CASES = [
 
 
 def measure(case: Case, device: torch.device, data: Path | None, repeat: int, rates: Rates) -> dict:
-    """Median seconds, particle-substeps a second, bytes and floor of one case, and the plain rollout's figures where it has one."""
-    gc.collect()  # a simulator and its kept rollouts refer to each other
+    """Return the row of a case: median time, particle-substeps per second, memory, lower bound, and the plain rollout if measured."""
+    gc.collect()  # a simulator and its stored rollouts refer to each other
     if device.type == "cuda":
         torch.cuda.empty_cache()
     sim, (elastic, plastic, leaves), steps = case.make(device, data)
@@ -234,7 +235,7 @@ def measure(case: Case, device: torch.device, data: Path | None, repeat: int, ra
         return run
 
     def figures(run: Callable[[], None], repeat: int) -> tuple[list[float], int, int]:
-        """Times, peak bytes, and bytes held between the calls."""
+        """Return the times, the peak memory, and the memory held between calls [B]."""
         run()
         if cuda:
             torch.cuda.reset_peak_memory_stats(device)
@@ -245,7 +246,7 @@ def measure(case: Case, device: torch.device, data: Path | None, repeat: int, ra
     ours = differentiated(lambda: sim.rollout(steps, elastic, plastic, every=5, check=False).x)
     times, peak, held = figures(ours, repeat)
     seconds = statistics.median(times)
-    # what a backward pass needs of every substep: x, v, C, F of each particle
+    # the backward pass needs x, v, C and F of each particle after every substep
     saved = STATE * len(sim.mass) * (steps + 1) if case.gradient else 0
     row = {"case": case.name, "particles": len(sim.mass), "substeps": steps, "seconds": seconds, "spread": max(times) - min(times),
            "microseconds_per_substep": 1e6 * seconds / steps, "rate": len(sim.mass) * steps / seconds,
@@ -263,7 +264,7 @@ def measure(case: Case, device: torch.device, data: Path | None, repeat: int, ra
 
 
 def verdict(case: Case, row: dict, one_scene: float | None) -> tuple[str, str]:
-    """The goal as text and the figure that it is compared with, as a ratio (above 1: better than the goal)."""
+    """Return the goal as text, and the ratio to the goal as text (above 1: better than the goal)."""
     if case.goal is None:
         return "", ""
     if case.unit == "s":

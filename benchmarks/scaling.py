@@ -1,15 +1,15 @@
-"""How time and memory of the differentiable rollout grow with particles, substeps, scenes and the grid.
+"""Measure how time and memory of the differentiable rollout scale with particles, substeps, scenes and grid.
 
     python benchmarks/scaling.py [--device cuda] [--repeat 5] [--out runs/scaling] [--quick]
 
-One quantity varies at a time, the others stay at the base in the table's first line. OUT gets `scaling.md`, the table with the fitted
-exponents, and `scaling.png`, both axes logarithmic. Bodies are cubes of evenly spaced particles under the neural law of
-`rollout.py`; `--quick` takes few small values, to try it out.
+One quantity is varied at a time; the others keep the base values in the first line of the table. OUT receives `scaling.md`, the table with
+the fitted exponents, and `scaling.png`, a log-log plot. The bodies are cubes of evenly spaced particles with the neural law of
+`rollout.py`. `--quick` uses few small values, to try the script.
 
-The exponent is the slope of the logarithm of the figure over that of the quantity, by least squares over all values, and in
-brackets between the last two: a time that a constant part dominates at first grows faster at the end. The grid counts by its cells
-along a side: 3 would be growth with its nodes. Memory is the peak of torch's tensors during a call, those
-of the simulator and on CUDA of the captured graphs included.
+The exponent is the slope in the log-log plot by least squares over all values. The slope between the last two values is given in brackets,
+because a constant part of the time lowers the slope at small values. The size of the grid is its number of cells along a side, so an
+exponent of 3 means growth with the number of nodes. Memory is the peak memory of torch tensors during a call, including those of the
+simulator and, on CUDA, of the captured graphs.
 """
 
 import argparse
@@ -36,7 +36,7 @@ FIGURES = ("forward ms", "forward + backward ms", "forward MB", "forward + backw
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """One rollout; `particles` are those of each scene, `grid` the cells along a side."""
+    """Size of a rollout; `particles` is the number per scene, `grid` the number of cells along a side."""
 
     particles: int
     substeps: int
@@ -63,7 +63,7 @@ VALUES = {
 
 
 def cube(count: int) -> Body:
-    """`count` particles on an even lattice in the middle of the domain, falling at 1 m/s."""
+    """Return a body of `count` particles on a regular lattice in the centre of the domain, falling at 1 m/s."""
     side = math.ceil(count ** (1 / 3) - 1e-9)
     line = 0.25 + 0.5 * (torch.arange(side, dtype=torch.float64) + 0.5) / side
     x = torch.cartesian_prod(line, line, line)[:count]
@@ -72,7 +72,7 @@ def cube(count: int) -> Body:
 
 
 def rollout_of(size: Size, device: torch.device) -> tuple[Callable[[], object], Callable[[], object]]:
-    """The forward pass, and forward and backward, of a rollout of this size."""
+    """Return two functions for a rollout of this size: the forward pass alone, and forward and backward pass."""
     sim = Simulator([Scene(cells=size.grid, dt=2e-4)] * size.scenes, [cube(size.particles)] * size.scenes, device=device)
     elastic, plastic, leaves = neural(size.scenes, device)
 
@@ -90,7 +90,7 @@ def rollout_of(size: Size, device: torch.device) -> tuple[Callable[[], object], 
 
 
 class Ledger(TorchDispatchMode):
-    """Counts the bytes of all tensors that operators make or meet while it is open, until they are freed."""
+    """Track the memory of all tensors that operators create or read while the mode is active, until they are freed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -98,14 +98,14 @@ class Ledger(TorchDispatchMode):
         self.older = self.now = self.most = 0
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.older += self._enter((args, kwargs))  # made before, alive all along
+        self.older += self._enter((args, kwargs))  # created earlier, and alive throughout
         out = func(*args, **(kwargs or {}))
         self.now += self._enter(out, self._leave)
         self.most = max(self.most, self.now)
         return out
 
     def _enter(self, tree: object, freed: Callable[[int], None] = lambda size: None) -> int:
-        """The bytes of the storages that were not known."""
+        """Return the total size of the storages that are new [B]."""
         total = 0
         for leaf in tree_leaves(tree):
             if isinstance(leaf, torch.Tensor) and leaf.untyped_storage()._cdata not in self.known:
@@ -125,7 +125,7 @@ class Ledger(TorchDispatchMode):
 
 
 def peak_bytes(prepare: Callable[[], Callable[[], object]], device: torch.device) -> int:
-    """What is held at most during a call: on CUDA of all that was allocated from `prepare` on, on the CPU of what the call uses."""
+    """Return the peak memory of a call [B]: on CUDA of all allocations since `prepare`, on the CPU of the tensors that the call uses."""
     gc.collect()
     if device.type == "cuda":
         before = torch.cuda.memory_allocated(device)
@@ -134,14 +134,14 @@ def peak_bytes(prepare: Callable[[], Callable[[], object]], device: torch.device
         run()
         return torch.cuda.max_memory_allocated(device) - before
     run = prepare()
-    run()  # laws share buffers between rollouts: now they are there, whoever made them
+    run()  # allocate the buffers that laws share between rollouts, so that they do not count
     with Ledger() as ledger:
         run()
     return ledger.peak
 
 
 def measure(size: Size, device: torch.device, repeat: int) -> tuple[float, ...]:
-    """The four FIGURES."""
+    """Return the four FIGURES of a size."""
     peaks = [peak_bytes(lambda k=k: rollout_of(size, device)[k], device) / 1e6 for k in range(2)]
     gc.collect()
     times = [1e3 * statistics.median(timed(run, device, repeat)) for run in rollout_of(size, device)]
@@ -149,7 +149,7 @@ def measure(size: Size, device: torch.device, repeat: int) -> tuple[float, ...]:
 
 
 def exponent(values: list[float], figures: list[float]) -> float:
-    """The slope of log figure over log value by least squares; NaN with fewer than two positive figures."""
+    """Return the slope of log(figure) over log(value) by least squares; NaN for fewer than two positive figures."""
     pairs = [(math.log(v), math.log(f)) for v, f in zip(values, figures) if f > 0]
     if len(pairs) < 2:
         return math.nan
@@ -159,7 +159,7 @@ def exponent(values: list[float], figures: list[float]) -> float:
 
 
 def table(title: str, base: Size, rows: dict[str, list[tuple[float, tuple[float, ...]]]]) -> str:
-    """The figures of each quantity, and below them their exponents, as Markdown."""
+    """Return a table in Markdown with the figures of each quantity, followed by their exponents."""
     lines = [title, "", "Base: " + ", ".join(f"{name} {value:,}" for name, value in dataclasses.asdict(base).items()) + ".", ""]
     lines += ["| quantity | value | " + " | ".join(FIGURES) + " |", "| --- " * (2 + len(FIGURES)) + "|"]
     for name, measured in rows.items():
@@ -174,8 +174,8 @@ def table(title: str, base: Size, rows: dict[str, list[tuple[float, tuple[float,
 
 
 def picture(title: str, rows: dict[str, list[tuple[float, tuple[float, ...]]]], path: Path) -> None:
-    """Time above, memory below, a column for each quantity."""
-    figure = Figure(figsize=(3.2 * len(rows), 6.0), layout="constrained")  # no pyplot: nothing opens a window
+    """Plot time (top) and memory (bottom) with a column for each quantity."""
+    figure = Figure(figsize=(3.2 * len(rows), 6.0), layout="constrained")  # without pyplot, which may open a window
     axes = figure.subplots(2, len(rows), squeeze=False, sharey="row")
     for column, (name, measured) in enumerate(rows.items()):
         values = [value for value, _ in measured]
@@ -200,7 +200,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--out", type=Path, default=Path("runs/scaling"))
-    parser.add_argument("--quick", action="store_true", help="few small values, once each")
+    parser.add_argument("--quick", action="store_true", help="use few small values, without repetitions")
     options = parser.parse_args(arguments)
     device = torch.device(options.device)
     if device.type == "cpu":
@@ -208,7 +208,7 @@ def main(arguments: list[str] | None = None) -> None:
     kind, repeat = ("quick", 1) if options.quick else (device.type, options.repeat)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.processor() or platform.machine()}, one thread"
     title = f"{name}, torch {torch.__version__}, neural law, median of {repeat}"
-    rollout_of(BASE["quick"], device)[1]()  # compiles and loads the kernels, outside of what is measured
+    rollout_of(BASE["quick"], device)[1]()  # compile and load the kernels before measuring
     rows: dict[str, list[tuple[float, tuple[float, ...]]]] = {}
     for quantity, values in VALUES[kind].items():
         rows[quantity] = []

@@ -1,13 +1,13 @@
-"""Stage I at the paper's scale for several latent dimensions and both trunks: one table, the paper's figures beside.
+"""Train Stage I at the scale of the paper for several latent dimensions and both trunks, and compare with the paper in one table.
 
     python benchmarks/stage1.py --data data/trajectories --out runs/stage1 [--runs objective-64-128 raw-128-128 ...]
 
-A run is named TRUNK-WIDTH-DIM[-KEY=VALUE ...]: the trunk, its hidden width, the latent dimension d, and further options of the model.
+The name of a run is TRUNK-WIDTH-DIM[-KEY=VALUE ...]: the trunk, its hidden width, the latent dimension d, and further model options.
 The paper's own Stage I: `--config configs/paper/stage1.yaml --setup configs/paper/trajectories.yaml --data data/trajectories_paper
 --runs raw-256-128-lr=0.003-basis_dim=64 ...`.
 
-Makes the trajectories first where they are missing. The fits run side by side, one or more for each GPU (`--per-device`),
-each as a process `neuido fit --config CONFIG`; OUT gets their logs, their weights (safetensors) and table.md.
+Missing trajectories are generated first. The fits run in parallel, one or more on each GPU (`--per-device`), each as a process
+`neuido fit --config CONFIG`. OUT receives their logs, weights (safetensors) and table.md.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from neuido.data.files.results import logs
 
 ROOT = Path(__file__).resolve().parent.parent
 PAPER = {32: (1023.0, 3.598e-8), 64: (839.2, 3.211e-8), 256: (688.5, 3.341e-8)}
-"""Stress MSE and plastic MSE of the paper's Table 3, which leaves out d = 128. The data are not the same: the paper gives no ranges."""
+"""Stress MSE and plastic MSE of the paper's Table 3, which omits d = 128. The data differ, as the paper gives no ranges."""
 
 COLUMNS = [
     ("val/stress_mse", "stress MSE [Pa^2]"),
@@ -54,7 +54,7 @@ def command(options: argparse.Namespace, name: str) -> list[str]:
 
 
 def figures(folder: Path) -> dict[str, float]:
-    """The last value of each column of a run's metrics.csv."""
+    """Return the last value of each column in the metrics.csv files of a run."""
     found: dict[str, float] = {}
     for path in logs(folder):
         with path.open() as file:
@@ -85,9 +85,9 @@ def main() -> None:
     parser.add_argument(
         "--runs", nargs="+", default=[f"{trunk}-{dim}" for trunk in ("objective-64", "raw-128") for dim in (32, 64, 128, 256)]
     )
-    parser.add_argument("--config", type=Path, default=ROOT / "configs" / "stage1.yaml", help="of the fits")
-    parser.add_argument("--setup", type=Path, default=ROOT / "configs" / "trajectories.yaml", help="of the trajectories")
-    parser.add_argument("--per-device", type=int, default=1, help="fits at a time on each GPU")
+    parser.add_argument("--config", type=Path, default=ROOT / "configs" / "stage1.yaml", help="configuration of the fits")
+    parser.add_argument("--setup", type=Path, default=ROOT / "configs" / "trajectories.yaml", help="configuration of the trajectories")
+    parser.add_argument("--per-device", type=int, default=1, help="number of parallel fits on each GPU")
     parser.add_argument("extra", nargs="*", help="further arguments of `neuido fit`, after --")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -96,7 +96,7 @@ def main() -> None:
         start = time.time()
         arguments = ["simulate", "--config", str(options.setup), "--out", str(options.data), "--batch", "40"]
         subprocess.run([sys.executable, "-m", "neuido", *arguments], check=True, env=environment)
-        print(f"trajectories made in {time.time() - start:.0f} s", flush=True)
+        print(f"trajectories generated in {time.time() - start:.0f} s", flush=True)
     devices = max(1, torch.cuda.device_count())
     waiting = list(options.runs)
     running: dict[str, tuple[subprocess.Popen, int, float]] = {}

@@ -1,9 +1,9 @@
-"""The README's tables of laws read from video, from the scores that `neuido test` and `neuido fit` wrote.
+"""Print tables of laws inferred from video, from the scores that `neuido test` and `neuido fit` write.
 
     python benchmarks/tables.py stage2 research/results/stage2.csv research/results/stage2_ten.csv [--before FILE ...]
     python benchmarks/tables.py methods research/results/table1.csv
 
-CD and its floor are times 1e4 as in the files, RMSE in 1e-3 of the unit cube.
+As in the files, CD and its floor are times 1e4. RMSE is in 1e-3 of the unit cube.
 """
 
 import argparse
@@ -16,11 +16,11 @@ STAGE2 = ("cd", "floor", "rmse", "psnr", "ssim", "crop_psnr", "crop_ssim", "seco
 METHODS = ("cd", "rmse", "psnr", "ssim", "crop_psnr", "steps", "seconds", "peak_memory_gb")
 SCALES = {"rmse": 1e3}
 DIGITS = {"steps": 4, "seconds": 2, "peak_memory_gb": 2}
-"""Where three would be too many or too few."""
+"""Significant digits of figures for which three are unsuitable."""
 
 
 def read(files: Iterable[Path]) -> list[dict[str, str]]:
-    """The rows of CSV files, one after the other."""
+    """Return the rows of CSV files, concatenated."""
     rows = []
     for file in files:
         with file.open(newline="") as stream:
@@ -29,7 +29,7 @@ def read(files: Iterable[Path]) -> list[dict[str, str]]:
 
 
 def shown(rows: Sequence[dict[str, str]], key: str, factor: float = 1.0) -> str:
-    """The mean of a figure over rows; empty where one of them lacks it."""
+    """Return the mean of a figure over rows as text; empty if a row lacks it."""
     values = [row.get(key) or "" for row in rows]
     if not rows or not all(values):
         return ""
@@ -37,12 +37,12 @@ def shown(rows: Sequence[dict[str, str]], key: str, factor: float = 1.0) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows))
 
 
 def stage2(files: Sequence[Path], before: Sequence[Path]) -> str:
-    """Zero-shot laws, a row a scene, the means of each file, and the unseen scenes beside latents that know nothing of them."""
+    """Return a table of zero-shot laws by scene with the means of each file, and a comparison with uninformed latents on unseen scenes."""
     earlier = {row["scene"]: row for row in read(before)}
 
     def figures(rows: Sequence[dict[str, str]]) -> list[str]:
@@ -70,14 +70,14 @@ def stage2(files: Sequence[Path], before: Sequence[Path]) -> str:
 
 
 def both(row: dict[str, str] | None) -> str:
-    """CD and PSNR of a row; what kept it from having them."""
+    """Return CD and PSNR of a row as text, or why they are missing."""
     if row is None:
         return "not run"
     return f"{shown([row], 'cd')} / {shown([row], 'psnr')}" if row.get("cd") else "fails"
 
 
 def methods(file: Path) -> str:
-    """A row a run and stage: means over the scenes that ran; then CD by scene."""
+    """Return a table of means over the scenes that ran, by run and stage, and a table of CD and PSNR by scene."""
     rows = read([file])
     groups: dict[tuple[str, str], list[dict[str, str]]] = {}
     for row in rows:
