@@ -153,7 +153,7 @@ def test_damaged_folders_are_named(prepared, tmp_path):
 
     refused("method.json", lambda folder: (folder / "method.json").unlink())
     refused("method.json", lambda folder: (folder / "method.json").write_text("[1, 2"))
-    refused("of method 'Other'", lambda folder: edit(folder / "method.json", "LowRankAdaptation", "Other"))
+    refused("of the method 'Other'", lambda folder: edit(folder / "method.json", "LowRankAdaptation", "Other"))
     refused("another operator", lambda folder: edit(folder / "method.json", fit.fingerprint, "0" * 12))
     refused("adapter_model.safetensors is missing", lambda folder: (folder / "adapter_model.safetensors").unlink())
     refused("adapter_model.safetensors", lambda folder: (folder / "adapter_model.safetensors").write_bytes(b"nonsense"))

@@ -70,7 +70,7 @@ def test_read_law_is_the_inference_of_predict(operator, encoder, tmp_path):
 
 def test_latents_of_another_length_are_refused(operator, tmp_path):
     other = DynamicsEncoder(FlowVAE(8), latent_dim=16, flow_size=32, width=48)
-    with pytest.raises(UserError, match="latents of 16 numbers, the operator takes 128"):
+    with pytest.raises(UserError, match="latents of length 16, but the operator takes 128"):
         read_law(tiny_scene(tmp_path), operator=operator, encoder=other, device="cpu")
 
 

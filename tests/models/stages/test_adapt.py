@@ -339,7 +339,7 @@ def test_methods_without_parameters_or_without_laws(tmp_path):
     assert set(load_file(tmp_path / "still" / "tiny-0" / "fit" / "parameters.safetensors")) == {"pull"}
     again = module(tmp_path, method=Still(), adapter=str(tmp_path / "still"))
     assert torch.equal(again.load_fit(data.scenes[0])[1].method.pull, model.fit_of("tiny-0").method.pull)
-    with pytest.raises(UserError, match="of method 'Still'"):
+    with pytest.raises(UserError, match="of the method 'Still'"):
         module(tmp_path, adapter=str(tmp_path / "still")).load_fit(data.scenes[0])
 
 
