@@ -30,7 +30,7 @@ def main() -> None:
     weight = torch.randn(len(body[0].x), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
 
     def run(fast: bool, dtype: torch.dtype = torch.float32, ulp: bool = False) -> list[torch.Tensor]:
-        sim = Simulator(scenes, body, device=device, dtype=dtype, graphs=fast, keep="auto" if fast else "state")
+        sim = Simulator(scenes, body, device=device, dtype=dtype, graphs=fast, store="auto" if fast else "state")
         elastic, plastic, leaves = neural(1, device)
         if not fast:
             for law in (elastic, plastic):

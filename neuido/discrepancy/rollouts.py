@@ -196,8 +196,8 @@ class BodyRollouts(Problem):
             if elements and len(full) == 1 and finer == 0:
                 out = _finite(simulator, full[0], steps, elasticity, plasticity, **given)
             else:
-                more = {"finer": FINER[finer]} if elements else {}
-                out = simulator.rollout(steps, elasticity, plasticity, lenient=len(full) > 1 or finer > 0, **given, **more)
+                more = {"inner_factor": FINER[finer]} if elements else {}
+                out = simulator.rollout(steps, elasticity, plasticity, nan_on_failure=len(full) > 1 or finer > 0, **given, **more)
         if lifts.any():
             out = out._replace(x=out.x + _of_particles(lifts, simulator))
         moved, offsets = [], simulator.particles.offsets[::size]
@@ -410,10 +410,10 @@ def _finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -
     *others, finest = _finer(point)
     for finer in others:
         try:
-            return simulator.rollout(*args, **given, finer=finer)
+            return simulator.rollout(*args, **given, inner_factor=finer)
         except UserError:
             continue
-    return simulator.rollout(*args, **given, finer=finest)
+    return simulator.rollout(*args, **given, inner_factor=finest)
 
 
 def _up(r: Measured) -> np.ndarray:

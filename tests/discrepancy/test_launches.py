@@ -159,9 +159,9 @@ def test_what_fails_in_a_launch_of_finite_elements_fails_alone(experiment, monke
     launches, rollout = [], FiniteElements.rollout
 
     def watched(self, *args, **options):
-        launches.append((self.scene_count, options.get("finer", 1)))
+        launches.append((self.scene_count, options.get("inner_factor", 1)))
         out = rollout(self, *args, **options)
-        if options.get("finer", 1) < 2:  # as a motion that pressed the body harder
+        if options.get("inner_factor", 1) < 2:  # as a motion that pressed the body harder
             scene = self.particles.scene.long()
             out.x[:, (scene == 1) | (scene == 4)] = torch.nan
         return out
@@ -218,11 +218,11 @@ def test_a_motion_that_fails_alone_takes_finer_steps_too(experiment, monkeypatch
     problem, setting = body_problem(experiment), rollouts.SOLVERS[1]
     asked, rollout = [], FiniteElements.rollout
 
-    def watched(self, *args, finer, lenient=False, **options):
-        asked.append(finer)
-        if finer < tried[-1]:
+    def watched(self, *args, inner_factor, nan_on_failure=False, **options):
+        asked.append(inner_factor)
+        if inner_factor < tried[-1]:
             raise UserError("the motion is not finite")
-        return rollout(self, *args, finer=finer, lenient=lenient, **options)
+        return rollout(self, *args, inner_factor=inner_factor, nan_on_failure=nan_on_failure, **options)
 
     monkeypatch.setattr(FiniteElements, "rollout", watched)
     assert torch.isfinite(problem._moved(point, 0, setting).x).all() and asked == tried

@@ -16,7 +16,7 @@ from neuido.physics.fem.assembly import Assembly
 from neuido.physics.laws.base import ElasticLaw, Engine, Law, PlasticLaw
 from neuido.physics.mpm.graphs import capture
 from neuido.physics.runtime.device import launch, real_of, torch_stream
-from neuido.physics.runtime.launches import Stretches
+from neuido.physics.runtime.launches import LaunchRecordings
 
 
 class Fields(NamedTuple):
@@ -92,7 +92,7 @@ class Loop:
         self.at_node = like.new_empty(nodes if self.nodal else 0)
         self.graph: torch.cuda.CUDAGraph | None = None
         self.warm = False
-        self.stretches = Stretches()
+        self.recordings = LaunchRecordings()
 
     @property
     def state(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -121,7 +121,7 @@ class Loop:
             self.run()
             self.warm = True
         elif self.assembly.solver.device.type == "cpu":
-            self.stretches.run("interval", self.run)
+            self.recordings.run("interval", self.run)
         elif not self.captured:
             self.run()
         else:

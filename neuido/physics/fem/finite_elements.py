@@ -1,8 +1,8 @@
-"""Explicit finite elements beside the material point method: the same scenes, laws, effects and call, another discretisation.
+"""Explicit finite elements with the interface of the material point method: the same scenes, laws, effects and call.
 
-Linear tetrahedra with lumped masses, symplectic Euler in time, contact of the nodes at the exact planes. Forward only. The body
-of particles is meshed (`meshing`), and the motion is given back at the particles. A step is cut into as many equal inner steps as
-the smallest element and the fastest wave ask for.
+Linear tetrahedra with lumped masses, symplectic Euler in time, contact of the nodes at the exact planes. Forward only. The particles
+of a body are meshed (`meshing`), and the motion is returned at the particles. A step is divided into equal inner steps, as many as
+the smallest element and the fastest wave require.
 """
 
 import math
@@ -21,6 +21,7 @@ from neuido.physics.fem.meshing import Mesh, mesh_body
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm import inputs
 from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.deprecated import renamed_option
 from neuido.physics.runtime.device import real_of
 from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
@@ -28,31 +29,31 @@ from neuido.physics.runtime.threads import one_thread_each, scene_pool
 from neuido.types import Body, ParticleState, Scene
 
 SAFETY = 0.5
-"""Inner step over the stable step of the undeformed mesh: elements get thinner while a body is pressed."""
+"""Ratio of the inner step to the stable step of the undeformed mesh; a margin for elements that get thinner under compression."""
 MAX_INNER_STEPS = 2000
-"""Inner steps a step, at the most, where nothing else is said."""
+"""Default of `max_inner_steps`."""
 
 
 class FiniteElements:
     """Explicit finite elements of one or several scenes, each with one body; used as `mpm.Simulator` is.
 
     Args:
-        scenes: One scene or a list of them; the grid (`cells`) plays no part.
-        bodies: As many bodies.
-        density: [kg/m^3], one number or one for each scene.
+        scenes: One scene or a list; the grid (`cells`) is not used.
+        bodies: One body per scene.
+        density: Mass density [kg/m^3], one number or one per scene.
         device: `auto` (CUDA where there is one), `cpu`, `cuda`, or a `torch.device`.
-        dtype: `torch.float32` for work, `torch.float64` for checks.
-        threads: On the CPU, run several scenes in as many threads as there are cores.
-        graphs: On CUDA, capture the launches between two frames once for each shape and replay them after.
-        elements: About how many elements a body gets; see `meshing.mesh_body`.
-        tetrahedra: A lattice cell is cut into 5 or 6.
-        smoothing: `none`, or `nodal`: the volume change of an element is the mean of its nodes' means, against the locking of
-            nearly incompressible bodies (average nodal pressure, Bonet and Burton 1998).
-        meshes: Meshes in place of the ones made here, one a body or one for all.
-        max_inner_steps: Inner steps a step, at the most; what needs more is an error.
+        dtype: `torch.float32` for production, `torch.float64` for checks.
+        threads: On the CPU, run scenes in parallel, one thread per core.
+        graphs: On CUDA, capture the launches between two frames as a CUDA graph once per shape and replay it afterwards.
+        elements: Approximate number of elements of a body; see `meshing.mesh_body`.
+        tetrahedra: Number of tetrahedra per lattice cell, 5 or 6.
+        smoothing: `none` or `nodal`. With `nodal`, the volume change of an element is averaged over its nodes, which avoids the locking
+            of nearly incompressible bodies (average nodal pressure, Bonet and Burton 1998).
+        meshes: Meshes to use instead of generated ones, one per body or one for all.
+        max_inner_steps: Largest number of inner steps per step; a scene that needs more is an error.
 
     Raises:
-        UserError: As `mpm.Simulator`, and a body that cannot be meshed.
+        UserError: As `mpm.Simulator`, or a body that cannot be meshed.
 
     Attributes:
         state: `ParticleState` at t = 0.
@@ -98,7 +99,7 @@ class FiniteElements:
         self.sizes: list[float] = []
         for s, body in enumerate(bodies):
             given = None if meshes is None else meshes[s]
-            key = (id(body.x), id(body.volume), id(given))  # copies of one body share their mesh
+            key = (id(body.x), id(body.volume), id(given))  # references to one body share its mesh
             if key not in made:
                 x, volume = torch.as_tensor(body.x).double().cpu(), torch.as_tensor(body.volume).double().cpu()
                 mesh = mesh_body(x, volume, elements=elements, kind=tetrahedra) if given is None else given
@@ -107,7 +108,7 @@ class FiniteElements:
             self.meshes += (mesh,)
             self.sizes.append(self.sizes[-1] if s and mesh is self.meshes[-2] else _size(mesh))
             tied_meshes.append(tied)
-        # on the CPU a scene is an assembly of its own, which a thread runs; on a GPU all scenes share their launches
+        # on the CPU each scene is an assembly that one thread runs; on a GPU one assembly holds all scenes
         count = len(self.scenes)
         ranges = [(s, s + 1) for s in range(count)] if self.device.type == "cpu" else [(0, count)]
         self.arrays = SolverArrays(
@@ -129,7 +130,7 @@ class FiniteElements:
 
     @property
     def assemblies(self) -> list[Assembly]:
-        """The meshes as the kernels read them: one for each scene on the CPU, one for all on a GPU."""
+        """The assembled meshes: one assembly per scene on the CPU, one for all scenes on a GPU."""
         return [run.assembly for run in self.runs]
 
     def inner_steps(
@@ -140,17 +141,18 @@ class FiniteElements:
         stiffening: tuple[Tensor, Tensor] | None = None,
         refused: list[int] | None = None,
     ) -> list[int]:
-        """Inner steps a step that each scene needs, by 2/omega of the worst element (a bound: Belytschko et al., sec. 6.2).
+        """Return the inner steps per step of each scene, by the bound 2/omega of its worst element (Belytschko et al., sec. 6.2).
 
         Args:
-            elasticity: The law, for its P-wave modulus.
-            viscosity: `Effects.viscosity` [Pa s], (S, 2), or None; it acts with the velocity of half a step before.
+            elasticity: Elastic law; its P-wave modulus sets the wave speed.
+            viscosity: `Effects.viscosity` [Pa s], (S, 2), or None; it acts on the velocity of half a step earlier.
             mass: Particle masses [kg], (P,).
-            stiffening: What effects add to each scene's modulus [Pa], and the largest factor on the sum, (S,) each.
-            refused: Gets the scenes that need more than `max_inner_steps`, in place of an error; they get no more than the others.
+            stiffening: What effects add to each scene's P-wave modulus [Pa], and the largest factor on the sum, (S,) each.
+            refused: A list to which scenes that need more than `max_inner_steps` are appended instead of raising; they run with the
+                inner steps of the others.
 
         Raises:
-            UserError: A modulus that is negative, or more than `max_inner_steps`.
+            UserError: A negative modulus, or a scene that needs more than `max_inner_steps`.
         """
         needs = [math.ceil(need - 1e-9) for need in self._needs(elasticity, viscosity, mass, stiffening)]
         out = []
@@ -170,7 +172,7 @@ class FiniteElements:
     def _needs(
         self, elasticity: ElasticLaw, viscosity: Tensor | None, mass: Tensor | None, stiffening: tuple[Tensor, Tensor] | None
     ) -> list[float]:
-        """Step over the stable one of each scene; arguments are those of `inner_steps`."""
+        """Return the ratio of the step to the stable inner step of each scene; arguments as for `inner_steps`."""
         bounds = inputs.waves(self, elasticity, mass, stiffening)
         out = []
         for assembly in self.assemblies:
@@ -190,10 +192,10 @@ class FiniteElements:
     def step_margin(
         self, steps: int, elasticity: ElasticLaw, plasticity: PlasticLaw | None = None, *, effects: Effects | None = None
     ) -> float:
-        """`max_inner_steps` over the inner steps in need, of the scene that has least to spare; below 1 a `rollout` of these refuses.
+        """Return the smallest ratio of `max_inner_steps` to required inner steps over the scenes; below 1, `rollout` raises.
 
         Raises:
-            UserError: As `rollout`, but for the inner steps.
+            UserError: As `rollout`, except for too many inner steps.
         """
         given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
         return self.max_inner_steps / max(self._needs(elasticity, given.viscosity, given.mass, given.stiffening(self)))
@@ -213,41 +215,49 @@ class FiniteElements:
         segment: int | None = None,
         check: bool = True,
         inner: int | None = None,
-        finer: int = 1,
-        lenient: bool = False,
+        inner_factor: int = 1,
+        nan_on_failure: bool = False,
+        finer: int | None = None,
+        lenient: bool | None = None,
     ) -> Frames:
-        """Run `steps` steps of the scenes; arguments and result are those of `mpm.Simulator.rollout`, without gradients.
+        """Simulate `steps` steps without gradients; arguments and result are those of `mpm.Simulator.rollout`.
 
         Args:
             steps: Number of steps.
             elasticity: F -> Kirchhoff stress.
-            plasticity: Trial F -> corrected F; none: purely elastic.
-            state: Start, (P, ...): its difference from the bodies as loaded, or from the end of the last rollout where that is where the
-                particles are, is interpolated to nodes and elements; F is the elastic strain of the start, whatever its positions.
-            effects: Further effects.
-            gravity: [m/s^2], (S, 3); the scenes' own where absent.
-            friction: Coefficients of the colliders, (S, K) in the order colliders, walls.
-            mass: [kg], (P,); density times volume where absent.
-            every: Keep a frame every so many steps.
-            segment: Not read; there is no tape.
-            check: Not read; the inner steps are always stable for the undeformed mesh.
-            inner: Inner steps a step, in place of `inner_steps`.
-            finer: Times that many: those of `inner_steps` are stable for the body at rest, and a law may stiffen with strain.
-            lenient: Frames of a scene that needs too many, or whose motion fails, are NaN, in place of an error.
+            plasticity: Trial F -> corrected F; None: purely elastic.
+            state: Initial state, (P, ...). Its difference from the bodies as loaded (or from the end of the last rollout, if the
+                particles are there) is interpolated to nodes and elements. F is the initial elastic deformation gradient and is
+                independent of the positions.
+            effects: Physical effects beyond the laws.
+            gravity: [m/s^2], (S, 3); by default that of the scenes.
+            friction: Friction coefficients, (S, K): colliders first, then walls.
+            mass: [kg], (P,); by default density times volume.
+            every: Steps between two frames.
+            segment: Ignored; there is no tape.
+            check: Ignored; the inner steps are always stable for the undeformed mesh.
+            inner: Inner steps per step, instead of `inner_steps`.
+            inner_factor: Factor on the number of inner steps. `inner_steps` ensures stability for the body at rest; a law that stiffens
+                with strain may need more.
+            nan_on_failure: Instead of raising, set the frames of a scene to NaN if it needs too many inner steps or its motion fails.
+            finer: Deprecated name of `inner_factor`.
+            lenient: Deprecated name of `nan_on_failure`.
 
         Returns:
-            Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1: x and v interpolated in the element of
-            each particle, C and F of that element. Frame 0 is the start.
+            Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1. x and v are interpolated within the
+            element of each particle, C and F are those of the element. Frame 0 is the initial state.
 
         Raises:
-            UserError: Before the start, as `inner_steps`; afterwards a motion that is not finite.
+            UserError: Before the start, as `inner_steps`; afterwards, a motion that is not finite.
         """
+        inner_factor = renamed_option("inner_factor", inner_factor, "finer", finer)
+        nan_on_failure = renamed_option("nan_on_failure", nan_on_failure, "lenient", lenient)
         inputs.check_frames(steps, every)
         with torch.no_grad():
             given = inputs.prepare(
                 self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
             )
-            return self._rollout(steps, elasticity, plasticity, given, every, inner, finer, lenient)
+            return self._rollout(steps, elasticity, plasticity, given, every, inner, inner_factor, nan_on_failure)
 
     def _rollout(
         self,
@@ -257,16 +267,17 @@ class FiniteElements:
         given: inputs.RolloutInputs,
         every: int,
         inner: int | None,
-        finer: int,
-        lenient: bool,
+        inner_factor: int,
+        nan_on_failure: bool,
     ) -> Frames:
         state, effects, tables, viscosity, stiffness = given.state, given.effects, given.tables, given.viscosity, given.stiffness
         refused: list[int] = []
         if inner is None:
-            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self), refused if lenient else None)
+            refused_or_raise = refused if nan_on_failure else None
+            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self), refused_or_raise)
         else:
             inner_of = [inner] * self.scene_count
-        inner_of = [n * finer for n in inner_of]
+        inner_of = [n * inner_factor for n in inner_of]
         frames = Frames(
             *(t.new_empty(steps // every + 1, *t.shape) for t in state),
             dt=[scene.dt * every for scene in self.scenes],
@@ -302,9 +313,9 @@ class FiniteElements:
                 list(self.pool.map(one, self.runs))
         scene = self.particles.scene.long()
         dt = self.dt / torch.tensor(inner_of).to(self.dt)
-        limit = (torch.tensor(self.sizes).to(self.dt) / dt)[scene]  # faster, and a point crosses an element in a step
+        limit = (torch.tensor(self.sizes).to(self.dt) / dt)[scene]  # a point must not cross an element within an inner step
         fine = torch.isfinite(frames.x).all(dim=2) & (frames.v.norm(dim=2) <= limit)
-        if lenient:
+        if nan_on_failure:
             refusing = torch.tensor([s in refused for s in range(self.scene_count)], device=self.device)
             invalidate(frames, refusing[scene] | ~fine.all(dim=0), scene)
         elif not bool(fine.all()):
@@ -312,7 +323,7 @@ class FiniteElements:
         return frames
 
     def _raise(self, fine: Tensor, steps: int, every: int, inner: list[int]) -> NoReturn:
-        """Say where a motion is not finite, or too fast; `fine` (K, P)."""
+        """Raise for the first particle whose motion is not finite or too fast; `fine` (K, P) says where the motion is valid."""
         frame, p = ((~fine).nonzero()[0]).tolist()
         s = int(self.particles.scene[p])
         raise UserError(f"the motion of scene {s} is not finite from step {max(frame - 1, 0) * every} of {steps} on; lower `dt` "

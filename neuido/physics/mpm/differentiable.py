@@ -1,4 +1,4 @@
-"""A rollout as one autograd function: whole, in segments that keep only the states between them, or a thread for each scene."""
+"""A rollout as one autograd function: with a full tape, with gradient checkpointing, or with one thread per scene."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,26 +15,28 @@ from neuido.physics.runtime.threads import one_thread_each
 T = TypeVar("T")
 
 FRICTION = 8
-"""Which input the friction is; each scene has its own number of colliders."""
+"""Index of the friction input; the number of colliders, hence its width, differs between scenes."""
 
 
 def run(
     plan: Plan, inputs: tuple[Tensor, ...], segment: int | None, cache: RolloutCache, pool: ThreadPoolExecutor | None
 ) -> tuple[Tensor, ...]:
-    """Frames of x, v, C, F and the history, in memory that the next rollout overwrites; differentiable where an input requires it.
+    """Return frames of x, v, C, F and the history; differentiable if an input requires a gradient.
+
+    Without gradients the frames lie in memory that the next rollout overwrites.
 
     Args:
-        plan: What to run.
-        inputs: As `KINDS` says, and the tensors of the laws.
-        segment: Substeps between checkpoints of a differentiable run; none: the tape spans the whole of it.
-        cache: The kept rollouts of the simulator.
-        pool: Threads for the scenes, or None: all of them in the same launches.
+        plan: The rollout to run.
+        inputs: The inputs in the order of `KINDS`, then the tensors of the laws.
+        segment: Substeps between two checkpoints; None: one tape for the whole rollout.
+        cache: The cached rollouts of the simulator.
+        pool: Threads, one scene each; None: all scenes share their launches.
 
     Raises:
-        UserError: What `Plan.check` finds.
+        UserError: As `rollout.check`.
     """
     differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
-    captured = plan.setup.device.type == "cuda"  # a graph of many thousand substeps would be large and slow to make
+    captured = plan.setup.device.type == "cuda"  # a graph of many thousand substeps is large and slow to capture
     if (differentiable or captured) and segment is not None and segment < plan.steps:
         return _Segments.apply(plan, segment, cache, *inputs)
     if pool is not None:
@@ -45,38 +47,38 @@ def run(
 
 
 def _frames(plan: Plan, cache: RolloutCache, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """Return the frames of a run without a tape."""
-    kept = cache.find(plan, inputs, keep_all=False)
-    kept.forward(plan, inputs)
-    check(plan, kept.tape)
-    return kept.tape.states
+    """Return the frames of a rollout without a tape."""
+    cached = cache.find(plan, inputs, keep_all=False)
+    cached.forward(plan, inputs)
+    check(plan, cached.tape)
+    return cached.tape.states
 
 
 class _Rollout(torch.autograd.Function):
-    """Frames of x, v, C, F from the start, the parameters and the laws' tensors."""
+    """Map the initial state, the parameters and the tensors of the laws to frames of x, v, C, F and the history."""
 
     @staticmethod
     def forward(ctx: Any, plan: Plan, cache: RolloutCache, *inputs: Tensor) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         inputs = tuple(t.detach() for t in inputs)
-        # the tape belongs to the simulator: a later rollout may overwrite it, and the backward pass then runs this one again
-        ctx.plan, ctx.lock, ctx.kept = plan, cache.lock, cache.find(plan, inputs, keep_all=True)
-        ctx.serial = ctx.kept.forward(plan, inputs)
-        check(plan, ctx.kept.tape)
+        # the tape is shared: if a later rollout overwrote it, the backward pass repeats this forward pass
+        ctx.plan, ctx.lock, ctx.cached = plan, cache.lock, cache.find(plan, inputs, keep_all=True)
+        ctx.serial = ctx.cached.forward(plan, inputs)
+        check(plan, ctx.cached.tape)
         ctx.save_for_backward(*(t.clone() for t in inputs))
-        return tuple(t[:: plan.every] for t in ctx.kept.tape.states)
+        return tuple(t[:: plan.every] for t in ctx.cached.tape.states)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         wanted = ctx.needs_input_grad[2:]
         with ctx.lock:
-            out = ctx.kept.backward(ctx.plan, ctx.saved_tensors, ctx.serial, gradients, wanted)
+            out = ctx.cached.backward(ctx.plan, ctx.saved_tensors, ctx.serial, gradients, wanted)
         return (None, None, *(g if want else None for g, want in zip(out, wanted, strict=True)))
 
 
 class _Segments(torch.autograd.Function):
-    """`_Rollout` in segments: only the states between them are kept, and the backward pass makes the tape of one segment at a time."""
+    """`_Rollout` with gradient checkpointing: stores the states between segments and recomputes the tape of one segment at a time."""
 
     @staticmethod
     def forward(ctx: Any, plan: Plan, segment: int, cache: RolloutCache, *inputs: Tensor) -> tuple[Tensor, ...]:
@@ -110,14 +112,14 @@ class _Segments(torch.autograd.Function):
             for a, gradient in zip(carry, gradients):
                 of_frames = a.new_zeros(length + 1, *a.shape)
                 if gradient is not None:
-                    # the first frame of a segment is the last one of the segment before
+                    # the first frame of a segment is the last frame of the previous one
                     of_frames[0 if i == 0 else 1 :] = gradient[i * length + (0 if i == 0 else 1) : (i + 1) * length + 1]
                 of_frames[-1] += a
                 own.append(of_frames)
             with cache.lock:
-                kept = cache.find(part, inputs, keep_all=True)
-                serial = kept.forward(part, inputs)
-                out = kept.backward(part, inputs, serial, own, (True,) * STATES + tuple(wanted[STATES:]))
+                cached = cache.find(part, inputs, keep_all=True)
+                serial = cached.forward(part, inputs)
+                out = cached.backward(part, inputs, serial, own, (True,) * STATES + tuple(wanted[STATES:]))
             carry = out[:STATES]
             for t, kind, new in zip(total, kinds, out[STATES:], strict=True):
                 if new is not None:
@@ -126,17 +128,17 @@ class _Segments(torch.autograd.Function):
 
 
 def _kinds(inputs: Sequence[Tensor]) -> tuple[str, ...]:
-    """Return the kinds of the inputs after the start."""
+    """Return the kinds of the inputs that follow the initial state."""
     return (*KINDS[STATES:], *("law",) * (len(inputs) - FIXED))
 
 
 def _own(t: Tensor, kind: str, i: int, steps: int) -> Tensor:
-    """Return the part of an input that segment i of `steps` substeps reads."""
+    """Return the part of an input that belongs to segment i of `steps` substeps."""
     return t[i * steps : (i + 1) * steps] if kind == "time" and t.numel() and len(t) > 1 else t
 
 
 class SingleScenes:
-    """The plans of single scenes that together do what one plan does; their inputs are its inputs' parts."""
+    """One plan for several scenes, split into one plan per scene; converts inputs and gradients between the two."""
 
     def __init__(self, plan: Plan, cache: RolloutCache, pool: ThreadPoolExecutor) -> None:
         self.whole, self.pool, self.lock = plan, pool, cache.lock
@@ -146,7 +148,7 @@ class SingleScenes:
         self.ranges = list(zip(offsets[:-1], offsets[1:]))
 
     def part(self, inputs: Sequence[Tensor], s: int) -> tuple[Tensor, ...]:
-        """Return the inputs of scene s: its particles, its row of the scenes' tables, its row of a law (or the one that all share)."""
+        """Return the inputs of scene s: its particles, its row of each table, and its row of each law, or the row that all scenes share."""
         i, j = self.ranges[s]
         parts = []
         for n, t in enumerate(inputs):
@@ -162,7 +164,7 @@ class SingleScenes:
         return tuple(t.contiguous() for t in parts)
 
     def whole_gradient(self, inputs: Sequence[Tensor], parts: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
-        """Return the gradients of the whole's inputs from those of the scenes."""
+        """Assemble the gradients of all inputs from those of the single scenes."""
         out: list[Tensor | None] = []
         for n, t in enumerate(inputs):
             if parts[0][n] is None:
@@ -185,13 +187,13 @@ class SingleScenes:
         return out
 
     def each(self, function: Callable[[int], T]) -> list[T]:
-        """Return the function of every scene's number, as many at a time as there are cores; the first error is raised."""
+        """Return `function(s)` for every scene s, computed in parallel; the first error is raised."""
         with one_thread_each():
             return list(self.pool.map(function, range(len(self.plans))))
 
 
 class _ThreadedRollout(torch.autograd.Function):
-    """`autograd._Rollout` of several scenes on the CPU."""
+    """`_Rollout` of several scenes on the CPU, one thread per scene."""
 
     @staticmethod
     def forward(ctx: Any, scenes: SingleScenes, keep_all: bool, *inputs: Tensor) -> tuple[Tensor, ...]:
@@ -201,15 +203,15 @@ class _ThreadedRollout(torch.autograd.Function):
 
         def one(s: int):
             plan, part = scenes.plans[s], scenes.part(inputs, s)
-            kept = scenes.caches[s].find(plan, part, keep_all)
-            serial = kept.forward(plan, part)
-            check(plan, kept.tape)
-            return kept, serial
+            cached = scenes.caches[s].find(plan, part, keep_all)
+            serial = cached.forward(plan, part)
+            check(plan, cached.tape)
+            return cached, serial
 
-        ctx.kept = scenes.each(one)
+        ctx.cached = scenes.each(one)
         ctx.save_for_backward(*(t.clone() for t in inputs))
         stride = scenes.whole.every if keep_all else 1
-        return tuple(torch.cat([kept.tape.states[n][::stride] for kept, _ in ctx.kept], dim=1) for n in range(STATES))
+        return tuple(torch.cat([cached.tape.states[n][::stride] for cached, _ in ctx.cached], dim=1) for n in range(STATES))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -219,8 +221,8 @@ class _ThreadedRollout(torch.autograd.Function):
         def one(s: int):
             i, j = scenes.ranges[s]
             own = [None if g is None else g[:, i:j] for g in gradients]
-            kept, serial = ctx.kept[s]
-            return kept.backward(scenes.plans[s], scenes.part(inputs, s), serial, own, wanted)
+            cached, serial = ctx.cached[s]
+            return cached.backward(scenes.plans[s], scenes.part(inputs, s), serial, own, wanted)
 
         with scenes.lock:
             out = scenes.whole_gradient(inputs, scenes.each(one))

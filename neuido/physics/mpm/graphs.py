@@ -1,8 +1,8 @@
-"""Rollouts that keep their memory: on a GPU as CUDA graphs, captured once for each shape and replayed after; on the CPU as a tape.
+"""A cache of rollouts by shape: on a GPU as CUDA graphs, captured once and replayed, on the CPU as a tape that is reused.
 
-A kept rollout owns its tape, a captured one its inputs and gradients too; the next run of the same shape overwrites them.
-Whoever wants the gradient of an earlier run says so by its serial number, and its forward pass is run again first. (On the
-CPU the page faults of a fresh tape cost more than the substeps.)
+A cached rollout owns its tape, and a captured one its inputs and gradients too; the next run of the same shape overwrites them. A serial
+number identifies a run. If a later run overwrote the tape, the backward pass repeats the forward pass first. The tape is reused on the CPU
+because the page faults of a new one cost more than the substeps.
 """
 
 import gc
@@ -21,18 +21,18 @@ from neuido.physics.mpm.rollout import new_tape, run_forward
 T = TypeVar("T")
 
 CAPACITY = 4
-"""Rollouts that a simulator keeps; each holds its tape."""
+"""Number of rollouts in the cache of a simulator; each holds its tape."""
 
 
-class KeptRollout:
-    """A tape for rollouts of one shape, eagerly run."""
+class CachedRollout:
+    """A rollout of one shape, run eagerly, with its tape."""
 
     def __init__(self, plan: Plan, keep_all: bool) -> None:
         self.tape = new_tape(plan, keep_all)
         self.serial = 0
 
     def forward(self, plan: Plan, inputs: Sequence[Tensor]) -> int:
-        """Run with new inputs; returns the serial number of this run."""
+        """Run with new inputs and return the serial number of the run."""
         self._forward(plan, inputs)
         self.serial += 1
         return self.serial
@@ -40,7 +40,7 @@ class KeptRollout:
     def backward(
         self, plan: Plan, inputs: Sequence[Tensor], serial: int, gradients: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
-        """Return the adjoint of the run `serial` with these inputs."""
+        """Return the gradients of the inputs for the run `serial`, which had these inputs."""
         if serial != self.serial:
             self.forward(plan, inputs)
         return self._backward(plan, inputs, gradients, wanted)
@@ -54,8 +54,8 @@ class KeptRollout:
         return run_backward(plan, inputs, self.tape, gradients, wanted)
 
 
-class CapturedRollout(KeptRollout):
-    """The forward graph of a plan, and a backward graph for each set of wanted gradients."""
+class CapturedRollout(CachedRollout):
+    """A rollout as CUDA graphs: one forward graph, and one backward graph per set of requested gradients."""
 
     def __init__(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> None:
         super().__init__(plan, keep_all)
@@ -88,10 +88,10 @@ class CapturedRollout(KeptRollout):
 
 
 def capture(launches: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
-    """Capture a CUDA graph of the launches, and return it with what they returned.
+    """Capture the launches as a CUDA graph, and return it with their result.
 
-    No garbage collection meanwhile, for freeing another graph would break it; and none before, as `torch.cuda.graph` has it: that takes
-    longer than to capture a hundred substeps.
+    Garbage collection is disabled during the capture, since freeing another graph would break it. Unlike `torch.cuda.graph`, it does not
+    collect beforehand either: that takes longer than capturing a hundred substeps.
     """
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
     torch.cuda.synchronize()
@@ -112,26 +112,26 @@ def capture(launches: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
 
 
 class RolloutCache:
-    """The kept rollouts of a simulator, the least recently used dropped first."""
+    """The cached rollouts of a simulator; the least recently used is dropped first."""
 
     def __init__(self, graphs: bool) -> None:
         self.graphs = graphs
         self.lock = threading.RLock()
-        """Held by a rollout or an adjoint: tape, grid and graphs are one set, which threads that share a simulator take in turn."""
-        self._kept: OrderedDict[tuple, KeptRollout] = OrderedDict()
+        """Held during a forward or backward pass: threads that share a simulator share its tape, grid and graphs."""
+        self._rollouts: OrderedDict[tuple, CachedRollout] = OrderedDict()
         self._single: dict[int, RolloutCache] = {}
 
     def single_scene(self, s: int) -> "RolloutCache":
         """Return the cache for the rollouts of scene s alone."""
         return self._single.setdefault(s, RolloutCache(self.graphs))
 
-    def find(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> KeptRollout:
-        """Return the kept rollout for a plan with inputs of these shapes; captured where graphs are on and its laws may be captured."""
+    def find(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> CachedRollout:
+        """Return the cached rollout for a plan and inputs of these shapes, or make one; captured if graphs are on and the laws allow it."""
         own = plan.key(inputs) if self.graphs else None
         key = (own, plan.steps, plan.every, plan.plasticity is None, keep_all, *(tuple(t.shape) for t in inputs))
-        if key not in self._kept:
-            while len(self._kept) >= CAPACITY:
-                self._kept.popitem(last=False)
-            self._kept[key] = KeptRollout(plan, keep_all) if own is None else CapturedRollout(plan, inputs, keep_all)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        if key not in self._rollouts:
+            while len(self._rollouts) >= CAPACITY:
+                self._rollouts.popitem(last=False)
+            self._rollouts[key] = CachedRollout(plan, keep_all) if own is None else CapturedRollout(plan, inputs, keep_all)
+        self._rollouts.move_to_end(key)
+        return self._rollouts[key]

@@ -1,4 +1,4 @@
-"""What a caller gives a rollout beside the laws, brought to the solver's type and checked: the same for every discretisation."""
+"""Inputs of a rollout other than the laws, converted to the solver's dtype and device and validated; shared by MPM and FEM."""
 
 from typing import NamedTuple, Protocol
 
@@ -15,7 +15,7 @@ from neuido.types import Particles, ParticleState
 
 
 class Solver(Protocol):
-    """What is read of `mpm.Simulator` and `finite_elements.FiniteElements`, which document it."""
+    """The attributes of `mpm.Simulator` and `FiniteElements` that this module reads; documented there."""
 
     device: torch.device
     dtype: torch.dtype
@@ -32,7 +32,7 @@ class Solver(Protocol):
 
 
 class RolloutInputs(NamedTuple):
-    """Of S scenes with P particles and K colliders, in the type and on the device of the solver."""
+    """Inputs for S scenes with P particles and K colliders, in the dtype and on the device of the solver."""
 
     state: ParticleState
     effects: Effects
@@ -56,7 +56,8 @@ class RolloutInputs(NamedTuple):
     def stiffening(self, solver: Solver) -> tuple[Tensor, Tensor] | None:
         """Return what the effects add to each scene's P-wave modulus [Pa], and the factor on the sum, (S,) float64 each.
 
-        Of particles with factors of their own that one whose waves are fastest counts, and its factor is told at the least density.
+        Where stiffness differs between particles, the particle with the fastest wave decides. Its factor is referred to the smallest
+        density of the scene, since the step limit combines the modulus with that density.
         """
         if self.tables is None:
             return None
@@ -72,7 +73,7 @@ class RolloutInputs(NamedTuple):
 
 
 def check_frames(steps: int, every: int) -> None:
-    """Raise UserError where `steps` is no positive multiple of `every`."""
+    """Raise UserError unless `steps` is a positive multiple of `every`."""
     if steps < 1 or every < 1 or steps % every:
         raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
 
@@ -89,10 +90,10 @@ def prepare(
     friction: Tensor | None = None,
     mass: Tensor | None = None,
 ) -> RolloutInputs:
-    """Return what `steps` steps read, differentiable in everything given; the arguments are those of `mpm.Simulator.rollout`.
+    """Return the inputs of a rollout, differentiable in all arguments, which are those of `mpm.Simulator.rollout`.
 
     Raises:
-        UserError: A shape that does not fit, an effect outside its range or without a law that it needs.
+        UserError: A shape that does not fit, an effect outside its range or with a law that does not support it.
     """
     count, like = solver.scene_count, solver.mass
 

@@ -1,4 +1,4 @@
-"""What one rollout does: its laws, its steps and its effects, over a fixed set-up of scenes and bodies."""
+"""The plan of one rollout: laws, number of steps and effects, for a given `Setup` of scenes and bodies."""
 
 import copy
 from collections.abc import Sequence
@@ -15,31 +15,31 @@ from neuido.physics.mpm.state import Setup
 from neuido.physics.runtime.device import launch, real_of
 
 STATES = 5
-"""Inputs that are the start: x, v, C, F and the history (no columns where no effect remembers)."""
+"""Number of inputs that form the initial state: x, v, C, F and the history (no columns if no effect has a history)."""
 KINDS = ("particle",) * 6 + ("time",) + ("scene",) * 3 + ("particle", "time") + ("scene",) * 3
-"""What an input before the tensors of the laws has a row for: the start, mass, pull, force, friction, viscosity, and of the effects
-on the material stiffness, growth, material, branches, flow. Those over time are (T, S, ...), or (1, S, ...) where constant; an absent
-one has no elements."""
+"""The leading axis of each input before the tensors of the laws: the initial state (5), mass, acceleration, force, friction,
+viscosity, and the tables of material effects: stiffness, growth, material, branches, flow. `time` is (T, S, ...), or (1, S, ...) if
+constant. An absent input has no elements."""
 FIXED = len(KINDS)
 
 LARGE = 1 << 17
-"""Particles above which blocks of 256 threads do as well as blocks of 32 on a GPU; smaller bodies need more blocks to fill it."""
+"""Number of particles from which a GPU uses blocks of 256 threads, else of 32: small bodies need more blocks to fill the GPU."""
 
 
 class Material(NamedTuple):
-    """The inputs of the effects on the material in one substep; None where absent."""
+    """The tables of material effects in one substep; None where an effect is absent."""
 
     stiffness: Tensor | None
     growth: Tensor | None
     material: Tensor | None
     branches: Tensor | None
     flow: Tensor | None
-    idle: bool = True
-    """Whether branches of weight zero are kept too, for a backward pass."""
+    all_branches: bool = True
+    """Whether Maxwell branches of zero weight are advanced too; a backward pass needs them for the gradient of the weight."""
 
 
 class Plan:
-    """What one rollout does, without its differentiable inputs.
+    """Everything that defines a rollout except its differentiable inputs.
 
     Args:
         setup: Scenes and bodies.
@@ -47,8 +47,8 @@ class Plan:
         plasticity: Plastic law or None.
         steps: Substeps.
         every: Substeps between frames.
-        tables: What the effects of the material need; of it the plan keeps what decides its launches.
-        lenient: Frames of a scene that fails are NaN, in place of an error.
+        tables: Tables of the material effects, if any; they decide which kernels are launched.
+        nan_on_failure: Set the frames of a failed scene to NaN instead of raising.
     """
 
     def __init__(
@@ -59,9 +59,10 @@ class Plan:
         steps: int,
         every: int,
         tables: Tables | None = None,
-        lenient: bool = False,
+        nan_on_failure: bool = False,
     ) -> None:
-        self.setup, self.elasticity, self.steps, self.every, self.lenient = setup, elasticity, steps, every, lenient
+        self.setup, self.elasticity, self.steps, self.every = setup, elasticity, steps, every
+        self.nan_on_failure = nan_on_failure
         self.layout = Layout() if tables is None else tables.layout
         self.spectral = tables is not None and tables.spectral
         self.flow_kinds = () if tables is None else tables.kinds
@@ -74,20 +75,20 @@ class Plan:
         self.block = 32 if len(setup.mass) < LARGE else 256
 
     def law_tensors(self) -> tuple[Tensor, ...]:
-        """Those of both laws, the elastic ones first."""
+        """Return the tensors of both laws, the elastic law's first."""
         elastic = self.elasticity.tensors()
         self.split = FIXED + len(elastic)
         return (*elastic, *(() if self.plasticity is None else self.plasticity.tensors()))
 
     def key(self, inputs: Sequence[Tensor]) -> tuple | None:
-        """Return what, beside the shapes of the inputs, decides the launches; None where they may not be captured."""
+        """Return the part of the cache key of the launches that shapes do not give; None if they must not be captured."""
         elastic = self.elasticity.key(inputs[FIXED : self.split])
         plastic = "none" if self.plasticity is None else self.plasticity.key(inputs[self.split :])
         own = (self.steps, self.every, self.layout, self.spectral, self.flow_kinds)
         return None if elastic is None or plastic is None else (*own, elastic, plastic)
 
     def shortened(self, steps: int) -> "Plan":
-        """Return the same plan for fewer substeps."""
+        """Return a copy of the plan with another number of substeps."""
         plan = copy.copy(self)
         plan.steps = steps
         return plan
@@ -101,7 +102,8 @@ class Plan:
         """Return the plan of one scene."""
         plastic = None if self.plasticity is None else self.plasticity.single_scene(s)
         tables = None if self.tables is None else self.tables._replace(kinds=self.flow_kinds[s : s + 1])
-        plan = Plan(self.setup.single_scene(s), self.elasticity.single_scene(s), plastic, self.steps, self.every, tables, self.lenient)
+        elastic = self.elasticity.single_scene(s)
+        plan = Plan(self.setup.single_scene(s), elastic, plastic, self.steps, self.every, tables, self.nan_on_failure)
         plan.split = self.split
         return plan
 
@@ -113,14 +115,14 @@ class Plan:
         """Whether the trial gradient is corrected, by a law or by an effect."""
         return self.plasticity is not None or bool(self.flow_kinds)
 
-    def material(self, inputs: Sequence[Tensor], n: int, *, idle: bool = True) -> Material | None:
-        """Return what the kernels of the effects read in substep n."""
+    def material(self, inputs: Sequence[Tensor], n: int, *, all_branches: bool = True) -> Material | None:
+        """Return the tables of material effects in substep n; None without such effects."""
         if self.tables is None:
             return None
         stiffness, growth, *tables = inputs[STATES + 5 : FIXED]
-        return Material(*(t if t.numel() else None for t in (stiffness, at_step(growth, n), *tables)), idle)
+        return Material(*(t if t.numel() else None for t in (stiffness, at_step(growth, n), *tables)), all_branches)
 
 
 def at_step(t: Tensor, n: int) -> Tensor:
-    """Return the row of an input over time that substep n reads."""
+    """Return the row for substep n of an input with a leading time axis."""
     return t[n if len(t) > 1 else 0] if t.numel() else t

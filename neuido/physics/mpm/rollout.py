@@ -1,6 +1,6 @@
-"""The forward pass of a rollout: launches alone, so that they run eagerly or inside a CUDA graph.
+"""The forward pass of a rollout: kernel launches only, so that it runs eagerly or inside a CUDA graph.
 
-It leaves a tape: x, v, C, F and the history of every substep, and where there is room stress and nodal momentum.
+It records a tape: x, v, C, F and the history of every substep and, if `Simulator(store=...)` asks for them, stress and nodal momentum.
 """
 
 import math
@@ -17,11 +17,11 @@ from neuido.physics.mpm import transfers as kernels
 from neuido.physics.mpm.plan import STATES, Material, Plan, at_step
 from neuido.physics.runtime.device import torch_stream
 from neuido.physics.runtime.invalidation import invalidate
-from neuido.physics.runtime.launches import Stretches
+from neuido.physics.runtime.launches import LaunchRecordings
 
 
 class Tape(NamedTuple):
-    """What a forward pass writes; K frames, of every substep where a backward pass follows."""
+    """What a forward pass writes, in K frames; one frame per substep if a backward pass follows."""
 
     x: Tensor
     v: Tensor
@@ -47,7 +47,7 @@ class Tape(NamedTuple):
 
 
 def new_tape(plan: Plan, keep_all: bool) -> Tape:
-    """Empty memory for a forward pass; `keep_all`: of every substep, for a backward pass."""
+    """Allocate the memory of a forward pass; `keep_all`: for every substep, as a backward pass needs it."""
     setup = plan.setup
     count = plan.steps if keep_all else plan.steps // plan.every
     history = setup.mass.new_empty(len(setup.mass), plan.layout.width)
@@ -61,7 +61,7 @@ def new_tape(plan: Plan, keep_all: bool) -> Tape:
 
 
 def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
-    """Launch the substeps (all, or the first `steps`); checks nothing."""
+    """Launch all substeps, or the first `steps`, without checking the result."""
     setup = plan.setup
     pull, force, friction = inputs[STATES + 1 : STATES + 4]
     stride = plan.steps // (len(tape.x) - 1)
@@ -71,17 +71,17 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
     spare = [tuple(torch.empty_like(t) for t in now) for _ in range(2)] if stride > 1 else []
     scratch, other = torch.empty_like(now[3]), torch.empty_like(now[3])
     copies = setup.device.type == "cpu"
-    clears = copies and tape.grid is None  # what the nodes held goes as they are read, instead of in a pass of its own
+    clears = copies and tape.grid is None  # the grid update zeroes the nodes as it reads them, which saves a pass
     for name in ("grid", "velocity") if clears else ():
         setup.scratch(name).zero_()
-    stretches = Stretches()
+    recordings = LaunchRecordings()
     steady = all(len(t) <= 1 for t in (pull, inputs[STATES + 6]))  # neither pull nor growth has a row for each substep
     tape.status.zero_()
     with torch_stream(setup.device):
         elastic, plastic = plan.engines(inputs)
         for n in range(plan.steps if steps is None else steps):
             frame = tuple(frames[(n + 1) // stride] for frames in tape.states) if (n + 1) % stride == 0 else None
-            # on the CPU a frame is a copy: launches whose tensors always lie in the same places are repeated as they were
+            # on the CPU a frame is copied out: launches that always use the same buffers can be recorded once and repeated
             then = spare[n % 2] if frame is None or (spare and copies) else frame
             same = n % 2 if spare and copies and steady and n else None
             reach = node_range(plan, now[0] if n == 0 else None) if tape.grid is None else slice(None)
@@ -90,7 +90,7 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
             grid = setup.scratch("grid") if tape.grid is None else tape.grid[n]
             velocity = setup.scratch("velocity") if tape.velocity is None else tape.velocity[n]
             if n == 0 or not steady:
-                material, pull_now = plan.material(inputs, n, idle=tape.whole), at_step(pull, n)
+                material, pull_now = plan.material(inputs, n, all_branches=tape.whole), at_step(pull, n)
             if not clears:
                 grid.zero_()
             to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid)
@@ -101,19 +101,19 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
                 on_nodes()
                 to_particles()
             else:
-                stretches.run(("scatter", same), to_nodes)
-                stretches.run((reach.start, reach.stop), on_nodes)
-                stretches.run(("gather", same), to_particles, n)
+                recordings.run(("scatter", same), to_nodes)
+                recordings.run((reach.start, reach.stop), on_nodes)
+                recordings.run(("gather", same), to_particles, n)
             if frame is not None and then is not frame:
-                for kept, t in zip(frame, then):
-                    kept.copy_(t)
+                for target, t in zip(frame, then):
+                    target.copy_(t)
             now = then
 
 
 def scatter(
     plan: Plan, inputs: Sequence[Tensor], now: Sequence[Tensor], material: Material | None, elastic: Engine, tau: Tensor, grid: Tensor
 ) -> None:
-    """Stress, and momentum and mass of the nodes, which are zero before."""
+    """Compute the stress and scatter momentum and mass to the nodes (P2G); `grid` must be zero before."""
     x, v, C, F, history = now
     stress(plan, elastic, F, C, history, inputs[STATES + 4], material, tau)
     add_to_grid(plan, x, v, C, tau, inputs[STATES], grid)
@@ -130,7 +130,7 @@ def gather(
     trial: Tensor,
     status: Tensor,
 ) -> None:
-    """Write the particles of the next substep, from the velocity of the nodes."""
+    """Write the particles of the next substep from the nodal velocities (G2P), then correct F and advance the history."""
     setup = plan.setup
     x, _, _, F, history = now
     plan.launch(setup.kernels.grid_to_particles, len(x),
@@ -148,7 +148,7 @@ def stress(
     setup = plan.setup
     elastic.forward(F, tau)
     if material is not None:
-        plan.launch(plan.effects.add_effect_stress, len(F), [*stress_inputs(plan, material), material.idle, F, history, tau])
+        plan.launch(plan.effects.add_effect_stress, len(F), [*stress_inputs(plan, material), material.all_branches, F, history, tau])
     if viscosity.numel():
         plan.launch(setup.kernels.add_viscous_stress, len(F), [setup.particles.scene, viscosity, C, F, tau])
 
@@ -164,10 +164,10 @@ def flow_inputs(plan: Plan, material: Material) -> list:
 
 
 def update_history(plan: Plan, material: Material, trial: Tensor, C: Tensor, history: Tensor, F: Tensor, history_next: Tensor) -> None:
-    """Write the history of the next substep, and its F where an effect makes it of the trial one."""
+    """Write the history of the next substep, and F if a plastic effect corrects the trial gradient."""
     setup, k = plan.setup, plan.effects
     if material.branches is not None:
-        plan.launch(k.relax, len(F), [setup.particles.scene, setup.dt, material.branches, material.idle, C, history, history_next])
+        plan.launch(k.relax, len(F), [setup.particles.scene, setup.dt, material.branches, material.all_branches, C, history, history_next])
     if material.flow is not None:
         plan.launch(k.flow, len(F), [*flow_inputs(plan, material), trial, C, history, F, history_next])
     if plan.layout.e_max:
@@ -175,9 +175,10 @@ def update_history(plan: Plan, material: Material, trial: Tensor, C: Tensor, his
 
 
 def node_range(plan: Plan, x: Tensor | None) -> slice:
-    """Return the range of nodes that particles touch: on the CPU the planes between the first and the last one, with one to spare.
+    """Return the range of nodes that the particles touch.
 
-    The particles are at x, or, if None, where the last `gather` left them.
+    For one scene on the CPU these are the grid planes from the first to the last particle along x, with a margin of one plane;
+    elsewhere all nodes. The particles are at x or, if x is None, where the last `gather` left them.
     """
     setup = plan.setup
     if not len(setup.span):
@@ -193,7 +194,7 @@ def node_range(plan: Plan, x: Tensor | None) -> slice:
 
 
 def to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> Tensor:
-    """Momentum and mass of the nodes."""
+    """Zero `grid`, write momentum and mass of the nodes into it, and return it."""
     add_to_grid(plan, x, v, C, tau, mass, grid.zero_())
     return grid
 
@@ -215,7 +216,7 @@ def update_nodes(
     reach: slice = slice(None),
     clear: bool = False,
 ) -> None:
-    """Velocities of the nodes within reach; `clear` empties them for the next scatter."""
+    """Compute the velocities of the nodes in `reach`; `clear` zeroes the momentum for the next scatter."""
     setup = plan.setup
     inputs = [*grid_inputs(plan, pull, force, friction, reach), grid[reach], velocity[reach], clear]
     plan.launch(setup.kernels.update_grid, len(grid[reach]) // setup.chunk, inputs)
@@ -241,7 +242,7 @@ def grid_inputs(plan: Plan, pull: Tensor, force: Tensor, friction: Tensor, reach
 
 
 def check(plan: Plan, tape: Tape) -> None:
-    """Raise what the kernels found, or a last frame that is not finite; if `lenient`, make the frames of such scenes NaN.
+    """Raise the first failure that the kernels reported; with `nan_on_failure`, set the frames of failed scenes to NaN instead.
 
     Raises:
         UserError: A particle lost, too fast, or not finite.
@@ -250,10 +251,10 @@ def check(plan: Plan, tape: Tape) -> None:
     finite = torch.isfinite(tape.F[-1]).all(dim=(1, 2))
     if bool(finite.all()) and not bool(found.any()):
         return
-    if plan.lenient:
+    if plan.nan_on_failure:
         invalidate(tape.states[:4], ~finite | (found[:, 0] != 0)[setup.particles.scene.long()], setup.particles.scene)
         return
-    # the first one in time
+    # report the earliest failure
     code, p, step = min((row for row in found.tolist() if row[0]), key=lambda row: row[2], default=(0, 0, 0))
     if code == 0:
         p, step = int((~finite).nonzero()[0]), plan.steps - 1

@@ -1,8 +1,8 @@
 """The differentiable material point method: one autograd function for a whole rollout, several scenes in one launch.
 
-Here are the set-up, the checks before a start, and the call; `rollout.py` holds the loops, `adjoint.py` makes one function of them, and
-`graphs.py` captures them on a GPU. The order of a substep is the paper's (appendix, "Material Point Method"): P2G with tau(F), grid,
-G2P, F_tr = (I + dt C) F, F = F_hat(F_tr). The slow twin is `reference.py`.
+This module validates the inputs and starts the rollout. `rollout.py` has the forward loop, `adjoint.py` the backward loop,
+`differentiable.py` the autograd functions and `graphs.py` the CUDA graphs. A substep has the paper's order (appendix, "Material Point
+Method"): P2G with tau(F), grid update, G2P, F_tr = (I + dt C) F, F = F_hat(F_tr). `reference.py` is a slow implementation for tests.
 """
 
 import math
@@ -20,6 +20,7 @@ from neuido.physics.mpm.differentiable import run
 from neuido.physics.mpm.graphs import RolloutCache
 from neuido.physics.mpm.plan import Plan
 from neuido.physics.mpm.state import Setup
+from neuido.physics.runtime.deprecated import renamed_option
 from neuido.physics.runtime.device import as_device
 from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
@@ -27,39 +28,42 @@ from neuido.physics.runtime.threads import scene_pool
 from neuido.types import Body, ParticleState, Scene
 
 COURANT_LIMIT = 1.0
-"""Largest dt c / dx, c the speed of the elastic P-wave; and of twice dt nu / dx^2, nu the kinematic P-viscosity."""
+"""Upper bound of the Courant number dt c / dx and of 2 dt nu / dx^2; c: elastic P-wave speed, nu: kinematic P-viscosity."""
 
 
 class StepLimit(NamedTuple):
-    """The longest stable steps of one scene [s]."""
+    """The longest stable time steps of one scene [s]."""
 
     of_waves: float
+    """Limit set by the elastic P-wave."""
     of_viscosity: float
+    """Limit set by viscous diffusion; infinite without viscosity."""
 
 
 class Simulator:
-    """MPM of one or several scenes, each with one body; all scenes move in the same launches.
+    """Simulate one or several scenes by MPM, each with one body; kernel launches are batched over scenes.
 
     Args:
-        scenes: One scene or a list of them; grid, step, gravity and colliders may differ.
-        bodies: As many bodies.
-        density: [kg/m^3], one number or one for each scene.
+        scenes: One scene or a list; grid, time step, gravity and colliders may differ between them.
+        bodies: One body per scene.
+        density: Mass density [kg/m^3], one number or one per scene.
         device: `auto` (CUDA where there is one), `cpu`, `cuda`, or a `torch.device`.
-        dtype: `torch.float32` for work, `torch.float64` for checks.
-        threads: On the CPU, run several scenes in as many threads as there are cores.
-        graphs: On CUDA, capture a rollout's launches once for each shape and replay them after.
-        keep: What the backward pass finds of each substep: `state` is x, v, C, F (96 bytes a particle in float32), and it
-            recomputes stress, trial and grid; `all` is these too (72 bytes more a particle, 32 a node) and faster; `auto` is
-            `all` where the nodes do not outnumber the particles by more than four.
+        dtype: `torch.float32` for production, `torch.float64` for gradient checks.
+        threads: On the CPU, run scenes in parallel, one thread per core.
+        graphs: On CUDA, capture the launches of a rollout as a CUDA graph once per shape and replay it afterwards.
+        store: What a forward pass stores of each substep for the backward pass. `state`: x, v, C, F (96 bytes a particle in
+            float32); stress, trial gradient and grid are recomputed. `all`: these too (72 bytes more a particle, 32 a node), which is
+            faster. `auto`: `all` if there are at most four nodes per particle, else `state`.
+        keep: Deprecated name of `store`.
 
     Raises:
-        UserError: A body outside its domain, a clamp or an attached mass that picks no particle, a shape that does not fit.
+        UserError: A body outside its domain, a clamp or an attached mass that contains no particle, a shape that does not fit.
 
     Attributes:
         state: `ParticleState` at t = 0, with C the gradient of the initial velocity.
         mass: Particle masses [kg], (P,), attached masses included.
         volume: Initial volumes [m^3], (P,).
-        particles: `Particles`, which scene each particle belongs to.
+        particles: `Particles`, the scene that each particle belongs to.
     """
 
     def __init__(
@@ -72,10 +76,12 @@ class Simulator:
         dtype: torch.dtype = torch.float32,
         threads: bool = True,
         graphs: bool = True,
-        keep: Literal["state", "all", "auto"] = "auto",
+        store: Literal["state", "all", "auto"] = "auto",
+        keep: Literal["state", "all", "auto"] | None = None,
     ) -> None:
-        if keep not in ("state", "all", "auto"):
-            raise UserError(f"keep is {keep!r}; choose state, all or auto")
+        store = renamed_option("store", store, "keep", keep)
+        if store not in ("state", "all", "auto"):
+            raise UserError(f"store is {store!r}; choose state, all or auto")
         self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
         bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
         if len(bodies) != len(self.scenes) or not bodies:
@@ -83,7 +89,7 @@ class Simulator:
         densities = [float(density)] * len(bodies) if isinstance(density, (int, float)) else [float(d) for d in density]
         if len(densities) != len(bodies) or not all(d > 0 for d in densities):
             raise UserError(f"density is {density}; give one positive number, or one for each of {len(bodies)} scenes")
-        self.setup = setup = Setup(self.scenes, bodies, densities, as_device(device), dtype, keep)
+        self.setup = setup = Setup(self.scenes, bodies, densities, as_device(device), dtype, store)
         self.device, self.dtype = setup.device, dtype
         self.particles, self.state, self.mass, self.volume = setup.particles, setup.state, setup.mass, setup.volume
         self.order, self.inverse, self.held = setup.order, setup.inverse, setup.held
@@ -127,10 +133,10 @@ class Simulator:
     def step_margin(
         self, steps: int, elasticity: ElasticLaw, plasticity: PlasticLaw | None = None, *, effects: Effects | None = None
     ) -> float:
-        """Return the longest stable step over the one in use, of the scene that has least to spare; below 1 a `rollout` of these refuses.
+        """Return the smallest ratio of stable to actual time step over the scenes; below 1, `rollout` raises.
 
         Raises:
-            UserError: As `rollout`, but for the step.
+            UserError: As `rollout`, except for an unstable step.
         """
         given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
         limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
@@ -143,17 +149,17 @@ class Simulator:
         mass: Tensor | None = None,
         stiffer: tuple[Tensor, Tensor] | None = None,
     ) -> None:
-        """Compare the time step with the fastest wave and the initial speed.
+        """Raise where the time step is too long for the elastic wave, the viscosity or the initial speed.
 
         Args:
-            elasticity: Its modulus is that of the wave.
+            elasticity: Elastic law; its P-wave modulus sets the wave speed.
             viscosity: `Effects.viscosity` [Pa s], (S, 2).
-            mass: [kg], (P,).
-            stiffer: What effects add to the modulus [Pa] and their largest factor on it, (S,) each.
+            mass: Particle masses [kg], (P,).
+            stiffer: What effects add to the P-wave modulus [Pa], and their largest factor on the sum, (S,) each.
 
         Raises:
-            UserError: A negative modulus, dt c / dx above `COURANT_LIMIT`, too viscous for an explicit step, or a body faster than a cell
-                a step.
+            UserError: A negative modulus, dt c / dx above `COURANT_LIMIT`, a viscosity too large for an explicit step, or a body that
+                starts faster than one cell a step.
         """
         for why in self._refusals(elasticity, viscosity, mass, stiffer):
             if why:
@@ -162,7 +168,7 @@ class Simulator:
     def _refusals(
         self, elasticity: ElasticLaw, viscosity: Tensor | None, mass: Tensor | None, stiffer: tuple[Tensor, Tensor] | None
     ) -> list[str]:
-        """Why the step of each scene is too long, in the words of `check_step`; nothing where it is not."""
+        """Return for each scene why its step is too long, as `check_step` reports it; an empty string where the step is stable."""
         out = []
         for s, limit in enumerate(self.step_limits(elasticity, viscosity, mass, stiffer)):
             why = ""
@@ -197,35 +203,39 @@ class Simulator:
         every: int = 1,
         segment: int | None = None,
         check: bool = True,
-        lenient: bool = False,
+        nan_on_failure: bool = False,
+        lenient: bool | None = None,
     ) -> Frames:
-        """Run `steps` substeps.
+        """Simulate `steps` substeps.
 
-        Differentiable with respect to `state`, `gravity`, `friction`, `mass`, the tensors of the laws and of the effects.
+        Differentiable with respect to `state`, `gravity`, `friction`, `mass` and the tensors of laws and effects.
 
         Args:
             steps: Number of substeps.
             elasticity: F -> Kirchhoff stress.
-            plasticity: Trial F -> corrected F; none: purely elastic.
-            state: Start, (P, ...); the bodies as loaded where absent.
-            effects: Further effects.
-            gravity: [m/s^2], (S, 3); the scenes' own where absent.
-            friction: Coefficients of the colliders, (S, K) in the order colliders, walls.
-            mass: [kg], (P,); density times volume where absent.
-            every: Keep a frame every so many substeps.
-            segment: For a long rollout with gradients: keep only the state every so many substeps, and make the rest again in the
-                backward pass, piece by piece (a third more time); on CUDA also without gradients: one captured piece serves all of them.
-                It must divide `steps` and be a multiple of `every`.
-            check: Compare the step with the stability limit first.
-            lenient: Frames of a scene whose step is too long, or whose motion fails, are NaN, in place of an error.
+            plasticity: Trial F -> corrected F; None: purely elastic.
+            state: Initial state, (P, ...); by default the bodies as loaded.
+            effects: Physical effects beyond the laws.
+            gravity: [m/s^2], (S, 3); by default that of the scenes.
+            friction: Friction coefficients, (S, K): colliders first, then walls.
+            mass: [kg], (P,); by default density times volume.
+            every: Substeps between two frames.
+            segment: Substeps between two checkpoints of gradient checkpointing, for long rollouts. The backward pass recomputes each
+                segment, which takes a third more time. On CUDA it applies without gradients too: one captured segment is replayed for
+                all. It must divide `steps` and be a multiple of `every`.
+            check: Whether to compare the time step with the stability limit first.
+            nan_on_failure: Instead of raising, set the frames of a scene to NaN if its step is too long or its motion fails; other
+                scenes are unaffected.
+            lenient: Deprecated name of `nan_on_failure`.
 
         Returns:
-            Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1; frame 0 is the start. They
-            unpack to these four, know their `times` and can be saved (`Frames`).
+            Frames x (K, P, 3), v (K, P, 3), C (K, P, 3, 3), F (K, P, 3, 3), K = steps / every + 1; frame 0 is the initial state. They
+            unpack to these four, have `times` and can be saved (`Frames`).
 
         Raises:
-            UserError: Before the start: an unstable step. Afterwards: a particle lost, too fast, or not finite.
+            UserError: Before the start, an unstable step; afterwards, a particle that left the domain, is too fast, or is not finite.
         """
+        nan_on_failure = renamed_option("nan_on_failure", nan_on_failure, "lenient", lenient)
         inputs.check_frames(steps, every)
         if segment is not None and (segment < 1 or steps % segment or segment % every):
             raise UserError(f"segment is {segment}; it must divide steps ({steps}) and be a multiple of every ({every})")
@@ -235,12 +245,12 @@ class Simulator:
         pull = given.effects.accelerations(given.gravity, self.dt, steps).contiguous()
         step = (elasticity, given.viscosity, given.mass, given.stiffening(self))
         refused = [""] * self.scene_count
-        if check and lenient:
+        if check and nan_on_failure:
             refused = self._refusals(*step)
         elif check:
             self.check_step(*step)
         tables, mass = given.tables, given.mass
-        plan = Plan(self.setup, elasticity, plasticity, steps, every, tables, lenient)
+        plan = Plan(self.setup, elasticity, plasticity, steps, every, tables, nan_on_failure)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
         history = mass.new_zeros(len(mass), plan.layout.width)
         start = [t[self.order] for t in (*given.state, history, mass)]
@@ -251,7 +261,7 @@ class Simulator:
             frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, self.pool)
             x, v, C, F, history = (t[:, self.inverse] for t in frames)
         out = Frames(x, v, C, F, [scene.dt * every for scene in self.scenes], self.particles, history)
-        if lenient:
+        if nan_on_failure:
             refusing = torch.tensor([bool(why) for why in refused], device=self.device)
             scene = self.particles.scene.long()
             invalidate(out, refusing[scene] | ~torch.isfinite(out.x[-1]).all(dim=1), scene)
@@ -259,5 +269,5 @@ class Simulator:
 
 
 def _span(values: list) -> str:
-    """Return the one value, or the range, of sorted values."""
+    """Format sorted values as their one value, or as a range."""
     return f"{values[0]:g}" if len(values) == 1 else f"{values[0]:g} to {values[-1]:g}"

@@ -45,31 +45,31 @@ def affine_velocity(x: Tensor, v: Tensor, neighbours: int = 32, chunk: int = 204
 
 
 class Setup:
-    """Scenes, bodies and scratch memory of a simulator. Nothing but the scratch memory changes once it is made.
+    """Scenes, bodies and scratch memory of a simulator; all but the scratch memory is immutable.
 
     Args:
         scenes: S scenes.
-        bodies: As many bodies.
-        densities: [kg/m^3], one for each scene.
-        device: Where the arrays lie, with its index.
-        dtype: Their scalar type.
-        keep: Of `Simulator`.
+        bodies: One body per scene.
+        densities: [kg/m^3], one per scene.
+        device: Device of the arrays, with its index.
+        dtype: Scalar type of the arrays.
+        store: As for `Simulator`.
 
     Raises:
         UserError: As `Simulator`.
 
     Attributes:
-        particles: Which scene each particle belongs to.
-        state: The start, in the order of the bodies.
+        particles: The scene that each particle belongs to.
+        state: The initial state, in the order of the bodies.
         mass: [kg], (P,).
         volume: [m^3], (P,).
         held: Particles in a clamp, (P,) uint8.
         order: The order in which the kernels see the particles, (P,): scene by scene, then by cell.
         inverse: The inverse permutation.
         nodes: Grid nodes along each axis, padding included.
-        keep_grid: Whether a tape holds stress and nodes too.
-        first_scene: Number of the first scene in the simulator that this is a part of.
-        first_particle: Likewise of the first particle.
+        keep_grid: Whether a tape stores stress and nodal values too.
+        first_scene: Index of the first scene within the whole simulator, if this is a part of one.
+        first_particle: Index of the first particle within the whole simulator.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Setup:
         densities: Sequence[float],
         device: torch.device,
         dtype: torch.dtype,
-        keep: Literal["state", "all", "auto"],
+        store: Literal["state", "all", "auto"],
     ) -> None:
         self.scenes, self.device, self.dtype = tuple(scenes), device, dtype
         self.kernels = kernels.build(real_of(dtype))
@@ -89,16 +89,16 @@ class Setup:
         self.nodes = wp.vec3i(*nodes)
         self.grid_shape = (len(self.scenes), *nodes)
         self.node_count = math.prod(self.grid_shape)
-        self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes a thread: on the CPU its call costs as much as a node
+        self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes per thread: on the CPU a thread's call costs as much as a node
         scene, *axes = (torch.arange(n, dtype=torch.int32) for n in self.grid_shape)
         s, i, j, k = torch.meshgrid(scene, *axes, indexing="ij")
         self.node_index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(self.device)
         watched = self.device.type == "cpu" and len(self.scenes) == 1
         self.span = torch.empty(2 if watched else 0, dtype=self.dtype, device=self.device)
-        """Least and greatest x [m] of the particles after a substep, of one scene on the CPU."""
+        """Smallest and largest x [m] of the particles after a substep; only for a single scene on the CPU."""
         self.ends = self.span.numpy() if watched else None
         self._sort()
-        self.keep_grid = keep == "all" or (keep == "auto" and self.node_count <= 4 * len(self.mass))
+        self.keep_grid = store == "all" or (store == "auto" and self.node_count <= 4 * len(self.mass))
         self.first_scene = self.first_particle = 0
         self._single: dict[int, Setup] = {}
         self._scratch: dict[str, Tensor] = {}
@@ -190,7 +190,7 @@ class Setup:
         return len(self.scenes)
 
     def scratch(self, name: str) -> Tensor:
-        """Return a buffer of four numbers a node, (S nx ny nz, 4), kept between rollouts."""
+        """Return a buffer of four numbers a node, (S nx ny nz, 4), reused by later rollouts."""
         if name not in self._scratch:
             self._scratch[name] = torch.empty(self.node_count, 4, dtype=self.dtype, device=self.device)
         return self._scratch[name]

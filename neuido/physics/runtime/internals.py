@@ -1,6 +1,6 @@
-"""The one place that uses private parts of Warp and torch: packed launches, array descriptors, out-variants of activations.
+"""Adapter for private parts of Warp and torch: packed launches, array descriptors, out-variants of activations.
 
-They save time and change no result. With a version that was not tried a warning of one line says so, and the public, slower way is taken.
+They save time and change no result. With an untested version of either package a warning is given once and slower public calls are used.
 """
 
 import ctypes
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 TRIED = {"torch": ((2, 11), (2, 13)), "warp": ((1, 19), (1, 19))}
-"""First and last minor version of each package with which the private parts were tried."""
+"""First and last minor version of each package that the private parts were tested with."""
 
 
 def was_tried(package: str, version: str) -> bool:
@@ -41,10 +41,10 @@ def parameters(kernel: wp.Kernel) -> list[Any]:
 
 
 def contract_products(kernel: wp.Kernel) -> None:
-    """Let the CPU code of a kernel's module round a product and a sum once: a tenth less time.
+    """Compile a kernel's module for the CPU with fused multiply-add across expressions: a tenth less time.
 
-    Warp's default is to do so within an expression. Call it before the module is first loaded, on whatever device: a module's options are
-    part of its name. Modules of other packages, and those whose flags are set, stay as they are.
+    Warp contracts only within an expression by default. Call it before the module is first loaded on any device, since the options are
+    part of the module's hash. Modules of other packages and modules with flags of their own are left unchanged.
     """
     module = kernel.module
     if WARP_TRIED and kernel.func.__module__.startswith("neuido.") and module.options["cpu_compiler_flags"] is None:
@@ -54,17 +54,17 @@ def contract_products(kernel: wp.Kernel) -> None:
 
 
 def load(kernel: wp.Kernel, device: torch.device, block: int) -> None:
-    """Load the code of a kernel for a number of threads a block; without this a launch loads it."""
+    """Load the code of a kernel ahead of its first launch, for `block` threads per block."""
     if WARP_TRIED:
         kernel.module.load(wp.device_from_torch(device), block)
 
 
 def describe_array(t: Tensor, dtype: type) -> Any:
-    """Return Warp's descriptor of a tensor: address, shape and strides. It does not keep the tensor alive (the slow way does)."""
+    """Return Warp's descriptor of a tensor: address, shape and strides. Only that of the public call keeps the tensor alive."""
     if not WARP_TRIED:
         return wp.from_torch(t.detach(), dtype=dtype, requires_grad=False)
     found = wp.from_torch(t.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-    found._ref = found._gradref = None  # Warp would hold the tensor's memory for as long as the descriptor is kept
+    found._ref = found._gradref = None  # Warp would hold the tensor's memory as long as the descriptor exists
     return found
 
 
@@ -72,14 +72,14 @@ _layouts: dict[wp.Kernel, type[ctypes.Structure]] = {}
 
 
 class PackedLaunch:
-    """A launch on the CPU with its arguments packed: Warp's own packing takes as long as the work of 500 particles.
+    """A CPU launch with packed arguments; Warp's own packing takes as long as the work of 500 particles.
 
-    It keeps no tensor: who calls it again brings tensors that lie in the same places.
+    It does not hold its tensors. The caller must ensure that tensors at the same addresses are alive when it is launched again.
 
     Args:
-        kernel: What is launched.
-        dim: Threads.
-        inputs: As `wp.launch` takes them.
+        kernel: The kernel.
+        dim: Number of threads.
+        inputs: As for `wp.launch`.
     """
 
     __slots__ = ("arguments", "bounds", "enter", "module")
@@ -92,18 +92,18 @@ class PackedLaunch:
             layout = _layouts[kernel] = type("Arguments", (ctypes.Structure,), {"_fields_": fields})
         self.bounds, self.arguments = recorded.bounds, layout(*recorded.params[1:])
         self.enter: Callable[[Any, Any], None] = recorded.hooks.forward
-        self.module = recorded.module_exec  # keeps the code
+        self.module = recorded.module_exec  # keeps the code loaded
 
 
 # torch.
 
 
 if TORCH_TRIED:
-    from torch.utils._python_dispatch import TorchDispatchMode as DispatchMode
+    from torch.utils._python_dispatch import TorchDispatchMode as DispatchMode  # type: ignore[assignment]  # the stand-in has the two methods in use
 else:
 
     class DispatchMode:
-        """A stand-in that sees no operation; `launches.Stretches` then repeats nothing."""
+        """Stand-in that intercepts no operation; `launches.LaunchRecordings` then repeats nothing."""
 
         def __enter__(self) -> "DispatchMode":
             return self

@@ -1,36 +1,36 @@
-"""Launches on the CPU that are repeated in the same memory: what a CUDA graph is on a GPU.
+"""Record and repeat kernel launches on the CPU, as a CUDA graph does on a GPU.
 
-To look a launch up by its tensors takes as long as the work of some hundred particles. A stretch of launches is recorded while it runs and
-repeated from then on as it was, in as little as Python needs to call it.
+Looking a launch up by its tensors takes as long as the work of some hundred particles. A sequence of launches is therefore recorded the
+first time it runs and repeated with the same memory afterwards, at the cost of one Python call each.
 """
 
 import ctypes
 import threading
 from collections.abc import Callable, Hashable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from neuido.physics.runtime import internals
 
 _active = threading.local()
 
 STEP = "step"
-"""The argument of a kernel that a repetition may change."""
+"""Name of the one kernel argument that may change when a recording is repeated."""
 
 
 class Launch(NamedTuple):
-    """A kernel's entry with its arguments packed."""
+    """The entry point of a compiled kernel with its packed arguments."""
 
     enter: Callable[[Any, Any], None]
     bounds: Any
     arguments: ctypes.Structure
     by_step: bool
-    """Whether one of the arguments is the step."""
+    """Whether the kernel takes the step as an argument."""
     owner: object
-    """What keeps the code and the packed objects."""
+    """Reference that keeps the code and the packed objects alive."""
 
 
 def note(enter: Callable[[Any, Any], None], bounds: Any, arguments: ctypes.Structure, owner: object) -> None:
-    """Tell the recording of this thread, if there is one, of a launch."""
+    """Append a launch to the active recording of this thread, if any."""
     recording = getattr(_active, "recording", None)
     if recording is not None:
         own = type(arguments).from_buffer_copy(arguments)
@@ -39,19 +39,19 @@ def note(enter: Callable[[Any, Any], None], bounds: Any, arguments: ctypes.Struc
 
 
 def forbid_repetition() -> None:
-    """Mark the recording of this thread, if there is one, as one that lacks a launch."""
+    """Mark the active recording of this thread, if any, as incomplete, so that it is not repeated."""
     recording = getattr(_active, "recording", None)
     if recording is not None:
         recording.whole = False
 
 
 class Recording(internals.DispatchMode):
-    """The launches of this thread while it is open; `repeat` runs them again, on the tensors that lay there.
+    """Record the launches of this thread as a context manager; `repeat` runs them again on the same memory.
 
-    It keeps no tensor: theirs must outlive it.
+    A recording does not hold its tensors: they must outlive it.
 
     Attributes:
-        whole: Whether launches were all that ran: an operation of torch that computes, or takes memory, is not repeated.
+        whole: Whether only launches ran. A torch operation that computes or allocates cannot be repeated.
     """
 
     def __init__(self) -> None:
@@ -63,9 +63,10 @@ class Recording(internals.DispatchMode):
         self.whole = self.whole and func.is_view
         return func(*args, **(kwargs or {}))
 
-    def __enter__(self) -> "Recording":
+    def __enter__(self) -> Self:
         self.outer, _active.recording = getattr(_active, "recording", None), self
-        return super().__enter__()
+        super().__enter__()
+        return self
 
     def __exit__(self, *error: Any) -> None:
         _active.recording = self.outer
@@ -73,31 +74,31 @@ class Recording(internals.DispatchMode):
         super().__exit__(*error)
 
     def repeat(self, step: int = 0) -> None:
-        """Run the launches again; `step` takes the place of theirs."""
+        """Run the launches again, with `step` as their step."""
         for launch in self.launches:
             if launch.by_step:
                 setattr(launch.arguments, STEP, step)
             launch.enter(launch.bounds, ctypes.byref(launch.arguments))
 
 
-class Stretches:
-    """The recorded stretches of one rollout, by what decides the memory that they work in."""
+class LaunchRecordings:
+    """The recordings of one rollout, by a key that identifies the memory they use."""
 
     def __init__(self) -> None:
-        self.kept: dict[Hashable, Recording | None] = {}
+        self.recordings: dict[Hashable, Recording | None] = {}
 
-    def run(self, key: Hashable, stretch: Callable[[], None], step: int = 0) -> None:
-        """Run a stretch; where it ran with this key it is repeated, if launches are all that it is."""
-        if not internals.TORCH_TRIED:  # an operation of torch between the launches would go unseen
-            stretch()
+    def run(self, key: Hashable, function: Callable[[], None], step: int = 0) -> None:
+        """Run a function of launches, or repeat its recording if it ran with this key before and did nothing but launch."""
+        if not internals.TORCH_TRIED:  # torch operations between the launches would go unnoticed
+            function()
             return
-        if key not in self.kept:
+        if key not in self.recordings:
             with Recording() as recording:
-                stretch()
-            self.kept[key] = recording if recording.whole else None
+                function()
+            self.recordings[key] = recording if recording.whole else None
             return
-        kept = self.kept[key]
-        if kept is None:
-            stretch()
+        recording = self.recordings[key]
+        if recording is None:
+            function()
         else:
-            kept.repeat(step)
+            recording.repeat(step)

@@ -390,7 +390,7 @@ def test_the_margin_is_where_a_rollout_refuses(effects):
     assert bodies(needed).step_margin(5, law, effects=effects) >= 1.0 > bodies(needed - 1).step_margin(5, law, effects=effects)
     with pytest.raises(UserError, match=f"scene 1 needs {needed} inner steps"):
         bodies(needed - 1).rollout(5, law, effects=effects)
-    out = bodies(needed - 1).rollout(5, law, effects=effects, lenient=True)
+    out = bodies(needed - 1).rollout(5, law, effects=effects, nan_on_failure=True)
     refused = out.x[-1].isnan().any(dim=1).reshape(2, -1)
     assert not refused[0].any() and refused[1].all()
 
@@ -420,7 +420,7 @@ def test_scenes_that_fail_are_nan_and_the_others_as_alone():
     start.v[sim.particles.offsets[2] : sim.particles.offsets[3]] *= 1e4
     for runs in (sim.runs, [joined(sim, 4)]):
         sim.runs, sim.pool = runs, None
-        out = sim.rollout(20, FixedCorotated(young, 0.3), state=start, every=10, lenient=True)
+        out = sim.rollout(20, FixedCorotated(young, 0.3), state=start, every=10, nan_on_failure=True)
         for s in range(4):
             own = slice(sim.particles.offsets[s], sim.particles.offsets[s + 1])
             if s in (1, 2):

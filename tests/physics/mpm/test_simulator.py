@@ -305,7 +305,7 @@ def test_nodes_that_a_substep_empties_are_as_good_as_new():
     """Without a tape the nodes in reach are emptied as they are read; with one each substep has nodes of its own."""
     scene = Scene(cells=16, dt=1e-3, gravity=(0.0, 0.0, 0.0), walls=Walls("slip", 0.0))
     sim = Simulator(scene, block((0.25, 0.375, 0.375), (0.5, 0.625, 0.625), (4, 4, 4), velocity=(3.0, 0.5, 0.0)), device=DEVICE,
-                    keep="all")  # fmt: skip
+                    store="all")  # fmt: skip
     law = FixedCorotated(2e4, 0.3)
     young = torch.tensor(2e4, requires_grad=True)
     taped = [t.detach() for t in sim.rollout(160, FixedCorotated(young, 0.3), every=20)]
@@ -371,7 +371,7 @@ def test_scenes_that_fail_are_nan_and_the_others_as_alone(device, segment):
     stretching = still._replace(v=3.0 * (still.x - 0.5))
     young = torch.tensor([5e4, 5e8, 5e4, 7e4])
     sim = Simulator([scene] * 4, [still, stretching, leaving, still], device=device)
-    out = sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment, lenient=True)
+    out = sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment, nan_on_failure=True)
     broken = [bool(torch.isnan(t[:, a:b]).all()) for a, b in zip(sim.particles.offsets[:-1], sim.particles.offsets[1:]) for t in out[:1]]
     assert broken == [False, True, True, False]
     for s in (0, 3):
@@ -382,5 +382,5 @@ def test_scenes_that_fail_are_nan_and_the_others_as_alone(device, segment):
         sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment)
     with pytest.raises(UserError, match=r"of scene [12] "):
         sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment, check=False)
-    unchecked = sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment, check=False, lenient=True)
+    unchecked = sim.rollout(60, FixedCorotated(young, 0.3), every=20, segment=segment, check=False, nan_on_failure=True)
     assert torch.equal(torch.isnan(unchecked.x), torch.isnan(out.x))

@@ -12,7 +12,7 @@ from neuido.physics.fem.finite_elements import FiniteElements
 from neuido.physics.laws.classical import FixedCorotated, Sigma, VonMises
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime import device
-from neuido.physics.runtime.launches import Stretches
+from neuido.physics.runtime.launches import LaunchRecordings
 from neuido.types import Scene
 
 CPU = torch.device("cpu")
@@ -103,11 +103,11 @@ def test_a_recorded_stretch_is_repeated_with_its_own_arguments():
         device.launch(stamp, 3, [a, 0.5, 10], CPU)
         device.launch(stamp, 2, [b[:2], 100.0, 10], CPU)
 
-    stretches = Stretches()
-    stretches.run("a", stretch, 10)
+    recordings = LaunchRecordings()
+    recordings.run("a", stretch, 10)
     device.launch(stamp, 3, [a, -0.5, 0], CPU)  # the same memory with other scalars
     for step in (20, 30):
-        stretches.run("a", lambda: pytest.fail("it ran again"), step)
+        recordings.run("a", lambda: pytest.fail("it ran again"), step)
     assert a.tolist() == [61.0] * 3
     assert b.tolist() == [360.0, 360.0, 0.0]
 
@@ -119,18 +119,18 @@ def test_what_is_more_than_launches_runs_again():
         device.launch(stamp, 3, [out, 0.0, 1], CPU)
         a.mul_(2.0)
 
-    stretches = Stretches()
+    recordings = LaunchRecordings()
     for _ in range(3):
-        stretches.run("a", stretch)
-    assert stretches.kept == {"a": None}
+        recordings.run("a", stretch)
+    assert recordings.recordings == {"a": None}
     assert out.tolist() == [3.0] * 3 and a.tolist() == [8.0] * 3
 
 
 def test_threads_record_their_own_launches():
     def work(n: int) -> list[float]:
-        out, stretches = torch.zeros(2), Stretches()
+        out, recordings = torch.zeros(2), LaunchRecordings()
         for step in range(50):
-            stretches.run(n, lambda: device.launch(stamp, 2, [out, float(n), step], CPU), step)  # noqa: B023 (run at once)
+            recordings.run(n, lambda: device.launch(stamp, 2, [out, float(n), step], CPU), step)  # noqa: B023 (run at once)
         return out.tolist()
 
     with ThreadPoolExecutor(4) as pool:
@@ -150,7 +150,7 @@ def test_repeated_launches_give_the_motion_of_fresh_ones(solver, law, monkeypatc
             return solver(scene, body).rollout(200, elastic, plastic, every=5, effects=effects)
 
     repeated = roll()
-    monkeypatch.setattr(Stretches, "run", lambda self, key, stretch, step=0: stretch())
+    monkeypatch.setattr(LaunchRecordings, "run", lambda self, key, stretch, step=0: stretch())
     for a, b in zip(repeated, roll()):
         assert torch.equal(a, b)
     assert float((repeated.x[-1] - repeated.x[0]).abs().max()) > 0.02

@@ -61,7 +61,7 @@ def test_captured_rollout_equals_the_eager_one_and_its_gradient():
     scene = Scene(cells=16, dt=5e-4, walls=Walls("separate", 0.3))
     results = []
     for graphs in (False, True):
-        sim = Simulator([scene] * 2, [body] * 2, device="cuda", graphs=graphs, keep="all" if graphs else "state")
+        sim = Simulator([scene] * 2, [body] * 2, device="cuda", graphs=graphs, store="all" if graphs else "state")
         elastic, plastic = (network(kind, 64, 2, 1) for kind in KINDS)
         leaves = [t.requires_grad_() for t in (*elastic, *plastic)]
         laws = ObjectiveElastic(*elastic), ObjectivePlastic(*plastic)
