@@ -1,4 +1,7 @@
-"""The one error that a user can mend: raised with a single line that names what was wrong, the value, and the option to change."""
+"""`UserError`, for faults that a user can fix, and the conversion of any error to one line for the terminal.
+
+The message of a `UserError` is one line: what is wrong, the value, and the option to change.
+"""
 
 import argparse
 import errno
@@ -11,27 +14,28 @@ class UserError(ValueError):
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether a device had no memory: torch says so in three types of error, of which a failed capture of a CUDA graph is one, and Warp in
-    another.
+    """Return whether an error means that a device ran out of memory.
+
+    torch reports it by three types of error, one of them a failed capture of a CUDA graph, and Warp by another.
     """
     return isinstance(error, RuntimeError) and any(words in str(error) for words in ("out of memory", "Failed to allocate"))
 
 
 LONGEST = 300
-"""Characters of an error's line at the most; of a longer one the middle goes."""
+"""Largest number of characters of an error's line; a longer line loses its middle."""
 
 _NO_MEMORY = re.compile(r"can't allocate memory|bad_alloc|bad allocation|Unable to allocate|not enough memory", re.IGNORECASE)
 _NOT_WRITTEN = re.compile(r"No space left on device|os error 28|PytorchStreamWriter failed|file write failed|\d+ requested and \d+ written")
 
 
 def one_line(error: BaseException) -> str | None:
-    """What a command prints of an error: one line of at most `LONGEST` characters, or None for an error that only a programmer can mend."""
+    """Return the line of at most `LONGEST` characters that a command prints; None for an error that only a programmer can fix."""
     line = _line_of(error)
     return None if line is None else shortened(line)
 
 
 def shortened(text: str) -> str:
-    """A text as one line that a terminal may show: no control characters, at most `LONGEST` characters."""
+    """Return a text as one printable line without control characters, of at most `LONGEST` characters."""
     text = " ".join(text.split())
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 103]} ... {text[-98:]}"
@@ -66,13 +70,13 @@ def _line_of(error: BaseException) -> str | None:
     return None
 
 
-_NOISE = re.compile(  # the lines of jsonargparse's messages that tell a user nothing
+_NOISE = re.compile(  # lines of jsonargparse's messages without information for a user
     r"Does not validate|Subtypes:|Errors:|Given value type:|Given value: (Nest|Name|[{\[])|Expected a (<class 'None|path but)|$"
 )
 
 
 def _condense(message: str) -> str:
-    """Keep of jsonargparse's indented message what names the key, the fault and the value."""
+    """Condense jsonargparse's indented message to the key, the fault and the value."""
     lines = [line.strip().removeprefix("- ") for line in message.splitlines()]
     text = ": ".join(dict.fromkeys(line.rstrip(":") for line in lines if not _NOISE.match(line)))
     text = re.sub(r"Parser key \"([\w.]+)\"", r"--\1", text)

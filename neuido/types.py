@@ -1,4 +1,4 @@
-"""The tuples that cross rooms. SI units; shapes with P particles, S scenes, B samples, K frames."""
+"""Data types shared by all packages. SI units; shapes with P particles, S scenes, B samples, K frames."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ Vector = tuple[float, float, float]
 
 
 def brief(value: object) -> str:
-    """Return a value in a few words: a tensor of one element as its number, a larger one as its shape and type."""
+    """Format a value briefly: a tensor of one element as its number, a larger one by its shape and dtype."""
     if isinstance(value, Tensor):
         kind = str(value.dtype).removeprefix("torch.")
         return f"{value.item():.6g}" if value.numel() == 1 else f"{tuple(value.shape)} {kind} on {value.device}"
@@ -18,7 +18,7 @@ def brief(value: object) -> str:
 
 
 def brief_fields(value: NamedTuple) -> str:
-    """Return a named tuple with its fields in a few words each, those that are None left out."""
+    """Format a named tuple with each field brief; fields that are None are left out."""
     fields = zip(value._fields, value)
     return f"{type(value).__name__}({', '.join(f'{name}: {brief(part)}' for name, part in fields if part is not None)})"
 
@@ -31,7 +31,7 @@ class ParticleState(NamedTuple):
     v: Tensor
     """Velocity [m/s], (P, 3)."""
     C: Tensor
-    """Affine velocity, about the velocity gradient [1/s], (P, 3, 3)."""
+    """Affine velocity matrix, approximately the velocity gradient [1/s], (P, 3, 3)."""
     F: Tensor
     """Elastic deformation gradient [-], (P, 3, 3)."""
 
@@ -40,12 +40,12 @@ class ParticleState(NamedTuple):
 
 
 class Particles(NamedTuple):
-    """Which scene each of the concatenated particles belongs to; scene s owns offsets[s]:offsets[s+1]."""
+    """The scene of each particle; the particles of all scenes are concatenated, and scene s has offsets[s]:offsets[s+1]."""
 
     scene: Tensor
     """Scene index, (P,) int32."""
     offsets: tuple[int, ...]
-    """First particle of each scene, and P at the end: S + 1 numbers."""
+    """Index of the first particle of each scene, then P; S + 1 numbers."""
 
     def __repr__(self) -> str:
         return brief_fields(self)
@@ -61,7 +61,7 @@ class Body(NamedTuple):
     volume: Tensor
     """Volume [m^3], (P,)."""
     F: Tensor | None = None
-    """Deformation gradient [-], (P, 3, 3); the identity where absent."""
+    """Deformation gradient [-], (P, 3, 3); None: the identity."""
 
     def __repr__(self) -> str:
         return brief_fields(self)
@@ -103,19 +103,19 @@ class MultiViewBatch(NamedTuple):
     scene: int
     """Index of the scene."""
     name: str
-    """Its name."""
+    """Name of the scene."""
     images: Tensor
-    """RGB in [0, 1] over the background, (V, T, H, W, 3) float32."""
+    """RGB in [0, 1], composited over `background`, (V, T, H, W, 3) float32."""
     masks: Tensor
-    """Share of the object in a pixel; one everywhere where nothing says it, (V, T, H, W) float32."""
+    """Coverage of each pixel by the object, (V, T, H, W) float32; one everywhere if no mask is given."""
     cameras: Cameras
     """The V cameras, for images of this size."""
     times: Tensor
     """Times of the frames [s], (T,) float64."""
     held_out: Tensor
-    """Which of the views are for scoring only, (V,) bool."""
+    """Views that are only scored, never fitted, (V,) bool."""
     background: Tensor
-    """Its colour, (3,) float32."""
+    """Colour of the background, (3,) float32."""
 
     def __repr__(self) -> str:
         return brief_fields(self)
@@ -123,10 +123,10 @@ class MultiViewBatch(NamedTuple):
 
 @dataclass(frozen=True)
 class Plane:
-    """A half-space collider: material is kept on the side that the normal points to.
+    """A half-space collider; material stays on the side that the normal points to.
 
     `contact` is `sticky` (velocity zero in the collider), `slip` (no normal velocity) or `separate` (no inward normal
-    velocity; `friction` is Coulomb's coefficient, and `inf` stops all sliding for as long as the material presses).
+    velocity; `friction` is Coulomb's coefficient, and `inf` prevents all sliding while there is contact).
     """
 
     point: Vector
@@ -162,7 +162,7 @@ class Walls:
 
 @dataclass(frozen=True)
 class Scene:
-    """The set-up of one simulation: domain, grid, step, gravity and what the body meets.
+    """The set-up of one simulation: domain, grid, time step, gravity, colliders, clamps and attached masses.
 
     `cells` counts the grid cells along the domain's longest side; `dt` is the substep [s]; `walls = None` leaves the domain
     open (a particle that leaves it is then an error).
@@ -199,9 +199,9 @@ class Gaussians(NamedTuple):
     opacities: Tensor
     """Opacity in 0..1, (N,)."""
     harmonics: Tensor
-    """Spherical harmonics of the colour less one half, (N, (degree + 1)^2, 3); degree 0 to 3."""
+    """Spherical harmonics of the colour minus one half, (N, (degree + 1)^2, 3); degree 0 to 3."""
     rotations: Tensor | None = None
-    """By how much each Gaussian is rotated since its harmonics were fitted, (N, 3, 3); not at all where absent."""
+    """Rotation of each Gaussian since its harmonics were fitted, (N, 3, 3); None: none."""
 
     def __repr__(self) -> str:
         return brief_fields(self)

@@ -38,7 +38,7 @@ def simulate(
     Args:
         out: Folder to write: one file per trajectory, or one folder per scene.
         scenes: Scenes to make in place of trajectories; each has `name`, the keys of a scene file (or `base`, the name of
-            one, with keys that differ), and any of `velocity`, `angular_velocity`, `shift`, `belief`, `split`, `substeps`.
+            one, with keys that differ), and any of `velocity`, `angular_velocity`, `shift`, `declared`, `split`, `substeps`.
         film: How they are filmed.
         experiment: Folder of an experiment whose recordings are to be simulated under its model.
         model: File with a model in place of the experiment's own, for example the model_after.yaml of `neuido diagnose`.

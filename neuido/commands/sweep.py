@@ -17,7 +17,7 @@ from neuido.commands.cli.sweep_file import Metric, Run, SweepFile, command_of, r
 from neuido.commands.interruption import SIGNALS, STATE
 from neuido.data.files.lock import Held, OwnedLock
 from neuido.data.files.score_tables import read_rows, write_rows
-from neuido.data.files.sweep_run import FOLDER, FORMAT, note, read_status
+from neuido.data.files.sweep_run import FOLDER, FORMAT, read_status, write_status
 from neuido.errors import UserError
 
 
@@ -86,17 +86,17 @@ def _one(plan: SweepFile, run: Run, folder: Path) -> str:
         if not (_interrupted(before) and before.get("command") == words and (folder / STATE).is_file()):  # else it is taken up again
             _empty(folder)
         state: dict[str, Any] = {"format": FORMAT, "run": run.name, "parameters": run.parameters, "command": words}
-        note(folder, {**state, "status": "started"})
+        write_status(folder, {**state, "status": "started"})
         start = time.monotonic()
         try:
             code = _execute(words, environment, folder / "log.txt", lock)
         except KeyboardInterrupt:
-            note(folder, {**state, "status": "interrupted", "seconds": round(time.monotonic() - start, 1)})
+            write_status(folder, {**state, "status": "interrupted", "seconds": round(time.monotonic() - start, 1)})
             raise
         state |= {"status": _status(code), "seconds": round(time.monotonic() - start, 1)}
         if code != 0:
             state["error"] = _last_line(folder / "log.txt") or f"exit status {code}"
-        note(folder, state)
+        write_status(folder, state)
     return f"{state['status']} in {state['seconds']:.0f} s{': ' + state['error'] if code else ''}"
 
 

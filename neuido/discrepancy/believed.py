@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuido.data.files.parsing import read_yaml
 from neuido.data.files.writing import replacing
-from neuido.data.measured.experiment import Experiment, read_belief
+from neuido.data.measured.experiment import Experiment, read_declared_model
 from neuido.discrepancy.library import effects_of
 from neuido.errors import UserError
 from neuido.models.inference.law_file import load_law
@@ -125,7 +125,7 @@ def ready(model: str | Path | Mapping[str, Any], simulator: Simulator | FiniteEl
         UserError: A file that is no model, an impossible material, an unknown effect.
     """
     content = read_model_file(str(model)) if isinstance(model, str | Path) else dict(model)
-    checked, _ = read_belief(content)
+    checked, _ = read_declared_model(content)
     effects = dict(checked.get("effects", {}))
     if duration is None:
         interval = effects.get("time_force.interval")

@@ -131,8 +131,8 @@ def test_long_recordings_run_in_pieces(folder, monkeypatch):
     problem.predict([{}], 0)
     assert asked == [(90, 30)]
     (simulator,) = problem._simulators.values()
-    (kept,) = simulator.cache._kept.values()
-    assert len(kept.tape.x) == 10
+    (cached,) = simulator.cache._rollouts.values()
+    assert len(cached.tape.x) == 10
 
 
 def test_settings_and_recordings_side_by_side_are_those_one_after_the_other(folder):

@@ -1,4 +1,4 @@
-"""The folder of a run of a sweep: which one this process writes into, and how far the run of a folder has come."""
+"""The folder of one run of a sweep: which one this process writes to, and the status of a run."""
 
 import json
 from collections.abc import Mapping
@@ -7,11 +7,11 @@ from typing import Any
 
 FORMAT = "neuido-run/1"
 FOLDER = "NEUIDO_RUN"
-"""The environment variable that names the folder of a run, into which everything of it goes."""
+"""Environment variable with the folder of a run, which receives all its files."""
 
 
 def read_status(folder: Path) -> dict[str, Any]:
-    """Return the content of a run's `run.json`; empty where there is none."""
+    """Return the content of a run's `run.json`; empty without one."""
     try:
         content = json.loads((folder / "run.json").read_text())
     except (OSError, ValueError):
@@ -19,15 +19,15 @@ def read_status(folder: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) and content.get("format") == FORMAT else {}
 
 
-def note(folder: Path, state: Mapping[str, Any]) -> None:
-    """Write `run.json` of a run."""
+def write_status(folder: Path, state: Mapping[str, Any]) -> None:
+    """Write the status of a run to its `run.json`."""
     from neuido.data.files.storage import write
 
     write(folder / "run.json", json.dumps(state, indent=1) + "\n")
 
 
 def own_folder(environment: Mapping[str, str]) -> Path | None:
-    """Return the folder of this process where it is a run of a sweep, of this command or of wandb's agent."""
+    """Return the folder of this process if it is a run of a sweep, started by `neuido sweep` or by wandb's agent; else None."""
     if environment.get(FOLDER):
         return Path(environment[FOLDER])
     if environment.get("WANDB_SWEEP_ID") and environment.get("WANDB_RUN_ID"):
@@ -36,7 +36,7 @@ def own_folder(environment: Mapping[str, str]) -> Path | None:
 
 
 def redirect(options: Any, folder: Path) -> None:
-    """Let a trainer's configuration write into a run's own folder: logs, checkpoints, `save_to` and `out` of the model.
+    """Redirect the output of a trainer's configuration to the folder of a run: logs, checkpoints, `save_to` and `out` of the model.
 
     Args:
         options: The parsed configuration of a subcommand, changed in place.

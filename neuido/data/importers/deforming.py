@@ -34,9 +34,7 @@ def experiment_of(
     from neuido.data.measured.experiment import read_experiment
 
     if density is None or young is None:
-        raise UserError(
-            "a deforming body needs what you believe of its material: give --density (kg/m^3) and --young (Pa), a guess will do"
-        )
+        raise UserError("a deforming body needs a declared material: give --density (kg/m^3) and --young (Pa); a guess is enough")
     arrays, said, low, high = {}, [], [], []
     for name, (t, points) in takes.items():
         if any(x.shape[1] != 3 for x in points.values()):

@@ -30,27 +30,27 @@ NEEDED, OPTIONAL = ("x", "t", "x0", "v0", "volume"), ("F0", "track", "anchor")
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One recorded motion: tracked points, images, or both; what was not recorded is none."""
+    """One recorded motion: tracked points, images, or both; a field that was not recorded is None."""
 
     name: str
     role: str
-    """`fit`, or `held_out`: only ever scored."""
+    """`fit` or `held_out`; held-out recordings are scored but never fitted."""
     scene: Scene
     """The experiment's scene with this recording's own gravity, colliders and attached masses."""
     frame_interval: float
     """Nominal time from one frame to the next [s]; `t` has the true times."""
     noise: float | None = None
-    """Standard deviation of the position error [m]; none: not known."""
+    """Standard deviation of the position error [m]; None if unknown."""
     x: Tensor | None = None
     """Position [m] of material point n in frame t, (T, N, 3) float32; NaN where it was not seen."""
     t: Tensor | None = None
-    """Times [s] of the frames, (T,) float64, rising from 0."""
+    """Times of the frames [s], (T,) float64, increasing from 0."""
     body: Body | None = None
     """The particles at t = 0: x0, v0, volume and F0."""
     track: Tensor | None = None
-    """The particle that point n follows, (N,) int64; -1 where that is not known."""
+    """Index of the particle that point n follows, (N,) int64; -1 if unknown."""
     anchor: Tensor | None = None
-    """Or where in the body of t = 0 point n sits [m], (N, 3) float32."""
+    """Position of point n in the body at t = 0 [m], (N, 3) float32; given instead of `track`."""
     video: MultiView | None = None
     """Cameras and images."""
     gaussians: Path | None = None
@@ -72,21 +72,21 @@ class Experiment:
     folder: Path
     scene: Scene
     model: dict[str, Any]
-    """What the experimenter believes: density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them), and perhaps
-    `effects`, flat figures such as {"viscosity_shear.eta": 12.0}."""
+    """The declared model: density [kg/m^3], elasticity and plasticity (as for `physics.laws.material`), and optionally `effects` by
+    flat names, such as {"viscosity_shear.eta": 12.0}."""
     free: tuple[str, ...]
-    """The parameters of the model that are to be fitted; every other figure is trusted."""
+    """The parameters of the model to fit; all others are taken as exact."""
     recordings: tuple[Recording, ...]
 
     def __getitem__(self, name: str) -> Recording:
-        """Return the recording of a name."""
+        """Return the recording with this name."""
         for recording in self.recordings:
             if recording.name == name:
                 return recording
         raise UserError(f"recording = {name!r} is not in {self.name}; one of {', '.join(r.name for r in self.recordings)}")
 
     def of(self, role: str) -> tuple[Recording, ...]:
-        """Return the recordings of a role."""
+        """Return the recordings with this role."""
         return tuple(recording for recording in self.recordings if recording.role == role)
 
 
@@ -95,11 +95,11 @@ def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None 
 
     Args:
         path: The folder or the file.
-        model: Takes the place of the file's own key `model`.
+        model: Replaces the key `model` of the file.
 
     Raises:
-        UserError: An unknown or missing key, a missing file, a figure outside its physical range, a shape that does not fit, a box
-            that picks no particle; one line that names the file and the key.
+        UserError: An unknown or missing key, a missing file, a value outside its physical range, a shape that does not fit, a box
+            that contains no particle. The message names the file and the key.
     """
     file, content = read_header(Path(path), "experiment.yaml", FORMAT)
     folder = file.parent
@@ -107,22 +107,22 @@ def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None 
         check_keys(content, "the file", ("format", "name", "scene", "model", "discretisation", "recordings"))
         name = read_text(content["name"], "name")
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
-        believed, free = read_belief(content["model"] if model is None else model, folder=folder)
+        declared, free = read_declared_model(content["model"] if model is None else model, folder=folder)
         recordings = read_entries(
             content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, content, folder)
         )
-    return Experiment(name, folder, scene, believed, free, recordings)
+    return Experiment(name, folder, scene, declared, free, recordings)
 
 
 def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
-    """Write an experiment's folder; images and Gaussians are copied from where they are.
+    """Write an experiment's folder, with copies of its images and Gaussians.
 
     Raises:
-        UserError: The folder has an experiment already, or what would be written could not be read again.
+        UserError: The folder already holds an experiment, or the experiment cannot be expressed in the format.
     """
     folder = Path(path).expanduser()
     if (folder / "experiment.yaml").exists():
-        raise UserError(f"{folder} holds an experiment already: give another folder")
+        raise UserError(f"{folder} holds an experiment already; give another folder")
     scene, discretisation = scene_to_dict(experiment.scene)
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -165,12 +165,13 @@ def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
     return out, {"grid": scene.cells, "dt": scene.dt}
 
 
-def read_belief(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Read the model of a body, which may have a key `law`: a neural law in place of elasticity and plasticity.
+def read_declared_model(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Validate a declared model, in which a neural law may replace elasticity and plasticity; return it with its free parameters.
 
     Args:
-        given: As `read_model` takes it, and `law`: a `file` and a factor on its stress, `stiffness`, which may be free.
-        folder: What the law's file is relative to.
+        given: As for `read_model`, with an optional key `law`: the `file` of a neural law and `stiffness`, a factor on its stress that
+            may be free.
+        folder: The folder that the path of the law's file is relative to.
 
     Raises:
         UserError: An unknown key, an impossible material, an unknown effect.
@@ -191,7 +192,7 @@ def read_belief(given: Any, *, folder: Path = Path(".")) -> tuple[dict[str, Any]
 
 
 def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the assumed model in the key `model` of a file, and which of its parameters are free."""
+    """Validate the declared model of a file's key `model`; return it with the names of its free parameters."""
     given = mapping(given, "model")
     free = given.pop("free", [])
     effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY))
@@ -262,14 +263,14 @@ def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
         if key != "x" and not np.isfinite(array).all():
             raise UserError(f"{path}: {key} holds a NaN or an infinity")
     if min(sizes.values()) < 1:
-        raise UserError(f"{path}: {', '.join(f'{n} = {m}' for n, m in sizes.items())}; none may be zero")
+        raise UserError(f"{path}: {', '.join(f'{n} = {m}' for n, m in sizes.items())}; all must be at least 1")
     x, t = arrays["x"], arrays["t"]
     if not np.isinf(x).any():
         x = arrays["x"] = mask_unseen(x, str(path))
     if np.isinf(x).any() or (np.isnan(x).any(axis=2) != np.isnan(x).all(axis=2)).any():
         raise UserError(f"{path}: x holds an infinity, or a point that is NaN in one coordinate only")
     if t[0] != 0 or (np.diff(t) <= 0).any():
-        raise UserError(f"{path}: t must rise from 0, got {', '.join(f'{time:g}' for time in t[:4])}, ...")
+        raise UserError(f"{path}: t must increase from 0, got {', '.join(f'{time:g}' for time in t[:4])}, ...")
     if len(t) > 1 and not 0.5 < t[-1] / (len(t) - 1) / interval < 2:
         raise UserError(f"{path}: t has a frame every {t[-1] / (len(t) - 1):.3g} s, but frame_interval is {interval:g} s")
     lower, upper = np.array(scene.lower), np.array(scene.upper)

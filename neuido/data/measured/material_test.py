@@ -74,13 +74,13 @@ class MaterialTests:
     name: str
     folder: Path
     model: dict[str, Any]
-    """What the experimenter believes: density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them)."""
+    """The declared model: density [kg/m^3], elasticity and plasticity (as for `physics.laws.material`)."""
     free: tuple[str, ...]
-    """The figures of the model that are to be fitted; every other one is trusted."""
+    """The parameters of the model to fit; all others are taken as exact."""
     incompressible: bool
     """Whether the lateral stress is zero by pressure."""
     effects: dict[str, float]
-    """Effects that the model has already, as flat figures, for example {"strain_stiffening.k": 0.01}."""
+    """Effects that the declared model includes, by flat names, for example {"strain_stiffening.k": 0.01}."""
     tests: tuple[MaterialTest, ...]
 
     def of(self, role: str) -> tuple[MaterialTest, ...]:
@@ -130,14 +130,14 @@ def read_material_tests(path: str | os.PathLike, *, model: Mapping[str, Any] | N
         if not isinstance(incompressible, bool):
             raise UserError(f"model.incompressible must be true or false, got {incompressible!r}")
         effects = read_effects(given.pop("effects", None), "model.effects", known=EFFECTS)
-        believed, free = read_model(given)
+        declared, free = read_model(given)
         tests = read_entries(content["tests"], "tests", "test", lambda entry, where: _test(entry, where, folder))
         if not any(test.role == "fit" for test in tests):
             raise UserError("tests has none whose role is fit")
-        _check(tests, believed)
-        if incompressible and believed["plasticity"]["law"] == "drucker_prager":
+        _check(tests, declared)
+        if incompressible and declared["plasticity"]["law"] == "drucker_prager":
             raise UserError("model.incompressible: drucker_prager depends on the pressure, which an incompressible law does not know")
-    return MaterialTests(name, folder, believed, free, incompressible, effects, tests)
+    return MaterialTests(name, folder, declared, free, incompressible, effects, tests)
 
 
 def _test(entry: Any, where: str, folder: Path) -> MaterialTest:

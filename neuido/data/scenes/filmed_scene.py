@@ -14,7 +14,7 @@ The folder, with what writes each part:
         report.json           PSNR, SSIM, and the errors against the truth where it is known
         comparison.png, log/  pictures and the losses of the optimisation as CSV
 
-The believed `model` of an experiment is what its file says; the true law is in truth.yaml and nowhere else.
+The `model` of an experiment is the declared one; the true law is only in truth.yaml.
 """
 
 import os
@@ -86,7 +86,7 @@ class Setting(NamedTuple):
     density: float
     """[kg/m^3]"""
     model: dict[str, Any]
-    """The believed material: density, elasticity, plasticity."""
+    """The declared material: density, elasticity, plasticity."""
     placing: Placing = Placing()
 
 
@@ -98,7 +98,7 @@ class VisualScene(NamedTuple):
     density: float
     """[kg/m^3]"""
     model: dict[str, Any]
-    """The believed material: density, elasticity, plasticity. Not the truth."""
+    """The declared material: density, elasticity, plasticity; not the true one."""
     body: Body
     """The reconstructed particles at t = 0, with the velocity that is known."""
     gaussians: Path | None

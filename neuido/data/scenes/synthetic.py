@@ -41,17 +41,17 @@ from neuido.types import Body, Cameras, ParticleState, Scene
 FORMAT = "neuido-scenes/1"
 RECORDING = "drop"
 PARTS = ("scene", "model", "body", "discretisation")
-OWN = ("name", "base", "velocity", "angular_velocity", "shift", "belief", "split", "substeps")
+OWN = ("name", "base", "velocity", "angular_velocity", "shift", "declared", "belief", "split", "substeps")
 SPLITS = ("train", "unseen")
 JELLY = {"density": 1000.0, "elasticity": {"law": "fixed_corotated", "young": 1e5, "poisson": 0.2}, "plasticity": {"law": "identity"}}
-"""What the experimenter believes unless a scene says otherwise: NCLaw's jelly, from which NeuMA starts too."""
+"""The declared model if a scene gives none: NCLaw's jelly, which NeuMA starts from too."""
 
 IMAGES_AT_ONCE = {"cpu": 8, "cuda": 80}
 WIDTH = 0.45
-"""Standard deviation of a Gaussian in spacings of the dense set: with those of the layers behind, they cover."""
+"""Standard deviation of a Gaussian over the spacing of the dense set; with the layers behind them, the Gaussians are then opaque."""
 
 INSET = 0.8
-"""So many standard deviations the Gaussians keep within a particle's share of the body, so that the body looks as large as it is."""
+"""Distance of the Gaussians from the border of a particle's share of the body, in standard deviations; keeps the apparent size true."""
 
 OPACITY = 0.9
 Draw = Callable[..., tuple[Tensor, Tensor]]
@@ -60,7 +60,7 @@ Draw = Callable[..., tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True)
 class Plan:
-    """One scene to be made."""
+    """One scene to generate."""
 
     name: str
     scene: Scene
@@ -68,15 +68,15 @@ class Plan:
     motion: Motion
     law: dict[str, Any]
     """The true density, elasticity and plasticity."""
-    belief: dict[str, Any]
-    """What experiment.yaml says of them."""
+    declared: dict[str, Any]
+    """The declared density, elasticity and plasticity, written to experiment.yaml."""
     split: str
     substeps: int
     source: str
 
 
 class Dense(NamedTuple):
-    """The Gaussians that the images show, M of each of P particles."""
+    """The rendered Gaussians: M for each of P particles."""
 
     offset: Tensor
     """From the particle at t = 0 [m], (P, M, 3)."""
@@ -97,13 +97,13 @@ def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.Path
 
     Args:
         given: `name`; the keys scene, model, body and discretisation of a scene file, or `base`, the name of one, with keys of the
-            four that differ; optional velocity [m/s] and angular_velocity [rad/s] of the whole body, shift [m], belief (a model),
-            split (train, unseen), substeps from frame to frame.
-        film: How it is filmed.
-        data_root: Folder of the particles.
+            four that differ; optional velocity [m/s] and angular_velocity [rad/s] of the whole body, shift [m], declared (a model;
+            the former name `belief` is accepted), split (train, unseen), substeps between frames.
+        film: Cameras and rendering options.
+        data_root: Folder of the particle files.
 
     Raises:
-        UserError: An unknown or missing key, a figure outside its range, a body outside the domain.
+        UserError: An unknown or missing key, a value outside its range, a body outside the domain.
     """
     given = mapping(given, "a scene")
     name = given.get("name")
@@ -123,7 +123,10 @@ def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.Path
         check_keys(given, "the scene", (*OWN, *PARTS), (*OWN[1:], *PARTS))
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
         law = scenes.model_from_dict(content["model"])
-        belief = scenes.model_from_dict(given.get("belief") or {**JELLY, "density": law["density"]})
+        if "declared" in given and "belief" in given:
+            raise UserError("declared and belief are two names of one key; give declared")
+        own_model = given.get("declared") or given.get("belief")
+        declared = scenes.model_from_dict(own_model or {**JELLY, "density": law["density"]})
         body = scenes.body_from_dict(content["body"], data_root)
         if "shift" in given:
             body = body._replace(x=body.x + torch.tensor(vector(given["shift"], "shift")))
@@ -138,7 +141,7 @@ def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.Path
         Simulator(scene, body, density=law["density"], device="cpu").check_step(material(law["elasticity"], law["plasticity"])[0])
     except UserError as error:
         raise UserError(f"scenes: {name}: {error}") from error
-    return Plan(name, scene, body, motion, law, belief, split, substeps, source)
+    return Plan(name, scene, body, motion, law, declared, split, substeps, source)
 
 
 def make_scenes(
@@ -214,10 +217,10 @@ def make_scene(
     (folder / "truth.yaml").write_text(yaml.safe_dump(truth, sort_keys=False, default_flow_style=None))
     write_motion(plan.motion, folder)
     interval = plan.substeps * plan.scene.dt
-    free = tuple(key for part in ("elasticity", "plasticity") for key in plan.belief[part] if key != "law")
+    free = tuple(key for part in ("elasticity", "plasticity") for key in plan.declared[part] if key != "law")
     recorded = Recording(RECORDING, "fit", plan.scene, interval)
-    write_experiment(Experiment(plan.name, folder, plan.scene, plan.belief, free, (recorded,)), folder)
-    read_experiment(folder)  # what cannot be read again is not published
+    write_experiment(Experiment(plan.name, folder, plan.scene, plan.declared, free, (recorded,)), folder)
+    read_experiment(folder)  # raises if the written files cannot be read
 
 
 def move(plan: Plan, film: Film, device: torch.device) -> ParticleState:

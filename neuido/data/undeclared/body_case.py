@@ -170,14 +170,14 @@ class BodyCase:
             yield_stress=float(self.material.plasticity.get("yield_stress", 0.0)),
         )
 
-        def apart(one: Drawn) -> float:
+        def moved_by(one: Drawn) -> float:
             return rms(self.seen(self.run(self.suggested, one.values, self.declared[:1]))[0] - self.plain[0])
 
         least = 1.2 * max(MIN_SEPARATION * self.noise, OVER_FLOOR * floor)
         for kind in self.kinds:
             ratio = separation or float(np.exp(self.rng.uniform(np.log(20.0), np.log(110.0))))
             target = min(max(ratio * self.noise, 1.5 * OVER_FLOOR * floor), 0.9 * MAX_SEPARATION * self.noise)
-            self.effects.append(scale_to_separation(draw_effect(kind, self.rng, scales), target, apart, least).rounded())
+            self.effects.append(scale_to_separation(draw_effect(kind, self.rng, scales), target, moved_by, least).rounded())
 
     def record(self, nuisances: bool | None) -> None:
         """Simulate with all effects, without each one, and at the suggested setting."""
@@ -193,17 +193,17 @@ class BodyCase:
         self.recorded, reference = (
             [recorded(motion, self.markers, i, self.at, self.off[i] if self.off else {}) for i in range(2)] for motion in (true, same)
         )
-        self.apart = [math.inf, math.inf]
+        self.separations = [math.inf, math.inf]
         for one in self.effects:
             rest = {key: value for key, value in self.values.items() if key not in one.values}
             without = self.seen(self.run(self.solver, rest)) if rest else self.bare
-            self.apart = [min(a, rms(x - y)) for a, x, y in zip(self.apart, self.recorded, without)]
+            self.separations = [min(a, rms(x - y)) for a, x, y in zip(self.separations, self.recorded, without)]
         self.reference = [rms(x - y) for x, y in zip(self.recorded, reference)]
         if self.effects and not (
-            MIN_SEPARATION <= self.apart[0] / self.noise <= MAX_SEPARATION and self.apart[1] >= MIN_SEPARATION * self.noise
+            MIN_SEPARATION <= self.separations[0] / self.noise <= MAX_SEPARATION and self.separations[1] >= MIN_SEPARATION * self.noise
         ):
-            raise Redraw(f"the effect moves the points by {self.apart[0]:.2g} and {self.apart[1]:.2g} m")
-        if self.effects and self.apart[0] < OVER_FLOOR * self.reference[0]:
+            raise Redraw(f"the effect moves the points by {self.separations[0]:.2g} and {self.separations[1]:.2g} m")
+        if self.effects and self.separations[0] < OVER_FLOOR * self.reference[0]:
             raise Redraw("the effect moves the points by little more than the solvers differ")
 
     def truth(self) -> dict[str, Any]:
@@ -212,8 +212,8 @@ class BodyCase:
         for i in range(2):
             row: dict[str, Any] = {"name": f"take{i + 1}", "role": ("fit", "held_out")[i]}
             if self.effects:
-                row["separation_rms_m"] = rounded_to_4(self.apart[i])
-                row["separation_over_noise"] = rounded_to_4(self.apart[i] / self.noise)
+                row["separation_rms_m"] = rounded_to_4(self.separations[i])
+                row["separation_over_noise"] = rounded_to_4(self.separations[i] / self.noise)
             row["reference_rms_m"] = rounded_to_4(self.reference[i])
             row["best_achievable_rms_m"] = rounded_to_4(math.hypot(self.noise, self.reference[i]))
             rows.append(row)
@@ -223,7 +223,7 @@ class BodyCase:
         truth = {
             "undeclared": [entry_of(one, free=material.free) for one in self.effects],
             "material": {**laws, **figures, "density": material.density},
-            "started_from": material.believed,
+            "started_from": material.declared,
             "simulated_with": self.solver.words(),
             "solver": self.solver.name,
             "noise": self.noise,

@@ -47,13 +47,13 @@ def curve_case(
 
 
 def _effect(
-    rng: np.random.Generator, kind: str, sizes: Sizes, target: float, noise: float, apart: Callable[[Mapping[str, float]], float]
+    rng: np.random.Generator, kind: str, sizes: Sizes, target: float, noise: float, separation: Callable[[Mapping[str, float]], float]
 ) -> Drawn | None:
     if kind == "none":
         return None
     values, names, least, most = sizes[kind]
     drawn = Drawn(kind, {f"{kind}.{k}": float(v) for k, v in values.items()}, tuple(f"{kind}.{k}" for k in names.split()), least, most)
-    found = scale_to_separation(drawn, target, lambda one: apart(one.values), 16.0 * noise)
+    found = scale_to_separation(drawn, target, lambda one: separation(one.values), 16.0 * noise)
     return found.rounded()
 
 
@@ -107,9 +107,9 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
     sizes = _test_sizes(rng, young, flow)
     drawn = _effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms(stresses(values)[0] - plain[0]))
     true = stresses(drawn.values) if drawn else plain
-    believed = float(f"{young * (rng.uniform(0.65, 0.85) if rng.random() < 0.5 else rng.uniform(1.2, 1.5)):.3g}")
+    declared = float(f"{young * (rng.uniform(0.65, 0.85) if rng.random() < 0.5 else rng.uniform(1.2, 1.5)):.3g}")
     free = ["young", "yield_stress"] if plastic == PLASTIC and rng.random() < 0.5 else ["young"]
-    start = {"young": believed} | ({"yield_stress": float(f"{1.3 * flow:.3g}")} if len(free) > 1 else {})
+    start = {"young": declared} | ({"yield_stress": float(f"{1.3 * flow:.3g}")} if len(free) > 1 else {})
     roles, names = [plan[2] for plan in plans], [plan[0] for plan in plans]
     truth = {
         "undeclared": [entry_of(drawn, free=tuple(free))] if drawn else [],

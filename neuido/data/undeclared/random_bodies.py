@@ -28,20 +28,20 @@ class Launch(NamedTuple):
 
 
 class Material(NamedTuple):
-    """What a body is made of, and what is believed of it."""
+    """The true material of a body, and the parameters declared for it."""
 
     density: float
     elasticity: dict[str, Any]
     plasticity: dict[str, Any]
     free: tuple[str, ...]
-    believed: dict[str, float]
+    declared: dict[str, float]
     """Starting values of `free`."""
 
     def model(self) -> dict[str, Any]:
         """Return the `model` of an experiment file, with the assumed parameters."""
 
         def part(given: dict[str, Any]) -> dict[str, Any]:
-            return {key: self.believed.get(key, value) for key, value in given.items()}
+            return {key: self.declared.get(key, value) for key, value in given.items()}
 
         return {"density": self.density, "elasticity": part(self.elasticity), "plasticity": part(self.plasticity)}
 

@@ -94,6 +94,6 @@ def _plan_of(key: Path) -> dict[str, Any]:
 def _readme(name: str, key: str) -> str:
     digest = hashlib.sha256(key.encode()).hexdigest()
     return (
-        f"# {name}\n\nMeasured data with the model that is believed. What the model lacks, if anything, is sealed in\n"
+        f"# {name}\n\nMeasured data with the declared model. What the model lacks, if anything, is sealed in\n"
         f"`../keys/{name}.yaml`; nothing that diagnoses may read it. The SHA-256 of that file is\n\n    {digest}\n"
     )

@@ -1,9 +1,9 @@
 """Physical effects beyond the declared law: each is a parameter that is zero (here: None or 0) when the effect is absent.
 
-Nested models are one model with parameters held at zero, so the gradient at zero is a score test for a candidate effect. The rollout
-takes the parameters as differentiable inputs and skips what is absent. Forces, contact and inertia act on the grid; effects of the
-material act on the stress and on a history (`effect_tables`, `effect_kernels`, and their torch twin `constitutive`).
-`LIBRARY` says of each effect its equation, parameters, prior range, where it shows and what it is confused with.
+Models with fewer effects are nested: their parameters are zero, so the gradient at zero is a score test for a candidate effect. A
+rollout takes the parameters as differentiable inputs and skips absent effects. Forces, contact and inertia act on the grid. Material
+effects act on the stress and on a history (`coefficients`, `stress_kernels`, and a torch implementation in `constitutive`).
+`LIBRARY` gives for each effect its equation, parameters, prior range, where it shows and what it is confused with.
 """
 
 import math
@@ -65,27 +65,27 @@ class Effects(NamedTuple):
     """Parameters of the effects; each a float or a tensor of shape () or (S,), vectors (3,) or (S, 3). None: absent."""
 
     uniform_acceleration: Triple = None
-    """An acceleration beside gravity, a tilt or a steady wind [m/s^2], (3,) or (S, 3)."""
+    """A uniform acceleration added to gravity [m/s^2], (3,) or (S, 3): a tilt or a steady wind."""
     drag_linear: Number = None
     """c of the acceleration -c v [1/s]."""
     drag_quadratic: Number = None
     """k of the acceleration -k |v| v [1/m]."""
     position_force: Number = None
-    """k of the acceleration -k (x - centre) [1/s^2], a pull to a place."""
+    """k of the acceleration -k (x - centre) [1/s^2], a pull towards a point."""
     position_centre: Triple = None
-    """That place [m], (3,) or (S, 3)."""
+    """The centre of `position_force` [m], (3,) or (S, 3)."""
     viscosity_shear: Number = None
-    """eta of Kelvin-Voigt's Cauchy stress 2 eta D [Pa s]: in full, not its deviator alone."""
+    """eta of Kelvin-Voigt's Cauchy stress 2 eta D [Pa s], with the full D rather than its deviator."""
     viscosity_bulk: Number = None
     """zeta of Kelvin-Voigt's Cauchy stress zeta tr(D) I [Pa s]."""
     gravity: Number = None
-    """Added to the size of gravity, along its own direction [m/s^2]."""
+    """Added to the magnitude of gravity, along its direction [m/s^2]."""
     magnus: Triple = None
     """w of the acceleration w x v [1/s], (3,) or (S, 3): the spin times a coefficient; in a turning frame minus twice its rate."""
     time_force: Tensor | None = None
-    """Accelerations [m/s^2] at J evenly spaced times from t = 0, (J, 3) or (S, J, 3); linear in between, constant after the last."""
+    """Accelerations [m/s^2] at J evenly spaced times from t = 0, (J, 3) or (S, J, 3); linearly interpolated, constant after the last."""
     time_force_interval: float | None = None
-    """Time between two of them [s]."""
+    """Time between two knots of `time_force` [s]."""
     stiffness: Tensor | None = None
     """Factor of each particle's elastic stress [-], (P,) in the order of the bodies; see `linear_gradient` and `ball_inclusion`."""
     stiffness_change: Number = None
@@ -93,12 +93,12 @@ class Effects(NamedTuple):
     maxwell_ratio: Number = None
     """Shear modulus of a parallel Maxwell branch over the base law's [-]."""
     maxwell_time: Number = None
-    """Its relaxation time [s], > 0."""
+    """Relaxation time of the Maxwell branch [s], > 0."""
     hysteresis: Number = None
-    """Loss factor [-] of a rate-independent loss (`effect_tables.hysteresis_spectrum`); twice a damping ratio."""
+    """Loss factor [-] of a rate-independent loss (`coefficients.hysteresis_spectrum`); twice a damping ratio."""
     strain_stiffening: Number = None
     """k of tau += mu k x / (1 - k x) dev bbar with x = I1bar - 3 [-], Gent's law: for small x Yeoh's second term mu k x dev bbar;
-    no stretch goes beyond x = 1/k. Negative k: a body that softens. The factor is bounded at `law_kernels.LOCKED`."""
+    x cannot exceed 1/k. Negative k: a body that softens. The factor is bounded at `classical_kernels.LOCKED`."""
     second_invariant: Number = None
     """c of W = 3/2 mu c ln(I2bar / 3) [-], Gent and Thomas' second term: for small strains Mooney and Rivlin's mu c / 2 (I2bar - 3)."""
     tension_compression: Number = None
@@ -106,49 +106,49 @@ class Effects(NamedTuple):
     fibre: Number = None
     """c of W = c / 4 (I4 - 1)^2 [Pa]."""
     fibre_direction: Triple = None
-    """Direction of the fibres in the reference body, (3,) or (S, 3); brought to length one."""
+    """Direction of the fibres in the reference body, (3,) or (S, 3); normalised."""
     yield_inverse: Number = None
     """One over the yield stress of an elastic body, the norm of its deviatoric Kirchhoff stress 2 mu dev ln V at yield [1/Pa]."""
     hardening: Number = None
-    """H of the yield stress plus H alpha [Pa], alpha the accumulated norm of the plastic strain."""
+    """H of isotropic hardening [Pa], which adds H alpha to the yield stress; alpha is the accumulated norm of the plastic strain."""
     softening: Number = None
-    """s of the yield stress times exp(-s alpha) [-]; of a body that does not yield the elastic stress times exp(-s e_max)."""
+    """s of the factor exp(-s alpha) on the yield stress [-]; for a body that does not yield, of exp(-s e_max) on the elastic stress."""
     kinematic_hardening: Number = None
     """H_k [Pa] of Prager's backstress, which grows by H_k times the plastic strain and turns with the spin."""
     rate_yield: Number = None
-    """eta of Perzyna's overstress [Pa s]; 0 is the flow that does not know the rate."""
+    """eta of Perzyna's overstress [Pa s]; 0 is rate-independent flow."""
     cohesion: Number = None
-    """Mohr and Coulomb's c of a body declared as Drucker and Prager's [Pa]."""
+    """Mohr-Coulomb cohesion c of a body declared as Drucker-Prager [Pa]."""
     friction: Number = None
     """Added to the friction coefficient of every collider and wall [-]."""
     stick: Number = None
-    """Velocity of a node inside a collider times exp(-stick dt), after contact [1/s]; infinity is a sticky floor."""
+    """Rate of the factor exp(-stick dt) on the velocity of a node inside a collider, after contact [1/s]; infinity is a sticky floor."""
     restitution: Number = None
-    """Its outward normal velocity alone times exp(-restitution dt) [1/s]: a lossy floor."""
+    """Rate of the factor exp(-restitution dt) on the outward normal velocity of such a node [1/s]: a lossy floor."""
     added_mass: Number = None
-    """c of the inertia 1 + c times as large at the same weight [-]."""
+    """c of the factor 1 + c on the inertia at unchanged weight [-]."""
     relative_density: Tensor | None = None
-    """Factor of each particle's mass and elastic stress [-], (P,) in the order of the bodies: a foam or a hollow body, whose modulus
-    goes with its relative density (Gibson and Ashby, exponent 1), or one whose particles lie closer in places than its volumes say. It
-    flows at the strain at which the solid does."""
+    """Factor of each particle's mass and elastic stress [-], (P,) in the order of the bodies. It describes a foam or a hollow body,
+    whose modulus is proportional to its relative density (Gibson and Ashby, exponent 1), or particles that lie closer together than
+    their volumes imply. The yield strain is that of the solid."""
 
     @classmethod
     def of(cls, values: Mapping[str, Tensor | float], *, x: Tensor | None = None, scene: Tensor | None = None) -> "Effects":
-        """Effects from flat names as `LIBRARY` lists them: "viscosity_shear.eta", "uniform_acceleration.x", "time_force.y2", ...
+        """Make effects from the flat names of `LIBRARY`: "viscosity_shear.eta", "uniform_acceleration.x", "time_force.y2", ...
 
         Args:
             values: Numbers or tensors (S,).
-            x: Reference positions [m], (P, 3), which `stiffness_gradient` needs.
-            scene: Scene of each particle, (P,), where its values have S > 1 rows.
+            x: Reference positions [m], (P, 3); needed by `stiffness_gradient`.
+            scene: Scene of each particle, (P,); needed if the values of `stiffness_gradient` have S > 1 rows.
 
         Raises:
-            UserError: A name that is not in the library, or one that needs another beside it.
+            UserError: A name that is not in the library, or that needs another argument.
         """
         return cls(**_fields(values, x, scene))
 
     @property
     def of_material(self) -> bool:
-        """Whether an effect acts on the law, viscosity apart."""
+        """Whether an effect other than viscosity acts on the law."""
         return any(getattr(self, name) is not None for name in _MATERIAL)
 
     def rows(self, name: str, scene_count: int, like: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ class Effects(NamedTuple):
         return rows.expand(scene_count, width)
 
     def particle_stiffness(self, count: int, like: Tensor) -> Tensor | None:
-        """Return the factor on each particle's elastic stress, (P,), of `stiffness` and `relative_density`; None: neither is given.
+        """Return the factor on each particle's elastic stress, (P,), from `stiffness` and `relative_density`; None without either.
 
         Raises:
             UserError: As `particle_factor`.
@@ -182,7 +182,7 @@ class Effects(NamedTuple):
         return math.prod(factors[1:], start=factors[0]) if factors else None
 
     def particle_factor(self, name: str, count: int, like: Tensor) -> Tensor:
-        """`stiffness` or `relative_density` as (P,), checked.
+        """Return `stiffness` or `relative_density` as (P,), validated.
 
         Raises:
             UserError: Another number of particles, or a factor that is not positive.
@@ -197,12 +197,12 @@ class Effects(NamedTuple):
         return factor
 
     def accelerations(self, gravity: Tensor, dt: Tensor, steps: int) -> Tensor:
-        """Gravity and all accelerations that are uniform in space, (1, S, 3), or (T, S, 3) where they change with time.
+        """Return gravity plus all spatially uniform accelerations, (1, S, 3), or (T, S, 3) if they vary in time.
 
         Args:
             gravity: [m/s^2], (S, 3).
             dt: Step of each scene [s], (S,).
-            steps: Substeps T; each gets the time force at its middle.
+            steps: Number of substeps T; `time_force` is evaluated at the middle of each.
         """
         count = len(gravity)
         if self.gravity is not None:
@@ -231,8 +231,8 @@ class Effects(NamedTuple):
     def force_table(self, scene_count: int, like: Tensor) -> Tensor:
         """Return the table of body forces that `mpm.grid.update_grid` reads.
 
-        Columns linear drag, quadratic drag, pull, centre x, y, z, (S, 6); where one of them is given also magnus x, y, z, stick and
-        restitution, (S, 11).
+        The columns are linear drag, quadratic drag, pull, centre x, y, z, (S, 6). If `magnus`, `stick` or `restitution` is given, five
+        follow: magnus x, y, z, stick, restitution, (S, 11).
         """
         names = ["drag_linear", "drag_quadratic", "position_force", "position_centre"]
         more = ["magnus", "stick", "restitution"]
@@ -241,9 +241,9 @@ class Effects(NamedTuple):
         return torch.cat([self.rows(name, scene_count, like) for name in names], dim=1)
 
     def viscosity(self, scene_count: int, like: Tensor) -> Tensor | None:
-        """Columns of 2 eta dev D + zeta tr(D) I, (S, 2), or None where neither is given (the rollout then skips them).
+        """Return eta and zeta of the viscous stress 2 eta dev D + zeta tr(D) I, (S, 2) [Pa s]; None without viscosity.
 
-        The trace of `viscosity_shear`'s own 2 eta D is in the second.
+        `viscosity_shear` defines 2 eta D with the full D; the trace of that term is part of zeta.
         """
         if self.viscosity_shear is None and self.viscosity_bulk is None:
             return None
@@ -251,7 +251,7 @@ class Effects(NamedTuple):
         return torch.cat([eta, zeta + 2.0 / 3.0 * eta], dim=1)
 
     def growth(self, dt: Tensor, steps: int) -> Tensor | None:
-        """exp(r t) of `stiffness_change` at the start of each substep, (T, S), or None."""
+        """Return exp(r t) of `stiffness_change` at the start of each substep, (T, S); None without it."""
         if self.stiffness_change is None:
             return None
         times = torch.arange(steps, dtype=torch.float64, device=dt.device)[:, None] * dt.double()
@@ -262,18 +262,18 @@ class Effects(NamedTuple):
 
 
 def _tensor(value) -> Tensor:
-    """Numbers become float64, so that they keep their digits."""
+    """Return a value as a tensor; numbers become float64, to lose no precision."""
     return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
 
 
 def linear_gradient(x: Tensor, slope: Tensor, *, mean: Tensor | None = None, length: Tensor | float | None = None) -> Tensor:
-    """Return the factor exp(slope . (X - mean) / length), (P,): a stiffness gradient over the body.
+    """Return the factor exp(slope . (X - mean) / length), (P,): a stiffness gradient across the body.
 
     Args:
         x: Reference positions [m], (P, 3).
         slope: Change of the factor's logarithm over `length` along each axis [-], (3,) or (P, 3).
-        mean: Where the factor is one [m]; the mean of `x` where absent.
-        length: [m]; the largest extent of `x` where absent.
+        mean: Position at which the factor is one [m]; by default the mean of `x`.
+        length: Reference length [m]; by default the largest extent of `x`.
     """
     mean = x.mean(dim=0) if mean is None else mean
     length = (x.amax(dim=0) - x.amin(dim=0)).max() if length is None else length
@@ -283,15 +283,16 @@ def linear_gradient(x: Tensor, slope: Tensor, *, mean: Tensor | None = None, len
 def ball_inclusion(
     x: Tensor, log_ratio: Tensor | float, centre: Tensor, radius: Tensor | float, *, width: Tensor | float = 0.0, mean: Tensor | None = None
 ) -> Tensor:
-    """Return the factor exp(log_ratio) inside a ball and one outside, (P,): a stiffer or a softer inclusion.
+    """Return the factor exp(log_ratio) inside a ball and 1 outside, (P,): a stiffer or softer inclusion.
 
     Args:
         x: Reference positions [m], (P, 3).
         log_ratio: Logarithm of the factor inside [-], () or (P,).
-        centre: Of the ball, from the mean of `x` [m], (3,) or (P, 3).
-        radius: [m], () or (P,).
-        width: Of a smooth border, tanh((radius - r) / width) [m]; 0 is a sharp one, whose factor has no slope in centre and radius.
-        mean: In place of the mean of `x`.
+        centre: Centre of the ball relative to the mean of `x` [m], (3,) or (P, 3).
+        radius: Radius of the ball [m], () or (P,).
+        width: Width of a smooth border tanh((radius - r) / width) [m]. With 0 the border is sharp, and the factor has no gradient with
+            respect to centre and radius.
+        mean: Replaces the mean of `x`.
     """
     r = torch.linalg.vector_norm(x - (x.mean(dim=0) if mean is None else mean) - centre, dim=-1)
     width = torch.as_tensor(width, dtype=x.dtype, device=x.device)
@@ -306,7 +307,7 @@ _FIELDS = {
     for parameter in entry.parameters
     if parameter.field in Effects._fields
 }
-"""Names that are one field of `Effects`, or (x, y, z) one part of it."""
+"""Flat names and the field of `Effects` that each sets, as a whole or as its component x, y or z."""
 
 
 def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tensor | None) -> dict[str, Tensor | float]:

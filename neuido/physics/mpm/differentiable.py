@@ -23,7 +23,7 @@ def run(
 ) -> tuple[Tensor, ...]:
     """Return frames of x, v, C, F and the history; differentiable if an input requires a gradient.
 
-    Without gradients the frames lie in memory that the next rollout overwrites.
+    The frames lie in memory that the next rollout overwrites.
 
     Args:
         plan: The rollout to run.

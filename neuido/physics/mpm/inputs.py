@@ -93,7 +93,7 @@ def prepare(
     """Return the inputs of a rollout, differentiable in all arguments, which are those of `mpm.Simulator.rollout`.
 
     Raises:
-        UserError: A shape that does not fit, an effect outside its range or with a law that does not support it.
+        UserError: A shape that does not fit, an effect outside its range or without the law that it needs.
     """
     count, like = solver.scene_count, solver.mass
 

@@ -242,7 +242,9 @@ def grid_inputs(plan: Plan, pull: Tensor, force: Tensor, friction: Tensor, reach
 
 
 def check(plan: Plan, tape: Tape) -> None:
-    """Raise the first failure that the kernels reported; with `nan_on_failure`, set the frames of failed scenes to NaN instead.
+    """Raise the earliest failure that the kernels reported, or raise if the last frame is not finite.
+
+    With `nan_on_failure` the frames of failed scenes are set to NaN instead.
 
     Raises:
         UserError: A particle lost, too fast, or not finite.

@@ -190,7 +190,7 @@ def _launch_again(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torc
     packed = command.launch
     for i, value in scalars:
         setattr(packed.arguments, internals.parameters(kernel)[i].label, value)
-    launches.note(packed.enter, packed.bounds, packed.arguments, command)
+    launches.record_launch(packed.enter, packed.bounds, packed.arguments, command)
     packed.enter(ctypes.byref(packed.bounds), ctypes.byref(packed.arguments))
 
 

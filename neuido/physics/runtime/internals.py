@@ -60,7 +60,7 @@ def load(kernel: wp.Kernel, device: torch.device, block: int) -> None:
 
 
 def describe_array(t: Tensor, dtype: type) -> Any:
-    """Return Warp's descriptor of a tensor: address, shape and strides. Only that of the public call keeps the tensor alive."""
+    """Return Warp's descriptor of a tensor: address, shape and strides. It does not keep the tensor alive; the slower public call does."""
     if not WARP_TRIED:
         return wp.from_torch(t.detach(), dtype=dtype, requires_grad=False)
     found = wp.from_torch(t.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
@@ -99,7 +99,7 @@ class PackedLaunch:
 
 
 if TORCH_TRIED:
-    from torch.utils._python_dispatch import TorchDispatchMode as DispatchMode  # type: ignore[assignment]  # the stand-in has the two methods in use
+    from torch.utils._python_dispatch import TorchDispatchMode as DispatchMode  # type: ignore[assignment]  # the stand-in below
 else:
 
     class DispatchMode:

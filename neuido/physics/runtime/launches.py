@@ -29,7 +29,7 @@ class Launch(NamedTuple):
     """Reference that keeps the code and the packed objects alive."""
 
 
-def note(enter: Callable[[Any, Any], None], bounds: Any, arguments: ctypes.Structure, owner: object) -> None:
+def record_launch(enter: Callable[[Any, Any], None], bounds: Any, arguments: ctypes.Structure, owner: object) -> None:
     """Append a launch to the active recording of this thread, if any."""
     recording = getattr(_active, "recording", None)
     if recording is not None:

@@ -59,7 +59,7 @@ def test_layout(ball):
     (recording,) = experiment.recordings
     assert recording.frame_interval == pytest.approx(0.02) and recording.body is None
     assert recording.video.held_out == (1,)
-    assert experiment.model["elasticity"]["young"] == 1e5  # the belief, not the truth
+    assert experiment.model["elasticity"]["young"] == 1e5  # the declared model, not the true one
     assert "5.0e+4" not in (ball / "experiment.yaml").read_text() and "50000" not in (ball / "experiment.yaml").read_text()
     index = json.loads((ball.parent / "index.json").read_text())
     assert index["scenes"][0]["law"]["elasticity"]["young"] == 5e4
@@ -211,3 +211,11 @@ def test_velocity_of_a_body_is_read_off():
 def test_preview(ball):
     image = cv2.imread(str(ball / "preview.png"))
     assert image.shape == (320, 1280, 3) and (image.reshape(-1, 3).min(1) < 128).mean() > 0.02
+
+
+def test_the_declared_model_may_have_its_former_name():
+    model = {**BALL["model"], "plasticity": {"law": "identity"}}
+    plans = [plan_scene({**BALL, name: model}, FILM) for name in ("declared", "belief")]
+    assert plans[0].declared == plans[1].declared == scenes.model_from_dict(model) != plan_scene(BALL, FILM).declared
+    with pytest.raises(UserError, match="two names of one key"):
+        plan_scene({**BALL, "declared": model, "belief": model}, FILM)

@@ -66,7 +66,7 @@ def test_files_are_what_stage_two_reads(box):
     visual = load_visual(box)
     truth = read_truth(box)
     assert visual.name == "Box" and visual.density == 1200.0 and visual.scene.cells == 16
-    assert visual.model["elasticity"]["young"] == 1e5  # the belief
+    assert visual.model["elasticity"]["young"] == 1e5  # the declared one
     assert visual.truth.law["elasticity"]["young"] == 5e4
     assert visual.batch.images.shape == (7, 3, 64, 64, 3) and visual.batch.held_out.nonzero().tolist() == [[2]]
     assert len(visual.truth.x) == len(visual.batch.times) == 3
