@@ -123,7 +123,7 @@ class SceneViews:
         """
         frames = range(len(self.frames)) if frames is None else frames
         shape = (len(views), len(frames), self.cameras.height, self.cameras.width, 4)
-        out = np.empty(shape, dtype=np.uint8)
+        out = np.empty(shape, dtype=np.float32 if self.find_masks else np.uint8)
         for i, v in enumerate(views):
             for k, t in enumerate(frames):
                 out[i, k] = self._image(self.chosen[v], self.frames[t])
@@ -174,7 +174,11 @@ class SceneViews:
         return rgba, False
 
     def _image(self, v: int, t: int) -> np.ndarray:
-        """Return RGB over the background, and the mask, (H, W, 4) uint8."""
+        """Return RGB over the background, and the mask, (H, W, 4) in 0..255.
+
+        The array is uint8; where masks are sought it is float32, and a mask that was found keeps its digits: half a step of eight bits
+        changes which pixels of an outline count as the body's.
+        """
         if (v, t) in self._kept:
             return self._kept[v, t]
         found = self.found
@@ -194,7 +198,10 @@ class SceneViews:
         if size != (found.cameras.width, found.cameras.height):
             layers = _resize(layers, size)
         image = layers[..., :3] + self.background_colour * (1 - layers[..., 4:])
-        done = np.rint(255 * np.clip(np.concatenate([image, layers[..., 3:4]], axis=2), 0, 1)).astype(np.uint8)
+        done = 255 * np.clip(np.concatenate([image, layers[..., 3:4]], axis=2), 0, 1)
+        rounded = slice(3) if self.find_masks and not masked else slice(4)
+        done[..., rounded] = np.rint(done[..., rounded])
+        done = done.astype(np.float32 if self.find_masks else np.uint8)
         if self.cache:
             self._kept[v, t] = done
         return done
