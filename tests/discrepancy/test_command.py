@@ -128,7 +128,7 @@ WRONG = {  # kind, what is done to it, words of the line
     ),
     "shape": ("experiment", arrays(x=lambda x: x[:, :, :2]), "shape"),
     "infinite": ("experiment", arrays(x=spoiled(3, 2, np.inf)), "infinity"),
-    "times": ("experiment", arrays(t=lambda t: t[::-1].copy()), "t must rise"),
+    "times": ("experiment", arrays(t=lambda t: t[::-1].copy()), "t must increase from 0"),
     "body": ("experiment", arrays(x0=lambda x: x + 2.0), "outside"),
     "track": ("experiment", arrays(track=lambda i: i + 1000), "track"),
     "neither-track": ("experiment", arrays(track=lambda i: None), "anchor"),

@@ -11,6 +11,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from neuido.data.files.writing import process_lives
 from neuido.errors import UserError
 
 
@@ -94,14 +95,8 @@ def _started(pid: int) -> str | None:
 
 def _lives(pid: Any, started: Any) -> bool:
     """Whether a process is alive and the one that was noted, not a later one with its number."""
-    if not isinstance(pid, int) or pid < 1 or os.name != "posix":  # elsewhere a signal of 0 would end it
+    if not isinstance(pid, int) or pid < 1 or not process_lives(pid, unknown=False):
         return False
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        pass
     if started is None:
         return True
     try:

@@ -71,7 +71,7 @@ def temporary(path: Path, suffix: str = "") -> Path:
         remove(old_name)
     for old in path.parent.glob(f".{_literal(path.name)}.{host}-*.tmp{_literal(suffix)}"):
         pid = old.name[len(path.name) + len(host) + 3 :].partition("-")[0]
-        if pid.isdigit() and not _lives(int(pid)):
+        if pid.isdigit() and not process_lives(int(pid), unknown=True):
             remove(old)
     return path.with_name(f".{path.name}.{host}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp{suffix}")
 
@@ -123,9 +123,10 @@ def _literal(text: str) -> str:
     return "".join(f"[{c}]" if c in "*?[" else c for c in text)
 
 
-def _lives(pid: int) -> bool:
+def process_lives(pid: int, *, unknown: bool) -> bool:
+    """Return whether a process of this host is alive; `unknown` where that cannot be asked, as on Windows."""
     if os.name != "posix":
-        return True  # a signal of 0 would end it there
+        return unknown  # a signal of 0 would end it there
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -1,14 +1,13 @@
 """Points on a deforming body as an experiment: the first frame is its rest shape."""
 
 import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from neuido.data.files.writing import new_folder
+from neuido.data.importers.checked_folder import write_checked
 from neuido.errors import UserError
 
 EARLY = 4
@@ -87,17 +86,8 @@ def experiment_of(
             (folder / name).mkdir()
             np.savez_compressed(folder / name / "particles.npz", **take)
         (folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-        try:
-            read_experiment(folder)
-        except UserError as error:
-            raise UserError(str(error).replace(f"{folder}{os.sep}", "")) from error
 
-    if out is None:
-        with tempfile.TemporaryDirectory() as folder:
-            fill(Path(folder))
-    else:
-        with new_folder(Path(out).expanduser()) as folder:
-            fill(folder)
+    write_checked(out, fill, read_experiment)
     return said
 
 

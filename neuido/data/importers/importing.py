@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from neuido.data.files.writing import new_folder
+from neuido.data.importers.checked_folder import write_checked
 from neuido.data.importers.testing_machine import Specimen, read_machine
 from neuido.data.importers.titled_tables import read_cells
 from neuido.data.importers.tracker_exports import Motion, read_motion
@@ -221,8 +221,6 @@ def _modulus(columns: Mapping[str, np.ndarray]) -> float:
 
 def _write(out: str | os.PathLike | None, name: str, content: dict[str, Any], tables: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     """Write a folder whole, once the readers take it; with no `out` only that is tried."""
-    import tempfile
-
     from neuido.data.measured.material_test import read_material_tests
     from neuido.data.measured.track import read_tracks
 
@@ -231,14 +229,5 @@ def _write(out: str | os.PathLike | None, name: str, content: dict[str, Any], ta
             lines = [",".join(columns), *(",".join(repr(float(v)) for v in row) for row in zip(*columns.values()))]
             (folder / file).write_text("\n".join(lines) + "\n")
         (folder / name).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
-        try:
-            (read_tracks if name == "track.yaml" else read_material_tests)(folder)
-        except UserError as error:
-            raise UserError(str(error).replace(f"{folder}{os.sep}", "")) from error
 
-    if out is None:
-        with tempfile.TemporaryDirectory() as folder:
-            fill(Path(folder))
-    else:
-        with new_folder(Path(out).expanduser()) as folder:
-            fill(folder)
+    write_checked(out, fill, read_tracks if name == "track.yaml" else read_material_tests)
