@@ -1,6 +1,6 @@
 """Blind test of diagnoses: experiments with or without an undeclared effect, diagnosed without their keys and then scored against them.
 
-    python benchmarks/blind.py --out runs/blind [--cases 60] [--curves 0] [--workers N] [--device cpu]
+    python benchmarks/blind.py --out runs/blind [--cases 60] [--curves 0] [--workers N] [--gpus 1] [--device cpu]
                                [--minutes 0] [--ablation single-recording no-discretisation] [--only make|diagnose|score]
                                [--folders FOLDER ...]
 
@@ -149,25 +149,27 @@ def _with_one_recording(folder: Path, target: Path) -> Path:
     return target
 
 
-def in_parallel(work, tasks: list[tuple], workers: int) -> Iterator[tuple[tuple, Any]]:
-    """Run tasks in separate processes; yield (task, result) as they finish."""
+def in_parallel(work, tasks: list[tuple], workers: int, gpus: int = 1) -> Iterator[tuple[tuple, Any]]:
+    """Run tasks in separate processes, spread over the first `gpus` GPUs; yield (task, result) as they finish."""
     os.environ["OMP_NUM_THREADS"] = "1"
     context = multiprocessing.get_context("spawn")
-    cores = context.SimpleQueue()
+    shares = context.SimpleQueue()
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     for n in range(workers):  # give each worker its own cores, so that their threads do not compete
-        cores.put(available[n::workers] or available)
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_keep_to, initargs=(cores,)) as pool:
+        shares.put((available[n::workers] or available, n % gpus if gpus > 1 else None))
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_keep_to, initargs=(shares,)) as pool:
         waiting = {pool.submit(work, *task): task for task in tasks}
         for done in as_completed(waiting):
             yield waiting[done], done.result()
 
 
-def _keep_to(cores) -> None:
-    """Pin this process to the next share of the cores."""
-    share = cores.get()
-    if share:
-        os.sched_setaffinity(0, share)
+def _keep_to(shares) -> None:
+    """Pin this process to the next share of the cores, and to its GPU where there are several."""
+    cores, gpu = shares.get()
+    if cores:
+        os.sched_setaffinity(0, cores)
+    if gpu is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = str(gpu)  # read when CUDA starts, which no import here does
 
 
 def record(path: Path, row: dict[str, Any]) -> None:
@@ -238,6 +240,7 @@ def main() -> None:
     parser.add_argument("--curves", type=int, default=0, help="additional cases that are alternately material tests and tracks")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, help="number of parallel processes; default: 2 on the CPU, 1 on a GPU")
+    parser.add_argument("--gpus", type=int, default=1, help="number of GPUs over which the processes are spread")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--minutes", type=float, default=0.0, help="time limit of a diagnosis [min]; 0: none")
     parser.add_argument("--ablation", nargs="*", choices=RERUN, default=[])
@@ -255,14 +258,14 @@ def main() -> None:
         folders = [options.out / "cases" / name for name, *_ in cases]
         if options.only in (None, "make"):
             missing = [(*one, str(options.out / "cases"), options.device) for one in cases if not (options.out / "cases" / one[0]).is_dir()]
-            for n, (task, failed) in enumerate(in_parallel(make_one, missing, workers), 1):
+            for n, (task, failed) in enumerate(in_parallel(make_one, missing, workers, options.gpus), 1):
                 print(f"made {n} of {len(missing)}: {task[0]}{': FAILED, ' + failed if failed else ''}", flush=True)
         folders = [folder for folder in folders if folder.is_dir()]
     if options.only in (None, "diagnose"):
         places = [(f, options.out / "answers" / how / f.name, how) for how in ("none", *options.ablation) for f in folders]
         asked = [(str(folder), str(place), how, options.device, options.minutes) for folder, place, how in places]
         waiting = [task for task in asked if not (Path(task[1]) / "diagnosis.json").is_file()]
-        for n, (task, failed) in enumerate(in_parallel(diagnose_one, waiting, workers), 1):
+        for n, (task, failed) in enumerate(in_parallel(diagnose_one, waiting, workers, options.gpus), 1):
             place = Path(task[1])
             found = answers(place) or []
             digest = "" if failed else hashlib.sha256((place / "diagnosis.json").read_bytes()).hexdigest()
