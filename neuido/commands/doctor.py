@@ -84,7 +84,7 @@ def _print_devices() -> list[str]:
 
 
 def _driver_release() -> str | None:
-    """The NVIDIA driver's release, such as 580.159."""
+    """Read the NVIDIA driver's release, such as 580.159; None without a driver."""
     if shutil.which("nvidia-smi") is None:
         return None
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]

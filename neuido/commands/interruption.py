@@ -24,7 +24,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def received() -> int | None:
-    """The first signal of this command that ends it, or None."""
+    """Return the number of the first signal that asked this command to end, or None."""
     return _received[0] if _received else None
 
 
@@ -61,7 +61,7 @@ def watched() -> Iterator[None]:
 
 
 def stop_at_step(path: Path | None = None) -> "Callback":
-    """A callback that lets a trainer end after the batch in which a signal came, with its state in a file.
+    """Build a callback that ends training after the batch in which a signal came, and saves the state.
 
     Args:
         path: The file; `interrupted.ckpt` beside the trainer's other checkpoints where absent.

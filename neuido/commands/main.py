@@ -81,7 +81,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _fault(error: Exception) -> str:
-    """The line of an error that nobody foresaw; its traceback goes to a file."""
+    """Return one line for an unexpected error, and write its traceback to a file."""
     text = "".join(traceback.format_exception(error))
     words = f"{sys.argv[0]} {' '.join(sys.argv[1:])}\nneuido {neuido.__version__}, Python {sys.version}\n"
     try:

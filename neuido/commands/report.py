@@ -84,7 +84,7 @@ class Line(NamedTuple):
 
 
 def lines_of(name: str, entries: Sequence[Entry], quoted: Sequence[dict[str, Any]]) -> list[Line]:
-    """The lines of a measure: a run each, and one more for each of a run's own rivals (`cd_random`); floor; paper."""
+    """List the rows of a measure: one per run and per baseline of that run (`cd_random`), then the floor and the paper's value."""
     out = []
     for entry in entries:
         known = set(MEASURES)
@@ -201,7 +201,7 @@ def _panels(count: int) -> tuple[Any, list[Any]] | None:
 
 
 def _by_frame(entries: list[Entry]) -> list[str]:
-    """The Chamfer distance over time, a panel a scene."""
+    """Plot the Chamfer distance over time, one panel per scene."""
     found = {s: {e.label: rows for e in entries if (rows := e.by_frame(s))} for s in scenes_of(entries)}
     found = dict(list((s, own) for s, own in found.items() if own)[:MOST_PANELS])
     drawn = _panels(len(found)) if found else None
@@ -221,7 +221,7 @@ def _by_frame(entries: list[Entry]) -> list[str]:
 
 
 def _logged(entries: list[Entry]) -> list[str]:
-    """What the runs logged, a panel a quantity; those that are averages over scenes or families."""
+    """Plot the logged quantities that are averages over scenes or families, one panel each."""
     found: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for entry in entries:
         for name, points in curves(entry.root).items() if entry.last else ():
@@ -244,7 +244,7 @@ def _logged(entries: list[Entry]) -> list[str]:
 
 
 def _videos(entries: list[Entry], most: float) -> list[str]:
-    """The videos of each scene side by side, until the page is full."""
+    """Show the videos of each scene side by side, until the page reaches its size limit."""
     parts, spent, left = [], 0, []
     for scene in scenes_of(entries):
         row = []

@@ -101,7 +101,7 @@ def _one(plan: SweepFile, run: Run, folder: Path) -> str:
 
 
 def _status(code: int) -> str:
-    """What an exit status says: a run that a signal ended, itself (-n) or by its own handler (128 + n), is neither done nor failed."""
+    """Classify an exit status; a run ended by a signal (-n, or 128 + n from its own handler) is neither done nor failed."""
     if code == 0:
         return "done"
     return "interrupted" if code < 0 or code - 128 in (*SIGNALS, signal.SIGKILL) else "failed"
@@ -149,7 +149,7 @@ def _last_line(path: Path) -> str:
 
 
 def logged(folder: Path) -> dict[str, float]:
-    """The last value of each column of the metrics.csv files below a folder, the newest file last."""
+    """Return the last value of each column of the metrics.csv files below a folder; a newer file wins."""
     from neuido.data.files.results import logs
 
     values: dict[str, float] = {}

@@ -7,7 +7,7 @@ from neuido.errors import UserError
 
 
 def find_config(name: str, option: str = "--config") -> str:
-    """The path of a configuration: a file here, or one that comes with neuido by its name."""
+    """Return the path of a configuration: a file given by path, or one that comes with neuido, given by name."""
     if name.lstrip().startswith("{") or Path(name).is_file():  # jsonargparse accepts the content itself too
         return name
     relative = name.removeprefix("configs/").removesuffix(".yaml") + ".yaml"

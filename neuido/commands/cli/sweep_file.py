@@ -146,7 +146,7 @@ def _leaves(parameters: dict[str, Any], path: tuple[str, ...], method: str) -> I
 
 
 def _checked(given: dict[str, Any], name: str, method: str) -> dict[str, Any]:
-    """A parameter with its distribution, which wandb tells from the keys where none is given."""
+    """Return a parameter with its distribution; where none is given, infer it from the keys as wandb does."""
     for key in given:
         if key not in SPECIFICATION:
             raise UserError(f"parameter {name} has the unknown key {key!r}; there are {', '.join(SPECIFICATION)}, parameters")
@@ -201,7 +201,7 @@ class Run(NamedTuple):
 
 
 def runs_of(sweep: SweepFile, *, count: int | None = None, seed: int = 0) -> list[Run]:
-    """The runs of a sweep, in an order that does not depend on who runs them.
+    """List the runs of a sweep, in an order that does not depend on the machine or the shard.
 
     Args:
         sweep: The file.
@@ -252,7 +252,7 @@ def _nested(point: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
 
 
 def _name(point: Mapping[tuple[str, ...], Any], sweep: SweepFile) -> str:
-    """What varies, as a name of a folder and of a run that wandb takes."""
+    """Name a run by the values that vary, in characters that a folder and wandb accept."""
     varied = {path: v for path, v in point.items() if sweep.leaves[path]["distribution"] != "constant"} or point
     last = [".".join(path).rpartition(".")[2] for path in varied]
     words = []
@@ -265,7 +265,7 @@ def _name(point: Mapping[tuple[str, ...], Any], sweep: SweepFile) -> str:
 
 
 def command_of(sweep: SweepFile, run: Run, environment: Mapping[str, str]) -> list[str]:
-    """The words of a run's command line: the file's, with wandb's macros replaced as wandb's agent does.
+    """Build the command line of a run: the file's words with wandb's macros replaced as wandb's agent replaces them.
 
     Raises:
         UserError: A variable of the environment that is not set.

@@ -111,7 +111,7 @@ def adapted_section(result: "Adapted") -> str:
 
 
 def loop_section(result: "LoopResult", folder: Path) -> str:
-    """The closed loop on the page, with a link to its own report."""
+    """Write the page's section on the closed loop, with a link to the loop's own report."""
     from neuido.commands.demo.closed_loop import figures
 
     rows: list[tuple[Any, ...]] = [
