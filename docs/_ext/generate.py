@@ -103,7 +103,11 @@ def effect_page() -> str:
     head = ["effect", "points or video of a body", "stress and stretch", "track of a point", "MPM", "finite elements", "looks like"]
     parts.append(table(head, rows))
     for e in LIBRARY:
-        parts += [f"\n## {e.name}\n", f"`{e.equation}`\n", f"Shows in {e.stage}: {UNDERSTOOD.get(e.stage, e.stage)}. Source: {e.source}.\n"]
+        parts += [
+            f"\n## {e.name}\n",
+            f"The model lacks {e.title}: `{e.equation}`\n",
+            f"Shows in {e.stage}: {UNDERSTOOD.get(e.stage, e.stage)}. Source: {e.source}.\n",
+        ]
         if e.limits:
             parts.append(f"At an end of its range it becomes {', '.join(e.limits)}.\n")
         rows = [

@@ -24,6 +24,8 @@ class Entry(NamedTuple):
     """One effect of the vocabulary: its equation, parameters and ranges, where it shows, and what it is mistaken for."""
 
     name: str
+    title: str
+    """The effect in words, as they stand after "the model lacks"."""
     equation: str
     parameters: tuple[Parameter, ...]
     stage: str
@@ -44,6 +46,7 @@ KNOTS = 5
 LIBRARY = (
     Entry(
         "gravity",
+        "a different gravity",
         "a += dg g/|g|",
         (Parameter("g", "gravity", "m/s^2", -3.0, 3.0, True),),
         "flight",
@@ -52,6 +55,7 @@ LIBRARY = (
     ),
     Entry(
         "uniform_acceleration",
+        "a constant acceleration",
         "a += w",
         _vector("uniform_acceleration", "m/s^2", 3.0),
         "flight",
@@ -60,6 +64,7 @@ LIBRARY = (
     ),
     Entry(
         "drag_linear",
+        "linear air drag",
         "a -= k v",
         (Parameter("k", "drag_linear", "1/s", 0.0, 5.0),),
         "flight",
@@ -68,6 +73,7 @@ LIBRARY = (
     ),
     Entry(
         "drag_quadratic",
+        "quadratic air drag",
         "a -= k |v| v",
         (Parameter("k", "drag_quadratic", "1/m", 0.0, 2.0),),
         "flight",
@@ -76,6 +82,7 @@ LIBRARY = (
     ),
     Entry(
         "magnus",
+        "a Magnus force",
         "a += w x v",
         _vector("magnus", "1/s", 5.0),
         "flight",
@@ -84,6 +91,7 @@ LIBRARY = (
     ),
     Entry(
         "position_force",
+        "a force towards a place",
         "a -= k (x - c)",
         (
             Parameter("k", "position_force", "1/s^2", -30.0, 30.0, True),
@@ -96,6 +104,7 @@ LIBRARY = (
     ),
     Entry(
         "time_force",
+        "a force that changes in time",
         "a += b(t), linear between knots",
         (
             *(Parameter(f"{a}{j}", "time_force", "m/s^2", -5.0, 5.0, True) for j in range(KNOTS) for a in "xyz"),
@@ -108,6 +117,7 @@ LIBRARY = (
     ),
     Entry(
         "viscosity_shear",
+        "shear viscosity",
         "sigma += 2 eta D",
         (Parameter("eta", "viscosity_shear", "Pa s", 0.0, 1e3),),
         "internal modes",
@@ -116,6 +126,7 @@ LIBRARY = (
     ),
     Entry(
         "viscosity_bulk",
+        "bulk viscosity",
         "sigma += zeta tr(D) I",
         (Parameter("zeta", "viscosity_bulk", "Pa s", 0.0, 1e3),),
         "internal modes",
@@ -124,6 +135,7 @@ LIBRARY = (
     ),
     Entry(
         "maxwell",
+        "stress relaxation",
         "tau += 2 g mu e, e' = dev D + W e - e W - e/T",
         (
             Parameter("ratio", "maxwell_ratio", "1", 0.0, 3.0),
@@ -136,6 +148,7 @@ LIBRARY = (
     ),
     Entry(
         "hysteresis",
+        "hysteresis",
         "six Maxwell branches, weights (2 eta/pi) G'(1/T) dln T: loss factor eta over 0.5-200 Hz",
         (Parameter("eta", "hysteresis", "1", 0.0, 0.5),),
         "internal modes",
@@ -144,6 +157,7 @@ LIBRARY = (
     ),
     Entry(
         "strain_stiffening",
+        "strain stiffening",
         "tau += mu k x/(1 - k x) dev bbar, x = I1bar - 3",
         (Parameter("k", "strain_stiffening", "1", -0.2, 10.0, True),),
         "internal modes",
@@ -152,6 +166,7 @@ LIBRARY = (
     ),
     Entry(
         "second_invariant",
+        "a dependence on the second invariant",
         "W += 3/2 mu c ln(I2bar/3)",
         (Parameter("c", "second_invariant", "1", -0.3, 2.0, True),),
         "internal modes",
@@ -160,6 +175,7 @@ LIBRARY = (
     ),
     Entry(
         "tension_compression",
+        "a difference between tension and compression",
         "tau += 2 mu r sum min(e_i, 0) n_i n_i",
         (Parameter("r", "tension_compression", "1", -0.7, 3.0, True),),
         "internal modes",
@@ -168,6 +184,7 @@ LIBRARY = (
     ),
     Entry(
         "fibre",
+        "a fibre direction",
         "W += c/4 (I4 - 1)^2, I4 = |F a0|^2",
         (
             Parameter("c", "fibre", "Pa", 0.0, 1e6),
@@ -180,6 +197,7 @@ LIBRARY = (
     ),
     Entry(
         "yield",
+        "yielding",
         "|2 mu dev ln V| <= 1/inverse",
         (Parameter("inverse", "yield_inverse", "1/Pa", 0.0, 1e-2),),
         "rest",
@@ -187,6 +205,7 @@ LIBRARY = (
         "von Mises 1913; paper, appendix, Von Mises Plasticity",
     ),
     Entry(
+        "hardening",
         "hardening",
         "yield stress + H alpha",
         (Parameter("h", "hardening", "Pa", 0.0, 1e6),),
@@ -196,6 +215,7 @@ LIBRARY = (
     ),
     Entry(
         "softening",
+        "softening",
         "yield stress times exp(-s alpha); where nothing yields elastic stress times exp(-s e_max)",
         (Parameter("s", "softening", "1", 0.0, 30.0),),
         "internal modes",
@@ -204,6 +224,7 @@ LIBRARY = (
     ),
     Entry(
         "kinematic_hardening",
+        "kinematic hardening",
         "backstress' = H_k plastic strain rate + W b - b W",
         (Parameter("h", "kinematic_hardening", "Pa", 0.0, 1e6),),
         "rest",
@@ -212,6 +233,7 @@ LIBRARY = (
     ),
     Entry(
         "rate_yield",
+        "rate-dependent yielding",
         "plastic rate = <|s| - yield stress>/eta",
         (Parameter("eta", "rate_yield", "Pa s", 0.0, 1e4),),
         "rest",
@@ -220,6 +242,7 @@ LIBRARY = (
     ),
     Entry(
         "stiffness_gradient",
+        "a stiffness that varies over the body",
         "elastic stress times exp(s . (X - mean)/L), or times exp(log_ratio) in a ball",
         (
             *_vector("stiffness", "1", 3.0),
@@ -234,6 +257,7 @@ LIBRARY = (
     ),
     Entry(
         "stiffness_change",
+        "a stiffness that changes in time",
         "elastic stress times exp(r t)",
         (Parameter("rate", "stiffness_change", "1/s", -3.0, 3.0, True),),
         "internal modes",
@@ -242,6 +266,7 @@ LIBRARY = (
     ),
     Entry(
         "friction",
+        "a different friction",
         "|v_t| falls by (mu + dmu) |v_n| in contact",
         (Parameter("mu", "friction", "1", -1.0, 1.0, True),),
         "contact",
@@ -250,6 +275,7 @@ LIBRARY = (
     ),
     Entry(
         "stick",
+        "sticking contact",
         "v of a node in contact times exp(-k dt)",
         (Parameter("rate", "stick", "1/s", 0.0, 1e4),),
         "contact",
@@ -258,6 +284,7 @@ LIBRARY = (
     ),
     Entry(
         "restitution",
+        "a damped bounce",
         "outward normal v of a node in contact times exp(-k dt)",
         (Parameter("rate", "restitution", "1/s", 0.0, 1e4),),
         "contact",
@@ -265,6 +292,7 @@ LIBRARY = (
         "a dashpot under the collider",
     ),
     Entry(
+        "cohesion",
         "cohesion",
         "|dev tau| <= -alpha (tr tau - 3 c cot phi)",
         (Parameter("c", "cohesion", "Pa", 0.0, 5e3),),
@@ -274,6 +302,7 @@ LIBRARY = (
     ),
     Entry(
         "added_mass",
+        "added mass",
         "mass (1 + c), weight unchanged",
         (Parameter("c", "added_mass", "1", -0.5, 2.0, True),),
         "flight",

@@ -362,8 +362,9 @@ def test_the_library_has_the_vocabulary():
     """.split()
     assert sorted(entry.name for entry in LIBRARY) == sorted(names)
     stages = {"flight", "rotation", "internal modes", "contact", "rest", "power"}
+    assert len({entry.title for entry in LIBRARY}) == len(LIBRARY)
     for entry in LIBRARY:
-        assert entry.stage in stages and entry.source and entry.equation
+        assert entry.stage in stages and entry.source and entry.equation and entry.title
         assert set(entry.limits) <= set(entry.confusions) <= set(names) - {entry.name}
         for p in entry.parameters:
             assert p.field in Effects._fields and p.low < p.high and p.signed == (p.low < 0.0)
