@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from neuido.data.files.writing import check_writable
-from neuido.data.trajectories.options import Film
+from neuido.data.scenes.film_options import Film
 from neuido.data.trajectories.options import simulate as trajectories
 from neuido.data.undeclared import Case, make_undeclared
 from neuido.errors import UserError

@@ -10,11 +10,11 @@ if TYPE_CHECKING:
     from neuido.data import cameras
     from neuido.data.bodies import shapes
     from neuido.data.bodies.scene_files import SceneSetup, load_scene, scene_names
+    from neuido.data.clips import FilmDataModule
     from neuido.data.formats.layout import MultiView
     from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
     from neuido.data.measured.material_test import MaterialTest, MaterialTests, read_material_tests
     from neuido.data.measured.track import Track, Tracks, read_tracks
-    from neuido.data.scenes.clips import FilmDataModule
     from neuido.data.scenes.filmed_scene_module import VisualDataModule
     from neuido.data.scenes.multiview import MultiViewDataModule
     from neuido.data.scenes.readers import read as read_recording
@@ -46,7 +46,7 @@ __all__ = [
 
 _PLACES = {
     "Experiment": "measured.experiment",
-    "FilmDataModule": "scenes.clips",
+    "FilmDataModule": "clips",
     "MaterialTest": "measured.material_test",
     "MaterialTests": "measured.material_test",
     "MultiView": "formats.layout",

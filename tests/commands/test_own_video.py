@@ -11,10 +11,10 @@ import torch
 from plyfile import PlyData
 
 from neuido.commands.main import main
+from neuido.data.scenes.film_options import Film
 from neuido.data.scenes.filmed_scene import read_truth
 from neuido.data.scenes.multiview import UP
 from neuido.data.scenes.synthetic import make_scenes
-from neuido.data.trajectories.options import Film
 from neuido.models.inference.law_file import load_law
 from neuido.models.render.splatting import rasterize
 

@@ -32,7 +32,7 @@ MODULES = (  # so that their class names resolve without a path
     *(f"neuido.models.baselines.{name}" for name in ("known_law", "nclaw", "spring_gaus", "sparse_law", "stage_one_latents")),
     "neuido.models.fewshot.low_rank",
     "neuido.data.trajectories.trajectory_module",
-    "neuido.data.scenes.clips",
+    "neuido.data.clips",
     "neuido.data.scenes.filmed_scene_module",
     "neuido.discrepancy.diagnosed",
 )

@@ -65,7 +65,7 @@ def demo_video(
     from neuido.commands.cli.trainer import run_lightning
     from neuido.commands.reconstruct import reconstruct
     from neuido.commands.simulate import simulate
-    from neuido.data.trajectories.options import Film
+    from neuido.data.scenes.film_options import Film
 
     folder = Path(out)
     settings = yaml.safe_load(Path(find_config("scenes/ten_small")).read_text())

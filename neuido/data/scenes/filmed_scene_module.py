@@ -12,9 +12,9 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
 from neuido.data.bodies.scene_files import VARIABLE, data_root
+from neuido.data.sampling import Resumable
 from neuido.data.scenes.filmed_scene import VisualScene, load_visual
 from neuido.data.scenes.known_body import load_known
-from neuido.data.trajectories.sampling import Resumable
 from neuido.errors import UserError
 from neuido.types import MultiViewBatch
 

@@ -30,8 +30,8 @@ from neuido.data.files.storage import claim, publish_folder, write
 from neuido.data.files.values import check_keys, mapping, vector
 from neuido.data.formats import nerfstudio
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
+from neuido.data.scenes.film_options import Film
 from neuido.data.scenes.filmed_scene import Motion, write_motion
-from neuido.data.trajectories.options import Film
 from neuido.errors import UserError
 from neuido.physics.laws.classical import material
 from neuido.physics.mpm.simulator import Simulator

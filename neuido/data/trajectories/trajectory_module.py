@@ -12,8 +12,8 @@ from torch import Tensor
 from neuido.data.files.parsing import read_json
 from neuido.data.files.storage import COLUMNS, FORMAT, Files, complete, split
 from neuido.data.files.values import file_name, listed, take
+from neuido.data.sampling import Batches, Order, Step, Steps
 from neuido.data.trajectories.options import simulate
-from neuido.data.trajectories.sampling import Batches, Order, Step, Steps
 from neuido.errors import UserError
 from neuido.types import TrajectoryBatch
 

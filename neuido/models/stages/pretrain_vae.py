@@ -7,7 +7,7 @@ import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor
 
-from neuido.data.scenes.clips import FlowBatch
+from neuido.data.clips import FlowBatch
 from neuido.errors import UserError
 from neuido.models.stages.training import optimiser_steps, report_and_save, validation_scores
 from neuido.models.video.flow import encode_flow

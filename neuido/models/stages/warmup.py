@@ -17,8 +17,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from neuido.data.bodies.families import laws
+from neuido.data.clips import Clip, FilmDataModule
 from neuido.data.files.writing import replacing
-from neuido.data.scenes.clips import Clip, FilmDataModule
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus

@@ -1,6 +1,6 @@
 """Generation of the clips of `neuido film`: random bodies, rollouts with classical laws, images, optical flow, samples of the law.
 
-`neuido.data.scenes.clips` documents and reads the folder.
+`neuido.data.clips` documents and reads the folder.
 """
 
 import json
@@ -20,9 +20,9 @@ from tqdm import tqdm
 from neuido.data.bodies.families import PARAMETERS, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
+from neuido.data.clips import FORMAT, complete
 from neuido.data.files.storage import claim, write
 from neuido.data.files.writing import replacing
-from neuido.data.scenes.clips import FORMAT, complete
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
 from neuido.models.render.splatting import render

@@ -19,8 +19,8 @@ from neuido.data.files.parsing import read_yaml
 from neuido.data.measured.experiment import read_experiment
 from neuido.data.scenes import filmed_scene as visual
 from neuido.data.scenes import synthetic
+from neuido.data.scenes.film_options import Film
 from neuido.data.scenes.synthetic import make_scenes, plan_scene
-from neuido.data.trajectories.options import Film
 from neuido.errors import UserError
 from neuido.models.render.splatting import rasterize
 from neuido.physics.laws.classical import material

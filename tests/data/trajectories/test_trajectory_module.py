@@ -7,7 +7,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from neuido.data.trajectories.sampling import Order
+from neuido.data.sampling import Order
 from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
 from neuido.errors import UserError
 

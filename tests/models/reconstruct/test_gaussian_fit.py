@@ -15,10 +15,10 @@ from neuido.commands.main import main
 from neuido.commands.reconstruct import reconstruct
 from neuido.data import cameras as convert
 from neuido.data.formats import nerfstudio
+from neuido.data.scenes.film_options import Film
 from neuido.data.scenes.filmed_scene import load_views, load_visual, read_body, read_setting, read_truth
 from neuido.data.scenes.masks import from_background
 from neuido.data.scenes.synthetic import make_scenes
-from neuido.data.trajectories.options import Film
 from neuido.errors import UserError
 from neuido.models.reconstruct.gaussian_fit import ReconstructModule
 from neuido.models.render.gaussians import bind, load_ply

@@ -10,7 +10,7 @@ from lightning.pytorch import Trainer, seed_everything
 
 from neuido.commands.film import film
 from neuido.data.bodies.families import laws
-from neuido.data.scenes.clips import FilmDataModule, read_clip
+from neuido.data.clips import FilmDataModule, read_clip
 from neuido.errors import UserError
 from neuido.models.stages.pretrain_vae import FlowVAEModule
 from neuido.models.stages.warmup import WarmupModule, compare_laws
