@@ -11,12 +11,12 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
-from neuido.physics.laws import classical_kernels as law_kernels
+from neuido.physics.laws import classical_kernels
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, StackedElastic
 from neuido.types import Particles
 
-NO_FLOW, VON_MISES, DRUCKER_PRAGER = law_kernels.IDENTITY, law_kernels.VON_MISES, law_kernels.DRUCKER_PRAGER
+NO_FLOW, VON_MISES, DRUCKER_PRAGER = classical_kernels.IDENTITY, classical_kernels.VON_MISES, classical_kernels.DRUCKER_PRAGER
 """Kinds of plastic flow that an effect takes over from the base law."""
 
 BAND = (0.5, 200.0)

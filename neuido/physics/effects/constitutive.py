@@ -67,7 +67,7 @@ def expm(A: Tensor) -> Tensor:
 
 
 def hencky(F: Tensor) -> Tensor:
-    """Return the left Hencky strain ln V of F = V R, (P, 3, 3); stretches are bounded below by `law_kernels.FLOOR`."""
+    """Return the left Hencky strain ln V of F = V R, (P, 3, 3); stretches are bounded below by `classical_kernels.FLOOR`."""
     at = linalg.frame(F)
     return linalg.isotropic_stress(F, at, at.sigma.clamp(min=FLOOR).log(), linalg.log_difference(at.sigma, FLOOR))
 

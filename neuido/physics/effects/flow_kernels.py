@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from neuido.physics.effects.history_functions import tools
-from neuido.physics.laws import classical_kernels as law_kernels
-from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.laws import classical_kernels
+from neuido.physics.linalg import warp_functions
 from neuido.physics.linalg.warp_functions import GAP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
@@ -28,7 +28,7 @@ def build(real: type) -> SimpleNamespace:
     name = f"neuido.flow.{real.__name__}"
     func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
-    own = warp_linalg.functions(real)
+    own = warp_functions.functions(real)
     frame, compose, eigen, hencky, exp_slope = own.frame, own.compose, own.eigen, own.hencky, own.exp_slope
     inverse_stretch, log_difference = own.inverse_stretch, own.log_difference
     shared = tools(real, name)
@@ -41,8 +41,8 @@ def build(real: type) -> SimpleNamespace:
     two = wp.constant(real(2.0))
     three = wp.constant(real(3.0))
     gap = wp.constant(real(GAP))
-    MISES = wp.constant(law_kernels.VON_MISES)
-    CONE = wp.constant(law_kernels.DRUCKER_PRAGER)
+    MISES = wp.constant(classical_kernels.VON_MISES)
+    CONE = wp.constant(classical_kernels.DRUCKER_PRAGER)
 
     @func
     def may_flow(F: mat33, beta: mat33, two_mu: real, limit: real):

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg import warp_functions
 from neuido.physics.runtime.once import cached
 
 
@@ -41,7 +41,7 @@ def tools(real: type, module: str) -> Tools:
     vec3 = wp.types.vector(length=3, dtype=real)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
     func = functools.partial(wp.func, module=module)
-    strain = warp_linalg.functions(real).strain
+    strain = warp_functions.functions(real).strain
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
     two = wp.constant(real(2.0))

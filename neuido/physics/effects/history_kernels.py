@@ -11,7 +11,7 @@ import warp as wp
 
 from neuido.physics.effects import flow_kernels
 from neuido.physics.effects.history_functions import tools
-from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg import warp_functions
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
@@ -23,7 +23,7 @@ def build(real: type) -> SimpleNamespace:
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
     name = f"neuido.history.{real.__name__}"
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
-    own = warp_linalg.functions(real)
+    own = warp_functions.functions(real)
     frame, hencky, exp_slope, inverse_stretch = own.frame, own.hencky, own.exp_slope, own.inverse_stretch
     shared = tools(real, name)
     load, store, gather, spread, deviator = shared.load, shared.store, shared.gather, shared.spread, shared.deviator

@@ -12,7 +12,7 @@ import warp as wp
 from neuido.physics.effects import history_kernels
 from neuido.physics.effects.history_functions import tools
 from neuido.physics.laws.classical_kernels import LOCKED
-from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg import warp_functions
 from neuido.physics.linalg.warp_functions import GAP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
@@ -27,7 +27,7 @@ def build(real: type) -> SimpleNamespace:
     name = f"neuido.effects.{real.__name__}"
     func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
-    own = warp_linalg.functions(real)
+    own = warp_functions.functions(real)
     log1p, exp_slope, strain, volume_change, cofactor = own.log1p, own.exp_slope, own.strain, own.volume_change, own.cofactor
     frame, compose, hencky = own.frame, own.compose, own.hencky
     inverse_stretch, log_difference = own.inverse_stretch, own.log_difference

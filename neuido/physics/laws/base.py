@@ -1,7 +1,8 @@
-"""What a constitutive law is, and any torch function as one.
+"""The interface of a constitutive law, and adapters that turn any torch function into a law.
 
-A law serves S scenes at once (S = 1: one law for all particles). Elastic laws give the Kirchhoff stress [Pa], plastic laws the corrected
-deformation gradient of a trial one. Each has an engine form (`tensors`, `forward`, `adjoint`: no autograd) and a slow twin (`__call__`).
+An elastic law maps the deformation gradient F to the Kirchhoff stress [Pa]. A plastic law maps a trial F to the corrected F. One law
+object serves S scenes at once; with S = 1 it serves all particles. A rollout calls `tensors`, `forward` and `adjoint`, which do not use
+autograd. Calling the law itself runs a slower implementation in plain torch, which autograd differentiates.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -14,20 +15,27 @@ from neuido.errors import UserError
 from neuido.types import Particles
 
 Parameter = float | Tensor
-"""A number, or a tensor of shape (S,), which may require grad."""
+"""A number, or a tensor of shape (S,) that may require a gradient."""
 
 
 class Law:
-    """One elastic or one plastic law for S scenes."""
+    """Base class of elastic and plastic laws for S scenes."""
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """Return the differentiable inputs in the form that `forward` takes, each with leading S; graph nodes of the law's parameters."""
+        """Return the differentiable inputs of `forward`, each with a leading axis of S scenes.
+
+        They are computed from the law's parameters by torch operations, so that gradients flow back to the parameters.
+        """
         raise NotImplementedError
 
     def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
-        """Write the law of F (P, 3, 3) into `out` (P, 3, 3); both contiguous, of one dtype and device, not aliased. No autograd.
+        """Evaluate the law without autograd.
 
-        `tensors` are those of `tensors()`, brought to the dtype and device of F by the caller, once.
+        Args:
+            tensors: The result of `tensors()`, converted to the dtype and device of F.
+            F: Deformation gradient [-], (P, 3, 3), contiguous.
+            out: Stress [Pa] or corrected F [-], (P, 3, 3), contiguous; overwritten. It must not share memory with F.
+            particles: The scene of each particle.
         """
         raise NotImplementedError
 
@@ -40,51 +48,68 @@ class Law:
         grad_tensors: Sequence[Tensor | None],
         particles: Particles,
     ) -> None:
-        """Add the vector-Jacobian product to `grad_F` (P, 3, 3), contiguous, and to each of `grad_tensors` (None: not wanted)."""
+        """Add the vector-Jacobian product of the law to the given gradients.
+
+        Args:
+            tensors: As for `forward`.
+            F: As for `forward`.
+            grad_out: Gradient of a loss with respect to the law's result, (P, 3, 3).
+            grad_F: Gradient with respect to F, (P, 3, 3), contiguous; added to.
+            grad_tensors: Gradient with respect to each tensor; added to. None where a gradient is not needed.
+            particles: The scene of each particle.
+        """
         raise NotImplementedError
 
     def engine(self, tensors: Sequence[Tensor], particles: Particles) -> "Engine":
-        """Return what runs this law in one rollout; a law with faster kernels for a device overrides it."""
+        """Return the object that runs this law during one rollout. A law with faster kernels for a device overrides this method."""
         return Engine(self, tensors, particles)
 
     def single_scene(self, s: int) -> "Law":
-        """Return this law for scene s; `forward` then gets that scene's rows of the tensors."""
+        """Return this law for scene s alone; its `forward` takes the row of scene s of each tensor."""
         return self
 
     def key(self, tensors: Sequence[Tensor]) -> Hashable | None:
-        """Return what, beside the shapes of its tensors, decides its launches with them; None: they may not be captured in a graph."""
+        """Return what determines the kernel launches of this law, apart from the shapes of its tensors.
+
+        Two laws with equal keys may share a captured CUDA graph. None: the launches must not be captured.
+        """
         return None
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
-        """Return the law of F in plain torch, for autograd. F (..., 3, 3) where S = 1, else (P, 3, 3) with its `particles`."""
+        """Evaluate the law in plain torch, differentiable by autograd.
+
+        Args:
+            F: Deformation gradient [-], (..., 3, 3); with several scenes (P, 3, 3).
+            particles: The scene of each particle; needed with several scenes.
+        """
         raise NotImplementedError
 
 
 class Engine:
-    """A law with its tensors and particles for the length of one rollout."""
+    """A law bound to its tensors and particles for one rollout."""
 
     def __init__(self, law: Law, tensors: Sequence[Tensor], particles: Particles):
         self.law, self.tensors, self.particles = law, list(tensors), particles
 
     def forward(self, F: Tensor, out: Tensor) -> None:
-        """`Law.forward`."""
+        """Evaluate the law (`Law.forward`)."""
         self.law.forward(self.tensors, F, out, self.particles)
 
     def start_adjoint(self, wanted: Sequence[bool]) -> None:
-        """Zero the gradients of the tensors that are wanted."""
+        """Allocate zero gradients for the tensors that are marked in `wanted`, before the first `adjoint` of a backward pass."""
         self.grads = [torch.zeros_like(t) if want else None for t, want in zip(self.tensors, wanted, strict=True)]
 
     def adjoint(self, F: Tensor, grad_out: Tensor, grad_F: Tensor) -> None:
-        """`Law.adjoint`, gathering the gradients of the tensors."""
+        """Add to `grad_F` and accumulate the gradients of the tensors (`Law.adjoint`)."""
         self.law.adjoint(self.tensors, F, grad_out, grad_F, self.grads, self.particles)
 
     def gradients(self) -> list[Tensor | None]:
-        """Return the gradients of the tensors, after the last `adjoint`."""
+        """Return the accumulated gradients of the tensors, once the last `adjoint` has run."""
         return self.grads
 
 
 class EngineLaw(Law):
-    """A law whose `engine` does all its work; a call outside a rollout makes one for itself."""
+    """Base class of laws that are implemented by their engine; `forward` and `adjoint` create a temporary one."""
 
     def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
         raise NotImplementedError
@@ -108,27 +133,27 @@ class EngineLaw(Law):
 
 
 class ElasticLaw(Law):
-    """F -> Kirchhoff stress tau [Pa]."""
+    """Map the deformation gradient F [-] to the Kirchhoff stress tau [Pa]."""
 
     def modulus(self) -> Tensor:
-        """P-wave modulus dtau_11/dF_11 at F = I [Pa], (S,)."""
+        """Return the P-wave modulus d tau_11 / d F_11 at F = I [Pa], (S,); it bounds the stable time step."""
         raise NotImplementedError
 
 
 class PlasticLaw(Law):
-    """Trial F -> corrected F."""
+    """Map the trial deformation gradient to the corrected one."""
 
     identity: bool = False
-    """True where the law returns F itself for every scene, so that a rollout may skip it."""
+    """Whether the law returns F unchanged in every scene, so that a rollout may skip it."""
 
 
 class AutogradLaw(Law):
-    """Any torch function as a law; use `AutogradElastic` or `AutogradPlastic`.
+    """Base class of laws from a torch function; use `AutogradElastic` or `AutogradPlastic`.
 
-    `function(F, *tensors)` is called once for each scene, with that scene's F (n, 3, 3) and each tensor indexed for the scene
-    (leading S removed); it returns (n, 3, 3). With S = 1 that is one call for all particles. Its adjoint is torch.autograd.grad
-    after a recomputation; in a rollout gradients reach F and `tensors`, not what the function closes over. Slow, general, and on CUDA
-    not capturable where the function is not.
+    The function is called as `function(F, *tensors)` once for each scene, with the n particles of the scene, F (n, 3, 3), and the
+    scene's row of each tensor. It returns (n, 3, 3). With S = 1 it is called once for all particles. The backward pass evaluates it again
+    and calls `torch.autograd.grad`. In a rollout, gradients reach F and `tensors`, but no other tensor that the function uses. Such a
+    law is slower than one with kernels, and its launches are not captured in a CUDA graph.
     """
 
     def __init__(self, function: Callable[..., Tensor], tensors: Sequence[Tensor] = ()):
@@ -137,7 +162,8 @@ class AutogradLaw(Law):
         sizes = {t.shape[0] if t.ndim else 0 for t in self._tensors}
         if len(sizes) > 1 or 0 in sizes:
             raise UserError(
-                f"{type(self).__name__}: tensors need one leading axis of S scenes, got {[tuple(t.shape) for t in self._tensors]}"
+                f"{type(self).__name__}: tensors have shapes {[tuple(t.shape) for t in self._tensors]}; "
+                "give each the same leading axis, one row for each scene"
             )
         self._scenes = sizes.pop() if sizes else 1
 
@@ -145,7 +171,7 @@ class AutogradLaw(Law):
         return self._tensors
 
     def _ranges(self, particles: Particles) -> list[tuple[int, int, int]]:
-        """(row of the tensors, first particle, end)."""
+        """List the row of the tensors, the first particle and the end of each scene."""
         if self._scenes == 1:
             return [(0, 0, particles.offsets[-1])]
         return [(s, first, end) for s, (first, end) in enumerate(pairwise(particles.offsets))]
@@ -183,7 +209,7 @@ class AutogradLaw(Law):
         if self._scenes == 1:
             return self.function(F, *(t[0] for t in self._tensors))
         if particles is None:
-            raise UserError(f"{type(self).__name__} holds {self._scenes} scenes: give `particles` to say which scene each F belongs to")
+            raise UserError(f"{type(self).__name__} has {self._scenes} scenes: give `particles`, the scene of each F")
         return torch.cat([self.function(F[a:b], *(t[s] for t in self._tensors)) for s, a, b in self._ranges(particles)])
 
     def __repr__(self) -> str:
@@ -191,14 +217,17 @@ class AutogradLaw(Law):
 
 
 class AutogradElastic(AutogradLaw, ElasticLaw):
-    """A torch function F -> tau as an elastic law."""
+    """An elastic law from a torch function F -> tau."""
 
     def __init__(self, function: Callable[..., Tensor], tensors: Sequence[Tensor] = (), *, modulus: Parameter):
         """
         Args:
-            function: (F (n, 3, 3), *tensors of one scene) -> tau (n, 3, 3) [Pa].
-            tensors: Differentiable inputs, each with leading S.
-            modulus: P-wave modulus at F = I [Pa], a number or (S,); bounds the time step.
+            function: Maps F (n, 3, 3) and the tensors of one scene to tau [Pa], (n, 3, 3).
+            tensors: Differentiable inputs, each with a leading axis of S scenes.
+            modulus: P-wave modulus at F = I [Pa], a number or (S,); it bounds the time step.
+
+        Raises:
+            UserError: Tensors without a common leading axis.
         """
         super().__init__(function, tensors)
         self._modulus = torch.as_tensor(modulus).reshape(-1).expand(self._scenes)
@@ -208,4 +237,12 @@ class AutogradElastic(AutogradLaw, ElasticLaw):
 
 
 class AutogradPlastic(AutogradLaw, PlasticLaw):
-    """A torch function, trial F -> corrected F, as a plastic law. Arguments as for `AutogradElastic`, without the modulus."""
+    """A plastic law from a torch function that maps the trial F to the corrected F.
+
+    Args:
+        function: Maps the trial F (n, 3, 3) and the tensors of one scene to the corrected F (n, 3, 3).
+        tensors: Differentiable inputs, each with a leading axis of S scenes.
+
+    Raises:
+        UserError: Tensors without a common leading axis.
+    """

@@ -1,4 +1,7 @@
-"""The classical elastic and plastic laws, and mixtures of them over scenes. Engine form in Warp, slow twin in torch; see `law.Law`."""
+"""The classical elastic and plastic laws, for one material per scene.
+
+A rollout runs them by the Warp kernels of `classical_kernels`; `twin` is the same law in plain torch.
+"""
 
 import math
 import numbers
@@ -9,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics.laws import classical_kernels as law_kernels
+from neuido.physics.laws import classical_kernels
 from neuido.physics.laws.base import AutogradElastic, AutogradLaw, AutogradPlastic, ElasticLaw, Law, Parameter, PlasticLaw
 from neuido.physics.linalg import decompositions as linalg
 from neuido.physics.linalg.warp_functions import FLOOR
@@ -38,11 +41,11 @@ __all__ = [
 
 
 def lame(young: Tensor, poisson: Tensor) -> tuple[Tensor, Tensor]:
-    """Lamé's parameters (mu, lambda) [Pa] of Young's modulus [Pa] and Poisson's ratio."""
+    """Convert Young's modulus [Pa] and Poisson's ratio [-] to Lamé's parameters mu and lambda [Pa]."""
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
-# Allowed open interval of each parameter, and its unit.
+# the open interval in which each parameter must lie, and its unit
 _RANGES = {
     "young": (0.0, math.inf, " Pa"),
     "poisson": (-1.0, 0.5, ""),
@@ -52,7 +55,7 @@ _RANGES = {
 
 
 def _parameters(law: type, **values: Parameter) -> tuple[Tensor, ...]:
-    """Check the parameters and bring them to one shape (S,). Numbers become float64, on the device of the tensors."""
+    """Validate the parameters and expand them to one shape (S,); numbers become float64 tensors on the device of the others."""
     tensors = []
     device = next((value.device for value in values.values() if isinstance(value, Tensor)), None)
     for name, value in values.items():
@@ -76,17 +79,17 @@ def _parameters(law: type, **values: Parameter) -> tuple[Tensor, ...]:
     sizes = {name: t.shape[0] for name, t in zip(values, tensors)}
     scenes = max(sizes.values())
     if any(size not in (1, scenes) for size in sizes.values()):
-        raise UserError(f"{law.__name__}: parameters of different length {sizes}; give one value, or one for each scene")
+        raise UserError(f"{law.__name__}: parameters have different lengths {sizes}; give one value, or one for each scene")
     return tuple(t.expand(scenes) for t in tensors)
 
 
 class _Classical(Law):
-    """The engine form shared by the classical laws: one (S, n) tensor of parameters and a kind for each scene."""
+    """Base class of the classical laws: one (S, n) tensor of parameters, and the number of a law for each scene."""
 
     kind: int
-    """Index of the law in `law_kernels`."""
-    _correct: bool
-    """True for plastic laws."""
+    """Number of the law in `classical_kernels`."""
+    _plastic: bool
+    """Whether the law is plastic."""
 
     def scene_laws(self) -> tuple[type["_Classical"], ...]:
         """Return the class of each scene's law, S of them."""
@@ -94,12 +97,17 @@ class _Classical(Law):
 
     @staticmethod
     def twin(F: Tensor, parameters: Tensor) -> Tensor:
-        """Return the law in plain torch; F (..., 3, 3), parameters (..., n) that broadcast against its leading axes."""
+        """Evaluate the law in plain torch.
+
+        Args:
+            F: Deformation gradient [-], (..., 3, 3).
+            parameters: The row of `tensors()` of each F, (..., n), broadcast against the leading axes of F.
+        """
         raise NotImplementedError
 
     def _kinds(self, device: torch.device) -> Tensor:
         cache = self.__dict__.setdefault("_kind_cache", {})
-        if device not in cache:  # of two threads the first one's is kept: launches know it by its address
+        if device not in cache:  # recorded launches refer to the tensor by its address, so two threads must share one
             cache.setdefault(device, torch.tensor([law.kind for law in self.scene_laws()], dtype=torch.int32, device=device))
         return cache[device]
 
@@ -107,7 +115,7 @@ class _Classical(Law):
         self, name: str, tensors: Sequence[Tensor], arrays: Sequence[Tensor], parameters: Tensor | None, particles: Particles
     ) -> None:
         F = arrays[0]
-        kernel = getattr(law_kernels.kernels(real_of(F.dtype)), name)
+        kernel = getattr(classical_kernels.kernels(real_of(F.dtype)), name)
         row = tensors[0].detach().to(F).contiguous()
         inputs: list[Any] = [F, self._kinds(F.device), row, particles.scene, *arrays[1:]]
         if name.endswith("adjoint"):
@@ -117,13 +125,13 @@ class _Classical(Law):
 
     def single_scene(self, s: int) -> Law:
         laws = self.scene_laws()
-        return _OfScene(laws[min(s, len(laws) - 1)], self._correct)
+        return _SingleScene(laws[min(s, len(laws) - 1)], self._plastic)
 
     def key(self, tensors: Sequence[Tensor]) -> Hashable:
         return tuple(law.__name__ for law in self.scene_laws())
 
     def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
-        self._launch("correct" if self._correct else "stress", tensors, [F, out], None, particles)
+        self._launch("correct" if self._plastic else "stress", tensors, [F, out], None, particles)
 
     def adjoint(
         self,
@@ -134,7 +142,7 @@ class _Classical(Law):
         grad_tensors: Sequence[Tensor | None],
         particles: Particles,
     ) -> None:
-        name = "correct_adjoint" if self._correct else "stress_adjoint"
+        name = "correct_adjoint" if self._plastic else "stress_adjoint"
         wanted = grad_tensors[0]
         direct = wanted is None or (wanted.dtype == F.dtype and wanted.device == F.device and wanted.is_contiguous())
         sink = wanted if direct else torch.zeros(wanted.shape, dtype=F.dtype, device=F.device)
@@ -148,7 +156,7 @@ class _Classical(Law):
         if len(laws) == 1:
             return laws[0].twin(F, parameters[0])
         if particles is None:
-            raise UserError(f"{type(self).__name__} holds {len(laws)} scenes: give `particles` to say which scene each F belongs to")
+            raise UserError(f"{type(self).__name__} has {len(laws)} scenes: give `particles`, the scene of each F")
         out = torch.zeros_like(F)
         scene = particles.scene.long()
         kinds = self._kinds(F.device)[scene]
@@ -167,24 +175,24 @@ class _Classical(Law):
         return f"{type(self).__name__}({values})"
 
     def _named(self) -> dict[str, Tensor]:
-        """Return the parameters that the law was made with, by their names."""
+        """Return the parameters that the constructor was given, by name."""
         return {name: t.detach() for name in _RANGES if isinstance(t := getattr(self, name, None), Tensor)}
 
 
-class _OfScene(_Classical):
-    """The kernels' side of one scene of a law: its kind, with tensors from elsewhere."""
+class _SingleScene(_Classical):
+    """The law of one scene out of several; its tensors are passed to `forward`."""
 
     identity = False
 
     def __init__(self, law: type[_Classical], correct: bool):
-        self._law, self._correct = law, correct
+        self._law, self._plastic = law, correct
 
     def scene_laws(self) -> tuple[type[_Classical], ...]:
         return (self._law,)
 
 
 class _ClassicalElastic(_Classical, ElasticLaw):
-    _correct = False
+    _plastic = False
 
     def __init__(self, young: Parameter, poisson: Parameter):
         """
@@ -193,12 +201,12 @@ class _ClassicalElastic(_Classical, ElasticLaw):
             poisson: Poisson's ratio [-], in (-1, 0.5).
 
         Raises:
-            UserError: where a parameter is out of its range.
+            UserError: A parameter out of its range.
         """
         self.young, self.poisson = _parameters(type(self), young=young, poisson=poisson)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """((S, 2) [mu, lambda] in Pa,)."""
+        """Return Lamé's parameters mu and lambda [Pa], one tensor (S, 2)."""
         return (torch.stack(lame(self.young, self.poisson), -1),)
 
     def modulus(self) -> Tensor:
@@ -207,9 +215,12 @@ class _ClassicalElastic(_Classical, ElasticLaw):
 
 
 class FixedCorotated(_ClassicalElastic):
-    """tau = 2 mu (F - R) F^T + lambda J (J - 1) I (paper, appendix "Classical Material Models", Fixed Corotated Elasticity)."""
+    """Fixed corotated elasticity: tau = 2 mu (F - R) F^T + lambda J (J - 1) I.
 
-    kind = law_kernels.FIXED_COROTATED
+    R is the rotation of the polar decomposition F = R S, and J = det F. Source: paper, appendix "Classical Material Models".
+    """
+
+    kind = classical_kernels.FIXED_COROTATED
 
     @staticmethod
     def twin(F: Tensor, parameters: Tensor) -> Tensor:
@@ -223,12 +234,13 @@ class FixedCorotated(_ClassicalElastic):
 
 
 class Sigma(_ClassicalElastic):
-    """tau = U diag(2 mu log sigma + lambda tr(log sigma)) U^T, Hencky's law (paper, appendix, Sigma Elasticity).
+    """Hencky elasticity: tau = U diag(2 mu log sigma + lambda tr(log sigma)) U^T with F = U diag(sigma) V^T.
 
-    Principal stretches are bounded below by `law_kernels.FLOOR` inside the logarithm.
+    The stress is linear in the logarithmic strain. Inside the logarithm, principal stretches are bounded below by
+    `warp_functions.FLOOR`. Source: paper, appendix "Classical Material Models", Sigma Elasticity.
     """
 
-    kind = law_kernels.SIGMA
+    kind = classical_kernels.SIGMA
 
     @staticmethod
     def twin(F: Tensor, parameters: Tensor) -> Tensor:
@@ -240,9 +252,12 @@ class Sigma(_ClassicalElastic):
 
 
 class NeoHookean(_ClassicalElastic):
-    """tau = mu F F^T + (lambda ln J - mu) I (PAC-NeRF, neo-Hookean elasticity). J is bounded below by `law_kernels.FLOOR` in ln J."""
+    """Neo-Hookean elasticity: tau = mu (F F^T - I) + lambda ln(J) I with J = det F.
 
-    kind = law_kernels.NEO_HOOKEAN
+    Inside the logarithm, J is bounded below by `warp_functions.FLOOR`. Source: PAC-NeRF (Li et al. 2023).
+    """
+
+    kind = classical_kernels.NEO_HOOKEAN
 
     @staticmethod
     def twin(F: Tensor, parameters: Tensor) -> Tensor:
@@ -253,17 +268,17 @@ class NeoHookean(_ClassicalElastic):
 
 
 class _ClassicalPlastic(_Classical, PlasticLaw):
-    _correct = True
+    _plastic = True
 
 
 class Identity(_ClassicalPlastic):
-    """The corrected gradient is F itself (paper, appendix, Identity Plasticity)."""
+    """No plasticity: the corrected gradient is the trial F (paper, appendix, Identity Plasticity)."""
 
-    kind = law_kernels.IDENTITY
+    kind = classical_kernels.IDENTITY
     identity = True
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """((1, 1) zero,)."""
+        """Return one placeholder (1, 1), since the law has no parameters."""
         return (torch.zeros(1, 1, dtype=torch.float64),)
 
     @staticmethod
@@ -272,10 +287,10 @@ class Identity(_ClassicalPlastic):
 
 
 def _return(F: Tensor, at: linalg.Frame, radius: Tensor, strain: Tensor, elastic: Tensor) -> Tensor:
-    """Scale the deviator of the Hencky strain to `radius` (..., 1), except where `elastic` (...)."""
+    """Return F with the norm of its deviatoric Hencky strain scaled to `radius` (..., 1), and F itself where `elastic` (...)."""
     mean = strain.mean(-1, keepdim=True)
     deviator = strain - mean
-    # Away from the surface the ratio is not used; 1 keeps its derivative finite at zero strain.
+    # inside the yield surface the ratio is not used; a norm of 1 keeps its derivative finite at zero strain
     norm = torch.where(elastic.unsqueeze(-1), torch.ones_like(deviator), deviator).norm(dim=-1, keepdim=True)
     ratio = radius / norm
     h = mean + ratio * deviator
@@ -284,27 +299,28 @@ def _return(F: Tensor, at: linalg.Frame, radius: Tensor, strain: Tensor, elastic
 
 
 class VonMises(_ClassicalPlastic):
-    """Return of the deviatoric Hencky strain to the radius tau_Y / (2 mu) (paper, appendix, Von Mises Plasticity).
+    """Von Mises plasticity: metal, clay.
 
-    F is returned unchanged inside the yield surface; det F never changes (stretches above `law_kernels.FLOOR`).
+    A deviatoric Hencky strain of norm above tau_Y / (2 mu) is scaled back to that norm. F is unchanged inside the yield surface, and
+    det F never changes (for stretches above `warp_functions.FLOOR`). Source: paper, appendix, Von Mises Plasticity.
     """
 
-    kind = law_kernels.VON_MISES
+    kind = classical_kernels.VON_MISES
 
     def __init__(self, yield_stress: Parameter, young: Parameter, poisson: Parameter):
         """
         Args:
-            yield_stress: tau_Y [Pa], > 0: the norm of the deviatoric Kirchhoff stress at yield.
+            yield_stress: tau_Y [Pa], > 0, the norm of the deviatoric Kirchhoff stress at yield.
             young: Young's modulus [Pa], > 0.
             poisson: Poisson's ratio [-], in (-1, 0.5).
 
         Raises:
-            UserError: where a parameter is out of its range.
+            UserError: A parameter out of its range.
         """
         self.yield_stress, self.young, self.poisson = _parameters(type(self), yield_stress=yield_stress, young=young, poisson=poisson)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """((S, 1) tau_Y / (2 mu), the strain at yield,)."""
+        """Return the strain at yield tau_Y / (2 mu) [-], one tensor (S, 1)."""
         mu, _ = lame(self.young, self.poisson)
         return ((self.yield_stress / (2 * mu)).unsqueeze(-1),)
 
@@ -317,12 +333,13 @@ class VonMises(_ClassicalPlastic):
 
 
 class DruckerPrager(_ClassicalPlastic):
-    """Sand without cohesion: the identity stretch in expansion, else a return to Drucker and Prager's cone (paper, appendix).
+    """Drucker-Prager plasticity: sand without cohesion.
 
-    F is returned unchanged inside the cone.
+    Under compression, a strain outside the cone of friction is returned to the cone. Under expansion the elastic stretch is reset to the
+    identity, so that sand does not resist. F is unchanged inside the cone. Source: paper, appendix, Drucker-Prager Plasticity.
     """
 
-    kind = law_kernels.DRUCKER_PRAGER
+    kind = classical_kernels.DRUCKER_PRAGER
 
     def __init__(self, friction_angle: Parameter, young: Parameter, poisson: Parameter):
         """
@@ -332,12 +349,12 @@ class DruckerPrager(_ClassicalPlastic):
             poisson: Poisson's ratio [-], in (-1, 0.5).
 
         Raises:
-            UserError: where a parameter is out of its range.
+            UserError: A parameter out of its range.
         """
         self.friction_angle, self.young, self.poisson = _parameters(type(self), friction_angle=friction_angle, young=young, poisson=poisson)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """((S, 1) alpha (3 lambda + 2 mu) / (2 mu), the slope of the cone in Hencky strain,)."""
+        """Return the slope of the cone in Hencky strain, alpha (3 lambda + 2 mu) / (2 mu) [-], one tensor (S, 1)."""
         mu, lam = lame(self.young, self.poisson)
         sine = torch.sin(torch.deg2rad(self.friction_angle))
         alpha = math.sqrt(2 / 3) * 2 * sine / (3 - sine)
@@ -371,18 +388,18 @@ class _Stacked(_Classical):
 
 
 class StackedElastic(_Stacked, ElasticLaw):
-    """Elastic laws of several kinds, one after the other over the scenes; see `stack`."""
+    """Elastic laws of several scenes in one object; made by `stack`."""
 
-    _correct = False
+    _plastic = False
 
     def modulus(self) -> Tensor:
         return torch.cat([law.modulus() for law in self.laws])
 
 
 class StackedPlastic(_Stacked, PlasticLaw):
-    """Plastic laws of several kinds, one after the other over the scenes; see `stack`."""
+    """Plastic laws of several scenes in one object; made by `stack`."""
 
-    _correct = True
+    _plastic = True
 
     def __init__(self, laws: Sequence[_Classical]):
         super().__init__(laws)
@@ -390,14 +407,20 @@ class StackedPlastic(_Stacked, PlasticLaw):
 
 
 def stack(laws: Sequence[Law]) -> StackedElastic | StackedPlastic:
-    """One law for the scenes of all `laws`, in their order: S = sum of theirs. They run in one launch.
+    """Combine classical laws into one law, so that scenes with different materials run in one kernel launch.
+
+    Args:
+        laws: Elastic laws, or plastic laws, of one or several scenes each.
+
+    Returns:
+        A law for the scenes of all `laws`, in their order.
 
     Raises:
-        UserError: where `laws` is empty, mixes elastic and plastic laws, or holds a law that is not a classical one.
+        UserError: No laws, elastic and plastic laws together, or a law that is not classical.
     """
     names = [type(law).__name__ for law in laws]
     if not laws or not all(isinstance(law, _Classical) for law in laws):
-        raise UserError(f"stack() takes one or more classical laws, got {names}")
+        raise UserError(f"stack() takes one or more classical laws, got {names}; run other laws in a simulator of their own")
     if all(isinstance(law, ElasticLaw) for law in laws):
         return StackedElastic(laws)
     if all(isinstance(law, PlasticLaw) for law in laws):
@@ -412,7 +435,7 @@ _PLASTIC = {"identity": (Identity, ()), "von_mises": (VonMises, ("yield_stress",
 def _named(section: str, given: Mapping[str, Any], laws: dict, common: tuple[str, ...]) -> tuple[type, dict[str, Any]]:
     name = given.get("law")
     if not isinstance(name, str) or name not in laws:
-        raise UserError(f"{section}.law = {name!r} is not known; one of {', '.join(laws)}")
+        raise UserError(f"{section}.law = {name!r} is not known; choose one of {', '.join(laws)}")
     law, own = laws[name]
     accepted = (*common, *own)
     for key in given:
@@ -425,15 +448,15 @@ def _named(section: str, given: Mapping[str, Any], laws: dict, common: tuple[str
 
 
 def material(elasticity: Mapping[str, Any], plasticity: Mapping[str, Any] | None = None) -> tuple[ElasticLaw, PlasticLaw]:
-    """Return the laws that an experiment file names.
+    """Create an elastic and a plastic law from the sections of an experiment file.
 
     Args:
         elasticity: `law` (fixed_corotated, sigma, neo_hookean), `young` [Pa], `poisson`; numbers or tensors (S,).
-        plasticity: `law` (identity, von_mises, drucker_prager) with `yield_stress` [Pa] or `friction_angle` [degrees]. It shares
-            `young` and `poisson` with the elasticity. Default: identity.
+        plasticity: `law` (identity, von_mises, drucker_prager) with `yield_stress` [Pa] or `friction_angle` [degrees]. `young` and
+            `poisson` are those of the elasticity. None: identity.
 
     Raises:
-        UserError: for an unknown law, an unknown or missing key, or a parameter out of its range.
+        UserError: An unknown law, an unknown or missing key, or a parameter out of its range.
     """
     law, elastic = _named("elasticity", elasticity, _ELASTIC, ("young", "poisson"))
     pair = law(**elastic)

@@ -1,16 +1,17 @@
 """Warp kernels of the classical laws, with hand-written adjoints.
 
-Every law here is isotropic: with F = U diag(sigma) V^T the stress is U diag(t) U^T and the corrected gradient U diag(z) V^T. Derivatives in
-the frame of U and V are divided differences of t and z, finite at repeated singular values, which is where every rollout begins (F = I).
+Every law here is isotropic: with F = U diag(sigma) V^T the stress is U diag(t) U^T and the corrected gradient is U diag(z) V^T. In the
+frame of U and V the derivatives are divided differences of t and z. These are finite at repeated singular values, where every rollout
+begins (F = I).
 
-The decomposition is `warp_linalg`'s; Warp's own `svd3` and its adjoint are not used.
+The decomposition is that of `warp_functions`. Warp's `svd3` is not used, since its adjoint is wrong near F = I.
 """
 
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg import warp_functions
 from neuido.physics.linalg.warp_functions import FLOOR, GAP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
@@ -19,30 +20,36 @@ FIXED_COROTATED, SIGMA, NEO_HOOKEAN = 0, 1, 2
 IDENTITY, VON_MISES, DRUCKER_PRAGER = 0, 1, 2
 
 LOCKED = 0.05
-"""Least share of its extensibility that `strain_stiffening` leaves a body: 1 - k (I1bar - 3) is bounded below by it."""
+"""Lower bound of 1 - k (I1bar - 3) in `strain_stiffening`, whose stress would become infinite where that reaches zero."""
 FLAT = 0.1
-"""det F below which a stretch is taken from the principal frame."""
+"""det F below which the stretch is computed from the principal frame, since `warp_functions.Functions.stretch` needs det F > 0."""
 
 
 class LawKernels(NamedTuple):
-    """The kernels for one scalar type. `kinds` (S,) int32, `params` (S, n); a particle of scene s reads row min(s, S - 1)."""
+    """The kernels for one scalar type; each comment lists the arguments.
+
+    `kinds` (S,) int32 has the number of each scene's law and `params` (S, n) its parameters. A particle of scene s reads row
+    min(s, S - 1).
+    """
 
     stress: Any
     """(F, kinds, params (S, 2) [mu, lambda], scene, tau)"""
     stress_adjoint: Any
-    """(F, kinds, params, scene, grad_tau, grad_F, grad_params or None): both gradients are added to."""
+    """(F, kinds, params, scene, grad_tau, grad_F, grad_params or None); adds to both gradients"""
     correct: Any
     """(F, kinds, params (S, 1), scene, corrected)"""
     correct_adjoint: Any
-    """(F, kinds, params, scene, grad_corrected, grad_F, grad_params or None): both gradients are added to."""
+    """(F, kinds, params, scene, grad_corrected, grad_F, grad_params or None); adds to both gradients"""
 
 
 @cached
 def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = False) -> LawKernels:
     """Build the kernels for `wp.float32` or `wp.float64`.
 
-    The two options exist for the tests: `enable_backward` lets Warp generate adjoints of the forward kernels as well, and `builtin_svd`
-    puts Warp's own `svd3` in place of the Jacobi iteration (whose data-dependent loop Warp cannot differentiate).
+    Args:
+        real: The scalar type.
+        enable_backward: Let Warp generate adjoints of the forward kernels too, for tests.
+        builtin_svd: Decompose by Warp's `svd3` in place of the Jacobi iteration, whose loop Warp cannot differentiate; for tests.
     """
     start_warp()
     mat = wp.types.matrix((3, 3), real)
@@ -54,7 +61,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
     two = wp.constant(real(2.0))
-    own = warp_linalg.functions(real, builtin_svd=builtin_svd)
+    own = warp_functions.functions(real, builtin_svd=builtin_svd)
     log1p, exp_slope, strain, volume_change, cofactor = own.log1p, own.exp_slope, own.strain, own.volume_change, own.cofactor
     frame, compose, bounded, hencky = own.frame, own.compose, own.bounded, own.hencky
     inverse_stretch, log_difference, stretch = own.inverse_stretch, own.log_difference, own.stretch
@@ -70,7 +77,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
 
     @wp.func
     def corotated_by_stretch(Fp: mat, mu: real, lam: real):
-        """tau = 2 mu (V^2 - V) + lambda J (J - 1) I, without a frame: a fifth of the time."""
+        """Return tau = 2 mu (V^2 - V) + lambda J (J - 1) I without a principal frame, in a fifth of the time."""
         dJ = volume_change(Fp)
         out = mat()
         if one + dJ > flat:
@@ -90,7 +97,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
 
     @wp.func
     def hencky_by_series(Fp: mat, mu: real, lam: real):
-        """tau = 2 mu ln V + lambda ln(J) I, without a frame where the strain is slight."""
+        """Return tau = 2 mu ln V + lambda ln(J) I; small strains need no principal frame."""
         E = strain(Fp)
         out = mat()
         if wp.ddot(E, E) <= slight * slight:
@@ -187,7 +194,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
 
     @wp.func
     def limit(q: real, trace: real, kind: wp.int32, param: real):
-        """(state, radius) of |dev e| = q: state 0 is elastic, 1 a return to |dev e| = radius, 2 a return to the identity."""
+        """Return the state and radius of yield for |dev e| = q; state 0: elastic, 1: return to |dev e| = radius, 2: to the identity."""
         radius = param
         if kind == DRUCKER_PRAGER:
             radius = -param * trace
@@ -200,7 +207,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
 
     @wp.func
     def flow(e: vec, kind: wp.int32, param: real):
-        """(state, trace, |dev e|, radius), as `limit`."""
+        """Return the state of yield, tr e, |dev e| and the radius of yield for the principal Hencky strains e."""
         trace = e[0] + e[1] + e[2]
         m = trace / real(3.0)
         q = wp.sqrt((e[0] - m) * (e[0] - m) + (e[1] - m) * (e[1] - m) + (e[2] - m) * (e[2] - m))
@@ -214,7 +221,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
         state, trace, q, radius = flow(e, kind, param)
         out = Fp
         if state > 0:
-            # z - sigma, so that F moves by the plastic increment alone and does not pick up the rounding of U and V.
+            # add z - sigma to F, so that only the plastic increment carries the rounding error of U and V
             c0 = -d[0]
             c1 = -d[1]
             c2 = -d[2]
@@ -232,7 +239,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
 
     @wp.func
     def return_by_series(Fp: mat, kind: wp.int32, param: real):
-        """Return the same without a frame where the strain is slight: F + (exp(X) - 1) F with X the plastic increment of -ln V."""
+        """Return the corrected gradient; small strains need no frame: F + (exp(X) - 1) F with X the plastic increment of -ln V."""
         E = strain(Fp)
         out = Fp
         if wp.ddot(E, E) <= slight * slight:
@@ -307,7 +314,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
                     g = vec(A[0, 0] * z[0], A[1, 1] * z[1], A[2, 2] * z[2])
                     along = wp.dot(g, n)
                     mean = (g[0] + g[1] + g[2]) / real(3.0)
-                    # Derivative of the radius with the trace of the strain, and with the law's parameter.
+                    # derivatives of the radius: with respect to the trace of the strain, and to the law's parameter
                     slope = zero
                     weight = one
                     if kind == DRUCKER_PRAGER:

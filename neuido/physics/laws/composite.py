@@ -1,6 +1,6 @@
-"""Several laws in one scene, each for particles of its own: bodies of different materials in contact.
+"""Several laws in one scene: bodies of different materials in contact.
 
-The parts run one after the other on their own particles, gathered and scattered; a rollout with them is not captured in a graph.
+Each law runs on a copy of the F of its own particles, one law after the other. Such a rollout is not captured in a CUDA graph.
 """
 
 from collections.abc import Sequence
@@ -14,16 +14,19 @@ from neuido.types import Particles
 
 
 class _Composite(Law):
-    """Laws of one scene, by particle.
+    """Base class of laws that differ between the particles of one scene.
 
     Args:
-        laws: B laws of one scene each.
-        body: Which law a particle has, (P,) int64, in the order in which the engine sees the particles (`by_body` sorts it so).
+        laws: B laws, each for one scene.
+        body: Index of each particle's law, (P,) int64, in the order of the kernels (`Simulator.order`), as `by_body` sorts it.
+
+    Raises:
+        UserError: An index without a law.
     """
 
     def __init__(self, laws: Sequence[Law], body: Tensor):
         if not laws or int(body.min()) < 0 or int(body.max()) >= len(laws):
-            raise UserError(f"{len(laws)} laws for particles of bodies {int(body.min())} to {int(body.max())}")
+            raise UserError(f"body has indices {int(body.min())} to {int(body.max())} for {len(laws)} laws; give one law for each body")
         self.laws = tuple(laws)
         self.rows = [(body == b).nonzero()[:, 0] for b in range(len(laws))]
         self.counts = [len(law.tensors()) for law in laws]
@@ -69,10 +72,10 @@ class _Composite(Law):
 
 
 class CompositeElastic(_Composite, ElasticLaw):
-    """Elastic laws by particle."""
+    """Elastic laws that differ between the particles of one scene; made by `by_body`."""
 
     def modulus(self) -> Tensor:
-        """Return the largest of the parts' [Pa], (1,)."""
+        """Return the largest P-wave modulus of the laws [Pa], (1,)."""
         return torch.stack([law.modulus().max().double() for law in self.laws]).max()[None]  # type: ignore[attr-defined]
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
@@ -83,7 +86,7 @@ class CompositeElastic(_Composite, ElasticLaw):
 
 
 class CompositePlastic(CompositeElastic, PlasticLaw):
-    """Plastic laws by particle."""
+    """Plastic laws that differ between the particles of one scene; made by `by_body`."""
 
     identity = False
 
@@ -91,18 +94,21 @@ class CompositePlastic(CompositeElastic, PlasticLaw):
 def by_body(
     elasticity: Sequence[ElasticLaw], plasticity: Sequence[PlasticLaw], counts: Sequence[int], order: Tensor
 ) -> tuple[CompositeElastic, CompositePlastic]:
-    """Return the laws of bodies that were concatenated to one.
+    """Combine the laws of several bodies whose particles were concatenated to one body.
 
     Args:
-        elasticity: An elastic law of one scene for each body.
-        plasticity: A plastic law for each body.
-        counts: Particles of each body, in the order of concatenation.
-        order: `Simulator.order` of the simulator that will run them.
+        elasticity: One elastic law for each body, of one scene.
+        plasticity: One plastic law for each body, of one scene.
+        counts: Number of particles of each body, in the order of concatenation.
+        order: `Simulator.order` of the simulator that will run the laws.
 
     Raises:
-        UserError: Numbers of laws, bodies and particles that do not fit.
+        UserError: Numbers of laws, bodies and particles that do not agree.
     """
     if not len(elasticity) == len(plasticity) == len(counts) or sum(counts) != len(order):
-        raise UserError(f"{len(elasticity)} and {len(plasticity)} laws for bodies of {list(counts)} particles, {len(order)} in all")
+        raise UserError(
+            f"{len(elasticity)} elastic and {len(plasticity)} plastic laws for bodies of {list(counts)} particles, and the simulator has "
+            f"{len(order)}; give one law of each kind and one count for each body"
+        )
     body = torch.arange(len(counts), device=order.device).repeat_interleave(torch.tensor(list(counts), device=order.device))[order]
     return CompositeElastic(elasticity, body), CompositePlastic(plasticity, body)

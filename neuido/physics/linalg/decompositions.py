@@ -3,7 +3,7 @@
 Convention throughout: F = U diag(sigma) V^T with rotations U and V, sigma_1 >= sigma_2 >= |sigma_3|; sigma_3 carries the sign of det F.
 In the frame P = U^T dF V the derivatives split into a symmetric part, divided by sigma_j - sigma_i, and a skew part, divided by
 sigma_i + sigma_j. Only the first is singular at repeated singular values, and for an isotropic function it is a divided difference.
-Everything here is plain torch, float32 or float64, the slow twin of `law_kernels`; on CUDA the frame itself comes from there.
+Everything here is plain torch, float32 or float64, the slow twin of `classical_kernels`; on CUDA the frame itself comes from there.
 """
 
 from typing import NamedTuple

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg import warp_functions
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
@@ -19,7 +19,7 @@ def build(real: type) -> SimpleNamespace:
     mat = wp.types.matrix((3, 3), real)
     vec = wp.types.vector(3, real)
     one = wp.constant(real(1.0))
-    frame = warp_linalg.functions(real).frame
+    frame = warp_functions.functions(real).frame
 
     @wp.kernel(enable_backward=False, module="unique")
     def decompose(F: wp.array(dtype=mat), U: wp.array(dtype=mat), sigma: wp.array(dtype=vec), V: wp.array(dtype=mat)):

@@ -8,7 +8,7 @@ import warp as wp
 
 from neuido.errors import UserError
 from neuido.physics.laws import classical as laws
-from neuido.physics.laws import classical_kernels as law_kernels
+from neuido.physics.laws import classical_kernels
 from neuido.physics.laws.classical import (
     AutogradElastic,
     AutogradPlastic,
@@ -191,7 +191,7 @@ def test_adjoint_adds_and_skips_what_is_not_wanted(law):
 def warp_adjoint(law, F: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """The adjoint that Warp generates, through its own svd3."""
     real, mat = (wp.float64, wp.mat33d) if F.dtype == torch.float64 else (wp.float32, wp.mat33f)
-    family = law_kernels.kernels(real, enable_backward=True, builtin_svd=True)
+    family = classical_kernels.kernels(real, enable_backward=True, builtin_svd=True)
     kernel = family.correct if isinstance(law, laws.PlasticLaw) else family.stress
     Fw = wp.from_torch(F.clone(), dtype=mat, requires_grad=True)
     out = wp.zeros(len(F), dtype=mat, requires_grad=True)

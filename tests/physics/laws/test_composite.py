@@ -57,5 +57,5 @@ def test_gradients_reach_each_law():
 def test_numbers_that_do_not_fit_are_refused():
     left, _ = bodies()
     simulator = Simulator(Scene(cells=16, dt=1e-3), left, device="cpu")
-    with pytest.raises(UserError, match="64 in all"):
+    with pytest.raises(UserError, match="the simulator has 64"):
         by_body([FixedCorotated(1e4, 0.2)], [Identity()], [60], simulator.order)

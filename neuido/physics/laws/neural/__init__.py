@@ -1,4 +1,4 @@
-"""Laws that were learned: networks and polynomials.
+"""Learned laws: neural networks and polynomials.
 
 The names of `__all__` are imported when they are first used.
 """

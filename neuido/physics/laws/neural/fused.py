@@ -1,10 +1,10 @@
-"""Objective networks as one kernel a law: features, network and read-out without a round trip to memory (CUDA, float32).
+"""Objective networks as one fused kernel per law (CUDA, float32): features, network and read-out without memory traffic in between.
 
-A warp carries 32 particles of one scene, a lane one of them. Strain, features and read-out are a lane's own; the network's
-layers are matrix products of the warp on the tensor cores, in tf32 with the residues (three products for one, relative error
-1e-7: plain float32 would be bound by reading weights, tf32 alone is right to 1e-3). The columns that a lane holds of one
-layer's result are those that it must hold of the next layer's operand once the weights' rows are permuted, so activations
-never leave their registers. `networks.py` is the slow twin.
+A warp processes 32 particles of one scene, one per lane. Each lane computes the strain, the features and the read-out of its particle.
+The layers are matrix products of the whole warp on the tensor cores, in tf32. Each product is computed as three, of the rounded operands
+and of their residues, which makes the relative error 1e-7 instead of 1e-3. Plain float32 would be slower, bound by reading the weights.
+The rows of the weights are permuted so that the columns that a lane holds of one layer's result are those that it needs as operand of the
+next layer: activations never leave the registers. `networks.py` is the implementation without fusion.
 
     m16n8k8: a lane (g, t) = (lane / 4, lane % 4) holds rows g, g + 8 and columns 2t, 2t + 1 of a 16 x 8 result.
 """
@@ -25,10 +25,10 @@ from neuido.physics.runtime.once import cached
 from neuido.types import Particles
 
 WIDTHS = (32, 64)
-"""Hidden widths that are compiled."""
+"""Hidden widths for which fused kernels exist."""
 
 BLOCK = 32
-"""Threads a block: the warps of a small body then spread most evenly over the multiprocessors."""
+"""Threads per block; with one warp per block, the warps of a small body spread evenly over the multiprocessors."""
 
 INPUTS = 16
 """Columns of the first operand: nine features, a one for the bias, padding."""
@@ -45,12 +45,17 @@ def build(width: int) -> SimpleNamespace:
         "SIZE3T": tiles * 128,
     }  # fmt: skip
     name = f"neuido.fused.{width}"
-    # approximate logarithms, roots and divisions in the strain and its features, right to 1e-6: a third of the instructions
+    # approximate logarithms, roots and divisions: relative error 1e-6 with a third of the instructions
     wp.set_module_options({"fast_math": True}, module=wp.get_module(name))
     own = network_kernels.functions(wp.float32, name)
     vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
     vecK = wp.types.vector(length=kept, dtype=wp.float32)
-    measure, features_of, stress_of, stress_coefficients = own.measure, own.features_of, own.stress_of, own.stress_coefficients
+    strain_invariants, features_of, stress_of, stress_coefficients = (
+        own.strain_invariants,
+        own.features_of,
+        own.stress_of,
+        own.stress_coefficients,
+    )
     stress_gradient, correction_of = own.stress_gradient, own.correction_of
     correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
@@ -81,7 +86,7 @@ def build(width: int) -> SimpleNamespace:
         p = firsts[warp] + tid % 32
         s = scenes[warp]
         Fp = F[wp.min(p, lasts[warp] - 1)]
-        N, h, l, A, q = measure(Fp)
+        N, h, l, A, q = strain_invariants(Fp)
         k = network(features_of(l, A, q), wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2, B2, W3, B3)
         if p < lasts[warp]:
             tau[p] = stress_of(l, A, q, outputs(k), scale)
@@ -96,7 +101,7 @@ def build(width: int) -> SimpleNamespace:
         p = firsts[warp] + tid % 32
         s = scenes[warp]
         Fp = F[wp.min(p, lasts[warp] - 1)]
-        N, h, l, A, q = measure(Fp)
+        N, h, l, A, q = strain_invariants(Fp)
         k = network(features_of(l, A, q), wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2, B2, W3, B3)
         if p < lasts[warp]:
             out[p] = correction_of(Fp, l, A, q, outputs(k), scale)
@@ -108,7 +113,10 @@ def build(width: int) -> SimpleNamespace:
         g_out: wp.array(dtype=mat33), g_F: wp.array(dtype=mat33),
         P3: floats, PB: floats, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
     ):  # fmt: skip
-        """Add to g_F, and to the warp's share of the last layer's gradient where P3 is given; writes units where X is."""
+        """Add to g_F.
+
+        With P3, add to the warp's part of the last layer's gradient; with X, write the features and activations for the other layers.
+        """
         tid = wp.tid()
         warp = tid / 32
         last = lasts[warp]
@@ -117,7 +125,7 @@ def build(width: int) -> SimpleNamespace:
         r = wp.min(scenes[warp], rows - 1)
         pp = wp.min(p, last - 1)
         g = g_out[pp]
-        N, h, l, A, q = measure(F[pp])
+        N, h, l, A, q = strain_invariants(F[pp])
         x = features_of(l, A, q)
         k = network(x, s, r, W1, W2, B2, W3, B3)
         gy = stress_coefficients(l, A, q, scale, g)
@@ -127,8 +135,8 @@ def build(width: int) -> SimpleNamespace:
         if p < last:
             if X:
                 X[p] = x
-            # measured again: cheaper than the registers to remember it
-            N2, h2, l2, A2, q2 = measure(F[p])
+            # computed again, since keeping it would cost registers
+            N2, h2, l2, A2, q2 = strain_invariants(F[p])
             g_F[p] = g_F[p] + stress_gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, g_out[p], gx)
 
     @kernel
@@ -138,7 +146,7 @@ def build(width: int) -> SimpleNamespace:
         g_out: wp.array(dtype=mat33), g_F: wp.array(dtype=mat33),
         P3: floats, PB: floats, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
     ):  # fmt: skip
-        """As `stress_adjoint`."""
+        """Compute the adjoint of `correct`; arguments as for `stress_adjoint`."""
         tid = wp.tid()
         warp = tid / 32
         last = lasts[warp]
@@ -147,7 +155,7 @@ def build(width: int) -> SimpleNamespace:
         r = wp.min(scenes[warp], rows - 1)
         pp = wp.min(p, last - 1)
         g = g_out[pp]
-        N, h, l, A, q = measure(F[pp])
+        N, h, l, A, q = strain_invariants(F[pp])
         x = features_of(l, A, q)
         k = network(x, s, r, W1, W2, B2, W3, B3)
         gy = correction_coefficients(F[pp], l, A, q, outputs(k), scale, 0, g)
@@ -157,7 +165,7 @@ def build(width: int) -> SimpleNamespace:
         if p < last:
             if X:
                 X[p] = x
-            N2, h2, l2, A2, q2 = measure(F[p])  # as above
+            N2, h2, l2, A2, q2 = strain_invariants(F[p])
             g_F[p] = g_F[p] + correction_gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, g_out[p], gx)
 
     return SimpleNamespace(stress=stress, correct=correct, stress_adjoint=stress_adjoint, correct_adjoint=correct_adjoint)
@@ -165,14 +173,17 @@ def build(width: int) -> SimpleNamespace:
 
 @cached(limit=16)
 def _warps(offsets: tuple[int, ...], device: torch.device) -> list[Tensor]:
-    """Scene, first and last particle of every warp; kept, since a graph may not copy from the host while it is captured."""
+    """Return the scene, the first particle and the end of every warp.
+
+    The tensors are cached, since nothing may be copied from the host while a graph is captured.
+    """
     table = [(s, p, min(p + 32, j)) for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])) for p in range(i, j, 32)]
     return [torch.tensor(column, dtype=torch.int32, device=device) for column in zip(*table)]
 
 
 @cached(limit=16)
 def _order(rows: int, columns: int, device: torch.device) -> Tensor:
-    """Where the two entries of each lane's fragment stand in a (rows, columns) matrix, (tiles, 32 lanes, 2)."""
+    """Return the flat indices of the two entries of each lane in a (rows, columns) matrix, (tiles, 32 lanes, 2)."""
     lane = torch.arange(32)
     g, t = lane // 4, lane % 4
     tiles = [
@@ -184,14 +195,14 @@ def _order(rows: int, columns: int, device: torch.device) -> Tensor:
 
 
 def _fragments(W: Tensor) -> Tensor:
-    """(S, rows, columns) -> (S, tiles * 32 * 4): of each lane two entries rounded to tf32, then their residues."""
+    """Pack matrices (S, rows, columns) as (S, tiles * 32 * 4): for each lane two entries rounded to tf32, then their residues."""
     entries = W.flatten(1)[:, _order(W.shape[1], W.shape[2], W.device)]
     high = ((entries.contiguous().view(torch.int32) + 0x1000) & ~0x1FFF).view(torch.float32)
     return torch.cat([high, entries - high], dim=-1).flatten(1).contiguous()
 
 
 class FusedEngine(Engine):
-    """An objective network for one rollout; the same interface and results as its law's own engine."""
+    """The engine of an objective network with fused kernels; same interface and results as `Engine`."""
 
     def __init__(self, law, tensors: Sequence[Tensor], particles: Particles):
         super().__init__(law, tensors, particles)
@@ -237,10 +248,10 @@ class FusedEngine(Engine):
                      self.P3, self.PB, self.X, self.H1, self.G1, self.G2]  # fmt: skip
         launch(self._adjoint, self.threads, arguments, F.device, block=BLOCK)
         if self.full:
-            self._reduce_first(len(F))
+            self._add_layer_gradients(len(F))
 
-    def _reduce_first(self, count: int) -> None:
-        """Add the gradients of the first two layers, shared by all scenes or one for each."""
+    def _add_layer_gradients(self, count: int) -> None:
+        """Add to the gradients of the first two layers, which all scenes share or each scene has for itself."""
         g1, b1, g2, b2 = self.grads[:4]
         h1, d1, d2 = (t.view(count, self.width) for t in (self.H1, self.G1, self.G2))
         ranges = [(0, 0, count)] if self.rows[0] == 1 else [
@@ -256,7 +267,7 @@ class FusedEngine(Engine):
 
     def gradients(self) -> list[Tensor | None]:
         if self.ends:
-            # a warp's share: tile j, lane (g, t) holds output g % 4 of column 8 j + 2 t + g / 4
+            # in the part of a warp, lane (g, t) of tile j holds output g % 4 of column 8 j + 2 t + g / 4
             tiles = self.width // 8
             share = self.P3.view(-1, tiles, 2, 4, 4).permute(0, 3, 1, 4, 2).reshape(-1, 4, self.width)
             for target, value in ((self.grads[4], share), (self.grads[5], self.PB.view(-1, 4))):

@@ -1,9 +1,9 @@
-"""CUDA source of the fused networks: three layers of a warp's 32 particles on the tensor cores, and their adjoint.
+"""CUDA source of the fused networks: three layers for the 32 particles of a warp on the tensor cores, and their adjoint.
 
     m16n8k8: a lane (g, t) = (lane / 4, lane % 4) holds rows g, g + 8 and columns 2t, 2t + 1 of a 16 x 8 result,
     and of the next operand the same columns, once the rows of its weights are permuted (`fused._order`).
 
-`FORWARD` and `BACKWARD` are bodies of Warp functions (`fused.build` fills in the sizes); on the CPU they are empty.
+`FORWARD` and `BACKWARD` are bodies of Warp functions, in which `fused.build` fills in the sizes. On the CPU they do nothing.
 """
 
 TOOLS = """
@@ -50,7 +50,7 @@ TOOLS = """
         for (int s = 0; s < 2; ++s) split(c[s], xh[m][s], xl[m][s]);
     }}
 """
-"""What both functions begin with: products, their operands' residues, and the features as operands."""
+"""The common beginning of both functions: matrix products, residues of operands, and the features as operands."""
 
 FORWARD = (
     "#if defined(__CUDA_ARCH__)"

@@ -1,4 +1,4 @@
-"""Warp kernels around NCLaw's networks (Ma et al. 2023, `InvariantFullMeta`), with hand-written adjoints.
+"""Warp kernels of NCLaw's networks before and after the matrix products (Ma et al. 2023), with hand-written adjoints.
 
 With F = U diag(sigma) V^T, sigma descending, and R = U V^T:
 
@@ -7,8 +7,9 @@ With F = U diag(sigma) V^T, sigma descending, and R = U V^T:
     elastic         tau = scale R X F^T
     plastic         F_hat = F + scale R X
 
-The derivative of R divides by sigma_i + sigma_j and holds at F = I. That of sigma does not exist where two are equal, since the networks
-treat them by rank: there the adjoint of each is the mean of theirs, which does not depend on the choice of the singular vectors.
+The derivative of R divides by sigma_i + sigma_j and is valid at F = I. The derivative of sigma does not exist where two singular values
+are equal, since the networks treat them by rank. There, each gets the mean of their gradients, which does not depend on the choice of the
+singular vectors.
 """
 
 import functools
@@ -16,7 +17,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.linalg import warp_functions as warp_linalg
+from neuido.physics.linalg import warp_functions
 from neuido.physics.linalg.warp_functions import GAP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
@@ -24,9 +25,10 @@ from neuido.physics.runtime.once import cached
 FEATURES = 13
 
 TIE = 4.0
-"""Singular values closer than so many machine epsilons count as equal."""
+"""Largest difference of two singular values that count as equal, in machine epsilons."""
 
 EPSILON = {wp.float32: 2.0**-23, wp.float64: 2.0**-52}
+"""Machine epsilon of each scalar type."""
 
 
 @cached
@@ -35,7 +37,7 @@ def build(real: type) -> SimpleNamespace:
     start_warp()
     mat = wp.types.matrix((3, 3), real)
     vec = wp.types.vector(3, real)
-    own = warp_linalg.functions(real)
+    own = warp_functions.functions(real)
     frame, volume_change, cofactor = own.frame, own.volume_change, own.cofactor
     name = f"neuido.invariants.{real.__name__}"
     func = functools.partial(wp.func, module=name)
@@ -55,7 +57,7 @@ def build(real: type) -> SimpleNamespace:
 
     @func
     def rotation_adjoint(U: mat, d: vec, V: mat, g: mat):
-        """Adjoint of F from that of its polar part."""
+        """Return the adjoint of F from the adjoint g of its rotation R."""
         A = wp.transpose(U) * g * V
         B = mat()
         for i in range(3):
@@ -65,7 +67,7 @@ def build(real: type) -> SimpleNamespace:
 
     @func
     def stretch_adjoint(U: mat, d: vec, V: mat, g: vec):
-        """Adjoint of F from that of the singular values."""
+        """Return the adjoint of F from the adjoint g of its singular values."""
         if d[0] - d[1] <= tie and d[1] - d[2] <= tie:
             m = (g[0] + g[1] + g[2]) / real(3.0)
             g = vec(m, m, m)
@@ -105,7 +107,7 @@ def build(real: type) -> SimpleNamespace:
     def outputs_adjoint(
         F: wp.array(dtype=mat), R: wp.array(dtype=mat), scale: real, elastic: int, g_out: wp.array(dtype=mat), g_Y: wp.array2d(dtype=real)
     ):
-        """Write the adjoint of the outputs."""
+        """Write the adjoint of the network's outputs."""
         p = wp.tid()
         g = g_out[p]
         if elastic == 1:
@@ -126,7 +128,7 @@ def build(real: type) -> SimpleNamespace:
         g_X: wp.array2d(dtype=real),
         g_F: wp.array(dtype=mat),
     ):
-        """Add to the adjoint of F what comes through the read-out, the rotation and the features, whose adjoint is g_X."""
+        """Add to the adjoint of F the contributions of the read-out, the rotation and the features; g_X is the adjoint of the features."""
         p = wp.tid()
         Fp = F[p]
         g = g_out[p]

@@ -1,7 +1,7 @@
-"""NCLaw's networks as laws for the rollout (Ma et al. 2023, `InvariantFullMeta`): invariants of F through three layers without bias.
+"""NCLaw's networks as laws (Ma et al. 2023, class `InvariantFullMeta`): three layers without bias on invariants of F.
 
-The engine form is batched: Warp kernels make features and read-out (`invariant_kernels`), torch multiplies the matrices. Each engine
-owns its memory, so that a rollout with these laws is captured in a CUDA graph like any other. Calling a law runs its twin in plain torch.
+In a rollout, Warp kernels compute the features and the read-out (`invariant_kernels`) and torch multiplies the matrices. Each engine
+owns its buffers, so that the rollout may be captured in a CUDA graph. Calling a law evaluates it in plain torch.
 """
 
 from collections.abc import Hashable, Sequence
@@ -22,11 +22,11 @@ from neuido.physics.runtime.internals import gelu_adjoint_into, gelu_into
 from neuido.types import Particles
 
 PLASTIC_SCALE = 1e-3
-"""NCLaw: F_hat = F + 1e-3 R X."""
+"""Factor of the plastic correction in NCLaw: F_hat = F + 1e-3 R X."""
 
 
 class InvariantEngine(Engine):
-    """One network for one rollout, with its own buffers: every intermediate result, and the adjoints in the same places."""
+    """The engine of an invariant network, with its own buffers for the intermediate results and their adjoints."""
 
     def __init__(self, law: "_Invariant", tensors: Sequence[Tensor], particles: Particles):
         super().__init__(law, [t.detach() for t in tensors], particles)
@@ -62,30 +62,30 @@ class InvariantEngine(Engine):
         self._evaluate(F)
         b, g, elastic = self.buffer, self.adjoints, int(self.law.elastic)
         self._launch(self.kernels.outputs_adjoint, F, self.R, self.law.scale, elastic, grad_out, g["y"])
-        self._layer(2, "h2", g["y"])
-        self._layer(1, "h1", self._through_gelu("h2", "z2"))
-        self._layer(0, "x", self._through_gelu("h1", "z1"))
+        self._layer_adjoint(2, "h2", g["y"])
+        self._layer_adjoint(1, "h1", self._gelu_adjoint("h2", "z2"))
+        self._layer_adjoint(0, "x", self._gelu_adjoint("h1", "z1"))
         self._launch(self.kernels.gradient_adjoint, F, self.R, b["y"], self.law.scale, elastic, grad_out, g["x"], grad_F)
 
-    def _through_gelu(self, h: str, z: str) -> Tensor:
+    def _gelu_adjoint(self, h: str, z: str) -> Tensor:
         grad = self.adjoints[h]
         gelu_adjoint_into(grad, self.buffer[z], grad)
         return grad
 
-    def _layer(self, i: int, x: str, grad: Tensor) -> None:
+    def _layer_adjoint(self, i: int, x: str, grad: Tensor) -> None:
         linear_adjoint(self.buffer[x], self.tensors[i], grad, self.particles.offsets, None, self.adjoints[x], self.grads[i], None)
 
 
 class _Invariant(EngineLaw):
-    """What the elastic and the plastic network share; not a law by itself.
+    """Base class of the elastic and the plastic network.
 
     Args:
-        W1: First layer, (1 or S, hidden, 13). A leading 1 is shared by all scenes.
-        W2: Second layer, (1 or S, hidden, hidden).
-        W3: Last layer, (1 or S, 9, hidden).
+        W1: Weights of the first layer, (1 or S, hidden, 13); with a leading 1 all scenes share them.
+        W2: Weights of the second layer, (1 or S, hidden, hidden).
+        W3: Weights of the last layer, (1 or S, 9, hidden).
 
     Raises:
-        UserError: shapes that do not fit.
+        UserError: Shapes that do not agree.
     """
 
     elastic: bool
@@ -100,7 +100,7 @@ class _Invariant(EngineLaw):
         self.weights = (W1, W2, W3)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """(W1, W2, W3); see the class."""
+        """Return W1, W2 and W3."""
         return self.weights
 
     def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
@@ -110,7 +110,7 @@ class _Invariant(EngineLaw):
         return type(self).__name__, self.scale
 
     def _network(self, F: Tensor, s: int) -> Tensor:
-        """R X of scene s in plain torch, (..., 3, 3)."""
+        """Evaluate R X with the weights of scene s in plain torch, (..., 3, 3)."""
         W1, W2, W3 = (W[min(s, len(W) - 1)].to(F.dtype) for W in self.weights)
         hidden = functional.gelu(functional.linear(functional.gelu(functional.linear(features(F), W1)), W2))
         Y = functional.linear(hidden, W3).unflatten(-1, (3, 3))
@@ -123,7 +123,7 @@ class _Invariant(EngineLaw):
         if max(len(W) for W in self.weights) == 1:
             return self._readout(F, self._network(F, 0))
         if particles is None:
-            raise UserError(f"{type(self).__name__} holds several scenes: give `particles` to say which scene each F belongs to")
+            raise UserError(f"{type(self).__name__} has several scenes: give `particles`, the scene of each F")
         ends = zip(particles.offsets[:-1], particles.offsets[1:])
         return torch.cat([self._readout(F[i:j], self._network(F[i:j], s)) for s, (i, j) in enumerate(ends)])
 
@@ -132,7 +132,10 @@ class _Invariant(EngineLaw):
 
 
 class InvariantElastic(_Invariant, ElasticLaw):
-    """tau = R X F^T [Pa], with X the symmetric part of the network's outputs."""
+    """NCLaw's elastic network: tau = R X F^T [Pa].
+
+    X is the symmetric part of the network's outputs, and R the rotation of F.
+    """
 
     elastic, scale = True, 1.0
 
@@ -140,7 +143,7 @@ class InvariantElastic(_Invariant, ElasticLaw):
         return self.scale * RX @ F.mT
 
     def modulus(self) -> Tensor:
-        """Secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,), in float64."""
+        """Return the secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,), computed in float64."""
         step, like = 1e-3, self.weights[0]
         F = torch.eye(3, dtype=torch.float64, device=like.device).repeat(2, 1, 1)
         F[:, 0, 0] += torch.tensor([step, -step], dtype=torch.float64, device=like.device)
@@ -150,7 +153,10 @@ class InvariantElastic(_Invariant, ElasticLaw):
 
 
 class InvariantPlastic(_Invariant, PlasticLaw):
-    """F_hat = F + 1e-3 R X."""
+    """NCLaw's plastic network: F_hat = F + 1e-3 R X.
+
+    X is the symmetric part of the network's outputs, and R the rotation of F.
+    """
 
     elastic, scale, identity = False, PLASTIC_SCALE, False
 
@@ -159,7 +165,10 @@ class InvariantPlastic(_Invariant, PlasticLaw):
 
 
 def features(F: Tensor) -> Tensor:
-    """sigma - 1, F^T F - I and det F - 1 of F (..., 3, 3), (..., 13); equal singular values share the mean of their adjoints."""
+    """Compute the inputs of the network: sigma - 1, F^T F - I and det F - 1 of F (..., 3, 3), (..., 13).
+
+    In the backward pass, equal singular values share the mean of their gradients.
+    """
     eye = torch.eye(3, dtype=F.dtype, device=F.device)
     sigma = linalg.frame(F).sigma
     sigma = (_ties(sigma.detach()) @ sigma.unsqueeze(-1)).squeeze(-1)
@@ -169,7 +178,7 @@ def features(F: Tensor) -> Tensor:
 
 
 def _ties(sigma: Tensor) -> Tensor:
-    """Return the mean over equal ones of descending values (..., 3), as matrices (..., 3, 3)."""
+    """Return matrices (..., 3, 3) that replace each of three descending values (..., 3) by the mean of those equal to it."""
     tie = TIE * EPSILON[real_of(sigma.dtype)]
     gaps = sigma[..., :-1] - sigma[..., 1:]
     group = torch.cat([torch.zeros_like(gaps[..., :1]), (gaps > tie).to(sigma.dtype).cumsum(-1)], -1)

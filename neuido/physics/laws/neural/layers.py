@@ -1,4 +1,4 @@
-"""Linear layers over the particles of several scenes, written into given memory, and their adjoints; no autograd."""
+"""Linear layers with one set of weights per scene, and their adjoints, written into existing memory without autograd."""
 
 from collections.abc import Sequence
 
@@ -7,14 +7,14 @@ from torch import Tensor
 
 
 def linear(x: Tensor, W: Tensor, b: Tensor | None, offsets: Sequence[int], out: Tensor) -> None:
-    """out = x W^T + b with the weights of each particle's scene.
+    """Write x W^T + b into `out`, with the weights of each particle's scene.
 
     Args:
-        x: (P, n).
-        W: (1 or S, m, n); a leading 1 is shared by all scenes.
-        b: (1 or S, m), or None.
-        offsets: First particle of each scene, and P at the end.
-        out: (P, m), written.
+        x: Inputs, (P, n).
+        W: Weights, (1 or S, m, n); with a leading 1 all scenes share them.
+        b: Biases, (1 or S, m), or None.
+        offsets: Index of the first particle of each scene, then P.
+        out: Outputs, (P, m); overwritten.
     """
     shared = W.shape[0] == 1 and (b is None or b.shape[0] == 1)
     for s, (i, j) in enumerate(((0, len(x)),) if shared else zip(offsets[:-1], offsets[1:])):
@@ -28,13 +28,24 @@ def linear(x: Tensor, W: Tensor, b: Tensor | None, offsets: Sequence[int], out: 
 def linear_adjoint(
     x: Tensor, W: Tensor, gy: Tensor, offsets: Sequence[int], ones: Tensor | None, gx: Tensor | None, gW: Tensor | None, gb: Tensor | None
 ) -> None:
-    """Write gx; add to gW and gb. Any of them may be None: not wanted. `ones` (P,) sums the rows for gb."""
-    single = gy.shape[0]
+    """Compute the adjoint of `linear`; a gradient that is None is skipped.
+
+    Args:
+        x: Inputs of the layer, (P, n).
+        W: Weights, (1 or S, m, n).
+        gy: Gradient with respect to the outputs, (P, m).
+        offsets: As for `linear`.
+        ones: Ones (P,), which sum the rows for gb; needed with gb.
+        gx: Gradient with respect to the inputs, (P, n); overwritten.
+        gW: Gradient with respect to the weights; added to.
+        gb: Gradient with respect to the biases; added to.
+    """
+    count = gy.shape[0]
     for target, parameter in ((gx, W), (gW, gW), (gb, gb)):
         if target is None:
             continue
         shared = parameter.shape[0] == 1
-        for s, (i, j) in enumerate(((0, single),) if shared else zip(offsets[:-1], offsets[1:])):
+        for s, (i, j) in enumerate(((0, count),) if shared else zip(offsets[:-1], offsets[1:])):
             if target is gx:
                 torch.mm(gy[i:j], W[s], out=gx[i:j])
             elif target is gW:

@@ -1,19 +1,19 @@
-"""Warp kernels around the effective networks: strain features, read-outs, and their hand-written adjoints.
+"""Warp kernels of the objective networks before and after the matrix products: strain features, read-outs and their adjoints.
 
-The strain of the objective trunk needs no SVD. With G = F - I,
+The Hencky strain is computed without SVD. With G = F - I,
 
     e = (G + G^T + G G^T) / 2 = (b - I) / 2,   N = (I + e)^-1,   h = e N        (eigenvalues of h: tanh ln sigma)
     H = h + h^3/3 + h^5/5 + h^7/7 ~ ln V,      l = tr H,   A = H - l/3 I,   q = sqrt(A:A + DELTA^2)
 
-Nine features of the invariants feed the network; its outputs c are coefficients:
+The network maps nine features of the invariants to coefficients c:
 
     elastic (4)   tau = scale (c0 l I + c1 A + c2 dev(A A)/q + c3 (A:A)/q I)
     plastic (3)   r_d = scale c0 + c1 max(-l, 0),   r_v = scale c2              (radii of the elastic domain)
                   f = clamp(1 - r_d/q, 0, 1),   u = clamp(l - r_v, 0, l) where l > 0, else 0
                   F_hat = exp(-u/3) exp(-f A) F
 
-Constant coefficients are Hencky elasticity, von Mises (c0) and Drucker-Prager plasticity (c1; c2 = 0).
-exp of a symmetric matrix: Taylor polynomial of degree 4 at a quarter of it, squared twice.
+With constant coefficients the laws are Hencky elasticity, von Mises plasticity (c0) and Drucker-Prager plasticity (c1, with c2 = 0).
+The exponential of a symmetric matrix is the Taylor polynomial of degree 4 of a quarter of the matrix, squared twice.
 """
 
 import functools
@@ -26,18 +26,24 @@ from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
 DELTA = 1e-5
-"""Floor of the deviatoric strain q [-]: keeps its derivative finite at F = I."""
+"""Lower bound of the deviatoric strain q [-], which keeps its derivative finite at F = I."""
 
 FINE, COARSE, LINEAR = 1e-3, 3e-2, 10.0
-"""Gains of the features: two asinh scales [-] and a linear one."""
+"""Scales of the features: strains at which a fine and a coarse asinh begin to bend [-], and the factor of the linear features."""
 
 LODE = 3.0 * math.sqrt(6.0)
+"""Factor of det A / q^3 in the Lode parameter, which then lies in [-1, 1]."""
 
 FEATURES, STRESS_COEFFICIENTS, YIELD_COEFFICIENTS = 9, 4, 3
 
 
 def functions(real: type, name: str) -> SimpleNamespace:
-    """Warp functions of one particle, for the kernels of a module `name` (those here, and the fused ones)."""
+    """Return the Warp functions of one particle, for the kernels of this file and of `fused`.
+
+    Args:
+        real: `wp.float32` or `wp.float64`.
+        name: Name of the Warp module that the functions belong to.
+    """
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -45,7 +51,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
     func = functools.partial(wp.func, module=name)
 
     @func
-    def unit():
+    def identity():
         return wp.identity(n=3, dtype=real)
 
     @func
@@ -65,19 +71,19 @@ def functions(real: type, name: str) -> SimpleNamespace:
         return real(0.5) * (m + wp.transpose(m))
 
     @func
-    def shrinkage(F: mat33):
-        """N = (I + e)^-1 and h = e N."""
-        G = F - unit()
+    def tanh_strain(F: mat33):
+        """Return N = (I + e)^-1 and h = e N."""
+        G = F - identity()
         e = real(0.5) * (G + wp.transpose(G) + G * wp.transpose(G))
-        N = wp.inverse(unit() + e)
+        N = wp.inverse(identity() + e)
         return N, symmetric(e * N)
 
     @func
     def hencky(h: mat33):
-        """H = artanh(h) to the seventh order."""
+        """Return H = artanh(h) to the seventh order."""
         h2 = h * h
-        T = real(wp.static(1.0 / 5.0)) * unit() + real(wp.static(1.0 / 7.0)) * h2
-        return h + h * h2 * (real(wp.static(1.0 / 3.0)) * unit() + h2 * T)
+        T = real(wp.static(1.0 / 5.0)) * identity() + real(wp.static(1.0 / 7.0)) * h2
+        return h + h * h2 * (real(wp.static(1.0 / 3.0)) * identity() + h2 * T)
 
     @func
     def norm(A: mat33):
@@ -85,11 +91,11 @@ def functions(real: type, name: str) -> SimpleNamespace:
 
     @func
     def strain_adjoint(F: mat33, N: mat33, h: mat33, gH: mat33):
-        """Adjoint of F from the adjoint of H."""
+        """Return the adjoint of F from the adjoint of H."""
         h2 = h * h
-        T = real(wp.static(1.0 / 5.0)) * unit() + real(wp.static(1.0 / 7.0)) * h2
-        U = real(wp.static(1.0 / 3.0)) * unit() + h2 * T
-        V = unit() + h2 * U
+        T = real(wp.static(1.0 / 5.0)) * identity() + real(wp.static(1.0 / 7.0)) * h2
+        U = real(wp.static(1.0 / 3.0)) * identity() + h2 * T
+        V = identity() + h2 * U
         gV = h * gH
         gU = h2 * gV
         gh2 = gV * U + (h2 * gU) * real(wp.static(1.0 / 7.0)) + gU * T
@@ -98,7 +104,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
 
     @func
     def cofactor(A: mat33):
-        """d det(A) / dA of a symmetric A."""
+        """Return d det(A) / dA of a symmetric A."""
         a = vec3(A[0, 0], A[0, 1], A[0, 2])
         b = vec3(A[1, 0], A[1, 1], A[1, 2])
         c = vec3(A[2, 0], A[2, 1], A[2, 2])
@@ -107,18 +113,18 @@ def functions(real: type, name: str) -> SimpleNamespace:
     @func
     def exponential(M: mat33):
         Y = real(0.25) * M
-        E = unit() + Y * (unit() + real(0.5) * Y * (unit() + real(wp.static(1.0 / 3.0)) * Y * (unit() + real(0.25) * Y)))
+        E = identity() + Y * (identity() + real(0.5) * Y * (identity() + real(wp.static(1.0 / 3.0)) * Y * (identity() + real(0.25) * Y)))
         E = E * E
         return E * E
 
     @func
     def exponential_adjoint(M: mat33, g: mat33):
-        """Adjoint of the symmetric M from the (symmetrised) adjoint of its exponential."""
+        """Return the adjoint of the symmetric M from the adjoint g of exp(M)."""
         Y = real(0.25) * M
-        C = unit() + real(0.25) * Y
-        B = unit() + real(wp.static(1.0 / 3.0)) * Y * C
-        A = unit() + real(0.5) * Y * B
-        E1 = unit() + Y * A
+        C = identity() + real(0.25) * Y
+        B = identity() + real(wp.static(1.0 / 3.0)) * Y * C
+        A = identity() + real(0.5) * Y * B
+        E1 = identity() + Y * A
         E2 = E1 * E1
         g = real(2.0) * symmetric(E2 * symmetric(g))
         g = real(2.0) * symmetric(E1 * g)
@@ -129,12 +135,12 @@ def functions(real: type, name: str) -> SimpleNamespace:
         return real(0.25) * symmetric(gY)
 
     @func
-    def measure(F: mat33):
-        """N, h, and the invariants l, A, q of the Hencky strain."""
-        N, h = shrinkage(F)
+    def strain_invariants(F: mat33):
+        """Return N, h, and the trace l, the deviator A and its norm q of the Hencky strain."""
+        N, h = tanh_strain(F)
         H = hencky(h)
         l = wp.trace(H)
-        A = H - (l / real(3.0)) * unit()
+        A = H - (l / real(3.0)) * identity()
         return N, h, l, A, norm(A)
 
     @func
@@ -154,7 +160,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
 
     @func
     def features_adjoint(l: real, A: mat33, q: real, X: vec9):
-        """Adjoints of l, q and A (through its determinant) from that of the features."""
+        """Return the adjoints of l, q and A (through det A) from the adjoint X of the features."""
         d = wp.determinant(A)
         r2 = l * l + q * q
         r3 = r2 * wp.sqrt(r2)
@@ -178,41 +184,41 @@ def functions(real: type, name: str) -> SimpleNamespace:
 
     @func
     def hencky_adjoint(gl: real, gq: real, gA: mat33, A: mat33, q: real):
-        """Adjoint of H from those of l, q and A."""
+        """Return the adjoint of H from the adjoints of l, q and A."""
         g = gA + (gq / q) * A
-        return symmetric(g) + ((gl - wp.trace(g) / real(3.0)) * unit())
+        return symmetric(g) + ((gl - wp.trace(g) / real(3.0)) * identity())
 
     @func
     def stress_of(l: real, A: mat33, q: real, c: vec4, scale: real):
         a = wp.ddot(A, A)
-        D = A * A - (a / real(3.0)) * unit()
-        return scale * ((c[0] * l + c[3] * a / q) * unit() + c[1] * A + (c[2] / q) * D)
+        D = A * A - (a / real(3.0)) * identity()
+        return scale * ((c[0] * l + c[3] * a / q) * identity() + c[1] * A + (c[2] / q) * D)
 
     @func
     def stress_coefficients(l: real, A: mat33, q: real, scale: real, g_tau: mat33):
-        """Adjoint of c."""
+        """Return the adjoint of the coefficients c."""
         a = wp.ddot(A, A)
-        D = A * A - (a / real(3.0)) * unit()
+        D = A * A - (a / real(3.0)) * identity()
         g = scale * g_tau
         t = wp.trace(g)
         return vec4(l * t, wp.ddot(g, A), wp.ddot(g, D) / q, a / q * t)
 
     @func
     def stress_gradient(F: mat33, N: mat33, h: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, g_tau: mat33, X: vec9):
-        """Adjoint of F: what comes through the generators, and through the features, whose adjoint is X."""
+        """Return the adjoint of F through the generators and through the features; X is the adjoint of the features."""
         a = wp.ddot(A, A)
         gl, gq, gA = features_adjoint(l, A, q, X)
         g = symmetric(scale * g_tau)
         t = wp.trace(g)
         gl += c[0] * t
-        gD = (c[2] / q) * (g - (t / real(3.0)) * unit())
+        gD = (c[2] / q) * (g - (t / real(3.0)) * identity())
         gA += c[1] * g + real(2.0) * symmetric(gD * A) + (real(2.0) * c[3] * t / q) * A
         gq -= (c[2] * (wp.ddot(g, A * A) - a * t / real(3.0)) + c[3] * a * t) / (q * q)
         return strain_adjoint(F, N, h, hencky_adjoint(gl, gq, gA, A, q))
 
     @func
     def flow(l: real, q: real, c: vec4, scale: real):
-        """Unclamped deviatoric fraction f, clamped f, and volumetric correction u."""
+        """Return the deviatoric fraction f before and after clamping, and the volumetric correction u."""
         x = real(1.0) - (scale * c[0] + c[1] * wp.max(-l, real(0.0))) / q
         f = wp.clamp(x, real(0.0), real(1.0))
         u = real(0.0)
@@ -227,7 +233,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
 
     @func
     def flow_adjoint(F: mat33, A: mat33, f: real, u: real, g: mat33):
-        """Adjoints of f and u, of M = -f A, and of F as the right factor."""
+        """Return the adjoints of f, u, M = -f A, and F as the right factor of exp(M) F."""
         M = -f * A
         E = exponential(M)
         s = wp.exp(-u / real(3.0))
@@ -236,7 +242,10 @@ def functions(real: type, name: str) -> SimpleNamespace:
 
     @func
     def correction_coefficients(F: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, straight_through: int, g_out: mat33):
-        """Adjoint of c; `straight_through` lets it pass a clamp where descent leads back into the range."""
+        """Return the adjoint of the coefficients c.
+
+        With `straight_through` it is passed at an active clamp if descent leads back into the range.
+        """
         x, f, u = flow(l, q, c, scale)
         gf, gu, gM, gF = flow_adjoint(F, A, f, u, g_out)
         if x < real(0.0) and not (straight_through == 1 and gf < real(0.0)):
@@ -254,7 +263,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
 
     @func
     def correction_gradient(F: mat33, N: mat33, h: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, g_out: mat33, X: vec9):
-        """Adjoint of F: what comes through the return map, and through the features, whose adjoint is X."""
+        """Return the adjoint of F through the return map and through the features; X is the adjoint of the features."""
         x, f, u = flow(l, q, c, scale)
         gf, gu, gM, gF = flow_adjoint(F, A, f, u, g_out)
         gl, gq, gA = features_adjoint(l, A, q, X)
@@ -271,7 +280,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
         vec4=vec4,
         vec9=vec9,
         mat33=mat33,
-        measure=measure,
+        strain_invariants=strain_invariants,
         features_of=features_of,
         stress_of=stress_of,
         stress_coefficients=stress_coefficients,
@@ -288,13 +297,18 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
 
     Args:
         real: `wp.float32` or `wp.float64`.
-        enable_backward: Also generate Warp's own adjoints (the oracle of the tests).
+        enable_backward: Let Warp generate adjoints too, for tests.
     """
     start_warp()
     name = f"neuido.networks.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
     own = functions(real, name)
     vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
-    measure, features_of, stress_of, stress_coefficients = own.measure, own.features_of, own.stress_of, own.stress_coefficients
+    strain_invariants, features_of, stress_of, stress_coefficients = (
+        own.strain_invariants,
+        own.features_of,
+        own.stress_of,
+        own.stress_coefficients,
+    )
     stress_gradient, correction_of = own.stress_gradient, own.correction_of
     correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
     func = functools.partial(wp.func, module=name)
@@ -317,7 +331,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     @kernel
     def features(F: wp.array(dtype=mat33), X: wp.array2d(dtype=real)):
         p = wp.tid()
-        N, h, l, A, q = measure(F[p])
+        N, h, l, A, q = strain_invariants(F[p])
         x = features_of(l, A, q)
         for i in range(9):
             X[p, i] = x[i]
@@ -325,14 +339,14 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     @kernel
     def stress(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, tau: wp.array(dtype=mat33)):
         p = wp.tid()
-        N, h, l, A, q = measure(F[p])
+        N, h, l, A, q = strain_invariants(F[p])
         tau[p] = stress_of(l, A, q, row4(c, p), scale)
 
     @kernel
     def stress_coefficients_adjoint(F: wp.array(dtype=mat33), scale: real, g_tau: wp.array(dtype=mat33), g_c: wp.array2d(dtype=real)):
-        """Write the adjoint of c."""
+        """Write the adjoint of the coefficients c."""
         p = wp.tid()
-        N, h, l, A, q = measure(F[p])
+        N, h, l, A, q = strain_invariants(F[p])
         g = stress_coefficients(l, A, q, scale, g_tau[p])
         for i in range(4):
             g_c[p, i] = g[i]
@@ -348,13 +362,13 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     ):
         """Add to the adjoint of F."""
         p = wp.tid()
-        N, h, l, A, q = measure(F[p])
+        N, h, l, A, q = strain_invariants(F[p])
         g_F[p] = g_F[p] + stress_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_tau[p], row9(g_X, p))
 
     @kernel
     def correction(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, out: wp.array(dtype=mat33)):
         p = wp.tid()
-        N, h, l, A, q = measure(F[p])
+        N, h, l, A, q = strain_invariants(F[p])
         out[p] = correction_of(F[p], l, A, q, row4(c, p), scale)
 
     @kernel
@@ -366,9 +380,9 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         g_out: wp.array(dtype=mat33),
         g_c: wp.array2d(dtype=real),
     ):
-        """Write the adjoint of c."""
+        """Write the adjoint of the coefficients c."""
         p = wp.tid()
-        N, h, l, A, q = measure(F[p])
+        N, h, l, A, q = strain_invariants(F[p])
         g = correction_coefficients(F[p], l, A, q, row4(c, p), scale, straight_through, g_out[p])
         for i in range(3):
             g_c[p, i] = g[i]
@@ -384,7 +398,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     ):
         """Add to the adjoint of F."""
         p = wp.tid()
-        N, h, l, A, q = measure(F[p])
+        N, h, l, A, q = strain_invariants(F[p])
         g_F[p] = g_F[p] + correction_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_out[p], row9(g_X, p))
 
     return SimpleNamespace(

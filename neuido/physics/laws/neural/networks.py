@@ -1,14 +1,15 @@
-"""Effective neural laws: three-layer networks with lambda contracted into the last layer, and hand-written adjoints.
+"""Neural laws of a rollout: three-layer networks with hand-written adjoints.
 
-lambda is constant over a rollout, so sum_k lambda_k W3_k is one matrix per scene (exact, since the last layer is linear), and
-a law is a small network F -> 9 -> hidden -> hidden -> outputs with SiLU (paper, "Model Architecture Details"). Two kinds:
+The operator's coefficients lambda are constant over a rollout, and its last layer is linear. So the sum of lambda_k W3_k over k is
+one matrix per scene, exactly, and the law is a small network F -> 9 -> hidden -> hidden -> outputs with SiLU (paper, "Model Architecture
+Details"). There are two kinds:
 
-    raw        the paper's: input 10 (F - I), outputs nine components of tau, or of F_hat - F
+    raw        input 10 (F - I), outputs nine components of tau, or of F_hat - F (the paper's form)
     objective  input invariants of the Hencky strain, outputs coefficients of an isotropic stress, or radii of a yield surface
                (`network_kernels`): frame-indifferent, isotropic, symmetric, free of stress at rest
 
-`forward` and `adjoint` keep their intermediate results in buffers that laws of the same size share; hidden activations are
-recomputed in the adjoint. Calling a law runs its twin in plain torch, which autograd differentiates.
+`forward` and `adjoint` write intermediate results into buffers that laws of the same size share; `adjoint` recomputes the hidden
+activations. Calling a law evaluates it in plain torch, which autograd differentiates.
 """
 
 import threading
@@ -29,7 +30,7 @@ from neuido.physics.runtime.once import cached
 from neuido.types import Particles
 
 RAW_GAIN = 10.0
-"""Gain of F - I at the input of a raw network; a larger input is learned faster."""
+"""Factor on F - I at the input of a raw network; with a larger input the network learns faster."""
 
 STRESS_SCALE = 1e5
 """Unit of the objective elastic coefficients [Pa]."""
@@ -42,28 +43,29 @@ STRAIN_SCALE = 1e-2
 
 
 def launch(kernel, like: Tensor, *arguments) -> None:
-    """Launch a kernel of `network_kernels` over the rows of `like`, on torch's device and current stream."""
+    """Launch a kernel with one thread per row of `like`, on the device of `like` and torch's current stream."""
     with torch_stream(like.device):
         device.launch(kernel, like.shape[0], arguments, like.device)
 
 
 def kernels(like: Tensor):
-    """Return the kernels for the scalar type of a tensor."""
+    """Return the kernels of `network_kernels` for the scalar type of a tensor."""
     return network_kernels.build(real_of(like.dtype))
 
 
-# The twins in plain torch: any leading shape, differentiable by autograd.
+# The same functions in plain torch: any leading shape, differentiable by autograd.
 
 
 def hencky_strain(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Volumetric and deviatoric left Hencky strain without SVD.
+    """Compute the trace and deviator of the left Hencky strain ln V by a series, without SVD.
+
+    The series ends at the seventh order. Its relative error is below 1e-6 at strains of 0.2, and 3e-4 at 0.5.
 
     Args:
         F: Deformation gradient [-], (..., 3, 3).
 
     Returns:
-        l (...), the trace; A (..., 3, 3), the deviator; q (...), its norm with the floor `DELTA`. The series of ln V ends at
-        the seventh order: relative error below 1e-6 at strains of 0.2, and 3e-4 at 0.5.
+        The trace l (...), the deviator A (..., 3, 3), and the norm q (...) of the deviator, bounded below by `DELTA`.
     """
     eye = torch.eye(3, dtype=F.dtype, device=F.device)
     G = F - eye
@@ -78,7 +80,16 @@ def hencky_strain(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def strain_features(l: Tensor, A: Tensor, q: Tensor) -> Tensor:
-    """Nine features (..., 9) of the invariants, each O(1) for strains of 1e-5 to 0.5 (see `network_kernels`)."""
+    """Compute the nine input features of an objective network, each of order 1 for strains of 1e-5 to 0.5.
+
+    Args:
+        l: Trace of the Hencky strain [-], (...).
+        A: Deviator of the Hencky strain [-], (..., 3, 3).
+        q: Norm of the deviator [-], (...).
+
+    Returns:
+        Features, (..., 9), as defined in `network_kernels`.
+    """
     a, b, c = A.unbind(-2)
     d = (torch.linalg.cross(a, b) * c).sum(-1)
     return torch.stack(
@@ -98,7 +109,13 @@ def strain_features(l: Tensor, A: Tensor, q: Tensor) -> Tensor:
 
 
 def isotropic_stress(F: Tensor, c: Tensor, scale: float = STRESS_SCALE) -> Tensor:
-    """Kirchhoff stress [Pa] (..., 3, 3) from its four coefficients c (..., 4)."""
+    """Compute the Kirchhoff stress [Pa], (..., 3, 3), of an objective network from its outputs.
+
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
+        c: Coefficients of the four generators, (..., 4); the formula is in `network_kernels`.
+        scale: Unit of the stress [Pa].
+    """
     l, A, q = hencky_strain(F)
     eye = torch.eye(3, dtype=F.dtype, device=F.device)
     a = A.square().sum((-2, -1))
@@ -108,7 +125,13 @@ def isotropic_stress(F: Tensor, c: Tensor, scale: float = STRESS_SCALE) -> Tenso
 
 
 def return_map(F: Tensor, c: Tensor, scale: float = STRAIN_SCALE) -> Tensor:
-    """Corrected deformation gradient (..., 3, 3) from the coefficients c (..., 3) of the yield radii."""
+    """Compute the corrected deformation gradient, (..., 3, 3), of an objective network from its outputs.
+
+    Args:
+        F: Trial deformation gradient [-], (..., 3, 3).
+        c: Coefficients of the yield radii, (..., 3); the formula is in `network_kernels`.
+        scale: Unit of the yield radii [-].
+    """
     l, A, q = hencky_strain(F)
     f = (1 - (scale * c[..., 0] + c[..., 1] * (-l).clamp(min=0)) / q).clamp(0, 1)
     u = torch.minimum((l - scale * c[..., 2]).clamp(min=0), l) * (l > 0)
@@ -123,7 +146,7 @@ def return_map(F: Tensor, c: Tensor, scale: float = STRAIN_SCALE) -> Tensor:
 
 
 class _Workspace:
-    """Intermediate results of one network for P particles, and their adjoints; of one thread alone."""
+    """Buffers for the intermediate results of a network for P particles, and for their adjoints; each thread has its own."""
 
     def __init__(self, rows: int, hidden: int, outputs: int, dtype: torch.dtype, device: torch.device, thread: int):
         def empty(columns: int) -> Tensor:
@@ -140,20 +163,24 @@ _workspace = cached(_Workspace, limit=8)
 
 
 class _Network:
-    """What the four laws share; not a law by itself.
+    """Base class of the four network laws.
 
     Args:
-        W1: First layer, (1 or S, hidden, 9); b1 (1 or S, hidden). A leading 1 is shared by all scenes.
-        W2: Second layer, (1 or S, hidden, hidden); b2 (1 or S, hidden).
-        W3: Last layer with the coefficients contracted into it, (S, outputs, hidden); b3 (S, outputs).
-        scale: Unit of the outputs [Pa] (elastic) or [-] (plastic); the class's `unit` by default.
+        W1: Weights of the first layer, (1 or S, hidden, 9); with a leading 1 all scenes share them.
+        b1: Biases of the first layer, (1 or S, hidden).
+        W2: Weights of the second layer, (1 or S, hidden, hidden).
+        b2: Biases of the second layer, (1 or S, hidden).
+        W3: Weights of the last layer, contracted with lambda, (S, outputs, hidden).
+        b3: Biases of the last layer, (S, outputs).
+        scale: Unit of the outputs, [Pa] for an elastic law and [-] for a plastic one; `unit` by default.
 
     Raises:
-        UserError: shapes that do not fit.
+        UserError: Shapes that do not agree.
     """
 
     outputs = 9
     unit: float
+    """Default of `scale`."""
 
     def __init__(self, W1: Tensor, b1: Tensor, W2: Tensor, b2: Tensor, W3: Tensor, b3: Tensor, *, scale: float | None = None):
         hidden = W1.shape[-2]
@@ -167,17 +194,17 @@ class _Network:
         self.scale = self.unit if scale is None else scale
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """(W1, b1, W2, b2, W3, b3); see the class."""
+        """Return W1, b1, W2, b2, W3 and b3."""
         return self.weights
 
     def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
-        """Return the fused kernels on CUDA where they exist for this network, else the engine of every law."""
+        """Return an engine with fused kernels where they exist (CUDA, float32, some widths), else the general one."""
         if self._fusable(tensors[0]):
             return fused.FusedEngine(self, tensors, particles)
         return Engine(self, tensors, particles)
 
     def key(self, tensors: Sequence[Tensor]) -> Hashable | None:
-        """Only the fused kernels may be captured: the others keep their results in buffers that laws share."""
+        """Return a key for the fused kernels alone: the others write into shared buffers and must not be captured."""
         return (type(self).__name__, self.scale) if self._fusable(tensors[0]) else None
 
     def _fusable(self, W1: Tensor) -> bool:
@@ -187,7 +214,7 @@ class _Network:
         return _workspace(F.shape[0], hidden, self.outputs, F.dtype, F.device, threading.get_ident())
 
     def _evaluate(self, tensors: Sequence[Tensor], F: Tensor, particles: Particles | None) -> _Workspace:
-        """Run the network; every intermediate result is in the workspace."""
+        """Run the network and return the workspace with all intermediate results."""
         W1, b1, W2, b2, W3, b3 = (t.detach() for t in tensors)
         offsets = self._offsets(F, particles)
         w = self._buffers(F, W1.shape[-2])
@@ -202,7 +229,7 @@ class _Network:
     def _backpropagate(
         self, w: _Workspace, tensors: Sequence[Tensor], grads: Sequence[Tensor | None], F: Tensor, particles: Particles | None
     ) -> None:
-        """From w.gy to w.gx and the adjoints of the weights; `w` must be fresh from `_evaluate`."""
+        """Propagate the gradient w.gy of the outputs to w.gx and to the weights; `w` must come from the last `_evaluate`."""
         W1, _, W2, _, W3, _ = (t.detach() for t in tensors)
         gW1, gb1, gW2, gb2, gW3, gb3 = grads
         offsets = self._offsets(F, particles)
@@ -217,7 +244,7 @@ class _Network:
         return (0, F.shape[0]) if particles is None else particles.offsets
 
     def _twin(self, features: Tensor, particles: Particles | None) -> Tensor:
-        """Return the network in plain torch, (..., 9) -> (..., outputs); (P, 9) where there are several scenes."""
+        """Evaluate the network in plain torch: (..., 9) -> (..., outputs), or (P, 9) -> (P, outputs) with several scenes."""
         rows = []
         offsets = (0, len(features)) if len(self.weights[4]) == 1 else self._offsets(features, particles)
         for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])):
@@ -227,7 +254,7 @@ class _Network:
         return torch.cat(rows)
 
     def _modulus(self) -> Tensor:
-        """d tau_11 / dF_11 at F = I for each scene [Pa], (S,): the twin's secant over F_11 = 1 +- 1e-3, in float64."""
+        """Return the secant of tau_11 over F_11 = 1 +- 1e-3 for each scene [Pa], (S,), computed in float64."""
         weights, step = self.weights, 1e-3
         F = torch.eye(3, dtype=torch.float64, device=weights[4].device).repeat(2, 1, 1)
         F[0, 0, 0] += step
@@ -250,7 +277,7 @@ class _Network:
 class _Raw(_Network):
     def _features(self, F: Tensor, out: Tensor) -> None:
         out.copy_(F.view(-1, 9))
-        out[:, ::4] -= 1  # exact near F = I
+        out[:, ::4] -= 1  # no rounding error near F = I
         out *= RAW_GAIN
 
 
@@ -260,7 +287,7 @@ class _Objective(_Network):
 
 
 class RawElastic(_Raw, ElasticLaw):
-    """tau = scale * network(10 (F - I)) [Pa], the paper's elastic law."""
+    """The paper's elastic network: tau = scale * network(10 (F - I)) [Pa]."""
 
     unit = RAW_STRESS_SCALE
 
@@ -277,12 +304,12 @@ class RawElastic(_Raw, ElasticLaw):
         return self.scale * self._twin(raw_features(F), particles).unflatten(-1, (3, 3))
 
     def modulus(self) -> Tensor:
-        """Secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,)."""
+        """Return the secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,)."""
         return self._modulus()
 
 
 class RawPlastic(_Raw, PlasticLaw):
-    """F_hat = F + scale * network(10 (F - I)), the paper's plastic law."""
+    """The paper's plastic network: F_hat = F + scale * network(10 (F - I))."""
 
     identity = False
     unit = STRAIN_SCALE
@@ -302,7 +329,10 @@ class RawPlastic(_Raw, PlasticLaw):
 
 
 class ObjectiveElastic(_Objective, ElasticLaw):
-    """tau [Pa] from four coefficients that a network makes of the strain's invariants; zero at F = I for any weights."""
+    """An isotropic elastic law whose four stress coefficients are a network of the strain's invariants.
+
+    It is frame-indifferent, and its stress is zero at F = I for any weights (`network_kernels` has the formula).
+    """
 
     outputs = network_kernels.STRESS_COEFFICIENTS
     unit = STRESS_SCALE
@@ -321,12 +351,15 @@ class ObjectiveElastic(_Objective, ElasticLaw):
         return isotropic_stress(F, self._twin(strain_features(*hencky_strain(F)), particles), self.scale)
 
     def modulus(self) -> Tensor:
-        """Secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,)."""
+        """Return the secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,)."""
         return self._modulus()
 
 
 class ObjectivePlastic(_Objective, PlasticLaw):
-    """F_hat by a return map whose deviatoric and volumetric yield radii a network makes of the strain's invariants."""
+    """A return map whose deviatoric and volumetric yield radii are a network of the strain's invariants.
+
+    `network_kernels` has the formula.
+    """
 
     identity = False
     outputs = network_kernels.YIELD_COEFFICIENTS
@@ -347,15 +380,15 @@ class ObjectivePlastic(_Objective, PlasticLaw):
 
 
 def raw_features(F: Tensor) -> Tensor:
-    """10 (F - I), (..., 9)."""
+    """Compute the input 10 (F - I) of a raw network, (..., 9)."""
     return RAW_GAIN * (F - torch.eye(3, dtype=F.dtype, device=F.device)).flatten(-2)
 
 
-# The read-outs as functions of the coefficients alone: Stage I learns from given F, so nothing flows to F.
+# Stage I learns from given F: these functions differentiate with respect to the coefficients and not to F.
 
 
 class StressReadout(torch.autograd.Function):
-    """`isotropic_stress` by its kernel; differentiable with respect to the coefficients c (B, 4) only."""
+    """`isotropic_stress` by a Warp kernel, differentiable with respect to the coefficients c (B, 4) alone."""
 
     @staticmethod
     def forward(ctx, c: Tensor, F: Tensor, scale: float) -> Tensor:
@@ -374,10 +407,10 @@ class StressReadout(torch.autograd.Function):
 
 
 class CorrectionReadout(torch.autograd.Function):
-    """`return_map` by its kernel; differentiable with respect to the coefficients c (B, 3) only.
+    """`return_map` by a Warp kernel, differentiable with respect to the coefficients c (B, 3) alone.
 
-    The gradient passes a clamp where descent moves the value back into the range, else a radius that has left it would
-    never learn; it is blocked where descent would move it further out.
+    Where a clamp is active, the gradient is passed if descent moves the value back into the range; without that, a radius outside the
+    range would never learn. The gradient is zero if descent would move the value further out.
     """
 
     @staticmethod
@@ -397,7 +430,7 @@ class CorrectionReadout(torch.autograd.Function):
 
 
 def compute_strain_features(F: Tensor) -> Tensor:
-    """`strain_features` of F (B, 3, 3) by its kernel, (B, 9); no gradient."""
+    """Compute `strain_features` of F (B, 3, 3) by a Warp kernel, (B, 9), without gradient."""
     out = torch.empty(F.shape[0], network_kernels.FEATURES, dtype=F.dtype, device=F.device)
     launch(kernels(F).features, F, F.detach().contiguous(), out)
     return out

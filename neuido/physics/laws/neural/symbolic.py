@@ -1,12 +1,12 @@
-"""Symbolic laws: the coefficients of an isotropic stress and of a yield surface as polynomials of the strain's invariants.
+"""Symbolic laws: an isotropic stress with polynomial coefficients, and a yield surface with constant ones.
 
-The read-outs are those of the objective networks (`network_kernels`), with a polynomial in the network's place. With l the trace, A the
-deviator and q the norm of the deviator of the left Hencky strain, and r = det A / q^2:
+They have the form of the objective networks (`network_kernels`), with a polynomial in place of the network. With the trace l, the
+deviator A and its norm q of the left Hencky strain, and r = det A / q^2:
 
-    stress   tau = 1e5 Pa (c0 l I + c1 A + c2 dev(A A)/q + c3 (A:A)/q I),   each c a sum over `TERMS`
-    yield    radii 1e-2 c0 + c1 max(-l, 0) of q and 1e-2 c2 of l > 0, each c a constant
+    stress   tau = 1e5 Pa (c0 l I + c1 A + c2 dev(A A)/q + c3 (A:A)/q I), each c a polynomial with the terms `TERMS`
+    yield    |dev| radius 1e-2 c0 + c1 max(-l, 0) for q, volumetric radius 1e-2 c2 for l > 0, each c a constant
 
-A term counts l, q and r tenfold. The engine form is batched and owns its memory, so that CUDA graphs hold it.
+In a term, l, q and r are multiplied by 10. An engine owns its buffers, so that a rollout may be captured in a CUDA graph.
 """
 
 from collections.abc import Hashable, Sequence
@@ -22,20 +22,23 @@ from neuido.physics.laws.neural.network_kernels import LINEAR, STRESS_COEFFICIEN
 from neuido.types import Particles
 
 TERMS = ("1", "l", "q", "r", "l^2", "l q", "q^2")
+"""Terms of the polynomials, the columns of the coefficients."""
 GENERATORS = ("l I", "A", "dev(A A)/q", "(A:A)/q I")
+"""Tensors that the polynomials multiply, the rows of the coefficients."""
 DEGREE = (0, 1, 1, 1, 2, 2, 2)
+"""Degree of each term."""
 FIRST = 6
-"""Column of the features in which 10 l, 10 q and 10 r begin."""
+"""First of the three feature columns 10 l, 10 q and 10 r."""
 
 
 class SymbolicEngine(Engine):
-    """One polynomial for one rollout, with its own buffers."""
+    """The engine of a symbolic law, with its own buffers."""
 
     def __init__(self, law: "_Symbolic", tensors: Sequence[Tensor], particles: Particles):
         super().__init__(law, [t.detach() for t in tensors], particles)
         (W,) = self.tensors
         count = particles.offsets[-1]
-        self.x, self.gx = W.new_zeros(count, 9), W.new_zeros(count, 9)  # columns that no term has keep a zero adjoint
+        self.x, self.gx = W.new_zeros(count, 9), W.new_zeros(count, 9)  # the adjoint of columns without a term stays zero
         self.terms, self.g_terms = (W.new_ones(count, W.shape[-1]) for _ in range(2))
         self.c, self.gc = (W.new_empty(count, W.shape[1]) for _ in range(2))
 
@@ -83,7 +86,7 @@ class _Symbolic(EngineLaw):
         self.coefficients = coefficients
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """(coefficients,); see the class."""
+        """Return the coefficients."""
         return (self.coefficients,)
 
     def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
@@ -93,13 +96,13 @@ class _Symbolic(EngineLaw):
         return type(self).__name__
 
     def _at(self, F: Tensor, particles: Particles | None) -> Tensor:
-        """Return the coefficients of each F in plain torch, (..., outputs)."""
+        """Evaluate the polynomials for each F in plain torch, (..., outputs)."""
         W = self.coefficients.to(F.dtype)
         terms = polynomial(F)[..., : self.columns]
         if len(W) == 1:
             return terms @ W[0].T
         if particles is None:
-            raise UserError(f"{type(self).__name__} holds {len(W)} scenes: give `particles` to say which scene each F belongs to")
+            raise UserError(f"{type(self).__name__} has {len(W)} scenes: give `particles`, the scene of each F")
         return (W[particles.scene.long()] @ terms[..., None])[..., 0]
 
     def __repr__(self) -> str:
@@ -109,7 +112,14 @@ class _Symbolic(EngineLaw):
 
 
 class SymbolicElastic(_Symbolic, ElasticLaw):
-    """Kirchhoff stress [Pa] by coefficients (S, 4, 7): of generators by terms."""
+    """An isotropic elastic law with polynomial coefficients; the module has the formula.
+
+    Args:
+        coefficients: Coefficient of each term (`TERMS`) of each generator (`GENERATORS`), (S, 4, 7).
+
+    Raises:
+        UserError: Another shape.
+    """
 
     elastic, outputs, columns, scale = True, STRESS_COEFFICIENTS, len(TERMS), networks.STRESS_SCALE
 
@@ -117,12 +127,19 @@ class SymbolicElastic(_Symbolic, ElasticLaw):
         return networks.isotropic_stress(F, self._at(F, particles), self.scale)
 
     def modulus(self) -> Tensor:
-        """P-wave modulus at rest [Pa], (S,): 1e5 (c0 + 2/3 c1) of the constant terms."""
+        """Return the P-wave modulus at rest [Pa], (S,): 1e5 (c0 + 2/3 c1) of the constant terms."""
         return self.scale * (self.coefficients[:, 0, 0] + 2 / 3 * self.coefficients[:, 1, 0])
 
 
 class SymbolicPlastic(_Symbolic, PlasticLaw):
-    """Return to the yield surface of constants (S, 3, 1)."""
+    """A return map with constant yield radii; the module has the formula.
+
+    Args:
+        coefficients: The constants c0, c1 and c2, (S, 3, 1).
+
+    Raises:
+        UserError: Another shape.
+    """
 
     elastic, outputs, columns, identity, scale = False, YIELD_COEFFICIENTS, 1, False, networks.STRAIN_SCALE
 
@@ -131,19 +148,23 @@ class SymbolicPlastic(_Symbolic, PlasticLaw):
 
 
 def polynomial(F: Tensor) -> Tensor:
-    """Return the terms of F (..., 3, 3) in plain torch, (..., 7), in the order of `TERMS`."""
+    """Evaluate the terms `TERMS` of F (..., 3, 3) in plain torch, (..., 7)."""
     l, q, r = networks.strain_features(*networks.hencky_strain(F))[..., FIRST:].unbind(-1)
     return torch.stack([torch.ones_like(l), l, q, r, l * l, l * q, q * q], -1)
 
 
 def generators(F: Tensor) -> Tensor:
-    """Return the four generators of F (..., 3, 3) in plain torch, (..., 4, 3, 3), in the order of `GENERATORS`."""
+    """Evaluate the generators `GENERATORS` of F (..., 3, 3) in plain torch, (..., 4, 3, 3)."""
     units = torch.eye(4, dtype=F.dtype, device=F.device)
     return torch.stack([networks.isotropic_stress(F, unit.expand(*F.shape[:-2], 4), 1.0) for unit in units], -3)
 
 
 def formula(coefficients: Tensor) -> str:
-    """Return a stress as text, tau/kPa, from coefficients (4, 7) of which zeros are left out."""
+    """Format the stress tau [kPa] of one scene as a formula.
+
+    Args:
+        coefficients: As for `SymbolicElastic`, (4, 7); terms with a coefficient of zero are left out.
+    """
     parts = []
     for row, generator in zip(coefficients.detach().cpu().tolist(), GENERATORS):
         for value, term, degree in zip(row, TERMS, DEGREE):
