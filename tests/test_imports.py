@@ -86,7 +86,7 @@ LIGHT = ("", ".__main__", ".errors", ".data.trajectories.options", ".data.scenes
          ".data.files.results", ".data.files.sweep_run", ".data.files.score_tables", ".commands.diagnose",
          *(f".commands.{name}" for name in ("main", "doctor", "simulate", "reconstruct", "film", "sweep", "report",
                                             "latents", "demo.demo", "cli.config_files", "cli.suggestions",
-                                            "cli.trainer", "cli.functions")))  # fmt: skip
+                                            "cli.trainer", "cli.trainer_help", "cli.signatures", "cli.functions")))  # fmt: skip
 
 
 @pytest.mark.parametrize("module", [f"neuido{name}" for name in LIGHT])

@@ -19,10 +19,11 @@ from typing import Any
 
 import neuido
 from neuido.commands import interruption
-from neuido.commands.cli.config_files import find_configs
+from neuido.commands.cli.config_files import expanded, find_configs
 from neuido.commands.cli.functions import run_function
 from neuido.commands.cli.suggestions import refuse_abbreviations, suggest
-from neuido.commands.cli.trainer import HEAVY, run_lightning
+from neuido.commands.cli.trainer import run_lightning
+from neuido.commands.cli.trainer_help import HEAVY, help_text, wants_help
 from neuido.commands.simulate_scene import is_scene
 from neuido.errors import UserError, one_line, shortened
 
@@ -105,6 +106,10 @@ def _dispatch(args: list[str]) -> int:
         known = [*HEAVY, *LIGHT]
         raise UserError(f"unknown command '{name}'{suggest(name, known) or ':'} The commands are {', '.join(known)}")
     args = find_configs(args)
+    if name in HEAVY and wants_help(args):
+        print(help_text(args))
+        return 0
+    args = expanded(args)
     os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # lightning's own calls, lightning issue 21900
     refuse_abbreviations()
     if name in LIGHT:

@@ -32,7 +32,9 @@ def assert_one_line(capsys, args: list[str], *words: str) -> None:
         assert word in lines[0]
 
 
-@pytest.mark.parametrize("name", ["--help", "--version", *[f"{name} --help" for name in cli.LIGHT]])
+@pytest.mark.parametrize(
+    "name", ["--help", "--version", *[f"{name} --help" for name in cli.LIGHT], "fit --help", "test --config adapt --help"]
+)
 def test_help_loads_no_torch(name):
     code = f"""
 import atexit, sys

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import neuido
 from neuido.commands import interruption
 from neuido.commands.cli.console import quiet_lightning
+from neuido.commands.cli.signatures import MODULES
+from neuido.commands.cli.trainer_help import HEAVY
 from neuido.data.files.renamed_options import rename_in_arguments, rename_in_configuration
 from neuido.data.files.sweep_run import own_folder, redirect
 from neuido.errors import UserError
@@ -20,36 +22,65 @@ from neuido.errors import UserError
 if TYPE_CHECKING:
     from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-HEAVY = {
-    "fit": "Train a model.",
-    "validate": "Run one validation epoch.",
-    "test": "Run one test epoch.",
-    "predict": "Run inference.",
-}
-
-MODULES = (  # so that their class names resolve without a path
-    *(f"neuido.models.stages.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt")),
-    *(f"neuido.models.baselines.{name}" for name in ("known_law", "nclaw", "spring_gaus", "sparse_law", "stage_one_latents")),
-    "neuido.models.fewshot.low_rank",
-    "neuido.data.trajectories.trajectory_module",
-    "neuido.data.clips",
-    "neuido.data.scenes.filmed_scene_module",
-    "neuido.discrepancy.diagnosed",
-)
-
 
 def run_lightning(args: list[str]) -> "LightningCLI":
     """Run a command of the trainer; the model, the data module and the trainer are attributes of what it returns."""
     quiet_lightning()
+    return _cli_class()(args=rename_in_arguments(args, "model.method", MODULES), **_settings())
+
+
+def trainer_parser() -> "LightningArgumentParser":
+    """Return the parser of the trainer's commands, which are its subcommands."""
+    quiet_lightning()
+
+    class ParserAlone(_cli_class()):
+        def parse_arguments(self, parser: "LightningArgumentParser", args: Any) -> None:
+            raise _ParserIsMadeError(parser)
+
+    try:
+        ParserAlone(args=[], **_settings())
+    except _ParserIsMadeError as made:
+        return made.args[0]
+    raise AssertionError("Lightning has read no arguments")
+
+
+class _ParserIsMadeError(Exception):
+    """Ends the construction of a LightningCLI once its parser is there."""
+
+
+def _settings() -> dict[str, Any]:
     from lightning.pytorch import LightningDataModule, LightningModule
+
+    parser = {"exit_on_error": False}  # raise argparse.ArgumentError instead of 100 lines of usage
+    return {
+        "model_class": LightningModule,
+        "datamodule_class": LightningDataModule,
+        "subclass_mode_model": True,
+        "subclass_mode_data": True,
+        "auto_configure_optimizers": False,
+        "seed_everything_default": 0,
+        "parser_kwargs": {"prog": "neuido", "version": neuido.__version__, **parser, **{name: dict(parser) for name in HEAVY}},
+    }
+
+
+@functools.cache
+def _cli_class() -> type["LightningCLI"]:
+    """Return the LightningCLI of neuido; the classes of neuido are imported, so that their names resolve without a path."""
     from lightning.pytorch.cli import LightningCLI, SaveConfigCallback
 
     for module in MODULES:
         importlib.import_module(module)
-    args = rename_in_arguments(args, "model.method", MODULES)
     _load_former_names()
 
+    class BesideTheLog(SaveConfigCallback):
+        def setup(self, trainer, pl_module, stage):  # without a log it would write into the current folder, and refuse to a second time
+            if trainer.loggers:
+                super().setup(trainer, pl_module, stage)
+
     class NeuidoCLI(LightningCLI):
+        def __init__(self, **settings: Any):
+            super().__init__(save_config_callback=BesideTheLog, **settings)
+
         def add_arguments_to_parser(self, parser: "LightningArgumentParser") -> None:
             parser.link_arguments("data.trajectory_count", "model.init_args.trajectory_count", apply_on="instantiate")
 
@@ -74,23 +105,7 @@ def run_lightning(args: list[str]) -> "LightningCLI":
                     options["ckpt_path"] = str(kept)
             self.trainer_defaults["callbacks"] = [interruption.stop_at_step(folder and folder / interruption.STATE)]
 
-    class BesideTheLog(SaveConfigCallback):
-        def setup(self, trainer, pl_module, stage):  # without a log it would write into the current folder, and refuse to a second time
-            if trainer.loggers:
-                super().setup(trainer, pl_module, stage)
-
-    parser = {"exit_on_error": False}  # raise argparse.ArgumentError instead of 100 lines of usage
-    return NeuidoCLI(
-        LightningModule,
-        LightningDataModule,
-        subclass_mode_model=True,
-        subclass_mode_data=True,
-        auto_configure_optimizers=False,
-        seed_everything_default=0,
-        save_config_callback=BesideTheLog,
-        parser_kwargs={"prog": "neuido", "version": neuido.__version__, **parser, **{name: dict(parser) for name in HEAVY}},
-        args=args,
-    )
+    return NeuidoCLI
 
 
 @functools.cache  # once a process
