@@ -1,4 +1,4 @@
-"""Scores of diagnoses against the sealed keys of `neuido simulate --undeclared`, and the answers of ablations.
+"""Scores of diagnoses against the sealed keys of `neuido undeclared`, and the answers of ablations.
 
 A key is a mapping written by `neuido.data.undeclared`, or a truth.yaml of the same form. A diagnosis is the content of diagnosis.json, and
 a trace is the content of trace.json.

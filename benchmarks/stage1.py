@@ -94,7 +94,7 @@ def main() -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     if not (options.data / "index.json").exists():
         start = time.time()
-        arguments = ["simulate", "--config", str(options.setup), "--out", str(options.data), "--batch", "40"]
+        arguments = ["trajectories", "--config", str(options.setup), "--out", str(options.data), "--batch", "40"]
         subprocess.run([sys.executable, "-m", "neuido", *arguments], check=True, env=environment)
         print(f"trajectories generated in {time.time() - start:.0f} s", flush=True)
     devices = max(1, torch.cuda.device_count())

@@ -28,7 +28,7 @@ def run(command):
 film = yaml.safe_load((neuido.configs_root() / "scenes" / "six_small.yaml").read_text())
 film["scenes"] = film["scenes"][:1]
 Path("ball.yaml").write_text(yaml.safe_dump(film))
-run("simulate --config ball.yaml --out film --device cpu")
+run("scenes --config ball.yaml --out film --device cpu")
 run("reconstruct film/Ball --steps 200 --start 800 --gaussians 1500 --particles 1500 --device cpu")
 run("predict --config predict.yaml --model.init_from pretrained-small --model.out law --data.root film --data.scenes [Ball]")
 

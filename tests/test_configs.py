@@ -15,9 +15,9 @@ from neuido.commands.cli.sweep_file import read_sweep, runs_of
 from neuido.commands.diagnose import diagnose
 from neuido.commands.film import film
 from neuido.commands.latents import latents
-from neuido.commands.simulate import simulate
+from neuido.commands.simulation.scenes import scenes
+from neuido.commands.simulation.trajectories import trajectories
 from neuido.data.files.score_tables import read_rows
-from neuido.data.trajectories.options import simulate as trajectories
 
 ROOT = neuido.configs_root()
 CONFIGS = sorted(ROOT.rglob("*.yaml"))
@@ -36,8 +36,10 @@ def command_of(path) -> str | None:
         return "fit"
     if keys <= {*inspect.signature(latents).parameters}:
         return "latents"
-    if keys <= {*inspect.signature(simulate).parameters, *inspect.signature(trajectories).parameters}:
-        return "simulate"
+    if keys <= {*inspect.signature(scenes).parameters}:
+        return "scenes"
+    if keys <= {*inspect.signature(trajectories).parameters}:
+        return "trajectories"
     if keys <= {*inspect.signature(film).parameters}:
         return "film"
     return None
@@ -57,7 +59,7 @@ def of_a_command(path) -> bool:
 def test_command_line_accepts(path, capsys):
     command = command_of(path)
     assert command is not None, f"no command takes {path.name}"
-    required = ["--out", "nowhere"] if command in ("simulate", "film", "diagnose") and "out" not in content(path) else []
+    required = ["--out", "nowhere"] if command in ("scenes", "trajectories", "film", "diagnose") and "out" not in content(path) else []
     required += ["--folder", "nowhere"] if command == "diagnose" else []
     with pytest.raises(SystemExit) as stop:
         cli.main([command, "--config", str(path), *required, "--print_config"])

@@ -24,7 +24,7 @@ if not DOCS.is_dir():
     pytest.skip("the documentation does not come with the installed package", allow_module_level=True)
 PAGES = sorted(p for p in DOCS.rglob("*.md") if not {"_build", "generated", "gallery"} & set(p.relative_to(DOCS).parts))
 QUICK = {"Box", "Plane", "Scene", "Walls", "AttachedMass", "UserError", "configs_root", "shapes", "read_tracks", "load_scene"}
-RUN = ("neuido doctor", "neuido simulate --out runs/small", "neuido fit --config configs/quickstart.yaml --data.root runs/small")
+RUN = ("neuido doctor", "neuido trajectories --out runs/small", "neuido fit --config configs/quickstart.yaml --data.root runs/small")
 """Commands that run at the size at which they stand, in the slow tier; the others are read by the command line that they are for."""
 LATER = ("demo", "report", "sweep", "diagnose", "reconstruct")
 """Commands that take a folder of their own first: their options are looked up in their help."""

@@ -1,6 +1,6 @@
 """Make the moving picture of the README from real output of neuido.
 
-    neuido simulate --config six_small --out film --device cpu
+    neuido scenes --config six_small --out film --device cpu
     neuido reconstruct film/Ball --steps 200 --start 800 --gaussians 1500 --particles 1500 --device cpu
     neuido predict --config predict.yaml --model.init_from pretrained-small --data.root film --data.scenes '[Ball]'
     neuido demo --parts loop

@@ -34,7 +34,7 @@ def film(
     Args:
         out: Folder to write: one .npz file a clip, plan.json at the start and index.json when all are there.
         count: Number of clips; the families take turns.
-        families: Parameter ranges, as `neuido simulate` takes them.
+        families: Parameter ranges, as `neuido trajectories` takes them.
         views: Random views of each clip.
         frames: Frames of a clip.
         frame_steps: Substeps from one frame to the next.

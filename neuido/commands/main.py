@@ -24,11 +24,15 @@ from neuido.commands.cli.functions import run_function
 from neuido.commands.cli.suggestions import refuse_abbreviations, suggest
 from neuido.commands.cli.trainer import run_lightning
 from neuido.commands.cli.trainer_help import HEAVY, help_text, wants_help
-from neuido.commands.simulate_scene import is_scene
+from neuido.commands.simulation.former_options import current_command
 from neuido.errors import UserError, one_line, shortened
 
 LIGHT = {  # name: (module, function, one line for the list); the module must import torch only inside its functions
-    "simulate": ("neuido.commands.simulate", "simulate", "Run a scene file; or generate the trajectories of Stage I, or filmed scenes."),
+    "simulate": ("neuido.commands.simulation.simulate", "simulate", "Run a scene file and write its motion."),
+    "trajectories": ("neuido.commands.simulation.trajectories", "trajectories", "Simulate the training data of Stage I."),
+    "scenes": ("neuido.commands.simulation.scenes", "scenes", "Simulate bodies and film them from several views, with the truth beside."),
+    "undeclared": ("neuido.commands.simulation.undeclared", "undeclared", "Make a folder to diagnose, with a sealed answer."),
+    "replay": ("neuido.commands.simulation.replay", "replay", "Simulate the recordings of an experiment under a model."),
     "reconstruct": ("neuido.commands.reconstruct", "reconstruct", "Gaussians and particles of a filmed body's first frame."),
     "import": ("neuido.commands.import_data", "import_data", "Turn tables of a testing machine or a tracker into a folder to diagnose."),
     "check": ("neuido.commands.import_data", "check", "Say whether measured data are plausible."),
@@ -113,17 +117,16 @@ def _dispatch(args: list[str]) -> int:
     os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # lightning's own calls, lightning issue 21900
     refuse_abbreviations()
     if name in LIGHT:
+        name, options = current_command(name, args[1:])
         module, function, _ = LIGHT[name]
-        if name == "simulate" and is_scene(args[1:]):
-            module, function = "neuido.commands.simulate_scene", "simulate_scene"
-        return run_function(name, module, function, args[1:])
+        return run_function(name, module, function, options)
     run_lightning(args)
     return 0
 
 
 def _help() -> str:
     table = HEAVY | {name: text for name, (*_, text) in LIGHT.items()}
-    commands = "\n".join(f"  {name:<13}{text}" for name, text in table.items())
+    commands = "\n".join(f"  {name:<14}{text}" for name, text in table.items())
     return (
         f"usage: neuido [--help] [--version] COMMAND [--config FILE] [OPTIONS]\n\n{neuido.__doc__.splitlines()[0]}\n\n"
         f"commands:\n{commands}\n\n`neuido COMMAND --help` lists the options of a command; `--print_config` writes them as YAML."

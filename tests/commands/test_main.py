@@ -13,7 +13,7 @@ import neuido
 from neuido.commands import main as cli
 from neuido.commands.cli.config_files import find_configs
 from neuido.commands.main import main
-from neuido.commands.simulate import simulate
+from neuido.commands.simulation.trajectories import trajectories
 from neuido.errors import one_line
 from tests.command import run
 
@@ -56,9 +56,9 @@ def test_help_names_every_command(capsys):
 
 
 def test_light_help_comes_from_the_docstring(capsys):
-    status, out, _ = run(capsys, "simulate", "--help")
+    status, out, _ = run(capsys, "trajectories", "--help")
     assert status == 0
-    for word in ("neuido simulate", "--config", "--print_config", "--held_out", "Substep, s."):
+    for word in ("neuido trajectories", "--config", "--print_config", "--held_out", "Substep, s."):
         assert word in out
 
 
@@ -74,16 +74,16 @@ def test_module_and_script_are_one_command():
 
 
 def test_a_device_without_memory_is_one_line(capsys, monkeypatch):
-    @functools.wraps(simulate)
+    @functools.wraps(trajectories)
     def full(**options):
         raise RuntimeError("CUDA error: out of memory\nFor debugging consider passing CUDA_LAUNCH_BLOCKING=1")
 
-    monkeypatch.setattr("neuido.commands.simulate.simulate", full)
-    assert_one_line(capsys, ["simulate", "--out", "x"], "no memory left", "CUDA error: out of memory)", "CPU")
+    monkeypatch.setattr("neuido.commands.simulation.trajectories.trajectories", full)
+    assert_one_line(capsys, ["trajectories", "--out", "x"], "no memory left", "CUDA error: out of memory)", "CPU")
 
 
 def test_light_wrong_key_on_the_command_line(capsys):
-    assert_one_line(capsys, ["simulate", "--out", "x", "--instancez", "3"], "instancez")
+    assert_one_line(capsys, ["trajectories", "--out", "x", "--instancez", "3"], "instancez")
 
 
 @pytest.mark.parametrize(("wrong", "meant"), [("devic", "device"), ("particlez", "particles"), ("seedd", "seed")])
@@ -95,39 +95,39 @@ def test_light_wrong_name_is_answered_with_the_one_that_was_meant(capsys, tmp_pa
 
 
 def test_light_abbreviation_is_refused(capsys, tmp_path):
-    assert_one_line(capsys, ["simulate", "--out", str(tmp_path / "x"), "--instanc", "3"], "instanc")
+    assert_one_line(capsys, ["trajectories", "--out", str(tmp_path / "x"), "--instanc", "3"], "instanc")
     assert not (tmp_path / "x").exists()
 
 
 def test_light_wrong_key_in_yaml(capsys, tmp_path):
     path = tmp_path / "wrong.yaml"
     path.write_text("out: x\ninstancez: 3\n")
-    assert_one_line(capsys, ["simulate", "--config", str(path)], "instancez")
+    assert_one_line(capsys, ["trajectories", "--config", str(path)], "instancez")
 
 
 def test_light_wrong_type(capsys):
-    assert_one_line(capsys, ["simulate", "--out", "x", "--instances", "many"], "instances", "int", "many")
+    assert_one_line(capsys, ["trajectories", "--out", "x", "--instances", "many"], "instances", "int", "many")
 
 
 def test_light_missing_option(capsys):
-    assert_one_line(capsys, ["simulate"], "--out")
+    assert_one_line(capsys, ["trajectories"], "--out")
 
 
 def test_broken_yaml(capsys, tmp_path):
     path = tmp_path / "broken.yaml"
     path.write_text("out: [\n a: b: c\n")
-    assert_one_line(capsys, ["simulate", "--config", str(path)], "line 2")
+    assert_one_line(capsys, ["trajectories", "--config", str(path)], "line 2")
 
 
 def test_yaml_is_read_safely(capsys, tmp_path):
     path, victim = tmp_path / "evil.yaml", tmp_path / "victim"
     path.write_text(f"out: !!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ['{victim}']]\n")
-    status, _, _ = run(capsys, "simulate", "--config", str(path))
+    status, _, _ = run(capsys, "trajectories", "--config", str(path))
     assert status == 2
     assert not victim.exists()
 
 
-@pytest.mark.parametrize("command", ["simulate", "fit"])
+@pytest.mark.parametrize("command", ["trajectories", "fit"])
 def test_missing_configuration(capsys, command):
     assert_one_line(capsys, [command, "--config", "nowhere.yaml"], "nowhere.yaml", "--config")
 
@@ -152,13 +152,25 @@ def test_configurations_that_come_with_neuido_are_found_from_anywhere(tmp_path, 
     ],
 )
 def test_impossible_material(capsys, tmp_path, families):
-    args = ["simulate", "--out", str(tmp_path / "out"), "--families", families]
+    args = ["trajectories", "--out", str(tmp_path / "out"), "--families", families]
     assert_one_line(capsys, args, "young" if "-1.0e5" in families else "poisson", "-100000" if "-1.0e5" in families else "0.5")
 
 
 def test_step_above_the_stability_limit(capsys, tmp_path):
-    args = ["simulate", "--out", str(tmp_path / "out"), "--dt", "0.1", "--steps", "2", "--instances", "1", "--held_out", "0"]
-    assert_one_line(capsys, [*args, "--particles_per_side", "3", "--progress", "false", "--device", "cpu"], "dt", "0.1")
+    args = [
+        "trajectories",
+        "--out",
+        str(tmp_path / "out"),
+        "--setup.dt",
+        "0.1",
+        "--setup.steps",
+        "2",
+        "--instances",
+        "1",
+        "--held_out",
+        "0",
+    ]
+    assert_one_line(capsys, [*args, "--setup.particles_per_side", "3", "--progress", "false", "--device", "cpu"], "dt", "0.1")
 
 
 def test_interrupt(capsys, monkeypatch):
@@ -221,7 +233,7 @@ class TestLightning:
         assert_one_line(capsys, ["fit"], "model", "data")
 
     def test_missing_trajectories(self, capsys, tmp_path):
-        assert_one_line(capsys, ["fit", "--config", STAGE1, "--data.root", str(tmp_path)], str(tmp_path), "neuido simulate")
+        assert_one_line(capsys, ["fit", "--config", STAGE1, "--data.root", str(tmp_path)], str(tmp_path), "neuido trajectories")
 
     def test_checkpoint_is_read_weights_only(self, capsys, tmp_path):
         checkpoint, victim = tmp_path / "evil.ckpt", tmp_path / "victim"

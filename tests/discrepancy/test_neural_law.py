@@ -74,7 +74,7 @@ def test_drag_on_a_neural_law_is_named_and_the_model_goes_back(law, folder, tmp_
     left = (moved.x[:, r.track] - r.x)[r.seen]
     assert float(left.square().mean().sqrt()) < 4e-4
 
-    status, _, err = run(capsys, "simulate", "--experiment", folder, "--model", out / "model_after.yaml", "--out", tmp_path / "again")
+    status, _, err = run(capsys, "replay", folder, "--model", out / "model_after.yaml", "--out", tmp_path / "again")
     assert status == 0, err
     again = read_experiment(tmp_path / "again")
     assert Path(again.model["law"]["file"]) == tmp_path / "again" / "law.safetensors"

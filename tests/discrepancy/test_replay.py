@@ -1,4 +1,4 @@
-"""model_after.yaml goes back: into `neuido simulate`, into `neuido diagnose`, and into a rollout of one's own."""
+"""model_after.yaml goes back: into `neuido replay`, into `neuido diagnose`, and into a rollout of one's own."""
 
 import json
 
@@ -38,7 +38,7 @@ def after(folder):
 
 
 def test_simulate_repeats_the_recordings_under_the_model(folder, after, tmp_path, capsys):
-    status, _, err = run(capsys, "simulate", "--experiment", folder, "--model", after, "--out", tmp_path / "again", "--device", "cpu")
+    status, _, err = run(capsys, "replay", folder, "--model", after, "--out", tmp_path / "again", "--device", "cpu")
     assert status == 0, err
     measured, again = read_experiment(folder), read_experiment(tmp_path / "again")
     assert again.model["effects"] == EFFECTS
@@ -52,7 +52,7 @@ def test_simulate_repeats_the_recordings_under_the_model(folder, after, tmp_path
 
 @pytest.mark.slow
 def test_diagnose_of_the_repeated_recordings_answers_none(folder, after, tmp_path, capsys):
-    run(capsys, "simulate", "--experiment", folder, "--model", after, "--out", tmp_path / "again", "--device", "cpu")
+    run(capsys, "replay", folder, "--model", after, "--out", tmp_path / "again", "--device", "cpu")
     options = ["--effects", "drag_linear,viscosity_shear", "--draws", "19", "--device", "cpu"]
     status, out, err = run(capsys, "diagnose", tmp_path / "again", "--out", tmp_path / "out", *options)
     assert status == 0, err
@@ -90,23 +90,21 @@ def test_ready_takes_fields_over_the_body_and_forces_in_time(folder):
 @pytest.mark.parametrize(
     ("more", "word"),
     [
-        (["--model", "nowhere.yaml", "--experiment", "FOLDER"], "nowhere.yaml"),
-        (["--model", "nowhere.yaml"], "experiment"),
-        (["--experiment", "FOLDER", "--undeclared", "3"], "undeclared"),
-        (["--experiment", "nowhere"], "nowhere"),
-        (["--experiment", "FOLDER", "--device", "abacus"], "abacus"),
+        (["FOLDER", "--model", "nowhere.yaml"], "nowhere.yaml"),
+        (["nowhere"], "nowhere"),
+        (["FOLDER", "--device", "abacus"], "abacus"),
     ],
 )
 def test_wrong_option_is_one_line(more, word, folder, tmp_path, capsys):
     given = [str(folder) if part == "FOLDER" else part for part in more]
-    status, _, err = run(capsys, "simulate", "--out", tmp_path / "out", *given)
+    status, _, err = run(capsys, "replay", *given, "--out", tmp_path / "out")
     assert (status, len(err.splitlines())) == (2, 1), err
     assert word in err
     assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_that_is_there_is_not_overwritten(folder, capsys):
-    status, _, err = run(capsys, "simulate", "--experiment", folder, "--out", folder)
+    status, _, err = run(capsys, "replay", folder, "--out", folder)
     assert (status, len(err.splitlines())) == (2, 1)
     assert "already" in err
 

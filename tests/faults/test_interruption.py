@@ -37,8 +37,8 @@ def made(tmp_path_factory) -> Path:
     """A folder with small trajectories and the configuration of a fit that has no end by itself."""
     folder = tmp_path_factory.mktemp("fit")
     with pytest.raises(SystemExit) as stop:
-        main(["simulate", "--out", str(folder / "trajectories"), "--instances=1", "--held_out=0", "--particles_per_side=3", "--steps=40",
-              "--device=cpu", "--progress=false"])  # fmt: skip
+        main(["trajectories", "--out", str(folder / "trajectories"), "--instances=1", "--held_out=0",
+              "--setup.particles_per_side=3", "--setup.steps=40", "--device=cpu", "--progress=false"])  # fmt: skip
     assert stop.value.code == 0
     (folder / "fit.yaml").write_text(yaml.safe_dump(FIT))
     return folder
@@ -96,7 +96,7 @@ def test_an_interrupted_fit_goes_on_to_the_same_bits(made, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_light_command_ends_with_the_signal_and_leaves_nothing_half_written(tmp_path, number):
-    args = ["simulate", "--out", "out", "--instances=1", "--held_out=0", "--steps=200000", "--device=cpu", "--progress=false"]
+    args = ["trajectories", "--out", "out", "--instances=1", "--held_out=0", "--setup.steps=200000", "--device=cpu", "--progress=false"]
     process = begin(tmp_path, *args)
     wait_for(lambda: (tmp_path / "out" / "plan.json").exists(), process)
     process.send_signal(number)

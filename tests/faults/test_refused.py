@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from neuido.commands.simulate import simulate
+from neuido.commands.simulation.trajectories import trajectories
 from neuido.commands.sweep import logged
 from neuido.data.bodies.scene_files import scene_from_dict
 from neuido.data.files.results import curves
@@ -28,9 +28,9 @@ def test_logs_are_ordered_by_their_version(tmp_path):
 
 def test_out_below_a_file_is_refused_before_work(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr("neuido.commands.simulate.trajectories", lambda *a, **k: pytest.fail("work began"))
+    monkeypatch.setattr("neuido.commands.simulation.trajectories.make_trajectories", lambda *a, **k: pytest.fail("work began"))
     with pytest.raises(UserError, match="is a file"):
-        simulate(str(tmp_path / "file" / "out"))
+        trajectories(str(tmp_path / "file" / "out"))
     monkeypatch.setattr(workflow, "choose_device", lambda *a, **k: pytest.fail("work began"))
     monkeypatch.setattr(workflow, "kind_of", lambda folder: ("experiment", Path(folder)))
     with pytest.raises(UserError, match="is a file"):

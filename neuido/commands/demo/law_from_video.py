@@ -64,15 +64,16 @@ def demo_video(
     from neuido.commands.cli.config_files import find_config
     from neuido.commands.cli.trainer import run_lightning
     from neuido.commands.reconstruct import reconstruct
-    from neuido.commands.simulate import simulate
     from neuido.data.scenes.film_options import Film
+    from neuido.data.scenes.synthetic import make_scenes
+    from neuido.models.render.splatting import rasterize
 
     folder = Path(out)
     settings = yaml.safe_load(Path(find_config("scenes/ten_small")).read_text())
     chosen = [scene for scene in settings["scenes"] if scene["name"] in (*TRAINING, *UNSEEN)]
     print("[video 1/5] filming three small bodies", flush=True)
     film = {key: tuple(value) if isinstance(value, list) else value for key, value in settings["film"].items()}
-    simulate(str(folder / "scenes"), scenes=chosen, film=Film(**film), device="cpu", progress=False)
+    make_scenes(chosen, Film(**film), folder / "scenes", draw=rasterize, device="cpu", progress=False)
     print("[video 2/5] reconstructing them from their first frame", flush=True)
     for name in (*TRAINING, *UNSEEN):
         reconstruct(str(folder / "scenes" / name), device="cpu", progress=False, **RECONSTRUCTION)

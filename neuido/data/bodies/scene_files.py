@@ -50,7 +50,7 @@ def data_root(option: str | os.PathLike | None = None) -> Path:
 
 
 def scene_names() -> list[str]:
-    """List the names that `load_scene` knows: files of configs/scenes of its format (others list scenes for `neuido simulate`)."""
+    """List the names that `load_scene` knows: files of configs/scenes of its format (others list scenes for `neuido scenes`)."""
     return sorted(path.stem for path in scenes_folder().glob("*.yaml") if f"\nformat: {FORMAT}\n" in path.read_text())
 
 

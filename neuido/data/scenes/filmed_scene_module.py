@@ -107,7 +107,7 @@ def train_on(batch: MultiViewBatch, views: int | list[int]) -> MultiViewBatch:
 
 
 class VisualDataModule(LightningDataModule):
-    """Scenes of `neuido simulate` or of one's own, each with what `neuido reconstruct` made of it (`data.visual`).
+    """Scenes of `neuido scenes` or of one's own, each with what `neuido reconstruct` made of it (`data.visual`).
 
     Training and validation take `scenes`; test and predict take `scenes` and `unseen`. Under several processes each trains on its own.
 

@@ -1,4 +1,4 @@
-"""The generation of the Stage I trajectories behind `neuido simulate`: plan, simulation, files.
+"""The generation of the Stage I trajectories behind `neuido trajectories`: plan, simulation, files.
 
 `storage.py` says what the folder holds.
 """
@@ -31,7 +31,7 @@ SEGMENT = 100  # substeps held in memory at a time
 
 @dataclass(frozen=True)
 class Setup:
-    """What decides the content of the files; `neuido simulate` documents each figure."""
+    """What decides the content of the files; `neuido trajectories --help` explains each figure."""
 
     families: dict[str, dict[str, tuple[float, float]]]
     instances: int

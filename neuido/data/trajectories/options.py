@@ -1,4 +1,8 @@
-"""The options of the `simulate` command: signatures and help alone, so that `--help` loads no torch."""
+"""The options of trajectories: signatures and help alone, so that `--help` loads no torch."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 Range = tuple[float, float]
 
@@ -10,42 +14,11 @@ FAMILIES: dict[str, dict[str, Range]] = {
 """Parameter ranges: young and yield_stress [Pa] drawn log-uniformly, poisson [-] and friction_angle [degrees] uniformly."""
 
 
-def simulate(
-    out: str,
-    *,
-    families: dict[str, dict[str, Range]] = FAMILIES,
-    instances: int = 30,
-    held_out: int = 10,
-    seed: int = 0,
-    length: float = 0.5,
-    particles_per_side: int = 10,
-    velocity: tuple[float, float, float] = (1.0, -1.5, -2.0),
-    angular_velocity: tuple[float, float, float] = (4.0, 4.0, 4.0),
-    density: float = 1000.0,
-    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0),
-    cells: int = 20,
-    wall_inset: float = 2.0,
-    dt: float = 5e-4,
-    steps: int = 1000,
-    record_every: int = 1,
-    shard: int = 0,
-    shards: int = 1,
-    device: str = "auto",
-    batch: int = 0,
-    progress: bool = True,
-) -> None:
-    """Simulate the constitutive trajectories of Stage I: a spinning cube thrown into a box, for many materials.
-
-    The set-up is NCLaw's; its three published materials are instance 0 of their families. A run that was interrupted goes on
-    where it stopped when the same command is given again. On the CPU the files are equal byte for byte however they are sharded.
+@dataclass(frozen=True)
+class Throw:
+    """The cube, its throw, the box and the substeps of the trajectories of Stage I.
 
     Args:
-        out: Folder to write: one .npy file per trajectory, plan.json at the start and index.json when all are there.
-        families: Parameter ranges of each family (elastic, plasticine, sand): young and yield_stress in Pa (log-uniform),
-            poisson and friction_angle in degrees (uniform).
-        instances: Training instances of each family.
-        held_out: Further instances of each family that are never trained on.
-        seed: Seed of the parameters; each trajectory's depend on the seed, its family and its number alone.
         length: Edge of the cube, m; it starts in the middle of the unit cube.
         particles_per_side: Particles along an edge.
         velocity: Velocity of the cube at the start, m/s.
@@ -57,32 +30,64 @@ def simulate(
         dt: Substep, s.
         steps: Substeps of a trajectory.
         record_every: Record every n-th substep.
+    """
+
+    length: float = 0.5
+    particles_per_side: int = 10
+    velocity: tuple[float, float, float] = (1.0, -1.5, -2.0)
+    angular_velocity: tuple[float, float, float] = (4.0, 4.0, 4.0)
+    density: float = 1000.0
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0)
+    cells: int = 20
+    wall_inset: float = 2.0
+    dt: float = 5e-4
+    steps: int = 1000
+    record_every: int = 1
+
+
+def make_trajectories(
+    out: str,
+    *,
+    families: dict[str, dict[str, Range]] = FAMILIES,
+    instances: int = 30,
+    held_out: int = 10,
+    seed: int = 0,
+    setup: Throw | Mapping[str, Any] = Throw(),
+    shard: int = 0,
+    shards: int = 1,
+    device: str = "auto",
+    batch: int = 0,
+    progress: bool = True,
+    **throw: Any,
+) -> None:
+    """Simulate the trajectories of Stage I; the options are those of `neuido trajectories`.
+
+    Args:
+        out: Folder to write.
+        families: Parameter ranges of each family.
+        instances: Training instances of each family.
+        held_out: Further instances of each family that are never trained on.
+        seed: Seed of the parameters.
+        setup: The cube, its throw, the box and the substeps.
         shard: Which share of the trajectories to simulate, counted from 0.
-        shards: Number of shares; trajectory i belongs to share i mod shards.
+        shards: Number of shares.
         device: auto, cpu or cuda.
         batch: Trajectories simulated in one launch; 0 chooses 1 on the CPU and 10 on a GPU.
         progress: Show a progress bar.
+        throw: Fields of `Throw` that differ from `setup`.
 
     Raises:
         UserError: An impossible material, a reversed range, a step above the stability limit, a folder that holds another set-up.
     """
     from neuido.data.trajectories.generation import Setup, generate
 
-    setup = Setup(
+    chosen = replace(setup, **throw) if isinstance(setup, Throw) else Throw(**{**setup, **throw})
+    vectors = {name: tuple(getattr(chosen, name)) for name in ("velocity", "angular_velocity", "gravity")}
+    plan = Setup(
         families={family: {name: tuple(bounds) for name, bounds in ranges.items()} for family, ranges in families.items()},
         instances=instances,
         held_out=held_out,
         seed=seed,
-        length=length,
-        particles_per_side=particles_per_side,
-        velocity=tuple(velocity),
-        angular_velocity=tuple(angular_velocity),
-        density=density,
-        gravity=tuple(gravity),
-        cells=cells,
-        wall_inset=wall_inset,
-        dt=dt,
-        steps=steps,
-        record_every=record_every,
+        **{**asdict(chosen), **vectors},
     )
-    generate(setup, out, shard=shard, shards=shards, device=device, batch=batch, progress=progress)
+    generate(plan, out, shard=shard, shards=shards, device=device, batch=batch, progress=progress)

@@ -1,6 +1,7 @@
-"""The Stage I samples (F_tr, F_hat, stress, trajectory) in balanced batches from the files of `neuido simulate`."""
+"""The Stage I samples (F_tr, F_hat, stress, trajectory) in balanced batches from the files of `neuido trajectories`."""
 
 import inspect
+from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from neuido.data.files.parsing import read_json
 from neuido.data.files.storage import COLUMNS, FORMAT, Files, complete, split
 from neuido.data.files.values import file_name, listed, take
 from neuido.data.sampling import Batches, Order, Step, Steps
-from neuido.data.trajectories.options import simulate
+from neuido.data.trajectories.options import Throw, make_trajectories
 from neuido.errors import UserError
 from neuido.types import TrajectoryBatch
 
@@ -28,7 +29,7 @@ class TrajectoryDataModule(LightningDataModule):
     a fixed number of exactly those. `instance_batches` gives the held-out instances: one half to fit a latent, one to score it.
 
     Args:
-        root: Folder written by `neuido simulate`.
+        root: Folder written by `neuido trajectories`.
         batch_size: Samples of a batch, shared equally by the trajectories: each gets batch_size // M (the paper's 10^4).
         held_out_particles: Fraction of the particles that is held out, the same ones in each trajectory.
         held_out_steps: Fraction of the steps that is held out, in whole blocks of time.
@@ -39,7 +40,7 @@ class TrajectoryDataModule(LightningDataModule):
             `auto` decides by the memory there is.
         num_workers: Worker processes that read when the training set is not preloaded.
         drop_last: Leave out the last batch of an epoch if it would be smaller than the others.
-        generate: Options of `neuido simulate` with which the folder is made if it is missing; none: a missing folder is an error.
+        generate: Options of `neuido trajectories` with which the folder is made if it is missing; none: a missing folder is an error.
 
     Attributes:
         trajectory_count, names, families, parameters: Of the training instances, in the order of the trajectory index.
@@ -71,9 +72,11 @@ class TrajectoryDataModule(LightningDataModule):
                 raise UserError(f"{name} must be at least 1, got {count}")
         if preload not in (True, False, "auto"):
             raise UserError(f"preload must be true, false or auto, got {preload!r}")
-        unknown = set(generate or {}) - set(inspect.signature(simulate).parameters)
+        throw = {field.name for field in fields(Throw)}
+        unknown = set(generate or {}) - throw - set(inspect.signature(make_trajectories).parameters)
+        unknown |= set((generate or {}).get("setup", {})) - throw
         if unknown:
-            raise UserError(f"data.generate has the unknown option {sorted(unknown)[0]!r}: `neuido simulate --help` lists them")
+            raise UserError(f"data.generate has the unknown option {sorted(unknown)[0]!r}: `neuido trajectories --help` lists them")
         self.root = Path(root)
         self.batch_size, self.seed, self.preload, self.num_workers, self.drop_last = batch_size, seed, preload, num_workers, drop_last
         self.held_out_particles, self.held_out_steps = held_out_particles, held_out_steps
@@ -93,7 +96,7 @@ class TrajectoryDataModule(LightningDataModule):
         if self.generate is not None:
             self.prepare_data()
         path = self.root / "index.json"
-        command = f"neuido simulate --config configs/trajectories.yaml --out {self.root}"
+        command = f"neuido trajectories --config configs/trajectories.yaml --out {self.root}"
         if not path.is_file():
             state = "is not complete" if (self.root / "plan.json").is_file() else "holds no trajectories"
             raise UserError(f"data.root = {self.root} {state} (no index.json): make it with `{command}`")
@@ -192,7 +195,7 @@ class TrajectoryDataModule(LightningDataModule):
 
     def prepare_data(self) -> None:
         if self.generate is not None and not (self.root / "index.json").is_file():
-            simulate(str(self.root), **self.generate)
+            make_trajectories(str(self.root), **self.generate)
 
     def setup(self, stage: str | None = None) -> None:
         samples = self.batch_size // self.trajectory_count
@@ -243,7 +246,7 @@ class TrajectoryDataModule(LightningDataModule):
         """
         files = self._files("held_out")
         if not files.paths:
-            raise UserError(f"{self.root} has no held-out instances: make it with `neuido simulate --held_out 10 ...`")
+            raise UserError(f"{self.root} has no held-out instances: make it with `neuido trajectories --held_out 10 ...`")
         fit = self._draw(self.rows("train"), self.instance_samples, len(files.paths), salt=1)
         return files.gather(fit), files.gather(self._held_out_rows(self.instance_samples, len(files.paths), salt=2))
 

@@ -1,5 +1,4 @@
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.commands.simulate import simulate
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.cameras import project
 from neuido.data.files.parsing import read_yaml
@@ -127,7 +125,7 @@ def test_killed_run_goes_on(ball, tmp_path):
     config = tmp_path / "scenes.json"
     config.write_text(json.dumps({"scenes": entries, "film": {**vars(FILM)}, "device": "cpu"}))
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "neuido", "simulate", "--config", str(config), "--out", str(out), "--progress", "false"]
+    command = [sys.executable, "-m", "neuido", "scenes", "--config", str(config), "--out", str(out), "--progress", "false"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE)
     while not (out / "Ball-1").exists():
         assert process.poll() is None, process.stderr.read()
@@ -194,8 +192,6 @@ def test_film_errors_and_mixed_options(tmp_path):
         make(tmp_path, film=replace(FILM, held_out=(0, 1, 2, 3)))
     with pytest.raises(UserError, match=r"film\.frames"):
         make(tmp_path, film=replace(FILM, frames=0))
-    with pytest.raises(UserError, match="instances = 3 is an option of trajectories"):
-        simulate(os.fspath(tmp_path), scenes=[BALL], instances=3)
     assert not list(tmp_path.iterdir())
 
 

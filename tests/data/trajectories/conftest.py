@@ -1,6 +1,6 @@
 import pytest
 
-from neuido.data.trajectories.options import simulate
+from neuido.data.trajectories.options import make_trajectories
 
 TINY = {
     "instances": 3,
@@ -18,5 +18,5 @@ TINY = {
 def folder(tmp_path_factory):
     """Nine training trajectories and six held-out ones of 30 steps of 64 particles."""
     path = tmp_path_factory.mktemp("trajectories")
-    simulate(str(path), **TINY)
+    make_trajectories(str(path), **TINY)
     return path

@@ -12,7 +12,7 @@ import torch
 from neuido.data.bodies import families
 from neuido.data.files import storage
 from neuido.data.trajectories import generation as generate
-from neuido.data.trajectories.options import FAMILIES, simulate
+from neuido.data.trajectories.options import FAMILIES, make_trajectories
 from neuido.errors import UserError
 
 from .conftest import TINY
@@ -91,10 +91,10 @@ def test_trial_follows_from_the_motion(folder):
 
 def test_shards_and_batches_make_the_same_bytes(folder, tmp_path):
     for shard in (1, 0):
-        simulate(str(tmp_path / "two"), **TINY, shard=shard, shards=2)
+        make_trajectories(str(tmp_path / "two"), **TINY, shard=shard, shards=2)
         assert (tmp_path / "two" / "index.json").exists() == (shard == 0)
     assert files(tmp_path / "two") == files(folder)
-    simulate(str(tmp_path / "batch"), **TINY, batch=4)
+    make_trajectories(str(tmp_path / "batch"), **TINY, batch=4)
     assert files(tmp_path / "batch") == files(folder)
 
 
@@ -108,7 +108,7 @@ def test_restart_makes_only_what_is_missing_or_cut_short(folder, tmp_path):
     (copy / "index.json").unlink()
     (copy / ".sand-001.npy.tmp").write_bytes(b"left behind by a killed run")
     before = {path.name: path.stat().st_mtime_ns for path in copy.glob("*.npy")}
-    simulate(str(copy), **TINY)
+    make_trajectories(str(copy), **TINY)
     assert files(copy) == files(folder)
     after = {path.name: path.stat().st_mtime_ns for path in copy.glob("*.npy")}
     assert {name for name in after if after[name] != before.get(name)} == {"sand-001.npy", "jelly.npy", "plasticine.npy"}
@@ -116,13 +116,13 @@ def test_restart_makes_only_what_is_missing_or_cut_short(folder, tmp_path):
 
 def test_segments_do_not_show(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(generate, "SEGMENT", 7)
-    simulate(str(tmp_path), **TINY)
+    make_trajectories(str(tmp_path), **TINY)
     assert files(tmp_path) == files(folder)
 
 
 def test_record_every(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(generate, "SEGMENT", 8)
-    simulate(str(tmp_path), **(TINY | {"record_every": 4}))
+    make_trajectories(str(tmp_path), **(TINY | {"record_every": 4}))
     for name in NAMES:
         assert np.array_equal(np.load(tmp_path / f"{name}.npy"), np.load(folder / f"{name}.npy")[3::4])
 
@@ -130,7 +130,7 @@ def test_record_every(folder, tmp_path, monkeypatch):
 def test_killed_run_leaves_no_broken_file(tmp_path):
     """SIGKILL in the middle: every file that has its name is whole."""
     options = TINY | {"steps": 400, "velocity": (1.0, -1.5, -2.0)}
-    worker = multiprocessing.get_context("spawn").Process(target=simulate, args=(str(tmp_path),), kwargs=options)
+    worker = multiprocessing.get_context("spawn").Process(target=make_trajectories, args=(str(tmp_path),), kwargs=options)
     worker.start()
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob("*.npy")) and time.monotonic() < deadline:
@@ -168,7 +168,7 @@ def test_killed_run_leaves_no_broken_file(tmp_path):
 )
 def test_errors_are_one_line(tmp_path, options, word):
     with pytest.raises(UserError, match=word) as error:
-        simulate(str(tmp_path / "out"), **(TINY | options))
+        make_trajectories(str(tmp_path / "out"), **(TINY | options))
     assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 
@@ -176,8 +176,8 @@ def test_errors_are_one_line(tmp_path, options, word):
 def test_folders_that_cannot_be_written(folder, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="is a file"):
-        simulate(str(tmp_path / "file"), **TINY)
+        make_trajectories(str(tmp_path / "file"), **TINY)
     with pytest.raises(UserError, match="is a file"):
-        simulate(str(tmp_path / "file" / "below"), **TINY)
+        make_trajectories(str(tmp_path / "file" / "below"), **TINY)
     with pytest.raises(UserError, match=r"another set-up \(steps 30 there, 31 here\)"):
-        simulate(str(folder), **(TINY | {"steps": 31}))
+        make_trajectories(str(folder), **(TINY | {"steps": 31}))

@@ -249,7 +249,7 @@ def test_missing_and_incomplete_folders(folder, tmp_path):
         if state.name == "half":
             state.mkdir()
             shutil.copy(folder / "plan.json", state)
-        with pytest.raises(UserError, match=f"{word}.*neuido simulate --config configs/trajectories.yaml --out") as error:
+        with pytest.raises(UserError, match=f"{word}.*neuido trajectories --config configs/trajectories.yaml --out") as error:
             module(state)
         assert "\n" not in str(error.value)
     shutil.copytree(folder, tmp_path / "cut")

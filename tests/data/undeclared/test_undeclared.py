@@ -88,9 +88,9 @@ def test_the_same_seed_gives_the_same_case(drag, tmp_path):
 
 def test_command(tmp_path, capsys):
     out = str(tmp_path / "a")
-    for options, status in ((["--case.measured", "track"], 0), (["--case.kind", "magic"], 2)):
+    for options, status in ((["--measured", "track"], 0), (["--kind", "magic"], 2)):
         with pytest.raises(SystemExit) as end:
-            main(["simulate", "--undeclared", "1", "--out", out, "--progress", "false", *options])
+            main(["undeclared", "--seed", "1", "--out", out, "--progress", "false", *options])
         assert end.value.code == status
     assert "one of none, gravity" in capsys.readouterr().err
     assert read_tracks(tmp_path / "a").name == "a" and (tmp_path / "keys" / "a.yaml").is_file()

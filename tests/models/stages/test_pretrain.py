@@ -10,7 +10,7 @@ import pytest
 import torch
 from lightning.pytorch import Trainer, seed_everything
 
-from neuido.data.trajectories.options import simulate
+from neuido.data.trajectories.options import make_trajectories
 from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
@@ -26,7 +26,9 @@ SMALL = {"latent_dim": 8, "basis_dim": 8, "hidden_dim": 16, "head_dim": 16}
 def folder(tmp_path_factory):
     """Six training trajectories and three held-out ones of 40 steps of 64 particles."""
     path = tmp_path_factory.mktemp("stage1")
-    simulate(str(path), instances=2, held_out=1, particles_per_side=4, steps=40, velocity=(1.0, -30.0, -2.0), device="cpu", progress=False)
+    make_trajectories(
+        str(path), instances=2, held_out=1, particles_per_side=4, steps=40, velocity=(1.0, -30.0, -2.0), device="cpu", progress=False
+    )
     return path
 
 

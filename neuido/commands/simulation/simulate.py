@@ -1,4 +1,4 @@
-"""`neuido simulate SCENE --out FOLDER`: the motion of one scene file. `--help` loads no torch."""
+"""The `simulate` command: the motion of one scene file. `--help` loads no torch."""
 
 import time
 from pathlib import Path
@@ -10,7 +10,7 @@ FRAMES = 100
 """Frames that are written at most where `every` is not given."""
 
 
-def simulate_scene(
+def simulate(
     scene: str,
     *,
     out: str,
@@ -20,7 +20,10 @@ def simulate_scene(
     data_root: str | None = None,
     device: str = "auto",
 ) -> None:
-    """Simulate the body of a scene file and write its motion.
+    """Simulate the body of a scene file and write its motion: `neuido simulate SCENE --out FOLDER`.
+
+    Further simulations have commands of their own: `neuido trajectories` (training data of Stage I), `neuido scenes` (filmed bodies),
+    `neuido undeclared` (a folder to diagnose, with a sealed answer) and `neuido replay` (the recordings of an experiment).
 
     Args:
         scene: Scene file, or the name of one that comes with neuido (bouncy-ball, nclaw-cube, ...).
@@ -67,14 +70,6 @@ def simulate_scene(
     )
 
 
-def is_scene(words: list[str]) -> bool:
-    """Return whether the words after `neuido simulate` start with a scene, and not with the folder to write."""
-    if not words or words[0].startswith("-"):
-        return False
-    given_out = any(word == "--out" or word.startswith("--out=") for word in words)
-    return given_out or words[0].endswith((".yaml", ".yml")) or (configs_root() / "scenes" / f"{words[0]}.yaml").is_file()
-
-
 def _unused(out: str) -> Path:
     """Return the folder to write, which must be new or empty."""
     folder = Path(out)
@@ -91,7 +86,7 @@ def _one_scene(scene: str) -> str:
 
     own = Path(scene) if scene.endswith((".yaml", ".yml")) else configs_root() / "scenes" / f"{scene}.yaml"
     if own.is_file() and "scenes" in read_yaml(own):
-        raise UserError(f"{scene} lists several scenes to film: `neuido simulate --config {scene} --out FOLDER` makes them")
+        raise UserError(f"{scene} lists several scenes to film: `neuido scenes --config {scene} --out FOLDER` makes them")
     return scene
 
 

@@ -69,7 +69,7 @@ def test_help_of_a_scene(capsys, scene):
         (["{scene}", "--out", "{new}", "--steps", "0"], ["steps is 0"]),
         (["{scene}", "--out", "{new}", "--law", "absent.safetensors"], ["absent.safetensors", "neuido predict"]),
         (["bouncy-bal", "--out", "{new}"], ["bouncy-bal", "bouncy-ball"]),
-        (["six_small", "--out", "{new}"], ["several scenes", "neuido simulate --config six_small"]),
+        (["six_small", "--out", "{new}"], ["several scenes", "neuido scenes --config six_small"]),
         (["absent.yaml", "--out", "{new}"], ["no scene file absent.yaml"]),
         (["{scene}", "--out", "{new}", "--stepz", "3"], ["--stepz", "did you mean 'steps'?"]),
     ],
