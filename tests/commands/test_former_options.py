@@ -56,6 +56,7 @@ def test_trajectories_by_their_former_command_are_the_same(tmp_path, capsys):
             assert (tmp_path / name / file).read_bytes() == (tmp_path / "new" / file).read_bytes()
 
 
+@pytest.mark.slow
 def test_scenes_cases_and_recordings_by_their_former_command(tmp_path, capsys):
     config = written({**SCENES, "undeclared": None, "case": {"measured": "body"}, "dt": 5e-4}, tmp_path / "scenes.yaml")
     status, _, err = run(capsys, "simulate", "--config", config, "--out", tmp_path / "film", "--device", "cpu", "--progress", "false")
@@ -69,6 +70,17 @@ def test_scenes_cases_and_recordings_by_their_former_command(tmp_path, capsys):
         assert err.count("\n") == 1 and "`neuido undeclared`" in err
     first, second = (sorted(p for p in (tmp_path / str(i) / "a").iterdir()) for i in range(2))
     assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second] and np.size(first) > 1
+
+
+def test_each_job_finds_its_command(tmp_path, capsys):
+    config = written({**SCENES, "undeclared": None, "case": {"measured": "body"}, "dt": 5e-4}, tmp_path / "scenes.yaml")
+    name, words = current_command("simulate", ["--out", "film", "--config", config])
+    assert name == "scenes" and yaml.safe_load(words[-1]) == SCENES
+    config = written({"undeclared": 1, "case": {"measured": "track"}}, tmp_path / "case.yaml")
+    name, words = current_command("simulate", ["--config=" + config, "--case.kind=none", "--out", "a"])
+    assert (name, words[1:]) == ("undeclared", ["--kind=none", "--out", "a"])
+    assert yaml.safe_load(words[0].removeprefix("--config=")) == {"seed": 1, "measured": "track"}
+    assert capsys.readouterr().err.count("\n") == 2
     name, words = current_command("simulate", ["--experiment", "throws", "--model=after.yaml", "--out", "again"])
     assert (name, words) == ("replay", ["--folder", "throws", "--model=after.yaml", "--out", "again"])
     assert capsys.readouterr().err.count("\n") == 1
