@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import blind_scores
 
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.storage import write
+from neuido.data.files.storage import write_text
 from neuido.data.undeclared import Case, make_undeclared
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.errors import UserError
@@ -275,7 +275,7 @@ def main() -> None:
             print(f"{n} of {len(waiting)}: {row['case']} ({task[2]}): {row['answer']} {row['named']} {failed}", flush=True)
     if options.only in (None, "score"):
         text = score_all(folders, options.out, options.ablation)
-        write(options.out / "table.md", text + "\n")
+        write_text(options.out / "table.md", text + "\n")
         print(text)
 
 

@@ -82,7 +82,7 @@ def _interpolation(
     import numpy as np
 
     from neuido.data.files.score_tables import write_rows
-    from neuido.data.files.writing import replacing
+    from neuido.data.files.writing import atomic_write
     from neuido.models.operator.interpolation import interpolate, monotonicity, pairwise_monotonicity, softest_and_stiffest
 
     pairs = [{"family": each, **pairwise_monotonicity(operator, each)} for each in dict.fromkeys(operator.latent_families)]
@@ -91,7 +91,7 @@ def _interpolation(
     write_rows(folder / "interpolation.csv", found.rows)
     rows = [{"measure": name, **monotonicity([row[name] for row in found.rows])} for name in ("modulus", "compression", "contact")]
     write_rows(folder / "monotonicity.csv", rows)
-    with replacing(folder / "interpolation.npz", keep_suffix=True) as hidden:
+    with atomic_write(folder / "interpolation.npz", keep_suffix=True) as hidden:
         np.savez_compressed(hidden, x=found.motion.numpy(), shares=found.shares.numpy(), names=np.array(found.names))
     draw_interpolation(found, folder / "interpolation.png")
     print(f"from {found.names[0]} to {found.names[1]}:")

@@ -9,7 +9,7 @@ from neuido.errors import UserError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from neuido.data.scenes.filmed_scene import Setting, Truth
+    from neuido.data.scenes.filmed_scene import SceneSetting, Truth
     from neuido.models.reconstruct.gaussian_fit import ReconstructModule
     from neuido.types import Body, Gaussians, MultiViewBatch, Vector
 
@@ -84,7 +84,7 @@ def reconstruct(
 
     import torch
 
-    from neuido.data.files.storage import write
+    from neuido.data.files.storage import write_text
     from neuido.data.scenes.filmed_scene import RECONSTRUCTION, load_views, read_truth, write_setting
     from neuido.physics.runtime.device import choose_device
     from neuido.types import Gaussians
@@ -101,7 +101,7 @@ def reconstruct(
     text = json.dumps(shown, indent=1, default=list) + "\n"
     if (target / SETUP).is_file() and (target / SETUP).read_text() != text:
         raise UserError(f"{target} holds a reconstruction with other options: give another out, or remove the folder")
-    write(target / SETUP, text)
+    write_text(target / SETUP, text)
     if (target / REPORT).is_file():
         print((target / REPORT).read_text(), end="")
         return
@@ -116,32 +116,32 @@ def reconstruct(
     write_setting(around, target / "scene.yaml")
     figures |= {"gaussians": len(found.means), "particles": len(body.x), "volume": float(body.volume.double().sum())}
     report = json.dumps({key: float(f"{value:.5g}") for key, value in figures.items()}, indent=1) + "\n"
-    write(target / REPORT, report)
+    write_text(target / REPORT, report)
     (target / RESUME).unlink(missing_ok=True)
     print(report, end="")
 
 
-def _setting(source: Path, file: str | None, recording: str | None, scale: float, shift: "Vector", up: str) -> "Setting":
-    from neuido.data.scenes.filmed_scene import Placing, Setting, read_setting
+def _setting(source: Path, file: str | None, recording: str | None, scale: float, shift: "Vector", up: str) -> "SceneSetting":
+    from neuido.data.scenes.filmed_scene import Placement, SceneSetting, read_setting
     from neuido.data.scenes.multiview import UP
     from neuido.data.scenes.synthetic import JELLY
     from neuido.types import Scene, Walls
 
     if up not in UP or not scale > 0:
         raise UserError(f"up = {up!r} must be one of {', '.join(UP)}, and scale = {scale} positive")
-    placing = Placing(scale, tuple(shift), up)
+    placing = Placement(scale, tuple(shift), up)
     if (source / "experiment.yaml").is_file() and file is None:
-        if placing != Placing():
+        if placing != Placement():
             raise UserError("scale, shift and up are not for experiments: their files are in metres")
         return read_setting(source / "experiment.yaml", recording=recording)
     if file is not None:
         found = read_setting(Path(file).expanduser())
-        return found if placing == Placing() else found._replace(placing=placing)
+        return found if placing == Placement() else found._replace(placing=placing)
     scene = Scene(cells=32, dt=5e-4, walls=Walls("separate", float("inf")))
-    return Setting(source.resolve().name, scene, JELLY["density"], dict(JELLY), placing)
+    return SceneSetting(source.resolve().name, scene, JELLY["density"], dict(JELLY), placing)
 
 
-def _optimise(batch: "MultiViewBatch", around: "Setting", target: Path, device: Any, options: dict[str, Any]) -> "ReconstructModule":
+def _optimise(batch: "MultiViewBatch", around: "SceneSetting", target: Path, device: Any, options: dict[str, Any]) -> "ReconstructModule":
     from lightning.pytorch import LightningDataModule, Trainer
     from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
     from lightning.pytorch.loggers import CSVLogger
@@ -199,7 +199,7 @@ def _select(batch: "MultiViewBatch", chosen: "Tensor") -> "MultiViewBatch":
 
 
 def _fill(
-    found: "Gaussians", module: "ReconstructModule", batch: "MultiViewBatch", around: "Setting", source: Path, options: dict[str, Any]
+    found: "Gaussians", module: "ReconstructModule", batch: "MultiViewBatch", around: "SceneSetting", source: Path, options: dict[str, Any]
 ) -> "Body":
     import torch
 
@@ -284,12 +284,12 @@ def _compare(body: "Body", found: "Gaussians", truth: "Truth | None") -> dict[st
 def _write(target: Path, found: "Gaussians", body: "Body") -> None:
     import numpy as np
 
-    from neuido.data.files.writing import replacing
+    from neuido.data.files.writing import atomic_write
     from neuido.models.render.gaussians import save_ply
 
-    with replacing(target / "gaussians.ply") as hidden:
+    with atomic_write(target / "gaussians.ply") as hidden:
         save_ply(hidden, found)
-    with replacing(target / "body.npz", keep_suffix=True) as hidden:
+    with atomic_write(target / "body.npz", keep_suffix=True) as hidden:
         np.savez(hidden, x0=body.x.numpy(), v0=body.v.numpy(), volume=body.volume.numpy())
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neuido.data.files.html_page import Best, escaped, figure, page, small, svg, table, video
-from neuido.data.files.results import Entry, curves, mean, open_runs, scenes_of
+from neuido.data.files.html_page import Best, escaped, figure, page, style_axes, svg, table, video
+from neuido.data.files.results import Entry, logged_curves, mean, open_runs, scenes_of
 from neuido.data.files.score_tables import read_rows
 from neuido.errors import UserError
 
@@ -54,7 +54,7 @@ def report(
     Raises:
         UserError: A folder without results, a malformed table.
     """
-    from neuido.data.files.storage import write
+    from neuido.data.files.storage import write_text
 
     if not runs:
         raise UserError("runs is empty: name at least one folder")
@@ -69,7 +69,7 @@ def report(
         parts += _videos(entries, 1e6 * limit)
     target = Path(out)
     target.parent.mkdir(parents=True, exist_ok=True)
-    write(target, page(title, "\n".join(parts)))
+    write_text(target, page(title, "\n".join(parts)))
     print(f"report: {target}")
 
 
@@ -158,7 +158,7 @@ def _last_logged(entries: list[Entry]) -> list[str]:
     """Of runs of sweeps: parameters, and the last value of what they logged."""
     runs = [e for e in entries if e.parameters and e.last]
     parameters = dict.fromkeys(p for e in runs for p in e.parameters)
-    last = [{name: points[-1][1] for name, points in curves(e.root).items()} for e in runs]
+    last = [{name: points[-1][1] for name, points in logged_curves(e.root).items()} for e in runs]
     names = [n for n in dict.fromkeys(n for own in last for n in own) if not n.startswith("train/") and n.count("/") == 1]
     if not names:
         return []
@@ -215,7 +215,7 @@ def _by_frame(entries: list[Entry]) -> list[str]:
         rows = next(iter(own.values()))
         ax.plot([r["frame"] for r in rows], [r["floor"] for r in rows], color="0.4", ls=":", lw=1, label=FLOOR)
         ax.set(title=scene, yscale="log", xlabel="frame", ylabel="CD [1e-4]")
-        small(ax)
+        style_axes(ax)
     axes[0].legend(fontsize=6, frameon=False)
     return ["<h2>Chamfer distance over time</h2>", svg(made)]
 
@@ -224,7 +224,7 @@ def _logged(entries: list[Entry]) -> list[str]:
     """Plot the logged quantities that are averages over scenes or families, one panel each."""
     found: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for entry in entries:
-        for name, points in curves(entry.root).items() if entry.last else ():
+        for name, points in logged_curves(entry.root).items() if entry.last else ():
             if name.count("/") <= 1 and len(points) > 1:
                 found.setdefault(name, {})[entry.label] = points
     order = sorted(found, key=lambda name: (not name.startswith("train/"), not name.startswith("val/")))[:MOST_PANELS]
@@ -238,7 +238,7 @@ def _logged(entries: list[Entry]) -> list[str]:
         if all(v > 0 for points in found[name].values() for _, v in points):
             ax.set_yscale("log")
         ax.set(title=name, xlabel="step")
-        small(ax)
+        style_axes(ax)
     axes[0].legend(fontsize=6, frameon=False)
     return ["<h2>Logged while training</h2>", svg(made)]
 

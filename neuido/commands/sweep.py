@@ -15,7 +15,7 @@ from typing import Any
 from neuido.commands.cli.config_files import find_config
 from neuido.commands.cli.sweep_file import Metric, Run, SweepFile, command_of, read_sweep, runs_of
 from neuido.commands.interruption import SIGNALS, STATE
-from neuido.data.files.lock import Held, OwnedLock
+from neuido.data.files.lock import LockHeld, OwnedLock
 from neuido.data.files.score_tables import read_rows, write_rows
 from neuido.data.files.sweep_run import FOLDER, FORMAT, read_status, write_status
 from neuido.errors import UserError
@@ -76,7 +76,7 @@ def _one(plan: SweepFile, run: Run, folder: Path) -> str:
     with contextlib.ExitStack() as stack:
         try:
             lock = stack.enter_context(OwnedLock(folder / ".lock", f"the run {run.name}"))
-        except Held as error:
+        except LockHeld as error:
             return f"another process runs it: {error}"
         environment = _environment(plan, run, folder)
         words = command_of(plan, run, environment)

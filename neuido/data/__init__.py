@@ -1,6 +1,6 @@
-"""Data: recordings of any known format, experiments, tests of materials, tracks, scenes and bodies.
+"""Data: multi-view recordings, experiments, material tests, tracks, simulation scenes and bodies.
 
-The names of `__all__` are imported when they are first used, so that `import neuido.data` loads no torch.
+The names of `__all__` are imported on first use, so `import neuido.data` does not load torch.
 """
 
 from importlib import import_module
@@ -67,11 +67,11 @@ _PLACES = {
     "shapes": "bodies.shapes",
     "write_experiment": "measured.experiment",
 }
-"""The module of each public name below this package; after a colon its name there, where it is another one."""
+"""Module of each public name, relative to this package; after a colon, its name in that module if it differs."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
+    """Import a public name on first use."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     place, _, own = _PLACES[name].partition(":")
@@ -82,5 +82,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the public names beside the module's own."""
+    """List the public names and the attributes of the module."""
     return sorted({*globals(), *__all__})

@@ -46,7 +46,7 @@ class FlowBatch(NamedTuple):
     """(B, t, S, S, 2) [m/s]."""
 
 
-def complete(path: Path) -> bool:
+def is_complete(path: Path) -> bool:
     """Whether a clip is there in full."""
     return path.is_file() and zipfile.is_zipfile(path)
 
@@ -65,7 +65,7 @@ def read_clip(path: Path) -> Clip:
     return Clip(**parts, frame_interval=interval)
 
 
-class Windows(Dataset):
+class FlowWindows(Dataset):
     """Random windows of the clips' flow; a function of seed and number alone."""
 
     def __init__(self, paths: list[Path], frames: int, per_clip: int, seed: int) -> None:
@@ -168,7 +168,7 @@ class FilmDataModule(LightningDataModule):
         else:
             paths = [self.root / f"{self.clips[i]['name']}.npz" for i in numbers]
             epoch = self.trainer.current_epoch if self.trainer is not None and shuffle else 0
-            dataset = Windows(paths, self.frames, self.windows, self.seed + 1000 * epoch)
+            dataset = FlowWindows(paths, self.frames, self.windows, self.seed + 1000 * epoch)
             collate = _stack
         generator = torch.Generator().manual_seed(self.seed)
         size = min(self.batch_size, len(dataset))  # type: ignore[arg-type]

@@ -26,7 +26,7 @@ class Step(NamedTuple):
     step: int
 
 
-class Order:
+class SampleOrder:
     """Which rows of each trajectory a training step takes: a function of (seed, epoch, step).
 
     Args:
@@ -59,7 +59,7 @@ class Order:
         return self._shuffled[(self._offsets + positions) % len(self.rows)]
 
 
-class Resumable(Generic[T]):
+class ResumableLoader(Generic[T]):
     """A training loader whose epochs go on where a resumed run stopped.
 
     Lightning calls `sampler.set_epoch` before the first batch of an epoch and stores `state_dict` in its checkpoints. The state
@@ -80,7 +80,7 @@ class Resumable(Generic[T]):
         raise NotImplementedError
 
     @property
-    def sampler(self) -> "Resumable":
+    def sampler(self) -> "ResumableLoader":
         """Where Lightning looks for `set_epoch`."""
         return self
 
@@ -108,7 +108,7 @@ class Resumable(Generic[T]):
         self._resume = (state["epoch"], state["step"])
 
 
-class Steps(Resumable[Step | TrajectoryBatch]):
+class TrainingSteps(ResumableLoader[Step | TrajectoryBatch]):
     """The steps of an epoch.
 
     Args:
@@ -120,7 +120,7 @@ class Steps(Resumable[Step | TrajectoryBatch]):
     """
 
     def __init__(
-        self, order: Order, gather: Callable[[int, int], TrajectoryBatch] | None, *, workers: int = 0, rank: int = 0, ranks: int = 1
+        self, order: SampleOrder, gather: Callable[[int, int], TrajectoryBatch] | None, *, workers: int = 0, rank: int = 0, ranks: int = 1
     ) -> None:
         count = {"trajectories": order.trajectory_count, "samples": order.samples, "rows": len(order.rows)}
         super().__init__({"seed": order.seed, **count, "ranks": ranks})
@@ -145,7 +145,7 @@ class _Gathered(Dataset):
         return self.gather(*self.steps[index])
 
 
-class Batches:
+class FixedBatches:
     """A fixed sequence of batches as a loader."""
 
     def __init__(self, batches: list[TrajectoryBatch]) -> None:

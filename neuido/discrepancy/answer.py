@@ -11,9 +11,9 @@ import numpy as np
 import yaml
 
 import neuido
-from neuido.data.files.storage import write as write_text
+from neuido.data.files.storage import write_text as write_text
 from neuido.data.files.values import file_name
-from neuido.data.files.writing import real_folder, replacing
+from neuido.data.files.writing import atomic_write, make_real_folder
 from neuido.discrepancy import ceiling, next_experiment, report, residual
 from neuido.discrepancy.attribution import Diagnosis
 from neuido.discrepancy.believed import beside
@@ -62,7 +62,7 @@ def write(
         made.content["seconds"] = round(spent + time.monotonic() - begun, 1) if seconds is None else seconds
         details.append(made)
     tell("writing")
-    predicted = real_folder(out / "predicted", "the folder")
+    predicted = make_real_folder(out / "predicted", "the folder")
     for made in details:
         for name, arrays in made.motion.items():
             _save(predicted / f"{file_name(name, 'the name of a recording')}.npz", arrays)
@@ -394,7 +394,7 @@ def _body(d: Diagnosis) -> str:
 
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with replacing(path) as hidden, hidden.open("wb") as stream:
+    with atomic_write(path) as hidden, hidden.open("wb") as stream:
         np.savez_compressed(stream, **arrays)
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.writing import replacing
+from neuido.data.files.writing import atomic_write
 from neuido.data.measured.experiment import Experiment, read_declared_model
 from neuido.discrepancy.library import effects_of
 from neuido.errors import UserError
@@ -145,7 +145,7 @@ def beside(folder: Path, model: Mapping[str, Any]) -> dict[str, Any]:
         return dict(model)
     source, target = Path(model["law"]["file"]), folder / "law.safetensors"
     if not (target.is_file() and target.samefile(source)):
-        with replacing(target) as hidden:
+        with atomic_write(target) as hidden:
             shutil.copyfile(source, hidden)
     return {**model, "law": {**model["law"], "file": target.name}}
 

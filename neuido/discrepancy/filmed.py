@@ -11,7 +11,7 @@ from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import project
 from neuido.data.measured.experiment import Experiment, Recording
 from neuido.data.scenes.filmed_scene import RECONSTRUCTION, read_body, read_motion
-from neuido.data.scenes.masks import from_background
+from neuido.data.scenes.masks import masks_from_background
 from neuido.data.scenes.multiview import SceneViews
 from neuido.discrepancy.silhouettes import LEVEL, usable
 from neuido.errors import UserError
@@ -131,7 +131,7 @@ def _masks(views: SceneViews, v: int, frames: list[int]) -> np.ndarray:
     """(T, H, W)"""
     images, masks = views.load([v], frames)
     if bool((masks == 1).all()):
-        _, masks = from_background(images)
+        _, masks = masks_from_background(images)
     return masks[0].numpy()
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from neuido.data.files.html_page import figure, small, svg
+from neuido.data.files.html_page import figure, style_axes, svg
 from neuido.discrepancy.residual import Series
 
 INK, BEFORE, AFTER = "#333333", "#c0392b", "#1f77b4"
@@ -36,7 +36,7 @@ def stage_curves(stages: Mapping[str, Sequence[Series]]) -> str:
             ax.fill_between(s.times, s.noise, color=INK, alpha=0.2, lw=0)
             ax.set_title(f"{recording}: {name} [{s.unit}]", fontsize=8)
             ax.set_ylim(bottom=0.0)
-            small(ax)
+            style_axes(ax)
             ax.set_xlabel("t [s]", fontsize=7)
     return svg(made)
 
@@ -58,7 +58,7 @@ def error_curves(motion: Mapping[str, Mapping[str, np.ndarray]], noise: float, d
         ax.set_xlabel("t [s]", fontsize=8)
         ax.set_ylabel("RMS distance [mm]", fontsize=8)
         ax.set_ylim(bottom=0.0)
-        small(ax)
+        style_axes(ax)
     axes[0][0].legend(fontsize=7, frameon=False)
     return svg(made)
 
@@ -84,7 +84,7 @@ def residual_maps(motion: Mapping[str, Mapping[str, np.ndarray]]) -> str:
             ax.set_title(f"{name}, {when}, along {'zx'[i % 2]}", fontsize=8)
             ax.set_xlabel(f"{'xz'[i % 2]} [m]", fontsize=7)
             ax.set_ylabel("y [m]" if i == 0 else "", fontsize=7)
-            small(ax)
+            style_axes(ax)
         bar = made.colorbar(shown, ax=list(row), shrink=0.8)
         bar.set_label("mm", fontsize=7)
         bar.ax.tick_params(labelsize=7)
@@ -108,7 +108,7 @@ def data_curves(motion: Mapping[str, Mapping[str, np.ndarray]], unit: str) -> st
         axes[0, column].set_title(name, fontsize=8)
         axes[1, column].axhline(0.0, color=INK, lw=0.6)
         for ax in axes[:, column]:
-            small(ax)
+            style_axes(ax)
     axes[0, 0].set_ylabel(f"data [{unit}]", fontsize=8)
     axes[1, 0].set_ylabel(f"residual [{unit}]", fontsize=8)
     return svg(made)
@@ -133,7 +133,7 @@ def ranking(trials: Sequence[tuple[str, float, bool]], floor: float) -> str:
     ax.set_xticks(log_ticks(*ax.get_xlim()))
     ax.xaxis.set_major_formatter("{x:g}")
     ax.set_xlabel("error before over error after (fitted or held out, the smaller); dashed: 95 % of what chance brings", fontsize=7)
-    small(ax)
+    style_axes(ax)
     return svg(made)
 
 

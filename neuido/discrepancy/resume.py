@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import neuido
-from neuido.data.files.writing import real_folder, remove, replacing
+from neuido.data.files.writing import atomic_write, make_real_folder, remove
 from neuido.discrepancy.problem import Ask, Point, Problem, Rows
 
 CHUNK = 32
@@ -131,7 +131,7 @@ class CachedProblem(Problem):
         stored = short if np.array_equal(short.astype(np.float64), values, equal_nan=True) else values  # the simulators work in float32
         if self.used + stored.nbytes > self.limit:
             return
-        with replacing(path) as hidden, hidden.open("wb") as stream:
+        with atomic_write(path) as hidden, hidden.open("wb") as stream:
             np.save(stream, stored)
         self.used += stored.nbytes
 
@@ -188,11 +188,11 @@ def outdated(out: Path, plan: str) -> list[str]:
 
 def workplace(out: Path, plan: str, *, resume: bool) -> Path:
     """The folder of a plan's predictions in `out`; those of other plans go, and its own too where nothing is to be resumed."""
-    root = real_folder(out / ".work", "the folder of predictions")
+    root = make_real_folder(out / ".work", "the folder of predictions")
     for other in root.iterdir():
         if other.name != plan or not resume:
             remove(other)
-    return real_folder(root / plan, "the folder of predictions")
+    return make_real_folder(root / plan, "the folder of predictions")
 
 
 def clear(out: Path) -> None:

@@ -94,7 +94,7 @@ def test_look_at_and_orbit():
     above = viewmat @ tensor([0.5, 0.5, 0.5, 1.0])
     assert target[2] > 0 and above[1] < 0  # y points down in the image
     assert float(torch.linalg.det(viewmat)) == pytest.approx(1)
-    with pytest.raises(UserError, match="cannot look at"):
+    with pytest.raises(UserError, match="looks along up"):
         convert.look_at((0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
 
     cameras = convert.orbit(8, target=(0.5, 0.4, 0.5), radius=2.0, elevations=(10.0, 40.0), angle=50.0, width=320, height=200)

@@ -18,7 +18,7 @@ from neuido.commands.demo.closed_loop import ELASTIC, Launch, record
 from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
-from neuido.data.undeclared.motion import Solver, move
+from neuido.data.undeclared.motion import Solver, simulate_motion
 from neuido.discrepancy import answer, attribution, residual
 from neuido.discrepancy.answer import motions
 from neuido.discrepancy.attribution import Diagnosis
@@ -149,12 +149,12 @@ def test_a_recording_that_does_not_move_is_left_out_of_the_report(lost, tmp_path
     """A motion may fail alone that was finite beside others, with their inner steps."""
     problem = body_problem(record(tmp_path / "block", {}, launches=FLIES, frames=13))
     found = attribution.diagnose(restricted(problem, "drag_linear"), draws=39, most=1)
-    move = BodyProblem._move
+    original_move = BodyProblem._move
 
     def fails(self, runs, setting, finer=0):
         if lost & {n for _, n in runs}:
             raise UserError("the motion of scene 0 is not finite from step 420 of 840 on")
-        return move(self, runs, setting, finer)
+        return original_move(self, runs, setting, finer)
 
     monkeypatch.setattr(BodyProblem, "_move", fails)
     answer.write(tmp_path / "out", [(found, 1.0)], kind="experiment", device="cpu")
@@ -180,7 +180,9 @@ def swollen(experiment: Experiment, rate: float) -> Experiment:
     bodies = [r.body for r in experiment.recordings]
     interval, frames = experiment.recordings[0].frame_interval, len(experiment.recordings[0].t)
     solver = Solver("same", experiment.scene.cells, experiment.scene.dt)
-    motion = move(solver, experiment.scene, bodies, ELASTIC, {"swelling.rate": rate}, seconds=(frames - 1) * interval, interval=interval)
+    motion = simulate_motion(
+        solver, experiment.scene, bodies, ELASTIC, {"swelling.rate": rate}, seconds=(frames - 1) * interval, interval=interval
+    )
     rng = np.random.default_rng(4)
     made = []
     for r, x in zip(experiment.recordings, motion.x, strict=True):

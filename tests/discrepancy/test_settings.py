@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neuido.commands.demo.closed_loop import ELASTIC, record
-from neuido.data.undeclared.motion import Solver, move
+from neuido.data.undeclared.motion import Solver, simulate_motion
 from neuido.discrepancy import laboratory
 from neuido.discrepancy.attribution import diagnose
 from neuido.discrepancy.body import body_problem
@@ -119,7 +119,7 @@ def test_a_body_on_a_finer_grid(effect, tmp_path: Path):
     solver = Solver("finer", 20, 5e-4)
     bodies = [r.body for r in experiment.recordings]
     truth = {"viscosity_shear.eta": 150.0} if effect else {}
-    motion = move(solver, experiment.scene, bodies, ELASTIC, truth, seconds=0.12, interval=0.01)
+    motion = simulate_motion(solver, experiment.scene, bodies, ELASTIC, truth, seconds=0.12, interval=0.01)
     rng = np.random.default_rng(3)
     for r, own, x in zip(experiment.recordings, problem.recordings, motion.x, strict=True):
         seen = r.seen.numpy()[1:]

@@ -8,7 +8,7 @@ import pytest
 from neuido.commands.simulation.trajectories import trajectories
 from neuido.commands.sweep import logged
 from neuido.data.bodies.scene_files import scene_from_dict
-from neuido.data.files.results import curves
+from neuido.data.files.results import logged_curves
 from neuido.discrepancy import workflow
 from neuido.errors import UserError
 
@@ -23,7 +23,7 @@ def test_logs_are_ordered_by_their_version(tmp_path):
         path.write_text(f"step,loss\n1,{version}\n")
         os.utime(path, (time, time))
     assert logged(tmp_path)["loss"] == 10
-    assert curves(tmp_path)["loss"] == [(1.0, 10.0)]
+    assert logged_curves(tmp_path)["loss"] == [(1.0, 10.0)]
 
 
 def test_out_below_a_file_is_refused_before_work(tmp_path, monkeypatch):

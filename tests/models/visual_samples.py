@@ -10,7 +10,7 @@ from lightning.pytorch import LightningDataModule
 from neuido.data.bodies.shapes import ball, box
 from neuido.data.cameras import orbit
 from neuido.data.scenes.filmed_scene import Truth, VisualScene
-from neuido.data.scenes.filmed_scene_module import OneByOne, Turns, in_order
+from neuido.data.scenes.filmed_scene_module import SequentialScenes, ShuffledScenes, ordered_loader
 from neuido.models.render.gaussians import deform, harmonics_of, save_ply
 from neuido.models.render.splatting import render
 from neuido.physics.effects.parameters import Effects
@@ -106,14 +106,14 @@ class TinyScenes(LightningDataModule):
 
     def train_dataloader(self):
         if self.steps_in_a_row is not None:
-            return OneByOne(self.scenes, steps=self.steps_in_a_row)
-        return Turns(self.scenes, seed=self.seed, **self._share())
+            return SequentialScenes(self.scenes, steps=self.steps_in_a_row)
+        return ShuffledScenes(self.scenes, seed=self.seed, **self._share())
 
     def val_dataloader(self):
-        return in_order(self.scenes, **self._share())
+        return ordered_loader(self.scenes, **self._share())
 
     def test_dataloader(self):
-        return in_order([*self.scenes, *self.unseen], **self._share())
+        return ordered_loader([*self.scenes, *self.unseen], **self._share())
 
     predict_dataloader = test_dataloader
 

@@ -134,6 +134,6 @@ def loop_section(result: "LoopResult", folder: Path) -> str:
 
 
 def _write(path: Path, body: str) -> None:
-    from neuido.data.files.storage import write
+    from neuido.data.files.storage import write_text
 
-    write(path, page("neuido demo", f"<h1>neuido demo</h1>\n{body}"))
+    write_text(path, page("neuido demo", f"<h1>neuido demo</h1>\n{body}"))

@@ -1,4 +1,4 @@
-"""The three families of materials that training data are made of: ranges of their parameters, and their laws."""
+"""The three material families of the training data (elastic, plasticine, sand): parameter ranges, random draws and laws."""
 
 import math
 from collections.abc import Mapping
@@ -28,23 +28,30 @@ PUBLISHED = {
 
 
 def check_ranges(family: str, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """Raise UserError for an unknown family, or for ranges of other parameters, reversed ranges and impossible ones."""
+    """Check the parameter ranges of a material family.
+
+    Args:
+        family: `elastic`, `plasticine` or `sand`.
+        ranges: (low, high) of each parameter in `PARAMETERS[family]`.
+
+    Raises:
+        UserError: The family is unknown, a parameter is missing or unknown, low exceeds high, or a bound is outside `LIMITS`.
+    """
     if family not in PARAMETERS:
-        raise UserError(f"unknown family {family!r} in families: choose from {', '.join(PARAMETERS)}")
+        raise UserError(f"families has the unknown family {family!r}: choose from {', '.join(PARAMETERS)}")
     if set(ranges) != set(PARAMETERS[family]):
-        raise UserError(f"families.{family} must give {', '.join(PARAMETERS[family])}, got {', '.join(ranges) or 'nothing'}")
+        raise UserError(f"families.{family} must give a range for {', '.join(PARAMETERS[family])}; got {', '.join(ranges) or 'none'}")
     for name, bounds in ranges.items():
         low, high = bounds
         if low > high:
-            raise UserError(f"families.{family}.{name} runs backwards: [{low}, {high}]; put the smaller figure first")
+            raise UserError(f"families.{family}.{name} = [{low}, {high}]: the lower bound exceeds the upper bound; swap them")
         floor, ceiling = LIMITS[name]
         if not (floor < low and high < ceiling):
-            bounds = f"strictly between {floor:g} and {ceiling:g}"
-            raise UserError(f"families.{family}.{name} = [{low}, {high}] is impossible: it must lie {bounds}")
+            raise UserError(f"families.{family}.{name} = [{low}, {high}]: both bounds must lie strictly between {floor:g} and {ceiling:g}")
 
 
 def draw_parameters(family: str, ranges: Mapping[str, tuple[float, float]], random: np.random.Generator) -> dict[str, float]:
-    """Draw the parameters of a family, each uniform over its range or log-uniform."""
+    """Draw random parameters of a family: `young` and `yield_stress` log-uniformly over their ranges, the others uniformly."""
     drawn = {}
     for name in PARAMETERS[family]:
         low, high = ranges[name]
@@ -54,7 +61,12 @@ def draw_parameters(family: str, ranges: Mapping[str, tuple[float, float]], rand
 
 
 def laws(family: str, parameters: list[dict[str, float]]) -> tuple[ElasticLaw, PlasticLaw]:
-    """Return the laws of several instances of one family as one batched pair (S = len(parameters))."""
+    """Build the batched elastic and plastic law of S materials of one family.
+
+    Args:
+        family: `elastic`, `plasticine` or `sand`.
+        parameters: Parameters of each of the S materials: young and yield_stress [Pa], poisson [-], friction_angle [degrees].
+    """
     columns = {name: torch.tensor([p[name] for p in parameters], dtype=torch.float64) for name in PARAMETERS[family]}
     stiffness = {name: columns[name] for name in ("young", "poisson")}
     if family == "elastic":
@@ -63,7 +75,7 @@ def laws(family: str, parameters: list[dict[str, float]]) -> tuple[ElasticLaw, P
 
 
 def evaluate(law: ElasticLaw | PlasticLaw, F: Tensor) -> Tensor:
-    """Evaluate a law of float32 F (..., 3, 3) in float64; return float32."""
+    """Evaluate a law in float64 at float32 deformation gradients F (..., 3, 3); return float32 of the same shape."""
     if isinstance(law, Identity):
         return F
     flat = F.reshape(-1, 3, 3).double()

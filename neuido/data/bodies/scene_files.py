@@ -1,7 +1,7 @@
-"""Scenes from YAML: the ten real bodies of the literature, and the scene part of an experiment file.
+"""Read simulation scenes from YAML files of the format `neuido-scene/1`.
 
-The keys `scene`, `model` and `discretisation` are those of the experiment format `neuido-experiment/1`, with `scene.walls` added;
-a scene file adds `body`, `name`, `source` and `steps`.
+`configs/scenes` has the scenes of the literature. The keys `scene`, `model` and `discretisation` are those of an experiment file
+(`neuido-experiment/1`), with `scene.walls` added. A scene file also has `name`, `source`, `body` and `steps`.
 """
 
 import math
@@ -15,7 +15,7 @@ import torch
 
 from neuido.data.bodies import shapes
 from neuido.data.files.parsing import check_limit, read_arrays, read_yaml
-from neuido.data.files.values import check_keys, inside, mapping, number, vector
+from neuido.data.files.values import check_keys, mapping, number, path_inside, vector
 from neuido.errors import UserError
 from neuido.physics.laws.classical import material
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
@@ -26,7 +26,7 @@ CONTACTS = ("sticky", "slip", "separate")
 
 
 class SceneSetup(NamedTuple):
-    """What a scene file describes."""
+    """The content of a scene file."""
 
     scene: Scene
     body: Body
@@ -35,14 +35,14 @@ class SceneSetup(NamedTuple):
 
 
 def data_root(option: str | os.PathLike | None = None) -> Path:
-    """Return the folder that holds the data: the option, else the variable NEUIDO_DATA.
+    """Return the data folder: `option`, or else the environment variable NEUIDO_DATA.
 
     Raises:
-        UserError: Neither is given, or the folder is not there.
+        UserError: Neither is given, or the folder does not exist.
     """
     given = option or os.environ.get(VARIABLE)
     if not given:
-        raise UserError(f"this scene needs the folder with the data: give the option data_root or set the variable {VARIABLE}")
+        raise UserError(f"this scene needs the data folder: give the option data_root or set the environment variable {VARIABLE}")
     root = Path(given).expanduser()
     if not root.is_dir():
         raise UserError(f"{'data_root' if option else VARIABLE} = {root} is not a folder")
@@ -50,31 +50,34 @@ def data_root(option: str | os.PathLike | None = None) -> Path:
 
 
 def scene_names() -> list[str]:
-    """List the names that `load_scene` knows: files of configs/scenes of its format (others list scenes for `neuido scenes`)."""
+    """List the names of the built-in scenes that `load_scene` reads.
+
+    Lists for `neuido scenes`, which lie in configs/scenes too, are left out.
+    """
     return sorted(path.stem for path in scenes_folder().glob("*.yaml") if f"\nformat: {FORMAT}\n" in path.read_text())
 
 
 def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -> SceneSetup:
-    """Read a scene by its name in configs/scenes, or from a YAML file.
+    """Read a simulation scene from `configs/scenes` or from a YAML file.
 
-    Particles of a file get one and the same volume, that of the body over their number (`body_volume`).
+    A body that is read from a particle file has particles of equal volume: `body_volume` over their number.
 
     Args:
-        name: For example `bouncy-ball`, or a path that ends in .yaml.
-        root: The data folder, see `data_root`; not needed by bodies that are made from shapes.
+        name: Name of a built-in scene such as `bouncy-ball`, or a path that ends in .yaml.
+        root: Data folder (`data_root`). Bodies that are made from shapes do not need it.
 
     Raises:
-        UserError: An unknown name or key, a missing file, a figure outside its physical range, a path that leaves the data folder.
+        UserError: The name or a key is unknown, a file is missing, a value is outside its physical range, or a path leaves the data folder.
     """
     path = Path(name) if str(name).endswith((".yaml", ".yml")) else scenes_folder() / f"{name}.yaml"
     if not path.is_file():
         known = "" if path.parent != scenes_folder() else f"; known scenes: {', '.join(scene_names())}"
-        raise UserError(f"no scene file {path}{known}")
+        raise UserError(f"the scene file {path} is missing{known}")
     content = read_yaml(path)
     try:
         check_keys(content, "the file", ("format", "name", "source", "scene", "model", "body", "discretisation", "steps"), ("source",))
         if content["format"] != FORMAT:
-            raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
+            raise UserError(f"format = {content['format']!r} must be {FORMAT!r}")
         for key in ("name", "source"):
             if not isinstance(content.get(key, ""), str):
                 raise UserError(f"{key} must be text, got {content[key]!r}")
@@ -86,7 +89,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         body = body_from_dict(content["body"], root)
         outside = ((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any(dim=1)
         if outside.any():
-            raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain")
+            raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain: enlarge the domain or move the body")
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     info = {"name": content["name"], "source": content.get("source", ""), "steps": steps, **model}
@@ -94,15 +97,15 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
 
 
 def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any]) -> Scene:
-    """Return the scene of an experiment file's `scene` and `discretisation` keys.
+    """Build a scene from the keys `scene` and `discretisation` of an experiment file.
 
     Args:
-        scene: domain, gravity; optional colliders, clamps, attached_masses, and walls (contact, friction, inset in cells; null for
-            none; where absent, frictionless walls at the domain's faces).
+        scene: domain [m] and gravity [m/s^2]; optionally colliders, clamps, attached_masses and walls. walls has contact, friction and
+            inset [cells]; null means no walls. Without the key, the faces of the domain are frictionless walls.
         discretisation: grid (cells along the longest side) and dt [s].
 
     Raises:
-        UserError: An unknown or missing key, a wrong type, a figure outside its range; the message names the key.
+        UserError: A key is unknown or missing, or a value has the wrong type or is outside its range. The message names the key.
     """
     optional = ("colliders", "clamps", "attached_masses", "walls")
     check_keys(scene, "scene", ("domain", "gravity", *optional), optional)
@@ -127,10 +130,10 @@ def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any])
 
 
 def model_from_dict(model: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an experiment file's `model` key, checked: density [kg/m^3], elasticity, plasticity.
+    """Validate the key `model` of an experiment file; return density [kg/m^3], elasticity and plasticity.
 
     Raises:
-        UserError: An unknown or missing key, or an impossible material.
+        UserError: A key is unknown or missing, or a parameter of the material is outside its physical range.
     """
     check_keys(model, "model", ("density", "elasticity", "plasticity"), ("plasticity",))
     density = number(model["density"], "model.density", above=0.0)
@@ -144,12 +147,12 @@ def model_from_dict(model: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def body_volume(x: np.ndarray) -> float:
-    """Return the volume [m^3] of a body that is filled with particles x (P, 3) [m], by voxel occupancy.
+    """Estimate the volume [m^3] of a body from its particles x (P, 3) [m], by voxel occupancy.
 
-    A voxel is twice the mean spacing (V / P)^(1/3) wide, so that about eight particles fill it and none inside stays empty; V and
-    the voxel are found together by iteration. A voxel that touches an empty one counts 2/3: the surface cuts it. The mean over
-    eight positions of the voxel grid is right to 10 % for 5,000 particles. The motion of a body hardly depends on it, because a
-    uniform volume scales masses and forces alike.
+    A voxel is twice as wide as the mean spacing (V / P)^(1/3). It then holds about eight particles, and no voxel inside the body is
+    empty. The volume V and the voxel width are found together by iteration. A voxel beside an empty one counts 2/3, because the surface
+    cuts it. The result is the mean over eight positions of the voxel grid; its error is below 10 % for 5,000 particles. The motion of
+    a body hardly depends on the volume, because a uniform volume scales masses and forces alike.
     """
     x = np.asarray(x, dtype=np.float64)
     lower, extent = x.min(axis=0), np.ptp(x, axis=0)
@@ -164,34 +167,46 @@ def body_volume(x: np.ndarray) -> float:
 
 
 def _occupied(x: np.ndarray) -> float:
-    """Count the unit cells that hold a point of x >= 0; those at the surface count 2/3."""
+    """Count the unit cells that contain a point x >= 0; a cell beside an empty one counts 2/3."""
     cells = np.floor(x).astype(np.int64) + 1
     occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
     occupied[tuple(cells.T)] = True
-    inside = occupied.copy()
+    interior = occupied.copy()
     for axis in range(3):
-        inside &= np.roll(occupied, 1, axis) & np.roll(occupied, -1, axis)
-    return (2 * occupied.sum() + inside.sum()) / 3
+        interior &= np.roll(occupied, 1, axis) & np.roll(occupied, -1, axis)
+    return (2 * occupied.sum() + interior.sum()) / 3
 
 
 def scenes_folder() -> Path:
-    """Return configs/scenes beside the package in a checkout, else inside the installed package."""
+    """Return the folder of the built-in scenes: `configs/scenes` of the checkout or of the installed package."""
     package = Path(__file__).resolve().parents[2]
     checkout = package.parent / "configs" / "scenes"
     return checkout if checkout.is_dir() else package / "configs" / "scenes"
 
 
 def body_from_dict(given: Any, root: str | os.PathLike | None) -> Body:
+    """Build a body from the key `body` of a scene file.
+
+    Args:
+        given: `shape` (cube, box, ball or cylinder) with the arguments of that function in `shapes`; or `particles`, the path of an .npz
+            file with x and v, relative to the data folder.
+        root: Data folder (`data_root`); used by `particles` alone.
+
+    Raises:
+        UserError: The shape, a key or a value is not accepted, or the particle file is missing or malformed.
+    """
     given = mapping(given, "body")
     makers = {"cube": shapes.cube, "box": shapes.box, "ball": shapes.ball, "cylinder": shapes.cylinder}
     if "shape" in given:
         options = {key: value for key, value in given.items() if key != "shape"}
         maker = makers.get(given["shape"])
         if maker is None:
-            raise UserError(f"body.shape = {given['shape']!r} is not known; one of {', '.join(makers)}")
+            raise UserError(f"body.shape = {given['shape']!r} is unknown: choose from {', '.join(makers)}")
         unknown = set(options) - set(maker.__kwdefaults__ or {}) - set(maker.__annotations__)
         if unknown:
-            raise UserError(f"unknown key body.{sorted(unknown)[0]}")
+            raise UserError(
+                f"unknown key {sorted(unknown)[0]!r} in body; it takes shape, {', '.join(sorted(set(maker.__annotations__) - {'return'}))}"
+            )
         try:
             return maker(**options)
         except TypeError as error:
@@ -201,9 +216,9 @@ def body_from_dict(given: Any, root: str | os.PathLike | None) -> Body:
 
 
 def _particles(relative: str, root: Path) -> Body:
-    path = inside(root, relative, "body.particles", kind="data folder")
+    path = path_inside(root, relative, "body.particles", kind="data folder")
     if not path.is_file():
-        raise UserError(f"body.particles: there is no {relative} in the data folder {root}; check data_root or {VARIABLE}")
+        raise UserError(f"body.particles: the data folder {root} has no file {relative}: check data_root or {VARIABLE}")
     try:
         arrays = read_arrays(path, ("x", "v"), what="archive with x and v")
     except UserError as error:
@@ -211,9 +226,9 @@ def _particles(relative: str, root: Path) -> Body:
     x, v = arrays["x"], arrays["v"]
     check_limit(len(x) if x.ndim else 0, "NEUIDO_MAX_PARTICLES", f"body.particles: {path} has {len(x) if x.ndim else 0} particles")
     if x.ndim != 2 or x.shape[1] != 3 or v.shape != x.shape or len(x) < 2:
-        raise UserError(f"body.particles: {path} has x of shape {x.shape} and v of shape {v.shape}, not (P, 3) both")
+        raise UserError(f"body.particles: {path} has x of shape {x.shape} and v of shape {v.shape}, ; both must be (P, 3)")
     if not (np.isfinite(x).all() and np.isfinite(v).all()):
-        raise UserError(f"body.particles: {path} holds a NaN or an infinity")
+        raise UserError(f"body.particles: {path} contains a NaN or an infinity")
     volume = body_volume(x) / len(x)
     return Body(torch.from_numpy(x).float(), torch.from_numpy(v).float(), torch.full((len(x),), volume))
 
@@ -222,7 +237,7 @@ def _plane(given: Any, where: str) -> Plane:
     given = mapping(given, where)
     check_keys(given, where, ("type", "point", "normal", "contact", "friction"), ("friction",))
     if given["type"] != "plane":
-        raise UserError(f"{where}.type = {given['type']!r} is not known; it must be plane")
+        raise UserError(f"{where}.type = {given['type']!r} is unknown: it must be plane")
     normal = vector(given["normal"], f"{where}.normal")
     if not math.hypot(*normal) > 0:
         raise UserError(f"{where}.normal must not be zero")
@@ -239,7 +254,7 @@ def _walls(given: Any) -> Walls | None:
 
 def _contact(given: Mapping[str, Any], where: str) -> tuple[str, float]:
     if given["contact"] not in CONTACTS:
-        raise UserError(f"{where}.contact = {given['contact']!r} is not known; one of {', '.join(CONTACTS)}")
+        raise UserError(f"{where}.contact = {given['contact']!r} is unknown: choose from {', '.join(CONTACTS)}")
     return given["contact"], number(given.get("friction", 0.0), f"{where}.friction", least=0.0, infinite=True)
 
 

@@ -1,4 +1,4 @@
-"""Simple bodies filled with particles, moving as rigid bodies at t = 0."""
+"""Cube, box, ball and cylinder filled with particles; at t = 0 they move as rigid bodies."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,9 @@ def cube(
     velocity: Vector = (0.0, 0.0, 0.0),
     angular_velocity: Vector = (0.0, 0.0, 0.0),
 ) -> Body:
-    """Fill a cube with a regular grid that includes its faces, as NCLaw does (its issue 3 admits that the volume is then approximate).
+    """Fill a cube with a regular particle grid that includes its faces, as NCLaw does.
+
+    With particles on the faces the volume of a particle is approximate (NCLaw, issue 3).
 
     Args:
         length: Edge [m].
@@ -29,11 +31,11 @@ def cube(
         angular_velocity: Angular velocity about the centre [rad/s].
 
     Raises:
-        UserError: An edge that is not positive, or fewer than two particles per side.
+        UserError: `length` is not positive, or `particles_per_side` is below 2.
     """
     _positive("length", length)
     if particles_per_side < 2:
-        raise UserError(f"a cube needs at least 2 particles a side, got {particles_per_side}: raise particles_per_side")
+        raise UserError(f"particles_per_side must be at least 2, got {particles_per_side}")
     _affordable(particles_per_side**3, "particles_per_side")
     lower = [c - length / 2 for c in _vector("centre", centre)]
     axes = [torch.linspace(l, l + length, particles_per_side, dtype=torch.float64) for l in lower]
@@ -50,19 +52,19 @@ def box(
     velocity: Vector = (0.0, 0.0, 0.0),
     angular_velocity: Vector = (0.0, 0.0, 0.0),
 ) -> Body:
-    """Fill a box with a cell-centred lattice.
+    """Fill a box with particles at the centres of a regular lattice of cells.
 
     Args:
         lower: Lower corner [m].
         upper: Upper corner [m].
-        spacing: Distance between particles [m]; rounded on each axis so that whole cells fill the box.
+        spacing: Distance between particles [m]. It is rounded on each axis so that whole cells fill the box.
         jitter: Random displacement in fractions of a cell, 0 (regular) to 1 (anywhere in the cell).
         seed: Seed of the jitter.
         velocity: Velocity of the centre [m/s].
         angular_velocity: Angular velocity about the centre [rad/s].
 
     Raises:
-        UserError: Corners in the wrong order, a spacing that is not positive, a jitter outside [0, 1].
+        UserError: lower >= upper on an axis, `spacing` is not positive, or `jitter` is outside [0, 1].
     """
     lower, upper = _vector("lower", lower), _vector("upper", upper)
     if any(u <= l for l, u in zip(lower, upper)):
@@ -83,7 +85,7 @@ def ball(
     velocity: Vector = (0.0, 0.0, 0.0),
     angular_velocity: Vector = (0.0, 0.0, 0.0),
 ) -> Body:
-    """Fill a ball with the lattice points of `box` inside it; the particles share its exact volume.
+    """Fill a ball with the particles of `box` that lie inside it; they share the exact volume of the ball equally.
 
     Args:
         centre: Centre [m].
@@ -95,7 +97,7 @@ def ball(
         angular_velocity: Angular velocity about the centre [rad/s].
 
     Raises:
-        UserError: A radius or spacing that is not positive, or a spacing too coarse for a single particle.
+        UserError: `radius` or `spacing` is not positive, or no particle lies inside.
     """
     _positive("radius", radius)
     centre = _vector("centre", centre)
@@ -116,7 +118,9 @@ def cylinder(
     velocity: Vector = (0.0, 0.0, 0.0),
     angular_velocity: Vector = (0.0, 0.0, 0.0),
 ) -> Body:
-    """Fill a cylinder along a coordinate axis with the lattice points of `box` inside it; the particles share its exact volume.
+    """Fill a cylinder along a coordinate axis with the particles of `box` that lie inside it.
+
+    The particles share the exact volume of the cylinder equally.
 
     Args:
         centre: Centre [m].
@@ -130,7 +134,7 @@ def cylinder(
         angular_velocity: Angular velocity about the centre [rad/s].
 
     Raises:
-        UserError: A radius, height or spacing that is not positive, an unknown axis.
+        UserError: `radius`, `height` or `spacing` is not positive, `axis` is unknown, or no particle lies inside.
     """
     _positive("radius", radius)
     _positive("height", height)
@@ -145,7 +149,7 @@ def cylinder(
 
 
 def rigid_velocity(x: Tensor, *, centre: Vector, velocity: Vector, angular_velocity: Vector) -> Tensor:
-    """Return the velocity of a rigid body [m/s], v + omega x (x - centre), shape (P, 3), for x [m] (P, 3)."""
+    """Compute the velocity v + omega x (x - centre) [m/s] (P, 3) of a rigid body at the points x [m] (P, 3)."""
     about = [
         torch.tensor(_vector(n, a), dtype=x.dtype, device=x.device)
         for n, a in (("centre", centre), ("velocity", velocity), ("angular_velocity", angular_velocity))
@@ -155,7 +159,7 @@ def rigid_velocity(x: Tensor, *, centre: Vector, velocity: Vector, angular_veloc
 
 def _body(x: Tensor, volume: float, centre: Vector, velocity: Vector, angular_velocity: Vector) -> Body:
     if len(x) == 0:
-        raise UserError("no particle lies in the body: lower its spacing")
+        raise UserError("no particle lies inside the body: lower spacing")
     v = rigid_velocity(x, centre=centre, velocity=velocity, angular_velocity=angular_velocity)
     return Body(x.float(), v.float(), torch.full((len(x),), volume / len(x), dtype=torch.float32))
 
@@ -192,4 +196,4 @@ def _positive(name: str, value: float) -> None:
 def _affordable(count: int, option: str) -> None:
     if count > limit("NEUIDO_MAX_PARTICLES"):
         largest = limit("NEUIDO_MAX_PARTICLES")
-        raise UserError(f"{count} particles asked for, more than {largest}: change {option}, or set NEUIDO_MAX_PARTICLES")
+        raise UserError(f"the body would have {count} particles, more than {largest}: change {option}, or set NEUIDO_MAX_PARTICLES")

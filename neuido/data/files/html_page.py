@@ -148,7 +148,7 @@ def svg(made: Any) -> str:
     return stream.getvalue().partition("<svg")[1] + stream.getvalue().partition("<svg")[2]
 
 
-def small(ax: Any) -> None:
+def style_axes(ax: Any) -> None:
     """Make the ticks small, and leave out the frame above and at the right."""
     ax.tick_params(which="both", labelsize=7)
     for side in ("top", "right"):

@@ -15,7 +15,7 @@ from neuido.data.files.writing import process_lives
 from neuido.errors import UserError
 
 
-class Held(UserError):
+class LockHeld(UserError):
     """Another process holds the lock."""
 
 
@@ -47,7 +47,7 @@ class OwnedLock:
             try:
                 self._lock.acquire(timeout=-1 if end == math.inf else max(0.0, end - time.monotonic()))
             except Timeout as error:
-                raise Held(self._message(self._record())) from error
+                raise LockHeld(self._message(self._record())) from error
             except OSError as error:
                 raise UserError(f"the lock {self.path} cannot be made: {(error.strerror or str(error)).lower()}") from error
             record = self._record()
@@ -56,7 +56,7 @@ class OwnedLock:
                 return self
             self._lock.release()
             if time.monotonic() >= end:
-                raise Held(self._message(record))
+                raise LockHeld(self._message(record))
             time.sleep(0.1)
 
     def hand_to(self, child: int) -> None:

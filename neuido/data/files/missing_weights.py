@@ -8,7 +8,7 @@ import yaml
 from neuido import configs_root
 
 
-def how_to_make(path: str | os.PathLike, option: str = "init_from") -> str:
+def weights_hint(path: str | os.PathLike, option: str = "init_from") -> str:
     """Return the words that end an error about missing weights: the command that makes the file, or where others come from.
 
     A configuration makes a file when its `save_to` names it.

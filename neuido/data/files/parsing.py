@@ -69,7 +69,7 @@ def parser_errors(path: str | os.PathLike, what: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:  # parsers raise what their authors did not think of: zlib.error, TokenError, RecursionError, ...
-        raise UserError(f"{path} is no {what}: {one_line(error)}") from error
+        raise UserError(f"{path} is not a valid {what}: {one_line(error)}") from error
 
 
 def one_line(error: BaseException) -> str:
@@ -203,7 +203,9 @@ def read_arrays(
         if not others and (unknown := sorted(set(members) - {*needed, *optional})):
             raise UserError(f"{path}: unknown array {unknown[0]!r}; it takes {', '.join((*needed, *optional))}")
         if missing := [name for name in needed if name not in members]:
-            raise UserError(f"{path} is no {what}: it lacks the array {missing[0]!r}; it has {', '.join(sorted(members)[:20]) or 'none'}")
+            raise UserError(
+                f"{path} is not a valid {what}: it lacks the array {missing[0]!r}; it has {', '.join(sorted(members)[:20]) or 'none'}"
+            )
         return {name: _read_array(archive, members[name], path, what) for name in (*needed, *optional) if name in members}
 
 
@@ -215,7 +217,7 @@ def _read_array(archive: zipfile.ZipFile, member: str, path: Path, what: str) ->
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = header(stream)
     if dtype.kind not in "biufU":
-        raise UserError(f"{path} is no {what}: {member} holds values of the kind {dtype}, no plain numbers")
+        raise UserError(f"{path} is not a valid {what}: {member} holds values of the kind {dtype}, no plain numbers")
     check_limit(math.prod(shape), "NEUIDO_MAX_ARRAY_ELEMENTS", f"{path}: {member} has {math.prod(shape)} elements")
     with archive.open(member) as stream:
         return np.lib.format.read_array(stream, allow_pickle=False)

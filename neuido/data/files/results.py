@@ -117,7 +117,7 @@ def _numbered(path: Path) -> list[tuple[str, int]]:
     return [(text, int(number or 0)) for text, number in re.findall(r"([^0-9]*)([0-9]*)", path.as_posix())]
 
 
-def curves(root: Path) -> dict[str, list[tuple[float, float]]]:
+def logged_curves(root: Path) -> dict[str, list[tuple[float, float]]]:
     """Return (step, value) of each logged column; of a column in several files the newest counts."""
     out: dict[str, list[tuple[float, float]]] = {}
     for path in logs(root):

@@ -12,7 +12,7 @@ from neuido.errors import UserError
 
 def write_rows(path: str | os.PathLike, rows: Sequence[dict[str, Any]]) -> None:
     """Write rows as CSV, all at once; a value that a row lacks is empty."""
-    from neuido.data.files.storage import write
+    from neuido.data.files.storage import write_text
 
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -21,7 +21,7 @@ def write_rows(path: str | os.PathLike, rows: Sequence[dict[str, Any]]) -> None:
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()} for row in rows)
-    write(path, text.getvalue())
+    write_text(path, text.getvalue())
 
 
 def read_rows(path: str | os.PathLike) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.files.writing import replacing
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.types import TrajectoryBatch
 
@@ -23,7 +23,7 @@ FORMAT = "neuido-trajectories/1"
 COLUMNS = 27
 
 
-def complete(path: Path, shape: tuple[int, ...]) -> bool:
+def is_complete(path: Path, shape: tuple[int, ...]) -> bool:
     """Whether a trajectory's file is there, whole and of this shape."""
     if not path.is_file():
         return False
@@ -34,13 +34,13 @@ def complete(path: Path, shape: tuple[int, ...]) -> bool:
     return array.shape == shape and array.dtype == np.float32
 
 
-def write(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
     """Write a small file all at once; several processes may write the same one."""
-    with replacing(path) as hidden:
+    with atomic_write(path) as hidden:
         hidden.write_text(text)
 
 
-def claim(folder: Path, text: str, held: str, *, compared: str | None = None) -> None:
+def claim_folder(folder: Path, text: str, held: str, *, compared: str | None = None) -> None:
     """Make a folder with `plan.json`, or check that its plan is this one.
 
     Args:
@@ -60,7 +60,7 @@ def claim(folder: Path, text: str, held: str, *, compared: str | None = None) ->
         raise UserError(f"out = {folder} cannot be made: {str(error.strerror).lower()} for {error.filename}") from error
     path = folder / "plan.json"
     if not path.exists():
-        write(path, text)
+        write_text(path, text)
     elif path.read_text() != text:
         changed = "" if compared is None else _difference(path, text, compared)
         raise UserError(f"{folder} holds {held}{changed}: give another out, or remove the folder")
@@ -99,7 +99,7 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-class Files:
+class TrajectoryFiles:
     """The memory-mapped arrays of several trajectories, opened when first read (and again in each worker)."""
 
     def __init__(self, paths: list[Path]) -> None:
@@ -116,7 +116,7 @@ class Files:
     def gather(self, rows: Tensor) -> TrajectoryBatch:
         """Return the samples at the rows t P + p of each trajectory, (M, n) int64, on the CPU."""
         picked = np.stack([array[index] for array, index in zip(self.arrays, rows.numpy(), strict=True)])
-        return split(torch.from_numpy(picked))
+        return to_batch(torch.from_numpy(picked))
 
     def load(self, device: torch.device) -> Tensor:
         """Load everything, (M, T P, 27) float32 on the device."""
@@ -126,7 +126,7 @@ class Files:
         return out
 
 
-def split(rows: Tensor) -> TrajectoryBatch:
+def to_batch(rows: Tensor) -> TrajectoryBatch:
     """Return stored columns (M, n, 27) as a batch of M n samples sorted by trajectory."""
     trajectories, samples = rows.shape[:2]
     trial, corrected, stress = rows.reshape(-1, 3, 3, 3).transpose(0, 1).contiguous()

@@ -21,9 +21,9 @@ def read_status(folder: Path) -> dict[str, Any]:
 
 def write_status(folder: Path, state: Mapping[str, Any]) -> None:
     """Write the status of a run to its `run.json`."""
-    from neuido.data.files.storage import write
+    from neuido.data.files.storage import write_text
 
-    write(folder / "run.json", json.dumps(state, indent=1) + "\n")
+    write_text(folder / "run.json", json.dumps(state, indent=1) + "\n")
 
 
 def own_folder(environment: Mapping[str, str]) -> Path | None:

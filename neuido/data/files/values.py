@@ -58,14 +58,14 @@ def check_keys(value: Any, where: str, allowed: tuple[str, ...], optional: tuple
             raise UserError(f"{where} lacks the key {key!r}")
 
 
-def listed(content: Any, where: str) -> list[dict[str, Any]]:
+def list_of_mappings(content: Any, where: str) -> list[dict[str, Any]]:
     """Return a list of mappings that is not empty."""
     if not isinstance(content, list) or not content or not all(isinstance(entry, dict) for entry in content):
         raise UserError(f"{where} must be a list of frames, each a mapping of keys to values, and not empty")
     return content
 
 
-def take(entry: dict[str, Any], key: str, where: str) -> Any:
+def require_key(entry: dict[str, Any], key: str, where: str) -> Any:
     """Return the value of a key that must be there."""
     if key not in entry:
         raise UserError(f"{where} lacks the key {key!r}")
@@ -92,7 +92,7 @@ def file_name(value: Any, where: str) -> str:
     return value
 
 
-def inside(folder: Path, relative: Any, where: str, *, kind: str = "folder") -> Path:
+def path_inside(folder: Path, relative: Any, where: str, *, kind: str = "folder") -> Path:
     r"""Return the path that a file names, which must stay in the folder; `\` separates folders as `/` does.
 
     Raises:

@@ -12,7 +12,7 @@ from neuido.errors import UserError
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike, *, keep_suffix: bool = False) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False) -> Iterator[Path]:
     """Give the name of a temporary file beside a file; when the block ends it takes the file's place, for good and all at once.
 
     Several processes may write one file: each has a temporary name of its own. Where the block fails, as on a full disk, the temporary
@@ -24,7 +24,7 @@ def replacing(path: str | os.PathLike, *, keep_suffix: bool = False) -> Iterator
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    hidden = temporary(path, path.suffix if keep_suffix else "")
+    hidden = temporary_path(path, path.suffix if keep_suffix else "")
     try:
         yield hidden
         _sync(hidden)
@@ -44,7 +44,7 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    hidden = temporary(path)
+    hidden = temporary_path(path)
     hidden.mkdir()
     try:
         yield hidden
@@ -63,7 +63,7 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
     _sync(path.parent)
 
 
-def temporary(path: Path, suffix: str = "") -> Path:
+def temporary_path(path: Path, suffix: str = "") -> Path:
     """Return a name beside a file that no other process uses; what dead processes of this machine left beside it goes first."""
     host = "".join(c for c in socket.gethostname() if c.isalnum())[:20]
     old_name = path.with_name(f".{path.name}.tmp")  # of earlier versions
@@ -84,7 +84,7 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
 
 
-def real_folder(path: Path, what: str) -> Path:
+def make_real_folder(path: Path, what: str) -> Path:
     """Make a folder, or take the one that is there.
 
     Raises:

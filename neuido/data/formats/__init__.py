@@ -1,1 +1,1 @@
-"""Readers of multi-view recordings, one module a format; `neuido.data.scenes.readers.read` chooses among them."""
+"""Readers of multi-view recordings, one module per file format; `neuido.data.read_recording` chooses the reader."""

@@ -1,7 +1,7 @@
-"""COLMAP's models, binary (`cameras.bin`, `images.bin`) or text (`cameras.txt`, `images.txt`): a set of views of one moment.
+"""Reader of COLMAP models, binary (`cameras.bin`, `images.bin`) or text (`cameras.txt`, `images.txt`).
 
-Spring-Gaus and NeuMA carry binary ones. `colmap image_undistorter` writes `sparse/`, the mapper `sparse/0/`. Masks are in `masks/`, named
-`<image name>.png` as COLMAP has it, or as the image with the ending `.png`.
+A model holds views of one moment. `colmap image_undistorter` writes it to `sparse/`, `colmap mapper` to `sparse/0/`. Spring-Gaus and
+NeuMA have binary models. Masks lie in `masks/`. A mask is named `<image name>.png`, as COLMAP does, or as its image with the suffix `.png`.
 """
 
 import contextlib
@@ -16,19 +16,21 @@ from torch import Tensor
 
 from neuido.data import cameras as convert
 from neuido.data.files.parsing import check_limit, one_line, read_text
-from neuido.data.files.values import inside
-from neuido.data.formats.layout import MultiView, Shot, assemble, natural
+from neuido.data.files.values import path_inside
+from neuido.data.formats.layout import MultiView, Shot, assemble, natural_key
 from neuido.errors import UserError
 
 NAMES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
          "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE")  # fmt: skip
-"""COLMAP's lens models by their number."""
+"""Names of COLMAP's camera models, by model number."""
 MODELS = {0: ("f", "cx", "cy"), 1: ("fx", "fy", "cx", "cy"), 2: ("f", "cx", "cy", "k1"), 3: ("f", "cx", "cy", "k1", "k2"),
           4: ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")}  # fmt: skip
-"""Parameters of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV; the other models are no pinholes."""
+"""Parameters of the supported camera models, by model number: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV."""
 
 
 class Camera(NamedTuple):
+    """A COLMAP camera: image size [px], intrinsic matrix and lens distortion."""
+
     width: int
     height: int
     K: Tensor
@@ -38,6 +40,8 @@ class Camera(NamedTuple):
 
 
 class Image(NamedTuple):
+    """A registered COLMAP image: file name, camera id and pose."""
+
     name: str
     camera: int
     viewmat: Tensor
@@ -45,10 +49,10 @@ class Image(NamedTuple):
 
 
 def read_cameras(path: Path) -> dict[int, Camera]:
-    """Return the cameras of `cameras.bin` or `cameras.txt` by their id.
+    """Read the cameras of `cameras.bin` or `cameras.txt`; return them by id.
 
     Raises:
-        UserError: The file is missing, cut short, or has a lens that is no pinhole.
+        UserError: The file is missing or truncated, or a camera model is not a pinhole.
     """
     out = {}
     for number, model, width, height, values in _camera_lines(path) if path.suffix == ".txt" else _camera_records(path):
@@ -56,19 +60,21 @@ def read_cameras(path: Path) -> dict[int, Camera]:
         fx, fy = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
         K = torch.tensor([[fx, 0, given["cx"]], [0, fy, given["cy"]], [0, 0, 1]], dtype=torch.float64)
         if not (fx > 0 and fy > 0 and width > 0 and height > 0 and bool(torch.isfinite(K).all())):
-            raise UserError(f"{path}: camera {number} has focal lengths {fx:g}, {fy:g} and the size {width} x {height}")
+            raise UserError(
+                f"{path}: camera {number} has the focal lengths {fx:g}, {fy:g} and the size {width} x {height}; all must be positive"
+            )
         lens = tuple(given.get(key, 0.0) for key in ("k1", "k2", "p1", "p2"))
         if not all(math.isfinite(term) for term in lens):
-            raise UserError(f"{path}: camera {number} has a lens term that is not finite: {list(lens)}")
+            raise UserError(f"{path}: camera {number} has a distortion coefficient that is not finite: {list(lens)}")
         check_limit(width * height, "NEUIDO_MAX_IMAGE_PIXELS", f"{path}: camera {number} has {width} x {height} pixels")
         out[number] = Camera(width, height, K, lens)
     if not out:
-        raise UserError(f"{path} holds no camera")
+        raise UserError(f"{path} contains no camera")
     return out
 
 
 def _camera_records(path: Path) -> Iterator[tuple[int, int, int, int, tuple[float, ...]]]:
-    data = _Bytes(path)
+    data = _ByteReader(path)
     for _ in range(data.take("<Q")[0]):
         number, model, width, height = data.take("<iiQQ")
         if model not in MODELS:
@@ -91,7 +97,7 @@ def _camera_lines(path: Path) -> Iterator[tuple[int, int, int, int, tuple[float,
 
 
 def _no_pinhole(path: Path, number: int | str, name: str) -> UserError:
-    return UserError(f"{path}: camera {number} has the lens model {name}, no pinhole: undistort the images with COLMAP first")
+    return UserError(f"{path}: camera {number} has the camera model {name}, not a pinhole: run `colmap image_undistorter` first")
 
 
 @contextlib.contextmanager
@@ -99,14 +105,14 @@ def _line_errors(path: Path, line: int, form: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, OverflowError) as error:
-        raise UserError(f"{path}, line {line} is not {form}: {one_line(error)}") from error
+        raise UserError(f"{path}, line {line} must have the form {form}: {one_line(error)}") from error
 
 
 def read_images(path: Path) -> list[Image]:
-    """Return the registered images of `images.bin` or `images.txt`, by name.
+    """Read the registered images of `images.bin` or `images.txt`, sorted by name.
 
     Raises:
-        UserError: The file is missing or cut short.
+        UserError: The file is missing or truncated, or a pose is invalid.
     """
     out = []
     for name, camera, pose in _image_lines(path) if path.suffix == ".txt" else _image_records(path):
@@ -115,17 +121,17 @@ def read_images(path: Path) -> list[Image]:
         except UserError as error:
             raise UserError(f"{path}: {name}: {error}") from error
         if not bool(torch.isfinite(viewmat).all()):
-            raise UserError(f"{path}: the pose of {name} holds a NaN")
+            raise UserError(f"{path}: the pose of {name} contains a NaN")
         out.append(Image(name, camera, viewmat))
-    return sorted(out, key=lambda image: natural(image.name))
+    return sorted(out, key=lambda image: natural_key(image.name))
 
 
 def _image_records(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
-    data = _Bytes(path)
+    data = _ByteReader(path)
     for _ in range(data.take("<Q")[0]):
         _, *pose, camera = data.take("<i7di")
         name = data.text()
-        data.skip(24 * data.take("<Q")[0])  # its 2D points
+        data.skip(24 * data.take("<Q")[0])  # the 2D points of the image
         yield name, camera, tuple(pose)
 
 
@@ -133,7 +139,7 @@ def _image_lines(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
     lines = [(i, line) for i, line in enumerate(read_text(path).splitlines(), 1) if not line.startswith("#")]
     while lines and not lines[0][1].strip():  # blank lines between the comments and the first image
         lines.pop(0)
-    for i, line in lines[::2]:  # each second line has the 2D points, and may be empty
+    for i, line in lines[::2]:  # every second line has the 2D points and may be empty
         if not line.strip():
             continue
         with _line_errors(path, i, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
@@ -142,7 +148,7 @@ def _image_lines(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
 
 
 def find_model(path: Path) -> Path | None:
-    """Return the folder of the model in a project: `sparse/0`, `sparse` or the project itself; none where there is none."""
+    """Find the model folder of a COLMAP project: `sparse/0`, `sparse` or the project folder; None if there is no model."""
     for folder in (path / "sparse" / "0", path / "sparse", path):
         if any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt")):
             return folder
@@ -150,42 +156,59 @@ def find_model(path: Path) -> Path | None:
 
 
 def read(path: Path, *, recording: str | None = None, frame_interval: float | None = None) -> MultiView:
-    """Read a COLMAP project: a model in `sparse/0`, `sparse` or the folder itself, pictures in `images`, perhaps masks in `masks`.
+    """Read a COLMAP project as views of one moment.
+
+    Args:
+        path: The project folder. The model lies in `sparse/0`, `sparse` or the folder itself, images lie in `images`, and masks, if there
+            are any, in `masks`.
+        recording: Not used.
+        frame_interval: Not used.
 
     Raises:
-        UserError: No model, a lens that is no pinhole, an image that is missing, or masks for some images alone.
+        UserError: There is no model, a camera model is not a pinhole, an image is missing, or some images have a mask and others none.
     """
     model = find_model(path)
     if model is None:
-        raise UserError(f"{path} has no COLMAP model: images.bin or images.txt is missing in it, in sparse and in sparse/0")
+        raise UserError(f"{path} has no COLMAP model: neither it nor sparse nor sparse/0 has images.bin or images.txt")
     masks = path / "masks" if (path / "masks").is_dir() else None
     return views(model, path / "images", folder=path, name=path.resolve().name, masks=masks)
 
 
 def views(model: Path, pictures: Path, *, folder: Path, name: str, masks: Path | None = None) -> MultiView:
-    """Read the registered images of a model folder, each one a view."""
+    """Read the registered images of a model folder; each image is one view.
+
+    Args:
+        model: Folder with `cameras` and `images`, .bin or .txt.
+        pictures: Folder of the image files.
+        folder: Folder of the recording, for `MultiView.folder`.
+        name: Name of the recording.
+        masks: Folder of the mask files, if there are any.
+
+    Raises:
+        UserError: As `read`.
+    """
     kind = "bin" if (model / "images.bin").is_file() or not (model / "images.txt").is_file() else "txt"
     cameras, images = model / f"cameras.{kind}", model / f"images.{kind}"
     lenses = read_cameras(cameras)
     shots = []
     for image in read_images(images):
         if image.camera not in lenses:
-            raise UserError(f"{images}: {image.name} names camera {image.camera}, which {cameras.name} lacks")
+            raise UserError(f"{images}: {image.name} refers to camera {image.camera}, which is not in {cameras.name}")
         lens = lenses[image.camera]
-        file = inside(pictures, image.name, f"{images}: name")
+        file = path_inside(pictures, image.name, f"{images}: name")
         mask = None if masks is None else _mask(masks, image.name)
         shots.append(Shot(image.name, 0.0, file, image.viewmat, lens.K, mask, lens.distortion, (lens.width, lens.height)))
     return assemble(shots, folder=folder, name=name, format="colmap")
 
 
 def _mask(masks: Path, name: str) -> Path:
-    """Return the mask of an image: `<name>.png`, or the name with the ending `.png`."""
-    own = inside(masks, f"{name}.png", "name")
-    return own if own.is_file() else inside(masks, name, "name").with_suffix(".png")
+    """Return the path of an image's mask: `<name>.png`, or the name with its suffix replaced by `.png`."""
+    own = path_inside(masks, f"{name}.png", "name")
+    return own if own.is_file() else path_inside(masks, name, "name").with_suffix(".png")
 
 
-class _Bytes:
-    """A binary file, read from its beginning."""
+class _ByteReader:
+    """Sequential reader of a binary file."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
@@ -199,14 +222,16 @@ class _Bytes:
     def skip(self, count: int) -> None:
         self.at += count
         if self.at > len(self.data):
-            raise UserError(f"{self.path} is cut short or no binary COLMAP file: it ends at byte {len(self.data)}, not {self.at}")
+            raise UserError(
+                f"{self.path} is truncated or not a binary COLMAP file: it ends at byte {len(self.data)}, before byte {self.at}"
+            )
 
     def text(self) -> str:
         end = self.data.find(b"\0", self.at)
         if end < 0:
-            raise UserError(f"{self.path} is cut short or no binary COLMAP file: a name has no end")
+            raise UserError(f"{self.path} is truncated or not a binary COLMAP file: an image name is not terminated")
         raw, self.at = self.data[self.at : end], end + 1
         try:
             return raw.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise UserError(f"{self.path} is no binary COLMAP file: a name is not text") from error
+            raise UserError(f"{self.path} is not a binary COLMAP file: an image name is not UTF-8") from error

@@ -1,4 +1,4 @@
-"""What each reader returns, and the checks that all of them share. The files are not trusted."""
+"""`MultiView`, which every reader of recordings returns, and the checks that all readers share. The files are not trusted."""
 
 import re
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from neuido.errors import UserError
 from neuido.types import Body, Cameras
 
 SAME_TIME = 1e-6  # s
-SAME_SHAPE = 0.01  # of the aspect ratios of two images
-SAME_POSE = 1e-5  # absolute, of the entries of a world-to-camera matrix
+SAME_SHAPE = 0.01  # relative difference of two aspect ratios
+SAME_POSE = 1e-5  # absolute difference of the entries of two world-to-camera matrices
 
 Grid = tuple[tuple[Path | None, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class MultiView:
-    """One motion filmed by V cameras in T frames: where the images are, not the images."""
+    """A motion filmed by V cameras in T frames: cameras, times and the paths of the images. No image is loaded."""
 
     name: str
     format: str
@@ -33,57 +33,58 @@ class MultiView:
     views: tuple[str, ...]
     """Names of the V views."""
     times: Tensor
-    """Times of the frames [s], (T,) float64, rising."""
+    """Times of the frames [s], (T,) float64, increasing."""
     images: Grid
-    """Path of the image of each view and frame; none where there is no such image."""
+    """images[v][t]: path of the image of view v and frame t; None if there is no such image."""
     masks: Grid | None = None
-    """Paths of separate masks; without them the alpha channel is the mask, where an image has one."""
+    """masks[v][t]: path of the mask of view v and frame t. If None, the alpha channel of an image is its mask."""
     held_out: tuple[int, ...] = ()
-    """Indices of the views that the format keeps for scoring."""
+    """Indices of the views that the files reserve for scoring."""
     distortion: Tensor | None = None
-    """OpenCV's k1, k2, p1, p2, k3 of each view, (V, 5) float64; none: images of ideal pinholes."""
+    """OpenCV's distortion coefficients k1, k2, p1, p2, k3 of each view, (V, 5) float64; None if no image is distorted."""
     backgrounds: tuple[Path | None, ...] | None = None
-    """An image of the empty scene for each view."""
+    """Path of an image of the empty scene for each view."""
     body: Body | None = None
-    """The particles at t = 0, where the format has them."""
+    """The particles at t = 0, if the files have them."""
     gaussians: Path | None = None
-    """The first frame as a 3DGS PLY, where the format has one."""
+    """Path of the first frame as a 3DGS PLY file, if the files have one."""
 
 
 class Shot(NamedTuple):
-    """One image as a file describes it."""
+    """One image with its camera and time."""
 
     view: str
     time: float
     image: Path
     viewmat: Tensor
-    """OpenCV world-to-camera, (4, 4) float64."""
+    """OpenCV world-to-camera matrix, (4, 4) float64."""
     K: Tensor
-    """(3, 3) float64, in pixels of the full image."""
+    """Intrinsic matrix [px], (3, 3) float64."""
     mask: Path | None = None
     distortion: tuple[float, ...] = ()
     size: tuple[int, int] | None = None
-    """Width and height [px] to which K refers; none: those of the recording."""
+    """Width and height [px] that K refers to; None: those of the recording."""
 
 
 def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, folder: Path, **fields: Any) -> MultiView:
-    """Sort shots into views (in order of appearance) and frames (by time).
+    """Assemble images into a `MultiView`: views in order of appearance, frames by time.
 
     Args:
         shots: All images of one motion.
-        size: Width and height [px] of all views; none: those of the first view. The intrinsics of a view of another size are scaled.
-        folder: The folder that holds them.
-        fields: The other fields of `MultiView`; `held_out` and `backgrounds` by name of view.
+        size: Width and height [px] of all views; None: those of the first view. The intrinsics of a view of another size are scaled.
+        folder: The folder of the recording.
+        fields: The other fields of `MultiView`. `held_out` holds names of views; `backgrounds` maps names of views to paths.
 
     Raises:
-        UserError: No shot, a missing file, two images for one view and frame, a view whose camera moves, or views of several shapes.
+        UserError: There is no image, a file is missing, two images have the same view and frame, the camera of a view moves, or views
+            have different aspect ratios.
     """
     if not shots:
-        raise UserError(f"{folder} names no image")
+        raise UserError(f"{folder} lists no image")
     missing = [path for shot in shots for path in (shot.image, shot.mask) if path is not None and not path.is_file()]
     if missing:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
-        raise UserError(f"the image {missing[0]} is missing{more}; {folder} names it")
+        raise UserError(f"the image {missing[0]} is missing{more}; {folder} lists it")
     views = list(dict.fromkeys(shot.view for shot in shots))
     times, at = _frames(shots)
     first: dict[str, Shot] = {}
@@ -96,11 +97,11 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
         camera = first.setdefault(shot.view, shot)
         if camera.size != shot.size:
             raise UserError(
-                f"view {shot.view} has images of 2 sizes, {camera.size} and {shot.size}: {camera.image.name}, {shot.image.name}"
+                f"view {shot.view} has images of two sizes: {camera.image.name} {camera.size} and {shot.image.name} {shot.size} px"
             )
         if not (torch.allclose(camera.viewmat, shot.viewmat, rtol=0, atol=SAME_POSE) and torch.allclose(camera.K, shot.K)):
             raise UserError(
-                f"view {shot.view} moves between {camera.image.name} and {shot.image.name}: give each pose of a camera a view of its own"
+                f"the camera of view {shot.view} moves between {camera.image.name} and {shot.image.name}: make each pose a separate view"
             )
     width, height = size or first[views[0]].size or image_size(shots[0].image)
     cameras = Cameras(
@@ -134,9 +135,9 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
 
 
 def _frames(shots: Sequence[Shot]) -> tuple[list[float], list[int]]:
-    """Return the times of the frames [s] and the frame of each shot.
+    """Group shots into frames; return the times of the frames [s] and the frame index of each shot.
 
-    Shutters of several cameras may differ by up to a quarter of the frame interval; a frame then has the mean of their times.
+    The times of several cameras may differ by up to a quarter of the frame interval. The time of a frame is the mean over its shots.
     """
     own: dict[str, list[float]] = {}
     for shot in shots:
@@ -155,7 +156,7 @@ def _frames(shots: Sequence[Shot]) -> tuple[list[float], list[int]]:
 
 
 def _resized(shot: Shot, width: int, height: int) -> Tensor:
-    """Return K of a shot for images of a size, which must have the shape of its own up to a per cent."""
+    """Scale the intrinsic matrix of a shot to another image size, whose aspect ratio may differ by one percent."""
     if shot.size is None or shot.size == (width, height):
         return shot.K
     own_width, own_height = shot.size
@@ -167,32 +168,32 @@ def _resized(shot: Shot, width: int, height: int) -> Tensor:
     return shot.K * shot.K.new_tensor([width / own_width, height / own_height, 1.0])[:, None]
 
 
-def matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
-    """Return numbers of one of the shapes as float64.
+def read_matrix(value: Any, where: str, *shapes: tuple[int, ...]) -> Tensor:
+    """Convert nested lists of numbers to a float64 tensor of one of the allowed `shapes`.
 
     Raises:
-        UserError: Another shape, text, a NaN or an infinity.
+        UserError: The shape is not allowed, or an entry is not a finite number.
     """
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise UserError(f"{where} must hold numbers, of shape {_or(shapes)}") from error
+        raise UserError(f"{where} must contain numbers and have the shape {_or(shapes)}") from error
     if array.shape not in shapes:
         raise UserError(f"{where} must have the shape {_or(shapes)}, got {array.shape}")
     if not np.isfinite(array).all():
-        raise UserError(f"{where} holds a NaN or an infinity")
+        raise UserError(f"{where} contains a NaN or an infinity")
     return torch.from_numpy(array)
 
 
-def opengl(value: Any, where: str) -> Tensor:
-    """Return OpenCV world-to-camera (4, 4), float64, of an OpenGL camera-to-world matrix (3, 4) or (4, 4) in a file.
+def viewmat_from_opengl(value: Any, where: str) -> Tensor:
+    """Convert an OpenGL camera-to-world matrix (3, 4) or (4, 4) of a file to an OpenCV world-to-camera matrix (4, 4), float64.
 
     Raises:
-        UserError: No such matrix, or a rotation that is sheared or mirrored.
+        UserError: It is not such a matrix, or its rotation is sheared or mirrored.
     """
-    c2w = matrix(value, where, (3, 4), (4, 4))
+    c2w = read_matrix(value, where, (3, 4), (4, 4))
     if len(c2w) == 4 and not torch.allclose(c2w[3], c2w.new_tensor([0.0, 0.0, 0.0, 1.0]), atol=1e-6):
-        hint = ": it is written column by column, give the transpose" if torch.allclose(c2w[:3, 3], c2w.new_zeros(3), atol=1e-6) else ""
+        hint = ": it seems to be transposed; write it row by row" if torch.allclose(c2w[:3, 3], c2w.new_zeros(3), atol=1e-6) else ""
         raise UserError(f"{where} has the last row {[round(float(n), 6) for n in c2w[3]]}, not 0, 0, 0, 1{hint}")
     try:
         return convert.from_opengl(c2w)
@@ -200,22 +201,22 @@ def opengl(value: Any, where: str) -> Tensor:
         raise UserError(f"{where}: {error}") from error
 
 
-def calibration(value: Any, where: str) -> Tensor:
-    """Return an intrinsic matrix K (3, 3).
+def read_intrinsics(value: Any, where: str) -> Tensor:
+    """Validate an intrinsic matrix K (3, 3) of a file; return it as float64.
 
     Raises:
-        UserError: Not a matrix, a focal length that is not positive, or a skew.
+        UserError: It is not a 3 x 3 matrix, a focal length is not positive, or it has a skew.
     """
-    K = matrix(value, where, (3, 3))
+    K = read_matrix(value, where, (3, 3))
     if not (K[0, 0] > 0 and K[1, 1] > 0):
         raise UserError(f"{where} has the focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they must be positive")
     if K[0, 1] != 0 or not torch.equal(K[2], K.new_tensor([0.0, 0.0, 1.0])) or K[1, 0] != 0:
-        raise UserError(f"{where} is no pinhole's matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        raise UserError(f"{where} must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     return K
 
 
-def natural(text: str) -> list[tuple[int, str]]:
-    """Return a key that sorts `r_2` before `r_10`."""
+def natural_key(text: str) -> list[tuple[int, str]]:
+    """Return a sort key that compares numbers in a text as numbers: `r_2` before `r_10`."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text) if part]
 
 

@@ -1,7 +1,7 @@
-"""Nerfstudio's `transforms.json` and Blender's `transforms_{train,val,test}.json` (NeRF, D-NeRF, GIC), read and written.
+"""Reader and writer of Nerfstudio's `transforms.json`; reader of Blender's `transforms_{train,val,test}.json` (NeRF, D-NeRF, GIC).
 
-Two keys of a frame are ours: `time` [s] and `view` (which camera). Frames without `view` belong to one view if they have the same
-pose. Without `time` and `view`, each pose is a view of one and the same moment.
+neuido adds two keys to a frame: `time` [s] and `view`, the number of the camera. Frames without `view` belong to the same view if they
+have the same pose. If frames have neither key, each pose is a view of the same moment.
 """
 
 import json
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from neuido.data import cameras as convert
 from neuido.data.files.parsing import image_size, read_json
-from neuido.data.files.values import inside, listed, number, take
-from neuido.data.formats.layout import MultiView, Shot, assemble, matrix, natural, opengl
+from neuido.data.files.values import list_of_mappings, number, path_inside, require_key
+from neuido.data.formats.layout import MultiView, Shot, assemble, natural_key, read_matrix, viewmat_from_opengl
 from neuido.errors import UserError
 from neuido.types import Cameras
 
@@ -25,20 +25,25 @@ SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json"
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 UNKNOWN_TERMS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2")
-"""Terms of lens models that are not applied; they must be zero."""
+"""Distortion coefficients that are not supported; they must be zero."""
 FISHEYES = ("is_fisheye", "fisheye", "ftheta_p0", "equirectangular")
 FOCAL = {"fl_x", "camera_angle_x", "camera_angle_y"}
 ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 
 
 def read(path: Path, *, recording: str | None = None, frame_interval: float | None = None) -> MultiView:
-    """Read a folder with `transforms.json`, or with Blender's three files, or one such JSON file.
+    """Read a Nerfstudio or Blender recording.
 
-    Views of `transforms_val.json`, `transforms_test.json`, or of `val_filenames` and `test_filenames`, count as held out, also
-    where the training file has them too (GIC's).
+    A view is held out if `transforms_val.json` or `transforms_test.json` has it, or if `val_filenames` or `test_filenames` lists it. It
+    is held out even if the training file has it too, as in GIC's data.
+
+    Args:
+        path: A folder with `transforms.json` or Blender's three files, or one such file.
+        recording: Not used.
+        frame_interval: Time between frames [s]. It replaces the times of the file.
 
     Raises:
-        UserError: A missing key or file, a lens that is no pinhole, frames with a view and no time.
+        UserError: A key or a file is missing, a camera is not a pinhole, or a view has several frames but no times.
     """
     folder, files = (path.parent, [path]) if path.is_file() else (path, _files(path))
     shots: list[Shot] = []
@@ -48,17 +53,17 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
     for file in files:
         content = read_json(file)
         if not isinstance(content, dict):
-            raise UserError(f"{file} must hold a mapping with a list `frames`")
+            raise UserError(f"{file} must contain a mapping with a list `frames`")
         kept = {name for key in ("val_filenames", "test_filenames") for name in _names(content, key, file)}
-        for i, entry in enumerate(listed(take(content, "frames", str(file)), f"{file}: frames")):
+        for i, entry in enumerate(list_of_mappings(require_key(content, "frames", str(file)), f"{file}: frames")):
             where = f"{file.name}: frames[{i}]"
             shot = _shot(entry, content, folder, where, poses)
             if file.name in SPLITS[1:] or str(entry["file_path"]) in kept:
                 held_out.add(shot.view)
-            if shot.image not in seen:  # GIC writes the test views into all three files
+            if shot.image not in seen:  # all three files of GIC list the test views
                 shots.append(shot)
             seen.add(shot.image)
-    shots = sorted(_timed(shots, frame_interval, folder), key=lambda shot: natural(shot.view))
+    shots = sorted(_timed(shots, frame_interval, folder), key=lambda shot: natural_key(shot.view))
     return assemble(shots, folder=folder, held_out=held_out, name=folder.resolve().name, format="nerfstudio")
 
 
@@ -71,15 +76,15 @@ def write(
     views: Sequence[str] | None = None,
     held_out: Sequence[int] = (),
 ) -> None:
-    """Write `transforms.json` and `images/<view>_<frame>.png`.
+    """Write a recording as `transforms.json` and `images/<view>_<frame>.png`.
 
     Args:
-        folder: Where to; made if it is missing.
+        folder: Output folder; it is created if it does not exist.
         cameras: V cameras.
-        times: (T,) [s].
-        images: images[v][t] is (H, W, 3 or 4) uint8, RGB or RGBA; loaded one by one, so it may be lazy.
-        views: Names of the views; whole numbers, as the format wants them. Default: 0, 1, ...
-        held_out: Views that are named under `test_filenames`.
+        times: Times of the frames [s], (T,).
+        images: images[v][t] is an RGB or RGBA image (H, W, 3 or 4) uint8. Images are accessed one by one, so the sequence may load lazily.
+        views: Names of the views; the format requires whole numbers. Default: 0, 1, ...
+        held_out: Indices of the views to list under `test_filenames`.
     """
     names = write_transforms(folder, cameras, times, views=views, held_out=held_out)
     for v, name in enumerate(names):
@@ -90,10 +95,13 @@ def write(
 def write_transforms(
     folder: Path, cameras: Cameras, times: Tensor, *, views: Sequence[str] | None = None, held_out: Sequence[int] = ()
 ) -> list[str]:
-    """Write `transforms.json` alone, for images that are written otherwise; arguments as in `write`. Returns the names of the views."""
+    """Write `transforms.json` without images; return the names of the views.
+
+    The arguments are those of `write`. The caller writes the images to `images/<view>_<frame>.png`.
+    """
     names = list(views) if views is not None else [str(v) for v in range(len(cameras.viewmats))]
     if not all(name.isdigit() for name in names):
-        raise UserError(f"views must be whole numbers, got {names}")
+        raise UserError(f"the names of views must be whole numbers, got {names}")
     (folder / "images").mkdir(parents=True, exist_ok=True)
     poses = convert.to_opengl(cameras.viewmats.double()).tolist()
     frames: list[dict[str, Any]] = []
@@ -113,13 +121,17 @@ def write_transforms(
 
 
 def write_image(path: Path, image: np.ndarray, *, size: tuple[int, int] | None = None) -> None:
-    """Write RGB or RGBA (H, W, 3 or 4) uint8 as PNG."""
+    """Write an RGB or RGBA image (H, W, 3 or 4) uint8 as a PNG file.
+
+    Raises:
+        UserError: The array has another shape or type, its (width, height) is not `size`, or the file cannot be written.
+    """
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] not in (3, 4) or image.dtype != np.uint8 or (size and image.shape[1::-1] != size):
         raise UserError(f"{path.name} must be (H, W, 3 or 4) uint8{f' of size {size}' if size else ''}, got {image.shape} {image.dtype}")
     order = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
     if not cv2.imwrite(str(path), cv2.cvtColor(image, order)):
-        raise UserError(f"cannot write the image {path}")
+        raise UserError(f"the image {path} cannot be written")
 
 
 def _files(folder: Path) -> list[Path]:
@@ -139,20 +151,20 @@ def _names(content: dict[str, Any], key: str, file: Path) -> list[str]:
 
 
 def _shot(own: dict[str, Any], shared: dict[str, Any], folder: Path, where: str, poses: dict[tuple, str]) -> Shot:
-    """Return a frame; what it does not say is taken from the keys of the file."""
+    """Read one entry of `frames`; keys that it lacks are taken from the top level of the file."""
     entry = shared | own
-    image = _image(folder, take(entry, "file_path", where), where)
-    viewmat = opengl(take(entry, "transform_matrix", where), f"{where}.transform_matrix")
+    image = _image(folder, require_key(entry, "file_path", where), where)
+    viewmat = viewmat_from_opengl(require_key(entry, "transform_matrix", where), f"{where}.transform_matrix")
     model = entry.get("camera_model", "OPENCV")
     if model not in PINHOLES:
-        raise UserError(f"{where}.camera_model = {model!r} is no pinhole; undistort the images first (one of {', '.join(PINHOLES)})")
+        raise UserError(f"{where}.camera_model = {model!r} must be one of {', '.join(PINHOLES)}: undistort the images first")
     for key in FISHEYES:
         if entry.get(key):
-            raise UserError(f"{where}.{key} = {entry[key]!r}: a fisheye or panoramic lens is no pinhole; undistort the images first")
+            raise UserError(f"{where}.{key} = {entry[key]!r}: fisheye and panoramic lenses are not supported: undistort the images first")
     size = _size(entry, where) if "w" in entry and "h" in entry else image_size(image)
     K = _lens(own, shared, size, where)
     lens = _distortion(own, shared, where)
-    mask = inside(folder, entry["mask_path"], f"{where}.mask_path") if "mask_path" in entry else None
+    mask = path_inside(folder, entry["mask_path"], f"{where}.mask_path") if "mask_path" in entry else None
     if "view" in entry:
         view = entry["view"]
         if isinstance(view, bool) or not isinstance(view, int | str):
@@ -166,18 +178,18 @@ def _shot(own: dict[str, Any], shared: dict[str, Any], folder: Path, where: str,
 
 
 def _distortion(own: dict[str, Any], shared: dict[str, Any], where: str) -> tuple[float, ...]:
-    """Return k1, k2, p1, p2, k3 of a frame, of single keys or of `distortion_params` (k1, k2, k3, k4, p1, p2, as Nerfstudio has them)."""
+    """Read k1, k2, p1, p2, k3 of a frame from single keys or from Nerfstudio's `distortion_params` (k1, k2, k3, k4, p1, p2)."""
     entry = shared | own
     terms = {key: number(entry.get(key, 0.0), f"{where}.{key}") for key in (*DISTORTION, *UNKNOWN_TERMS)}
     if (given := entry.get("distortion_params")) is not None:
-        values = matrix(given, f"{where}.distortion_params", (6,)).tolist()
+        values = read_matrix(given, f"{where}.distortion_params", (6,)).tolist()
         for key, value in zip(("k1", "k2", "k3", "k4", "p1", "p2"), values):
             if key in entry and terms[key] != value:
-                raise UserError(f"{where}: {key} = {terms[key]:g} and distortion_params say different things; leave one out")
+                raise UserError(f"{where}: {key} = {terms[key]:g} contradicts distortion_params: remove one of them")
             terms[key] = value
     for key in UNKNOWN_TERMS:
         if terms[key] != 0:
-            raise UserError(f"{where}.{key} = {terms[key]:g}: this term of a lens is not applied; undistort the images first")
+            raise UserError(f"{where}.{key} = {terms[key]:g} is not supported: undistort the images first")
     return tuple(terms[key] for key in DISTORTION)
 
 
@@ -187,7 +199,7 @@ def _size(entry: dict[str, Any], where: str) -> tuple[int, int]:
 
 
 def _lens(own: dict[str, Any], shared: dict[str, Any], size: tuple[int, int], where: str) -> Tensor:
-    """Return K of a frame; a focal length of the frame, in pixels or as an angle, comes before that of the file."""
+    """Return the intrinsic matrix of a frame. Its focal length, in pixels or as an angle, takes precedence over that of the file."""
     width, height = size
     entry = shared | own
     keys = next((given for given in (own, shared) if FOCAL & set(given)), {})
@@ -206,24 +218,26 @@ def _lens(own: dict[str, Any], shared: dict[str, Any], size: tuple[int, int], wh
         fx = focal.get("camera_angle_x", focal.get("camera_angle_y", 0.0))
         fy = focal.get("camera_angle_y", fx)
     else:
-        raise UserError(f"{where} has neither fl_x nor camera_angle_x: the focal length is not known")
+        raise UserError(f"{where} has neither fl_x nor camera_angle_x: give one of them for the focal length")
     cx, cy = (number(entry.get(key, half / 2), f"{where}.{key}") for key, half in (("cx", width), ("cy", height)))
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 
 def _image(folder: Path, given: Any, where: str) -> Path:
-    """Return the path of an image; Blender leaves its ending away."""
-    path = inside(folder, given, f"{where}.file_path")
+    """Return the path of an image, with the suffix that Blender omits."""
+    path = path_inside(folder, given, f"{where}.file_path")
     if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
         return path
     return next((path.with_name(path.name + end) for end in ENDINGS if path.with_name(path.name + end).is_file()), path)
 
 
 def _timed(shots: list[Shot], frame_interval: float | None, folder: Path) -> list[Shot]:
-    """Return the shots with times: those of the file, else one moment, else the order in each view."""
+    """Assign a time to each shot: that of the file, zero if a view has one shot, else its position in its view times `frame_interval`."""
     timeless = [shot for shot in shots if np.isnan(shot.time)]
     if timeless and len(timeless) < len(shots):
-        raise UserError(f"{folder}: {len(timeless)} of {len(shots)} frames have no time ({timeless[0].image.name}): give all or none one")
+        raise UserError(
+            f"{folder}: {len(timeless)} of {len(shots)} frames have no time ({timeless[0].image.name}): give all frames a time, or none"
+        )
     if frame_interval is not None and not timeless:
         order = {time: k for k, time in enumerate(sorted({shot.time for shot in shots}))}
         return [shot._replace(time=order[shot.time] * frame_interval) for shot in shots]
@@ -235,9 +249,9 @@ def _timed(shots: list[Shot], frame_interval: float | None, folder: Path) -> lis
     if all(len(group) == 1 for group in groups.values()):
         return [shot._replace(time=0.0) for shot in shots]
     if frame_interval is None:
-        raise UserError(f"{folder}: the frames of a view have no time: add `time` (s) to each, or give the option frame_interval")
+        raise UserError(f"{folder}: a view has several frames without a time: add `time` (s) to each frame, or give frame_interval")
     return [
         shot._replace(time=k * frame_interval)
         for group in groups.values()
-        for k, shot in enumerate(sorted(group, key=lambda shot: natural(shot.image.name)))
+        for k, shot in enumerate(sorted(group, key=lambda shot: natural_key(shot.image.name)))
     ]

@@ -1,6 +1,6 @@
-"""NeuMA's data: a synthetic scene (`data_dynamic.json`, `eval_dynamic.json`), a real one (`dynamics/`), and its assets.
+"""Reader of NeuMA's data: synthetic scenes (`data_dynamic.json`, `eval_dynamic.json`), real scenes (`dynamics/`) and assets.
 
-Its synthetic rotations may carry a scale (0.41 in BouncyBall), which no projection sees; it is taken out.
+The rotations of synthetic scenes may contain a scale, 0.41 in BouncyBall. It does not change the images and is removed.
 """
 
 import re
@@ -14,40 +14,45 @@ from torch import Tensor
 
 from neuido.data import cameras as convert
 from neuido.data.files.parsing import image_size, read_arrays, read_json
-from neuido.data.files.values import inside, listed, take
+from neuido.data.files.values import list_of_mappings, path_inside, require_key
 from neuido.data.formats import colmap
-from neuido.data.formats.layout import MultiView, Shot, assemble, calibration, matrix, natural, opengl
+from neuido.data.formats.layout import MultiView, Shot, assemble, natural_key, read_intrinsics, read_matrix, viewmat_from_opengl
 from neuido.errors import UserError
 
 INTERVALS = {"bouncyball": 1e-3, "jellyduck": 1e-3, "claycat": 5e-4, "honeybottle": 5e-4, "rubberpawn": 5e-4, "sandfish": 5e-4}
-"""Seconds a frame of the six scenes, one substep of NeuMA's (its experiments/configs/synthetic)."""
+"""Time between frames [s] of the six synthetic scenes: one substep of NeuMA's experiments/configs/synthetic."""
 REAL_INTERVAL = 1 / 120
-"""The capture of the real scenes is Spring-Gaus's, at 120 Hz; NeuMA itself integrates 0.01 s a frame."""
+"""Time between frames [s] of the real scenes, which Spring-Gaus filmed at 120 Hz. NeuMA itself integrates 0.01 s per frame."""
 NAME = re.compile(r"^(.+)_(-?[0-9]+)$")
 
 
 class Assets(NamedTuple):
-    """What NeuMA keeps of a scene beside its images; none where a file is not there."""
+    """Assets of a NeuMA scene beside its images; a field is None if its file does not exist."""
 
     x: Tensor | None = None
-    """Particles at t = 0 in the simulation's domain [m], (P, 3) float32."""
+    """Positions of the particles at t = 0 in the simulation domain [m], (P, 3) float32."""
     v: Tensor | None = None
-    """Their velocity [m/s], (P, 3) float32."""
+    """Velocities of the particles [m/s], (P, 3) float32."""
     volume: Tensor | None = None
-    """Their volume [m^3], (P,) float32."""
+    """Volumes of the particles [m^3], (P,) float32."""
     bindings: Tensor | None = None
-    """Weights of the particles of each Gaussian, sparse (K, P) float32."""
+    """Weight of each particle for each of K Gaussians, sparse (K, P) float32."""
     gaussians: Path | None = None
-    """`kernels.ply`, in the layout of 3DGS."""
+    """Path of `kernels.ply`, a 3DGS PLY file."""
     particles: Path | None = None
-    """`particles.ply`, in the world of the images."""
+    """Path of `particles.ply`, in the world coordinates of the cameras."""
 
 
 def read(path: Path, *, recording: str | None = None, frame_interval: float | None = None) -> MultiView:
-    """Read a synthetic or a real scene's folder; the views of `eval_dynamic.json` are held out.
+    """Read a synthetic or real scene of NeuMA; the views of `eval_dynamic.json` are held out.
+
+    Args:
+        path: The folder of the scene.
+        recording: Not used.
+        frame_interval: Time between frames [s]. Default: `INTERVALS` for NeuMA's synthetic scenes, 1/120 s for real ones.
 
     Raises:
-        UserError: A missing key or file, a name of another form, a frame interval that is not known.
+        UserError: A key or a file is missing, a file name is not `<view>_<step>`, or the frame interval is unknown.
     """
     if (path / "data_dynamic.json").is_file():
         return _synthetic(path, frame_interval)
@@ -55,13 +60,13 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
 
 
 def read_assets(path: Path) -> Assets:
-    """Read `assets/<name>`: `init.pt`, `bindings.pt`, `particles.npz` and the PLY files, those that are there.
+    """Read the files that exist of a folder `assets/<name>`: `init.pt`, `bindings.pt`, `particles.npz` and the PLY files.
 
     Raises:
-        UserError: A file that is malformed, or whose arrays do not fit.
+        UserError: The folder does not exist, a file is malformed, or the shapes of its arrays do not match.
     """
     if not path.is_dir():
-        raise UserError(f"there is no folder {path}")
+        raise UserError(f"the folder {path} is missing")
     x = v = volume = bindings = None
     if (path / "init.pt").is_file():
         file = path / "init.pt"
@@ -81,7 +86,7 @@ def read_assets(path: Path) -> Assets:
 def _synthetic(path: Path, frame_interval: float | None) -> MultiView:
     interval = frame_interval or INTERVALS.get(path.resolve().name.lower())
     if interval is None:
-        raise UserError(f"the frames of {path.resolve().name} have no times: give the option frame_interval (s); NeuMA's own scenes are "
+        raise UserError(f"the frames of {path.resolve().name} have no times: give frame_interval (s). Scenes with a default: "
                         f"{', '.join(INTERVALS)}")  # fmt: skip
     shots, held_out = [], set()
     for set_name in ("data_dynamic", "eval_dynamic"):
@@ -89,16 +94,16 @@ def _synthetic(path: Path, frame_interval: float | None) -> MultiView:
         if not file.is_file():
             continue
         part = []
-        for i, entry in enumerate(listed(read_json(file), str(file))):
+        for i, entry in enumerate(list_of_mappings(read_json(file), str(file))):
             where = f"{file.name}[{i}]"
-            image = inside(path, take(entry, "file_path", where), f"{where}.file_path")
+            image = path_inside(path, require_key(entry, "file_path", where), f"{where}.file_path")
             view, step = _view_and_step(image, where)
             if step < 0:
                 continue
-            viewmat = opengl(take(entry, "c2w", where), f"{where}.c2w")
-            K = calibration(take(entry, "intrinsic", where), f"{where}.intrinsic")
+            viewmat = viewmat_from_opengl(require_key(entry, "c2w", where), f"{where}.c2w")
+            K = read_intrinsics(require_key(entry, "intrinsic", where), f"{where}.intrinsic")
             part.append(Shot(view, step * interval, image, viewmat, K))
-        part.sort(key=lambda shot: natural(shot.view))
+        part.sort(key=lambda shot: natural_key(shot.view))
         shots += part
         held_out |= {shot.view for shot in part} if set_name == "eval_dynamic" else set()
     return assemble(shots, folder=path, name=path.resolve().name, format="neuma", held_out=held_out)
@@ -110,9 +115,9 @@ def _real(path: Path, interval: float) -> MultiView:
     if not isinstance(calibrated, dict):
         raise UserError(f"{path / 'cameras_calib.json'} must be a mapping of views to rvecs and tvecs")
     if not (path / "dynamics").is_dir():
-        raise UserError(f"{path} has neither data_dynamic.json nor the folder dynamics")
+        raise UserError(f"{path} is not a NeuMA scene: it has neither data_dynamic.json nor the folder dynamics")
     shots = []
-    images = sorted((file for file in (path / "dynamics").iterdir() if file.suffix == ".jpg"), key=lambda file: natural(file.name))
+    images = sorted((file for file in (path / "dynamics").iterdir() if file.suffix == ".jpg"), key=lambda file: natural_key(file.name))
     size = image_size(images[0]) if images else (1, 1)
     K = dynamic_lens(next(iter(lens.values())), size)
     for image in images:
@@ -125,9 +130,10 @@ def _real(path: Path, interval: float) -> MultiView:
 
 
 def dynamic_lens(static: colmap.Camera, size: tuple[int, int]) -> Tensor:
-    """Return K of a video from the still camera's, its focal lengths scaled, the principal point in the middle.
+    """Return the intrinsic matrix of a video whose images have the `size` (width, height) [px].
 
-    NeuMA and Spring-Gaus exchange the two focal lengths (which differ by 0.04 %); here they are not.
+    The focal lengths are those of the still camera, scaled to the video; the principal point is the image centre. NeuMA and Spring-Gaus
+    swap the two focal lengths, which differ by 0.04 %; here they are not swapped.
     """
     width, height = size
     fx, fy = float(static.K[0, 0]) * width / static.width, float(static.K[1, 1]) * height / static.height
@@ -135,12 +141,23 @@ def dynamic_lens(static: colmap.Camera, size: tuple[int, int]) -> Tensor:
 
 
 def extrinsics(calibrated: dict[str, Any], view: str, file: Path) -> Tensor:
-    """Return world-to-camera (4, 4) of a view's `rvecs` and `tvecs`, which OpenCV writes as (3,), (3, 1) or (1, 3)."""
+    """Return the world-to-camera matrix (4, 4) of a view from its OpenCV `rvecs` and `tvecs`.
+
+    Args:
+        calibrated: Content of `cameras_calib.json`: a mapping of views to `rvecs` and `tvecs` of shape (3,), (3, 1), (1, 3) or (1, 3, 1).
+        view: Name of the view.
+        file: Path of the file, for error messages.
+
+    Raises:
+        UserError: The view or one of its vectors is missing or malformed.
+    """
     entry = calibrated.get(view)
     if not isinstance(entry, dict):
         raise UserError(f"{file} lacks the view {view!r}")
     vectors = [
-        matrix(take(entry, key, f"{file.name}: {view}"), f"{file.name}: {view}.{key}", (3,), (3, 1), (1, 3), (1, 3, 1)).flatten()
+        read_matrix(
+            require_key(entry, key, f"{file.name}: {view}"), f"{file.name}: {view}.{key}", (3,), (3, 1), (1, 3), (1, 3, 1)
+        ).flatten()
         for key in ("rvecs", "tvecs")
     ]
     return convert.from_rodrigues(*vectors)
@@ -149,17 +166,19 @@ def extrinsics(calibrated: dict[str, Any], view: str, file: Path) -> Tensor:
 def _view_and_step(image: Path, where: str) -> tuple[str, int]:
     match = NAME.match(image.stem)
     if match is None:
-        raise UserError(f"{where}: {image.name!r} is not of the form <view>_<step>{image.suffix}")
+        raise UserError(f"{where}: the file name {image.name!r} must have the form <view>_<step>{image.suffix}")
     return match[1], int(match[2])
 
 
 def _load(path: Path, keys: tuple[str, ...]) -> dict[str, Any]:
-    """Return a file of torch.save with these keys, weights only."""
+    """Load a dictionary with these keys from a torch.save file, weights only."""
     try:
         with torch.serialization.safe_globals([torch.Size]):
             content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch names no one type for a file that is malformed or not safe
-        raise UserError(f"{path} is no file of tensors: {str(error).splitlines()[0] if str(error) else type(error).__name__}") from error
+    except Exception as error:  # torch raises exceptions of many types for malformed or unsafe files
+        raise UserError(
+            f"{path} is not a torch.save file of tensors: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
+        ) from error
     for key in keys:
         if not isinstance(content, dict) or key not in content:
             raise UserError(f"{path} lacks the entry {key!r}")
@@ -172,9 +191,9 @@ def _bindings(path: Path, particle_count: int | None) -> Tensor:
     content = _load(path, ("bindings_ind", "bindings_val", "bindings_size"))
     index, value, size = content["bindings_ind"], content["bindings_val"], tuple(int(n) for n in _flat(content["bindings_size"]))
     if index.ndim != 2 or len(index) != 2 or value.shape != index.shape[1:] or len(size) != 2 or index.dtype != torch.int64:
-        raise UserError(f"{path}: bindings_ind {tuple(index.shape)}, bindings_val {tuple(value.shape)}, bindings_size {size} do not fit")
+        raise UserError(f"{path}: bindings_ind {tuple(index.shape)}, bindings_val {tuple(value.shape)}, bindings_size {size} do not match")
     if bool((index < 0).any() | (index >= torch.tensor(size)[:, None]).any()) or particle_count not in (None, size[1]):
-        raise UserError(f"{path}: an index lies outside bindings_size {size}, or init.pt has another number of particles")
+        raise UserError(f"{path}: an index is outside bindings_size = {size}, or init.pt has {particle_count} particles")
     return torch.sparse_coo_tensor(index, value.float(), size, check_invariants=True).coalesce()
 
 
@@ -187,7 +206,7 @@ def _volume(path: Path, particle_count: int | None) -> Tensor:
     arrays = read_arrays(path, ("p_x", "vol"), what="archive with p_x and vol")
     points, volume = arrays["p_x"], np.asarray(arrays["vol"], dtype=np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or particle_count not in (None, len(points)):
-        raise UserError(f"{path}: p_x has the shape {points.shape}; it must be (P, 3), with the P of init.pt")
+        raise UserError(f"{path}: p_x has the shape {points.shape}; it must be ({particle_count or 'P'}, 3)")
     if volume.size not in (1, len(points)) or not (np.isfinite(volume).all() and (volume > 0).all()):
-        raise UserError(f"{path}: vol must be one positive volume, or one for each of {len(points)} particles")
+        raise UserError(f"{path}: vol must hold one positive volume, or one for each of {len(points)} particles")
     return torch.from_numpy(np.broadcast_to(volume.reshape(-1), (len(points),)).copy())

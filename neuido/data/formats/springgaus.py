@@ -1,4 +1,4 @@
-"""Spring-Gaus's data: `mpm_synthetic/<object>` and `real_capture`.
+"""Reader of Spring-Gaus's data: `mpm_synthetic/<object>` and `real_capture`.
 
 ```
 <object>/camera.json, <object>/<camera>/000.png ...                  mpm_synthetic, RGBA
@@ -11,28 +11,28 @@ dynamic/{videos_images/<camera>/*.jpg,videos_masks/<camera>/*.png}
 from pathlib import Path
 
 from neuido.data.files.parsing import image_size, read_json
-from neuido.data.files.values import inside, listed, take
+from neuido.data.files.values import list_of_mappings, path_inside, require_key
 from neuido.data.formats import colmap
-from neuido.data.formats.layout import MultiView, Shot, assemble, calibration, natural, opengl
+from neuido.data.formats.layout import MultiView, Shot, assemble, natural_key, read_intrinsics, viewmat_from_opengl
 from neuido.data.formats.neuma import dynamic_lens, extrinsics
 from neuido.errors import UserError
 
 SYNTHETIC_INTERVAL = 0.03
-"""Seconds a frame of mpm_synthetic (`DT` in its configurations)."""
+"""Time between frames [s] of mpm_synthetic (`DT` in Spring-Gaus's configurations)."""
 REAL_INTERVAL = 1 / 120
-"""Seconds a frame of real_capture (`FREQ` in its configurations)."""
+"""Time between frames [s] of real_capture (`FREQ` in Spring-Gaus's configurations)."""
 
 
 def read(path: Path, *, recording: str | None = None, frame_interval: float | None = None) -> MultiView:
-    """Read an object of mpm_synthetic, or a sequence of real_capture.
+    """Read an object of mpm_synthetic or a sequence of real_capture.
 
     Args:
-        path: `mpm_synthetic/<object>` or the folder `real_capture` with `static` and `dynamic`.
-        recording: `<object>/<sequence>` of real_capture, say `bun/0`; needed where there are several.
-        frame_interval: Default: 0.03 s (synthetic) and 1/120 s (real).
+        path: The folder `mpm_synthetic/<object>`, or the folder `real_capture`.
+        recording: `<object>/<sequence>` of real_capture, for example `bun/0`. Needed if there are several.
+        frame_interval: Time between frames [s]. Default: 0.03 s (mpm_synthetic), 1/120 s (real_capture).
 
     Raises:
-        UserError: A missing key or file, an unknown sequence, cameras with unequal numbers of frames.
+        UserError: A key or a file is missing, the sequence is unknown, or a camera lacks a frame of another one.
     """
     if (path / "camera.json").is_file():
         return _synthetic(path, frame_interval or SYNTHETIC_INTERVAL)
@@ -40,23 +40,33 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
 
 
 def read_static(path: Path, name: str) -> MultiView:
-    """Return the stills of an object of real_capture, in COLMAP's own frame and scale: the object has to be registered to the video."""
+    """Read the still images of an object of real_capture.
+
+    Cameras are in COLMAP's own frame and scale; the object has to be registered to the video.
+
+    Args:
+        path: The folder `real_capture`.
+        name: Name of the object.
+
+    Raises:
+        UserError: The object has no COLMAP model, or an image is missing.
+    """
     static = path / "static"
-    model = inside(static, f"colmap/{name}", "the object's name")
+    model = path_inside(static, f"colmap/{name}", "the object's name")
     return colmap.views(model, static / "images" / name, folder=path, name=name, masks=static / "masks" / name)
 
 
 def _synthetic(path: Path, interval: float) -> MultiView:
     shots = []
-    for i, entry in enumerate(listed(read_json(path / "camera.json"), str(path / "camera.json"))):
+    for i, entry in enumerate(list_of_mappings(read_json(path / "camera.json"), str(path / "camera.json"))):
         where = f"camera.json[{i}]"
-        name = take(entry, "camera", where)
-        folder = inside(path, name, f"{where}.camera")
-        viewmat = opengl(take(entry, "c2w", where), f"{where}.c2w")
-        K = calibration(take(entry, "K", where), f"{where}.K")
+        name = require_key(entry, "camera", where)
+        folder = path_inside(path, name, f"{where}.camera")
+        viewmat = viewmat_from_opengl(require_key(entry, "c2w", where), f"{where}.c2w")
+        K = read_intrinsics(require_key(entry, "K", where), f"{where}.K")
         frames = sorted((file for file in folder.glob("*.png") if file.stem.isdigit()), key=lambda file: int(file.stem))
         if not frames:
-            raise UserError(f"{where}: {folder} holds no frame 000.png, 001.png, ...")
+            raise UserError(f"{where}: {folder} contains no frames 000.png, 001.png, ...")
         shots += [Shot(name, int(file.stem) * interval, file, viewmat, K) for file in frames]
     return _whole(assemble(shots, folder=path, name=path.resolve().name, format="springgaus"))
 
@@ -64,7 +74,7 @@ def _synthetic(path: Path, interval: float) -> MultiView:
 def _real(path: Path, recording: str | None, interval: float) -> MultiView:
     dynamic = path / "dynamic"
     name = _sequence(dynamic, recording)
-    content = read_json(inside(dynamic / "sequences", f"{name}.json", "recording"))
+    content = read_json(path_inside(dynamic / "sequences", f"{name}.json", "recording"))
     calibrated = read_json(dynamic / "cameras_calib.json")
     if not isinstance(calibrated, dict) or not isinstance(content, dict):
         raise UserError(f"{dynamic}: cameras_calib.json and sequences/{name}.json must be mappings")
@@ -75,11 +85,11 @@ def _real(path: Path, recording: str | None, interval: float) -> MultiView:
     lens = next(iter(colmap.read_cameras(static).values()))
     shots = []
     K, size = None, (1, 1)
-    for view in sorted(views, key=natural):
+    for view in sorted(views, key=natural_key):
         viewmat = extrinsics(calibrated, view, dynamic / "cameras_calib.json")
-        pictures, masks = (inside(dynamic, f"{kind}/{view}", "camera") for kind in ("videos_images", "videos_masks"))
+        pictures, masks = (path_inside(dynamic, f"{kind}/{view}", "camera") for kind in ("videos_images", "videos_masks"))
         for t, given in enumerate(views[view]):
-            image = inside(pictures, given, f"sequences/{name}.json: {view}[{t}]")
+            image = path_inside(pictures, given, f"sequences/{name}.json: {view}[{t}]")
             if K is None:
                 size = image_size(image)
                 K = dynamic_lens(lens, size)
@@ -93,7 +103,7 @@ def _sequence(dynamic: Path, recording: str | None) -> str:
     if recording is None and len(known) == 1:
         return known[0]
     if recording not in known:
-        raise UserError(f"recording = {recording!r} is not in {dynamic / 'sequences'}; one of {', '.join(known) or '(none there)'}")
+        raise UserError(f"recording = {recording!r} is not in {dynamic / 'sequences'}: choose from {', '.join(known) or '(none found)'}")
     return recording
 
 

@@ -10,11 +10,11 @@ import yaml
 from neuido.data.importers.checked_folder import write_checked
 from neuido.errors import UserError
 
-EARLY = 4
+VELOCITY_FRAMES = 4
 """Frames from which the first velocities are estimated."""
 
 
-def experiment_of(
+def write_deforming_body(
     takes: Mapping[str, tuple[np.ndarray, Mapping[str, np.ndarray]]],
     out: str | os.PathLike | None,
     *,
@@ -93,7 +93,7 @@ def experiment_of(
 
 def _velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the velocities (N, 3) at the first frame [m/s], from a parabola through the first frames; the mean where points were lost."""
-    count = min(EARLY, len(t))
+    count = min(VELOCITY_FRAMES, len(t))
     basis = np.stack([t[:count] ** power for power in range(min(3, count))], 1)
     out = np.einsum("f,fna->na", np.linalg.pinv(basis)[1], x[:count])
     lost = ~np.isfinite(out).all(axis=1)

@@ -13,7 +13,7 @@ from neuido.data.importers.checked_folder import write_checked
 from neuido.data.importers.testing_machine import Specimen, read_machine
 from neuido.data.importers.titled_tables import read_cells
 from neuido.data.importers.tracker_exports import Motion, read_motion
-from neuido.data.importers.units import factor
+from neuido.data.importers.units import conversion_factor
 from neuido.errors import UserError
 
 KINDS = ("auto", "material", "track", "body")
@@ -118,14 +118,14 @@ def import_file(
                    "recordings": recordings}  # fmt: skip
         _write(out, "track.yaml", content, tables)
     else:
-        from neuido.data.importers.deforming import experiment_of
+        from neuido.data.importers.deforming import write_deforming_body
 
         takes = {}
         for path, name in zip(paths, names):
             t, points, notes = _motion(path, read_motion(path, columns), scale, y_down, up, frame_rate, units)
             said += [f"{path.name}: {note}" for note in notes]
             takes[name] = (t, points)
-        said += experiment_of(takes, out, roles=roles, density=density, young=young, poisson=poisson, volume=volume, floor=floor)
+        said += write_deforming_body(takes, out, roles=roles, density=density, young=young, poisson=poisson, volume=volume, floor=floor)
     if out is not None:
         said.append(f"next: neuido check {out}; neuido diagnose {out} --out {out}-answer")
     return said
@@ -134,7 +134,7 @@ def import_file(
 def _kind(path: Path, columns: Mapping[str, str]) -> str:
     """Return what a file holds: a material test, a track or a body."""
     from neuido.data.importers.titled_tables import read_titled
-    from neuido.data.importers.titles import meanings
+    from neuido.data.importers.titles import find_columns
 
     if path.suffix.lower() in (".c3d", ".trc"):
         return "track"
@@ -142,7 +142,7 @@ def _kind(path: Path, columns: Mapping[str, str]) -> str:
     first = rows[0][0].lower() if rows and rows[0] else ""
     if first in ("scorer", "trajectories", "format version") or first.startswith("pathfiletype"):
         return "track"
-    found = meanings(read_titled(path).titles, dict(columns))
+    found = find_columns(read_titled(path).titles, dict(columns))
     if {"x", "y", "z"} & set(found) and {"time", "frame"} & set(found):
         return "body" if "id" in found else "track"
     return "material"
@@ -160,14 +160,14 @@ def _motion(
             raise UserError(f"{path.name} counts frames: give --frame_rate, in frames a second")
         t = t / rate
     elif "time" in units:
-        t = t * factor(units["time"], "s", "--units.time")
+        t = t * conversion_factor(units["time"], "s", "--units.time")
     unit = units.get("x", motion.unit)
     if scale is not None:
         ratio = scale
     elif unit.lower() in ("px", "pixel", "pixels"):
         raise UserError(f"{path.name} is in pixels: give --scale, in metres a pixel, and --y_down true where y points down")
     else:
-        ratio = factor(unit, "m", f"{path.name}, positions") if unit else 1.0
+        ratio = conversion_factor(unit, "m", f"{path.name}, positions") if unit else 1.0
         notes.append(f"positions in {unit}" if unit else "positions without a unit, taken as metres (--scale)")
     order = np.argsort(t, kind="stable")
     order = order[np.isfinite(t[order])]

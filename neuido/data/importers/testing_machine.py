@@ -8,11 +8,11 @@ import numpy as np
 
 from neuido.data.files.delimited import is_number
 from neuido.data.importers.titled_tables import Table, read_titled
-from neuido.data.importers.titles import meanings
-from neuido.data.importers.units import factor, quantity
+from neuido.data.importers.titles import find_columns
+from neuido.data.importers.units import conversion_factor, parse_quantity
 from neuido.errors import UserError
 
-MOST_ROWS = 400
+MAX_ROWS = 400
 """Of a longer table every second, third, ... row is kept."""
 _SIZES = {"length": r".*gau?ge length|.*specimen length|length|messl.nge|einspannl.nge", "width": r"width|breite|probenbreite",
           "thickness": r"thickness|dicke|probendicke", "diameter": r"diameter|durchmesser"}  # fmt: skip
@@ -27,14 +27,16 @@ class Specimen(NamedTuple):
     diameter: str | None = None
 
 
-class Measured(NamedTuple):
+class MeasuredTest(NamedTuple):
     """The columns of one test in SI units, and what was understood."""
 
     columns: dict[str, np.ndarray]
     summary: list[str]
 
 
-def read_machine(path: Path, specimen: Specimen, mode: str, columns: dict[str, str], units: dict[str, str], compression: bool) -> Measured:
+def read_machine(
+    path: Path, specimen: Specimen, mode: str, columns: dict[str, str], units: dict[str, str], compression: bool
+) -> MeasuredTest:
     """Read a table of a testing machine.
 
     Args:
@@ -49,7 +51,7 @@ def read_machine(path: Path, specimen: Specimen, mode: str, columns: dict[str, s
         UserError: A column, a unit or a size is missing; the line names the option.
     """
     table = read_titled(path)
-    found = meanings(table.titles, columns)
+    found = find_columns(table.titles, columns)
     sizes = _sizes(table, specimen)
     out: dict[str, np.ndarray] = {}
     said = list(table.notes)
@@ -62,7 +64,7 @@ def read_machine(path: Path, specimen: Specimen, mode: str, columns: dict[str, s
                 f"{path.name}: column {table.titles[found[name]]!r} has no unit: give --units.{name}, for example {unit or 'percent'}"
             )
         said.append(f"column {found[name] + 1} {table.titles[found[name]]!r} -> {name}, {own or 'a ratio'}")
-        return table.data[:, found[name]] * factor(own, unit, f"{path.name}, {name}")
+        return table.data[:, found[name]] * conversion_factor(own, unit, f"{path.name}, {name}")
 
     if mode == "biaxial":
         for key in ("stretch_1", "stretch_2", "nominal_stress_1", "nominal_stress_2"):
@@ -108,7 +110,7 @@ def read_machine(path: Path, specimen: Specimen, mode: str, columns: dict[str, s
             raise UserError(f"{path.name} has no stress or force: name it, --columns.force TITLE ({', '.join(table.titles)})")
     if "time" in found:
         out["time"] = take("time", "s", ask=False) if table.units[found["time"]] or "time" in units else table.data[:, found["time"]]
-    return Measured(_cleaned(out, said), said)
+    return MeasuredTest(_cleaned(out, said), said)
 
 
 def _sizes(table: Table, specimen: Specimen) -> dict[str, float]:
@@ -120,8 +122,8 @@ def _sizes(table: Table, specimen: Specimen) -> dict[str, float]:
         if len(cells) > 1 and is_number(cells[1]) and (len(cells) > 2 or unit):
             for name, pattern in _SIZES.items():
                 if re.fullmatch(pattern, label):
-                    sizes[name] = float(cells[1]) * factor(unit[1] if unit else cells[2], "m", f"{cells[0]} in the preamble")
-    return sizes | {name: quantity(text, "m", name) for name, text in specimen._asdict().items() if text}
+                    sizes[name] = float(cells[1]) * conversion_factor(unit[1] if unit else cells[2], "m", f"{cells[0]} in the preamble")
+    return sizes | {name: parse_quantity(text, "m", name) for name, text in specimen._asdict().items() if text}
 
 
 def _cleaned(columns: dict[str, np.ndarray], said: list[str]) -> dict[str, np.ndarray]:
@@ -133,7 +135,7 @@ def _cleaned(columns: dict[str, np.ndarray], said: list[str]) -> dict[str, np.nd
             said.append(f"{again.sum()} rows whose time does not rise are left out")
         keep &= ~again
     rows = np.flatnonzero(keep)
-    every = -(-len(rows) // MOST_ROWS)
+    every = -(-len(rows) // MAX_ROWS)
     if every > 1:
         said.append(f"one row in {every} is kept of {len(rows)}")
     if len(rows[::every]) < 3:

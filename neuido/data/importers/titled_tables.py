@@ -8,7 +8,7 @@ import numpy as np
 
 from neuido.data.files.delimited import is_number, read_delimited
 from neuido.data.files.parsing import parser_errors
-from neuido.data.importers.units import is_unit, needed
+from neuido.data.importers.units import import_extra, is_unit
 from neuido.errors import UserError
 
 
@@ -28,8 +28,8 @@ class Table(NamedTuple):
 def read_cells(path: Path) -> tuple[list[list[str]], list[str]]:
     """Return the rows of a file of text or of the first sheet of an Excel file, and notes for the summary."""
     if path.suffix.lower() in (".xlsx", ".xls", ".xlsm"):
-        pandas = needed("pandas", f"{path.name}")
-        needed("openpyxl", f"{path.name}")
+        pandas = import_extra("pandas", f"{path.name}")
+        import_extra("openpyxl", f"{path.name}")
         with parser_errors(path, "sheet of Excel"):
             sheet = pandas.read_excel(path, header=None, dtype=object)
         rows = [["" if pandas.isna(cell) else str(cell).strip() for cell in row] for row in sheet.to_numpy()]

@@ -27,7 +27,7 @@ MEANINGS = {  # quantity: pattern of its title; the first that fits counts
 }
 
 
-def meanings(titles: list[str], given: dict[str, str] | None = None) -> dict[str, int]:
+def find_columns(titles: list[str], given: dict[str, str] | None = None) -> dict[str, int]:
     """Return quantity -> index of its column.
 
     Args:

@@ -9,11 +9,11 @@ import numpy as np
 from neuido.data.files.delimited import is_number
 from neuido.data.files.parsing import parser_errors
 from neuido.data.importers.titled_tables import read_cells, read_titled
-from neuido.data.importers.titles import meanings
-from neuido.data.importers.units import factor, needed
+from neuido.data.importers.titles import find_columns
+from neuido.data.importers.units import conversion_factor, import_extra
 from neuido.errors import UserError
 
-LIKELY = 0.6
+MIN_LIKELIHOOD = 0.6
 """Points of DeepLabCut below this likelihood count as not seen."""
 
 
@@ -106,12 +106,14 @@ def _deeplabcut(path: Path, rows: list[list[str]]) -> Motion:
     points = {}
     for j in range(1, len(kinds) - 2):
         if [kind.lower() for kind in kinds[j : j + 3]] == ["x", "y", "likelihood"]:
-            points[parts[j]] = np.where(data[:, j + 2 : j + 3] < LIKELY, np.nan, data[:, j : j + 2])
-    return Motion(data[:, 0], points, "pixel", True, [f"DeepLabCut, {len(points)} body parts, likelihood below {LIKELY} as not seen"])
+            points[parts[j]] = np.where(data[:, j + 2 : j + 3] < MIN_LIKELIHOOD, np.nan, data[:, j : j + 2])
+    return Motion(
+        data[:, 0], points, "pixel", True, [f"DeepLabCut, {len(points)} body parts, likelihood below {MIN_LIKELIHOOD} as not seen"]
+    )
 
 
 def _c3d(path: Path) -> Motion:
-    ezc3d = needed("ezc3d", path.name)
+    ezc3d = import_extra("ezc3d", path.name)
     with parser_errors(path, "C3D file"):
         content = ezc3d.c3d(str(path))
         given = content["parameters"]["POINT"]
@@ -123,7 +125,7 @@ def _c3d(path: Path) -> Motion:
 
 def _plain(path: Path, columns: dict[str, str]) -> Motion:
     table = read_titled(path)
-    found = meanings(table.titles, columns)
+    found = find_columns(table.titles, columns)
     axes = [axis for axis in "xyz" if axis in found]
     clock = next((name for name in ("time", "frame") if name in found), None)
     if not axes or clock is None:
@@ -134,7 +136,7 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
         raise UserError(f"{path.name}: the axes have several units, {', '.join(sorted(units))}")
     t = table.data[:, found[clock]]
     if clock == "time" and table.units[found["time"]]:
-        t = t * factor(table.units[found["time"]], "s", f"{path.name}, time")
+        t = t * conversion_factor(table.units[found["time"]], "s", f"{path.name}, time")
     x = table.data[:, [found[axis] for axis in axes]]
     notes = [*table.notes, *(f"column {found[key] + 1} {table.titles[found[key]]!r} -> {key}" for key in (clock, *axes))]
     if axes == ["y"]:

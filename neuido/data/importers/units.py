@@ -13,7 +13,7 @@ _SPELLED = {
 }  # fmt: skip
 
 
-def needed(module: str, what: str) -> Any:
+def import_extra(module: str, what: str) -> Any:
     """Import a library of the extra `import`.
 
     Raises:
@@ -29,10 +29,10 @@ def needed(module: str, what: str) -> Any:
 
 @cache
 def _registry() -> Any:
-    return needed("pint", "a unit").UnitRegistry(non_int_type=float)
+    return import_extra("pint", "a unit").UnitRegistry(non_int_type=float)
 
 
-def factor(unit: str, to: str, where: str) -> float:
+def conversion_factor(unit: str, to: str, where: str) -> float:
     """Return what a figure in a unit is multiplied by to be in another.
 
     Raises:
@@ -47,7 +47,7 @@ def factor(unit: str, to: str, where: str) -> float:
         raise UserError(f"{where}: the unit {unit[:40]!r} is not one of {to or 'a ratio'}") from error
 
 
-def quantity(text: str, to: str, option: str) -> float:
+def parse_quantity(text: str, to: str, option: str) -> float:
     """Return an option such as `25.4 mm` in another unit.
 
     Raises:
@@ -56,7 +56,7 @@ def quantity(text: str, to: str, option: str) -> float:
     found = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([^\s\d].*)", str(text))
     if found is None or found[1].count(".") > 1:
         raise UserError(f"--{option} = {text!r} must be a number and its unit, for example '25.4 mm'")
-    value = float(found[1]) * factor(found[2].strip(), to, f"--{option}")
+    value = float(found[1]) * conversion_factor(found[2].strip(), to, f"--{option}")
     if not value > 0:
         raise UserError(f"--{option} = {text!r} must be above 0")
     return value

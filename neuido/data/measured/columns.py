@@ -9,7 +9,7 @@ import numpy as np
 
 from neuido.data.files.delimited import is_number, read_delimited
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.values import check_keys, inside, mapping, number
+from neuido.data.files.values import check_keys, mapping, number, path_inside
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY, Effects
 
@@ -83,7 +83,7 @@ def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: M
     Raises:
         UserError: A missing file or column, a cell that is no finite number, rows that are not there.
     """
-    path = inside(folder, entry["file"], f"{where}.file")
+    path = path_inside(folder, entry["file"], f"{where}.file")
     if not path.is_file():
         raise UserError(f"{where}: the file {path} is missing")
     columns = mapping(entry["columns"], f"{where}.columns")

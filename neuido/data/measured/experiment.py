@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.files.parsing import read_arrays
-from neuido.data.files.values import check_keys, file_name, inside, mapping, number
+from neuido.data.files.values import check_keys, file_name, mapping, number, path_inside
 from neuido.data.formats import nerfstudio
 from neuido.data.formats.layout import MultiView
 from neuido.data.measured.columns import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
@@ -139,7 +139,7 @@ def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
             raise UserError(f"recording {recording.name} differs from the experiment in more than {', '.join(OVERRIDES)}")
         entry = {"name": recording.name, "role": recording.role, "frame_interval": recording.frame_interval, **changed}
         content["recordings"].append(entry if recording.noise is None else {**entry, "noise": recording.noise})
-        inside(folder, recording.name, "name of the recording").mkdir(parents=True, exist_ok=True)
+        path_inside(folder, recording.name, "name of the recording").mkdir(parents=True, exist_ok=True)
         _write_files(recording, folder / recording.name)
     (folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
 
@@ -219,7 +219,7 @@ def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path)
         scene = scenes.scene_from_dict(merged, content["discretisation"])
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
-    own = inside(folder, name, f"{where}.name")
+    own = path_inside(folder, name, f"{where}.name")
     if own.resolve() == folder.resolve() or not own.is_dir():
         raise UserError(f"{where}: the folder {own} is missing")
     if not (own / "particles.npz").is_file() and not (own / "transforms.json").is_file():

@@ -9,11 +9,11 @@ import numpy as np
 
 from neuido.errors import UserError
 
-FACTOR = 300.0
+MAX_UNIT_FACTOR = 300.0
 """How far a stiffness or an acceleration may be from the declared one before a unit is to blame."""
-WIDE = 3.0
+MAX_REST_FACTOR = 3.0
 """A path of stretches must come this near to 1 (as a factor), and none may be above `MOST`."""
-MOST = 20.0
+MAX_STRETCH = 20.0
 SENTINELS = (0.0, -9999.0, 9999.0, -999999.0)
 """What trackers write in all three coordinates of a marker that they did not see."""
 
@@ -26,7 +26,7 @@ def check_stretches(path: np.ndarray, where: str) -> None:
     """
     away = np.maximum(path, 1 / np.maximum(path, 1e-300)).max(axis=1)
     row = int(np.argmax(away))
-    if away.min() > WIDE or path.max() > MOST:
+    if away.min() > MAX_REST_FACTOR or path.max() > MAX_STRETCH:
         raise UserError(
             f"{where}: stretches run from {path.min():g} to {path.max():g} (data row {row}), and a stretch is 1 at rest: a strain in "
             "percent or a length? Let `neuido import` turn it into a stretch (--strain_unit percent, --length)"
@@ -84,7 +84,7 @@ def check_stress(path: np.ndarray, stress: np.ndarray, model: Mapping[str, Any],
     if not isinstance(young, int | float) or not young > 0:
         return
     ratios = np.abs(secant) / young
-    if ratios.max() < 1 / FACTOR or ratios.min() > FACTOR:
+    if ratios.max() < 1 / MAX_UNIT_FACTOR or ratios.min() > MAX_UNIT_FACTOR:
         power = 10.0 ** (3 * round(math.log10(float(np.median(ratios))) / 3))
         raise UserError(
             f"{where}: stress over strain is {np.median(np.abs(secant)):.3g} Pa, about {power:g} times model.elasticity.young = {young:g} "

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.files.parsing import read_arrays, read_yaml
-from neuido.data.files.storage import write
+from neuido.data.files.storage import write_text
 from neuido.data.files.values import check_keys, mapping, number, vector
 from neuido.data.measured.experiment import read_experiment, scene_to_dict
 from neuido.data.scenes.multiview import UP, SceneViews
@@ -70,7 +70,7 @@ class Motion(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Placing:
+class Placement:
     """x -> scale R x + shift from the recording's world to the simulation's domain; R turns the axis `up` upwards (as `SceneViews`)."""
 
     scale: float = 1.0
@@ -78,7 +78,7 @@ class Placing:
     up: str = "y"
 
 
-class Setting(NamedTuple):
+class SceneSetting(NamedTuple):
     """What is known of a body's surroundings and material, without any image."""
 
     name: str
@@ -87,7 +87,7 @@ class Setting(NamedTuple):
     """[kg/m^3]"""
     model: dict[str, Any]
     """The declared material: density, elasticity, plasticity."""
-    placing: Placing = Placing()
+    placing: Placement = Placement()
 
 
 class VisualScene(NamedTuple):
@@ -109,7 +109,7 @@ class VisualScene(NamedTuple):
     """None where it is not known."""
 
 
-def load_visual(
+def load_visual_scene(
     folder: str | os.PathLike,
     *,
     reconstruction: str | os.PathLike | None = None,
@@ -153,7 +153,7 @@ def load_visual(
 def load_views(
     folder: str | os.PathLike,
     *,
-    placing: Placing = Placing(),
+    placing: Placement = Placement(),
     recording: str | None = None,
     frame_interval: float | None = None,
     workers: int | None = None,
@@ -195,7 +195,7 @@ def load_views(
     return MultiViewBatch(0, views.name, images, masks, views.cameras, views.times, held_out, colour)
 
 
-def read_setting(path: Path, *, recording: str | None = None) -> Setting:
+def read_setting(path: Path, *, recording: str | None = None) -> SceneSetting:
     """Read `scene.yaml` of a reconstruction, or `experiment.yaml`.
 
     Args:
@@ -210,7 +210,7 @@ def read_setting(path: Path, *, recording: str | None = None) -> Setting:
         filmed = [one.name for one in experiment.recordings if one.video is not None]
         if recording is None and len(filmed) != 1:
             raise UserError(f"{path} has {len(filmed)} recordings with images ({', '.join(filmed)}): give the option recording")
-        return Setting(experiment.name, experiment[recording or filmed[0]].scene, experiment.model["density"], experiment.model)
+        return SceneSetting(experiment.name, experiment[recording or filmed[0]].scene, experiment.model["density"], experiment.model)
     if not path.is_file():
         raise UserError(f"{path} is missing")
     content = read_yaml(path)
@@ -225,19 +225,19 @@ def read_setting(path: Path, *, recording: str | None = None) -> Setting:
         if given["up"] not in UP:
             raise UserError(f"placing.up = {given['up']!r}; one of {', '.join(UP)}")
         scale = number(given["scale"], "placing.scale", above=0.0)
-        placing = Placing(scale, vector(given["shift"], "placing.shift"), given["up"])
+        placing = Placement(scale, vector(given["shift"], "placing.shift"), given["up"])
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    return Setting(str(content["name"]), scene, model["density"], model, placing)
+    return SceneSetting(str(content["name"]), scene, model["density"], model, placing)
 
 
-def write_setting(setting: Setting, path: Path) -> None:
+def write_setting(setting: SceneSetting, path: Path) -> None:
     """Write `scene.yaml` of a reconstruction."""
     scene, discretisation = scene_to_dict(setting.scene)
     placing = {"scale": setting.placing.scale, "shift": list(setting.placing.shift), "up": setting.placing.up}
     content = {"format": FORMAT, "name": setting.name, "scene": scene, "discretisation": discretisation}
     content |= {"model": setting.model, "placing": placing}
-    write(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
+    write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
 
 
 def read_motion(folder: Path) -> Motion | None:
@@ -264,7 +264,7 @@ def write_motion(motion: Motion, folder: Path) -> None:
     """Write `motion.yaml`."""
     content: dict[str, Any] = {"format": MOTION}
     content |= {key: list(value) for key, value in motion._asdict().items() if value is not None}
-    write(folder / "motion.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    write_text(folder / "motion.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 
 def read_body(path: Path) -> Body:

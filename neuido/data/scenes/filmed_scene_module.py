@@ -12,9 +12,9 @@ from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
 from neuido.data.bodies.scene_files import VARIABLE, data_root
-from neuido.data.sampling import Resumable
-from neuido.data.scenes.filmed_scene import VisualScene, load_visual
-from neuido.data.scenes.known_body import load_known
+from neuido.data.sampling import ResumableLoader
+from neuido.data.scenes.filmed_scene import VisualScene, load_visual_scene
+from neuido.data.scenes.known_body import load_known_body
 from neuido.errors import UserError
 from neuido.types import MultiViewBatch
 
@@ -25,7 +25,7 @@ KEYS = {
 """What a scene's mapping takes beside `path`, by where its body comes from (`body`)."""
 
 
-def in_order(scenes: Sequence[VisualScene], *, rank: int = 0, ranks: int = 1) -> DataLoader:
+def ordered_loader(scenes: Sequence[VisualScene], *, rank: int = 0, ranks: int = 1) -> DataLoader:
     """Load scenes in their order, each by one of the processes."""
     return DataLoader(_Listed(scenes[rank::ranks]), batch_size=1, collate_fn=_only)
 
@@ -45,7 +45,7 @@ def _only(samples: list[VisualScene]) -> VisualScene:
     return samples[0]
 
 
-class Turns(Resumable[VisualScene]):
+class ShuffledScenes(ResumableLoader[VisualScene]):
     """Scenes one after the other, in an order that is a function of seed and epoch alone.
 
     Args:
@@ -68,7 +68,7 @@ class Turns(Resumable[VisualScene]):
         return (self.scenes[order[(k * self.ranks + self.rank) % count]] for k in range(start, len(self)))
 
 
-class OneByOne(Resumable[VisualScene]):
+class SequentialScenes(ResumableLoader[VisualScene]):
     """Each scene for so many steps: an epoch is one scene, in the order given."""
 
     def __init__(self, scenes: Sequence[VisualScene], *, steps: int) -> None:
@@ -82,7 +82,7 @@ class OneByOne(Resumable[VisualScene]):
         return [self.scenes[epoch]] * (self.steps - start) if epoch < len(self.scenes) else []
 
 
-def train_on(batch: MultiViewBatch, views: int | list[int]) -> MultiViewBatch:
+def select_training_views(batch: MultiViewBatch, views: int | list[int]) -> MultiViewBatch:
     """Return the batch without the views that training is not to see; those that are held out stay.
 
     Args:
@@ -112,8 +112,9 @@ class VisualDataModule(LightningDataModule):
     Training and validation take `scenes`; test and predict take `scenes` and `unseen`. Under several processes each trains on its own.
 
     Args:
-        scenes: Folders, or mappings with `path` and any of `reconstruction`, `recording`, `views`, `frame_interval` (as `load_visual` takes
-            them); with `body: particles` instead of `recording`, `views`, `dt`, `crop`, `frame_interval` (as `load_known` takes them).
+        scenes: Folders, or mappings with `path` and options of `load_visual_scene`: `reconstruction`, `recording`, `views`,
+            `frame_interval`. With `body: particles`, the options are those of `load_known_body`: `recording`, `views`, `dt`, `crop`,
+            `frame_interval`.
         unseen: Scenes that training never sees.
         root: Folder to which the paths of scenes are relative; none: the current one, and what is not there is sought in NEUIDO_DATA.
         reconstructions: Folder that holds a reconstruction for each scene under the name of the scene's folder; none: inside each scene.
@@ -171,16 +172,16 @@ class VisualDataModule(LightningDataModule):
             if bool(scene.batch.held_out.all()):
                 raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} are held out")
 
-    def train_dataloader(self) -> Turns | OneByOne:
+    def train_dataloader(self) -> ShuffledScenes | SequentialScenes:
         if self.steps_in_a_row is not None:
-            return OneByOne(self.scenes, steps=self.steps_in_a_row)
-        return Turns(self.scenes, seed=self.seed, **self._share())
+            return SequentialScenes(self.scenes, steps=self.steps_in_a_row)
+        return ShuffledScenes(self.scenes, seed=self.seed, **self._share())
 
     def val_dataloader(self) -> DataLoader:
-        return in_order(self.scenes, **self._share())
+        return ordered_loader(self.scenes, **self._share())
 
     def test_dataloader(self) -> DataLoader:
-        return in_order([*self.scenes, *self.unseen], **self._share())
+        return ordered_loader([*self.scenes, *self.unseen], **self._share())
 
     def _share(self) -> dict[str, int]:
         return {} if self.trainer is None else {"rank": self.trainer.global_rank, "ranks": self.trainer.world_size}
@@ -200,7 +201,7 @@ class VisualDataModule(LightningDataModule):
         scenes = [self._open(each, f"{where}[{i}]") for i, each in enumerate(given)]
         if self.training_views is None:
             return scenes
-        return [scene._replace(batch=train_on(scene.batch, self.training_views)) for scene in scenes]
+        return [scene._replace(batch=select_training_views(scene.batch, self.training_views)) for scene in scenes]
 
     def _find(self, path: Path) -> Path:
         own = Path(self.root or ".") / path
@@ -223,6 +224,6 @@ class VisualDataModule(LightningDataModule):
         if body == "reconstruction" and "reconstruction" not in options and self.reconstructions is not None:
             options["reconstruction"] = Path(self.reconstructions) / path.resolve().name
         try:
-            return (load_known if body == "particles" else load_visual)(path, **options, **self.options)
+            return (load_known_body if body == "particles" else load_visual_scene)(path, **options, **self.options)
         except UserError as error:
             raise UserError(f"{where}: {error}") from error

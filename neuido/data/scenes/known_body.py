@@ -10,7 +10,7 @@ from neuido.errors import UserError
 from neuido.types import MultiViewBatch
 
 
-def load_known(
+def load_known_body(
     folder: str | os.PathLike,
     *,
     recording: str | None = None,
@@ -45,11 +45,11 @@ def load_known(
     batch = load_views(experiment.folder, recording=chosen.name, **options)
     scene = chosen.scene if dt is None else replace(chosen.scene, dt=dt)
     if crop is not None:
-        batch = cropped(batch, crop)
+        batch = crop_images(batch, crop)
     return VisualScene(experiment.name, scene, experiment.model["density"], experiment.model, chosen.body, None, batch, None)
 
 
-def cropped(batch: MultiViewBatch, crop: Sequence[int]) -> MultiViewBatch:
+def crop_images(batch: MultiViewBatch, crop: Sequence[int]) -> MultiViewBatch:
     """Return the part of the images from column `left` to before `right` and row `top` to before `bottom`, with cameras to match.
 
     Raises:

@@ -10,7 +10,7 @@ from torch import Tensor
 from neuido.data.files.parsing import image_size, read_image
 from neuido.errors import UserError
 
-DIFFERENT = 0.06  # of the colour range: more than what noise and a soft shadow change
+MIN_DIFFERENCE = 0.06  # of the colour range: more than what noise and a soft shadow change
 
 
 def mask_channel(path: Path) -> np.ndarray:
@@ -59,7 +59,7 @@ def rim_colour(rims: np.ndarray) -> np.ndarray:
         UserError: The rims have no one colour.
     """
     colour = np.median(rims, axis=0).astype(np.float32)
-    far = float((np.abs(rims - colour).max(axis=1) > DIFFERENT).mean())
+    far = float((np.abs(rims - colour).max(axis=1) > MIN_DIFFERENCE).mean())
     if far > 0.2:
         raise UserError(
             f"the images have no masks, and {far:.0%} of their rims differ from one colour: give an alpha channel, mask_path in "
@@ -68,27 +68,27 @@ def rim_colour(rims: np.ndarray) -> np.ndarray:
     return colour
 
 
-def mask_before(image: np.ndarray, colour: np.ndarray) -> np.ndarray:
+def mask_on_plain_background(image: np.ndarray, colour: np.ndarray) -> np.ndarray:
     """Return the mask (H, W) of an object before a plain background, for an image (H, W, 3).
 
     A pixel at the outline is a mixture: its share of the object is its difference from the background over the largest one within two
     pixels; further inside it is one.
     """
     difference = np.abs(image - colour).max(axis=2)
-    differs = (difference > DIFFERENT).astype(np.float32)
+    differs = (difference > MIN_DIFFERENCE).astype(np.float32)
     window = np.ones((5, 5), np.uint8)
     inside = cv2.erode(differs, window, borderType=cv2.BORDER_CONSTANT, borderValue=1.0)
     largest = cv2.dilate(difference, window, borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
-    return np.maximum(inside, differs * difference / np.maximum(largest, DIFFERENT))
+    return np.maximum(inside, differs * difference / np.maximum(largest, MIN_DIFFERENCE))
 
 
 def mask_from_empty(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
     """Return a rough mask (H, W): where an image differs from that of the empty scene, without single pixels."""
-    differs = (np.abs(image - empty).max(axis=2) > DIFFERENT).astype(np.uint8)
+    differs = (np.abs(image - empty).max(axis=2) > MIN_DIFFERENCE).astype(np.uint8)
     return cv2.medianBlur(differs, 3).astype(np.float32)
 
 
-def from_background(images: Tensor) -> tuple[Tensor, Tensor]:
+def masks_from_background(images: Tensor) -> tuple[Tensor, Tensor]:
     """Return the colour (3,) of the plain background of images (V, T, H, W, 3), and their masks (V, T, H, W) in 0..1.
 
     The colour is the median of the rims of the first frames.
@@ -99,5 +99,5 @@ def from_background(images: Tensor) -> tuple[Tensor, Tensor]:
     first = images[:, 0].numpy()
     rims = [part.reshape(-1, 3) for part in (first[:, 0], first[:, -1], first[:, :, 0], first[:, :, -1])]
     colour = rim_colour(np.concatenate(rims))
-    masks = [[torch.from_numpy(mask_before(image.numpy(), colour)) for image in view] for view in images]
+    masks = [[torch.from_numpy(mask_on_plain_background(image.numpy(), colour)) for image in view] for view in images]
     return torch.from_numpy(colour), torch.stack([torch.stack(view) for view in masks])

@@ -15,8 +15,8 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 from neuido.data import cameras as convert
 from neuido.data.files.parsing import read_image
 from neuido.data.files.values import number
-from neuido.data.formats.layout import SAME_SHAPE, MultiView, matrix
-from neuido.data.scenes.masks import mask_before, mask_channel, mask_from_empty, rim_colour
+from neuido.data.formats.layout import SAME_SHAPE, MultiView, read_matrix
+from neuido.data.scenes.masks import mask_channel, mask_from_empty, mask_on_plain_background, rim_colour
 from neuido.data.scenes.readers import read
 from neuido.errors import UserError
 from neuido.types import Cameras, MultiViewBatch, Vector
@@ -85,7 +85,7 @@ class SceneViews:
         if width is not None and width < 1:
             raise UserError(f"width must be at least 1 pixel, got {width}")
         number(scale, "scale", above=0.0)
-        matrix(shift, "shift", (3,))
+        read_matrix(shift, "shift", (3,))
         self.found, self.background, self.masked, self.cache = found, background, masked, cache
         self.chosen = _indices(found, views, "views") if views is not None else list(range(len(found.views)))
         kept = set(_indices(found, held_out_views, "held_out_views") if held_out_views is not None else found.held_out)
@@ -187,7 +187,7 @@ class SceneViews:
             colour = self.plain_background
             if colour is None:  # the first frames have masks, this one has none
                 colour = rim_colour(np.concatenate([rgba[0, :, :3], rgba[-1, :, :3], rgba[:, 0, :3], rgba[:, -1, :3]]))
-            rgba[..., 3] = mask_before(rgba[..., :3], colour)
+            rgba[..., 3] = mask_on_plain_background(rgba[..., :3], colour)
         keeps = not self.masked or (not masked and (self.unmasked or not self.find_masks))
         shown = np.ones_like(rgba[..., 3:]) if keeps else rgba[..., 3:]
         # premultiplied, so that no colour from outside the mask bleeds in when pixels are averaged

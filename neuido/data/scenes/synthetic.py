@@ -26,7 +26,7 @@ from neuido.data import cameras as convert
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.storage import claim, publish_folder, write
+from neuido.data.files.storage import claim_folder, publish_folder, write_text
 from neuido.data.files.values import check_keys, mapping, vector
 from neuido.data.formats import nerfstudio
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
@@ -41,7 +41,7 @@ from neuido.types import Body, Cameras, ParticleState, Scene
 FORMAT = "neuido-scenes/1"
 RECORDING = "drop"
 PARTS = ("scene", "model", "body", "discretisation")
-OWN = ("name", "base", "velocity", "angular_velocity", "shift", "declared", "belief", "split", "substeps")
+SCENE_KEYS = ("name", "base", "velocity", "angular_velocity", "shift", "declared", "belief", "split", "substeps")
 SPLITS = ("train", "unseen")
 JELLY = {"density": 1000.0, "elasticity": {"law": "fixed_corotated", "young": 1e5, "poisson": 0.2}, "plasticity": {"law": "identity"}}
 """The declared model if a scene gives none: NCLaw's jelly, which NeuMA starts from too."""
@@ -75,7 +75,7 @@ class Plan:
     source: str
 
 
-class Dense(NamedTuple):
+class DenseGaussians(NamedTuple):
     """The rendered Gaussians: M for each of P particles."""
 
     offset: Tensor
@@ -120,7 +120,7 @@ def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.Path
         for part in PARTS:
             own = mapping(given.get(part, {}), part)
             content[part] = own if part == "body" and own else {**content.get(part, {}), **own}
-        check_keys(given, "the scene", (*OWN, *PARTS), (*OWN[1:], *PARTS))
+        check_keys(given, "the scene", (*SCENE_KEYS, *PARTS), (*SCENE_KEYS[1:], *PARTS))
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
         law = scenes.model_from_dict(content["model"])
         if "declared" in given and "belief" in given:
@@ -130,7 +130,7 @@ def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.Path
         body = scenes.body_from_dict(content["body"], data_root)
         if "shift" in given:
             body = body._replace(x=body.x + torch.tensor(vector(given["shift"], "shift")))
-        body, motion = _set_off(body, given)
+        body, motion = _set_velocity(body, given)
         split, substeps = given.get("split", "train"), given.get("substeps", film.substeps)
         if split not in SPLITS:
             raise UserError(f"split = {split!r}; one of {', '.join(SPLITS)}")
@@ -178,7 +178,7 @@ def make_scenes(
         raise UserError("scenes must name at least one scene, and each once")
     folder = Path(out).expanduser()
     text = json.dumps({"format": FORMAT, "film": asdict(film), "scenes": entries}, indent=1, default=list) + "\n"
-    claim(folder, text, "other scenes, or the same filmed otherwise")
+    claim_folder(folder, text, "other scenes, or the same filmed otherwise")
     paths = [folder / plan.name for plan in plans]
     missing = [(plan, path) for plan, path in zip(plans, paths) if not (path / "experiment.yaml").is_file()]
     images = film.views * film.frames
@@ -193,7 +193,7 @@ def make_scenes(
                 raise UserError(f"scenes: {plan.name}: {error}") from error
             publish_folder(hidden, path)
     index = [{"name": p.name, "split": p.split, "law": p.law, "particles": len(p.body.x), "substeps": p.substeps} for p in plans]
-    write(folder / "index.json", json.dumps({"format": FORMAT, "scenes": index}, indent=1) + "\n")
+    write_text(folder / "index.json", json.dumps({"format": FORMAT, "scenes": index}, indent=1) + "\n")
     return paths
 
 
@@ -201,9 +201,9 @@ def make_scene(
     plan: Plan, film: Film, folder: Path, *, draw: Draw, device: torch.device, advance: Callable[[int], Any] = lambda images: None
 ) -> None:
     """Simulate, film and write one scene; `advance` is called with the number of images done."""
-    frames = move(plan, film, device)
+    frames = simulate_motion(plan, film, device)
     times = torch.arange(film.frames, dtype=torch.float64) * plan.substeps * plan.scene.dt
-    cameras = orbit(film)
+    cameras = film_cameras(film)
     recording = folder / RECORDING
     nerfstudio.write_transforms(recording, cameras, times, held_out=film.held_out)
     dense = surround_with_gaussians(plan.body, film.density, seed=plan.name, device=device)
@@ -223,7 +223,7 @@ def make_scene(
     read_experiment(folder)  # raises if the written files cannot be read
 
 
-def move(plan: Plan, film: Film, device: torch.device) -> ParticleState:
+def simulate_motion(plan: Plan, film: Film, device: torch.device) -> ParticleState:
     """Simulate the true motion; return frames with x (T, P, 3) and F (T, P, 3, 3)."""
     simulator = Simulator(plan.scene, plan.body, density=plan.law["density"], device=device)
     if film.frames == 1:
@@ -233,24 +233,24 @@ def move(plan: Plan, film: Film, device: torch.device) -> ParticleState:
         return simulator.rollout((film.frames - 1) * plan.substeps, *laws, every=plan.substeps)
 
 
-def orbit(film: Film) -> Cameras:
+def film_cameras(film: Film) -> Cameras:
     """Return the cameras of a film."""
     options = {"target": film.target, "radius": film.radius, "elevations": film.elevations, "angle": film.angle}
     return convert.orbit(film.views, width=film.width, height=film.height, start=18.0, **options)
 
 
-def surround_with_gaussians(body: Body, density: int, *, seed: str, device: torch.device | str = "cpu") -> Dense:
+def surround_with_gaussians(body: Body, density: int, *, seed: str, device: torch.device | str = "cpu") -> DenseGaussians:
     """Surround the particles of a body with Gaussians, textured by this seed."""
     generator = np.random.default_rng(list(seed.encode()))
     edge = body.volume.double().pow(1 / 3).numpy()
     spread = WIDTH * edge / density ** (1 / 3)
     offset = generator.uniform(-1, 1, (len(edge), density, 3)) * (0.5 * edge - INSET * spread).clip(0)[:, None, None]
-    colour = texture((body.x.double().numpy()[:, None] + offset).reshape(-1, 3), generator)
+    colour = solid_texture((body.x.double().numpy()[:, None] + offset).reshape(-1, 3), generator)
     parts = (offset, spread, colour)
-    return Dense(*(torch.from_numpy(part).float().to(device) for part in parts))
+    return DenseGaussians(*(torch.from_numpy(part).float().to(device) for part in parts))
 
 
-def texture(x: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+def solid_texture(x: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Return a solid texture: RGB in 0..1 (N, 3) of points x (N, 3), patches of four colours with a fine grain.
 
     The patches are some tenths of the body's size wide, so that optical flow finds something to follow everywhere.
@@ -277,7 +277,7 @@ def _waves(x: np.ndarray, generator: np.random.Generator, length: float, count: 
 
 
 def _film(
-    dense: Dense,
+    dense: DenseGaussians,
     frames: ParticleState,
     cameras: Cameras,
     film: Film,
@@ -329,7 +329,7 @@ def _write_preview(images: np.ndarray, path: Path, side: int = 160) -> None:
     nerfstudio.write_image(path, np.concatenate(rows, 0))
 
 
-def _set_off(body: Body, given: Mapping[str, Any]) -> tuple[Body, Motion]:
+def _set_velocity(body: Body, given: Mapping[str, Any]) -> tuple[Body, Motion]:
     """Return the body with the velocity that the entry gives, else with its own, and that motion, which must be rigid."""
     centre = tuple(round(c, 6) for c in body.x.double().mean(0).tolist())
     if "velocity" in given or "angular_velocity" in given:

@@ -18,8 +18,8 @@ from tqdm import tqdm
 
 from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import cube
-from neuido.data.files.storage import COLUMNS, FORMAT, claim, complete, write
-from neuido.data.files.writing import replacing
+from neuido.data.files.storage import COLUMNS, FORMAT, claim_folder, is_complete, write_text
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm.simulator import Simulator
@@ -114,11 +114,11 @@ def generate(
     _check_steps(setup, everything)
     folder = Path(out)
     content = {"format": FORMAT, "setup": asdict(setup), "trajectories": [asdict(instance) for instance in everything]}
-    claim(folder, _json(content), "trajectories of another set-up", compared="setup")
+    claim_folder(folder, _json(content), "trajectories of another set-up", compared="setup")
     files = {instance.name: folder / f"{instance.name}.npy" for instance in everything}
 
     mine = [instance for i, instance in enumerate(everything) if i % shards == shard]
-    missing = [instance for instance in mine if not complete(files[instance.name], setup.shape)]
+    missing = [instance for instance in mine if not is_complete(files[instance.name], setup.shape)]
     size = batch or (10 if chosen.type == "cuda" else 1)
     with tqdm(total=len(mine), initial=len(mine) - len(missing), unit="trajectory", disable=not progress) as bar:
         for family in PARAMETERS:
@@ -129,7 +129,7 @@ def generate(
                 bar.update(len(group))
 
     if missing or not (folder / "index.json").exists():
-        if all(complete(path, setup.shape) for path in files.values()):
+        if all(is_complete(path, setup.shape) for path in files.values()):
             _write_index(folder, setup, everything)
 
 
@@ -165,7 +165,7 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
         simulator = Simulator([setup.scene] * len(group), [body] * len(group), density=setup.density, device=device)
         state = simulator.state
         with torch.no_grad(), contextlib.ExitStack() as stack:
-            hidden = [stack.enter_context(replacing(path)) for path in paths]
+            hidden = [stack.enter_context(atomic_write(path)) for path in paths]
             files = [stack.enter_context(path.open("wb")) for path in hidden]
             for file in files:
                 np.lib.format.write_array_header_1_0(file, header)
@@ -207,7 +207,7 @@ def _write_index(folder: Path, setup: Setup, everything: list[Instance]) -> None
     from neuido import __version__
 
     entries = [{**asdict(instance), **_statistics(folder / f"{instance.name}.npy")} for instance in everything]
-    write(folder / "index.json", _json({"format": FORMAT, "version": __version__, "setup": asdict(setup), "trajectories": entries}))
+    write_text(folder / "index.json", _json({"format": FORMAT, "version": __version__, "setup": asdict(setup), "trajectories": entries}))
 
 
 def _statistics(path: Path) -> dict[str, float]:

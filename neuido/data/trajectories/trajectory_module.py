@@ -11,9 +11,9 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from neuido.data.files.parsing import read_json
-from neuido.data.files.storage import COLUMNS, FORMAT, Files, complete, split
-from neuido.data.files.values import file_name, listed, take
-from neuido.data.sampling import Batches, Order, Step, Steps
+from neuido.data.files.storage import COLUMNS, FORMAT, TrajectoryFiles, is_complete, to_batch
+from neuido.data.files.values import file_name, list_of_mappings, require_key
+from neuido.data.sampling import FixedBatches, SampleOrder, Step, TrainingSteps
 from neuido.data.trajectories.options import Throw, make_trajectories
 from neuido.errors import UserError
 from neuido.types import TrajectoryBatch
@@ -104,68 +104,68 @@ class TrajectoryDataModule(LightningDataModule):
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             content = content if isinstance(content, dict) else {}
             raise UserError(f"{path} has format {content.get('format')!r}, not {FORMAT!r}: make it anew with `{command}`")
-        for i, entry in enumerate(listed(take(content, "trajectories", str(path)), f"{path}: trajectories")):
+        for i, entry in enumerate(list_of_mappings(require_key(content, "trajectories", str(path)), f"{path}: trajectories")):
             for key in ("name", "family", "split", "parameters", "stress_rms", "residual_rms"):
-                take(entry, key, f"{path}: trajectories[{i}]")
+                require_key(entry, key, f"{path}: trajectories[{i}]")
             file_name(entry["name"], f"{path}: trajectories[{i}].name")
-            if not complete(self.root / f"{entry['name']}.npy", self._shape(content)):
+            if not is_complete(self.root / f"{entry['name']}.npy", self._shape(content)):
                 raise UserError(f"{self.root / entry['name']}.npy is missing or cut short: repair it with `{command}`")
         return content
 
     @property
     def trajectory_count(self) -> int:
-        return len(self._of("train"))
+        return len(self._entries("train"))
 
     @property
     def names(self) -> list[str]:
-        return [entry["name"] for entry in self._of("train")]
+        return [entry["name"] for entry in self._entries("train")]
 
     @property
     def families(self) -> list[str]:
-        return [entry["family"] for entry in self._of("train")]
+        return [entry["family"] for entry in self._entries("train")]
 
     @property
     def parameters(self) -> list[dict[str, float]]:
-        return [entry["parameters"] for entry in self._of("train")]
+        return [entry["parameters"] for entry in self._entries("train")]
 
     @property
     def stress_rms(self) -> Tensor:
-        return torch.tensor([entry["stress_rms"] for entry in self._of("train")])
+        return torch.tensor([entry["stress_rms"] for entry in self._entries("train")])
 
     @property
     def residual_rms(self) -> Tensor:
-        return torch.tensor([entry["residual_rms"] for entry in self._of("train")])
+        return torch.tensor([entry["residual_rms"] for entry in self._entries("train")])
 
     @property
     def instance_names(self) -> list[str]:
-        return [entry["name"] for entry in self._of("held_out")]
+        return [entry["name"] for entry in self._entries("held_out")]
 
     @property
     def instance_families(self) -> list[str]:
-        return [entry["family"] for entry in self._of("held_out")]
+        return [entry["family"] for entry in self._entries("held_out")]
 
     @property
     def instance_parameters(self) -> list[dict[str, float]]:
-        return [entry["parameters"] for entry in self._of("held_out")]
+        return [entry["parameters"] for entry in self._entries("held_out")]
 
     @property
     def instance_stress_rms(self) -> Tensor:
-        return torch.tensor([entry["stress_rms"] for entry in self._of("held_out")])
+        return torch.tensor([entry["stress_rms"] for entry in self._entries("held_out")])
 
     @property
     def instance_residual_rms(self) -> Tensor:
-        return torch.tensor([entry["residual_rms"] for entry in self._of("held_out")])
+        return torch.tensor([entry["residual_rms"] for entry in self._entries("held_out")])
 
-    def _of(self, split: str) -> list[dict[str, Any]]:
-        return [entry for entry in self.index["trajectories"] if entry["split"] == split]
+    def _entries(self, part: str) -> list[dict[str, Any]]:
+        return [entry for entry in self.index["trajectories"] if entry["split"] == part]
 
     @staticmethod
     def _shape(content: dict[str, Any]) -> tuple[int, int, int]:
         setup = content["setup"]
         return setup["steps"] // setup["record_every"], setup["particles_per_side"] ** 3, COLUMNS
 
-    def _files(self, split: str) -> Files:
-        return Files([self.root / f"{entry['name']}.npy" for entry in self._of(split)])
+    def _files(self, part: str) -> TrajectoryFiles:
+        return TrajectoryFiles([self.root / f"{entry['name']}.npy" for entry in self._entries(part)])
 
     # The split.
 
@@ -202,18 +202,18 @@ class TrajectoryDataModule(LightningDataModule):
         if samples == 0:
             raise UserError(f"batch_size = {self.batch_size} is less than one sample for each of {self.trajectory_count} trajectories")
         self.files = self._files("train")
-        self.order = Order(self.rows("train"), self.trajectory_count, samples, seed=self.seed, drop_last=self.drop_last)
+        self.order = SampleOrder(self.rows("train"), self.trajectory_count, samples, seed=self.seed, drop_last=self.drop_last)
 
-    def train_dataloader(self) -> Steps:
+    def train_dataloader(self) -> TrainingSteps:
         trainer = self.trainer
         rank, ranks = (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
         resident = trainer is not None and self._preload(trainer.strategy.root_device)
-        return Steps(self.order, None if resident else self.gather, workers=self.num_workers, rank=rank, ranks=ranks)
+        return TrainingSteps(self.order, None if resident else self.gather, workers=self.num_workers, rank=rank, ranks=ranks)
 
-    def val_dataloader(self) -> Batches:
+    def val_dataloader(self) -> FixedBatches:
         return self._validation
 
-    def test_dataloader(self) -> Batches:
+    def test_dataloader(self) -> FixedBatches:
         return self._validation
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
@@ -224,7 +224,7 @@ class TrajectoryDataModule(LightningDataModule):
         rows = self.order(*batch, self._resident.device)
         rows = rows + self._resident.shape[1] * torch.arange(len(rows), device=rows.device)[:, None]
         picked = self._resident.view(-1, self._resident.shape[-1]).index_select(0, rows.view(-1))
-        return split(picked.view(*rows.shape, -1))
+        return to_batch(picked.view(*rows.shape, -1))
 
     def teardown(self, stage: str) -> None:
         self._resident = None
@@ -251,10 +251,10 @@ class TrajectoryDataModule(LightningDataModule):
         return files.gather(fit), files.gather(self._held_out_rows(self.instance_samples, len(files.paths), salt=2))
 
     @cached_property
-    def _validation(self) -> Batches:
+    def _validation(self) -> FixedBatches:
         rows = self._held_out_rows(self.validation_samples, self.trajectory_count, salt=3)
         files, samples = self._files("train"), max(1, self.batch_size // self.trajectory_count)
-        return Batches([files.gather(part) for part in rows.split(samples, dim=1)])
+        return FixedBatches([files.gather(part) for part in rows.split(samples, dim=1)])
 
     def _held_out_rows(self, samples: int, trajectories: int, *, salt: int) -> Tensor:
         """Draw half from the held-out particles, half from the held-out steps, (trajectories, <= samples)."""

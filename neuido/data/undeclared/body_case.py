@@ -12,8 +12,8 @@ import torch
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
 from neuido.data.undeclared import random_bodies as bodies
 from neuido.data.undeclared.case import Case
-from neuido.data.undeclared.instruments import Markers, fastest, recorded, vector, wrong_nuisances
-from neuido.data.undeclared.motion import Motion, Solver, move
+from neuido.data.undeclared.instruments import Markers, max_speed, measured_positions, nuisance_vector, wrong_nuisances
+from neuido.data.undeclared.motion import Motion, Solver, simulate_motion
 from neuido.data.undeclared.random_effects import (
     ANY,
     ELASTIC,
@@ -26,7 +26,7 @@ from neuido.data.undeclared.random_effects import (
     Kind,
     Scales,
     draw_effect,
-    entry_of,
+    truth_entry,
 )
 from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, OVER_FLOOR, Redraw, rms, rounded_to_4, scale_to_separation
 from neuido.errors import UserError
@@ -103,7 +103,7 @@ class BodyCase:
         self.launches = bodies.draw_launches(
             rng, self.points, floor, self.seconds, turned=turned, sliding=bool(set(self.kinds) & {"friction", "stick"}), hard=hard
         )
-        self.declared = [bodies.launched(self.points, self.volume, launch) for launch in self.launches]
+        self.declared = [bodies.launched_body(self.points, self.volume, launch) for launch in self.launches]
         self.markers = Markers(rng, self.points, min(int(rng.integers(300, 451)), len(self.points)))
         self.markers.fix(self.launches, self.points)
         self.effects: list[Drawn] = []
@@ -138,7 +138,9 @@ class BodyCase:
         started = self.declared if started is None else started
         seconds = self.seconds + extra
         try:
-            moved = move(solver, self.scene, started, law, values, seconds=seconds, interval=self.interval / 2, device=self.device)
+            moved = simulate_motion(
+                solver, self.scene, started, law, values, seconds=seconds, interval=self.interval / 2, device=self.device
+            )
         except UserError as error:
             raise Redraw(str(error)) from error
         finally:
@@ -164,7 +166,7 @@ class BodyCase:
             half=0.5 * extent,
             centre=self.launches[0].centre,
             duration=self.seconds,
-            speed=max(fastest(x, self.interval) for x in self.plain),
+            speed=max(max_speed(x, self.interval) for x in self.plain),
             dt=self.scene.dt,
             dx=self.scene.dx,
             yield_stress=float(self.material.plasticity.get("yield_stress", 0.0)),
@@ -184,14 +186,17 @@ class BodyCase:
         wanted = nuisances if nuisances is not None else not self.kinds and self.rng.random() < 0.5
         self.off = wrong_nuisances(self.rng, self.plain, self.interval, float(np.ptp(self.points, axis=0).max())) if wanted else []
         started = [
-            bodies.launched(self.points, self.volume, launch, velocity=vector(own, "velocity"), spin=vector(own, "spin"))
+            bodies.launched_body(
+                self.points, self.volume, launch, velocity=nuisance_vector(own, "velocity"), spin=nuisance_vector(own, "spin")
+            )
             for launch, own in zip(self.launches, self.off)
         ]
         extra = 3 * self.interval  # a clock that is ahead sees more
         true = self.run(self.solver, self.values, started or None, extra)
         same = true if self.solver == self.suggested else self.run(self.suggested, self.values, started or None, extra)
         self.recorded, reference = (
-            [recorded(motion, self.markers, i, self.at, self.off[i] if self.off else {}) for i in range(2)] for motion in (true, same)
+            [measured_positions(motion, self.markers, i, self.at, self.off[i] if self.off else {}) for i in range(2)]
+            for motion in (true, same)
         )
         self.separations = [math.inf, math.inf]
         for one in self.effects:
@@ -221,7 +226,7 @@ class BodyCase:
         figures = {k: v for part in (material.elasticity, material.plasticity) for k, v in part.items() if k != "law"}
         laws = {"elasticity": material.elasticity["law"], "plasticity": material.plasticity["law"]}
         truth = {
-            "undeclared": [entry_of(one, free=material.free) for one in self.effects],
+            "undeclared": [truth_entry(one, free=material.free) for one in self.effects],
             "material": {**laws, **figures, "density": material.density},
             "started_from": material.declared,
             "simulated_with": self.solver.words(),

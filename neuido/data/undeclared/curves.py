@@ -14,7 +14,7 @@ import yaml
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.case import Case
-from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, entry_of
+from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, truth_entry
 from neuido.data.undeclared.sizing import Redraw, rms, rounded_to_4, scale_to_separation
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
@@ -112,7 +112,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
     start = {"young": declared} | ({"yield_stress": float(f"{1.3 * flow:.3g}")} if len(free) > 1 else {})
     roles, names = [plan[2] for plan in plans], [plan[0] for plan in plans]
     truth = {
-        "undeclared": [entry_of(drawn, free=tuple(free))] if drawn else [],
+        "undeclared": [truth_entry(drawn, free=tuple(free))] if drawn else [],
         "measured": "material_test",
         "material": {"elasticity": elasticity["law"], "plasticity": plastic,
                      **{k: v for part in (elasticity, plasticity) for k, v in part.items() if k != "law"}},
@@ -192,7 +192,7 @@ def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance
     true = paths(drawn.values) if drawn else plain
     roles, names = ["fit", "fit", "held_out", "held_out"], [f"throw-{i + 1}" for i in range(count)]
     truth = {
-        "undeclared": [entry_of(drawn)] if drawn else [],
+        "undeclared": [truth_entry(drawn)] if drawn else [],
         "measured": "track",
         "simulated_with": "a point mass, Runge-Kutta steps of 2 ms",
         "noise": noise,

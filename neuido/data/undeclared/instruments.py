@@ -55,7 +55,7 @@ def wrong_nuisances(rng: np.random.Generator, plain: np.ndarray, interval: float
     """Draw the nuisances of two recordings whose motion without nuisances is (2, T, N, 3) [m]."""
     out = []
     for i in range(2):
-        speed = fastest(plain[i], interval)
+        speed = max_speed(plain[i], interval)
         unit = {"release_time": interval, "velocity": speed, "spin": speed / length}
         own: dict[str, float] = {}
         for name, _, relative in WRONG_NUISANCES:
@@ -66,7 +66,7 @@ def wrong_nuisances(rng: np.random.Generator, plain: np.ndarray, interval: float
     return out
 
 
-def recorded(motion: Motion, markers: Markers, i: int, at: np.ndarray, off: Mapping[str, float]) -> np.ndarray:
+def measured_positions(motion: Motion, markers: Markers, i: int, at: np.ndarray, off: Mapping[str, float]) -> np.ndarray:
     """Return the positions that the instruments measure; clock and ruler may be off."""
     place, _ = motion.at(at * (1 + off.get("time_base", 0.0)) + off.get("release_time", 0.0), i)
     x = markers.follow(place, i)
@@ -74,11 +74,11 @@ def recorded(motion: Motion, markers: Markers, i: int, at: np.ndarray, off: Mapp
     return centre + (1 + off.get("length_scale", 0.0)) * (x - centre)
 
 
-def vector(own: Mapping[str, float], name: str) -> np.ndarray:
+def nuisance_vector(own: Mapping[str, float], name: str) -> np.ndarray:
     """Return the velocity or the spin of some nuisances."""
     return np.array([own[f"{name}_{a}"] for a in "xyz"])
 
 
-def fastest(x: np.ndarray, interval: float) -> float:
+def max_speed(x: np.ndarray, interval: float) -> float:
     """Return the largest speed of the mean point [m/s], (T, N, 3)."""
     return float(np.linalg.norm(np.diff(x.mean(axis=1), axis=0), axis=1).max() / interval)

@@ -30,6 +30,6 @@ def make_undeclared(
     Raises:
         UserError: An unknown kind or option, a kind that does not fit the others, or a folder that holds something else.
     """
-    from neuido.data.undeclared.sealed_folder import make
+    from neuido.data.undeclared.sealed_folder import make_sealed_case
 
-    return make(seed, out, case=case, device=device, progress=progress)
+    return make_sealed_case(seed, out, case=case, device=device, progress=progress)

@@ -65,7 +65,7 @@ class Motion(NamedTuple):
         return place, ((1 - u) * v0 + u * v1) / h
 
 
-def move(
+def simulate_motion(
     solver: Solver,
     scene: Scene,
     bodies: Sequence[Body],
@@ -96,15 +96,15 @@ def move(
     every = round(interval / scene.dt)
     frames = math.ceil(seconds / interval - 1e-6)
     elasticity, plasticity = material(law["elasticity"], law["plasticity"])
-    known, own = _sorted(values)
+    known, own = _split_by_library(values)
     effects = Effects.of(known, x=simulator.state.x, scene=simulator.particles.scene)
     slope, lift = own.pop("density_gradient", None), own.pop("moving_floor", None)
-    mass = None if slope is None else _graded(simulator, slope)
+    mass = None if slope is None else _graded_masses(simulator, slope)
     if lift is not None:
-        effects = effects._replace(**_shaken(lift, frames * every, scene.dt))
+        effects = effects._replace(**_moving_floor_force(lift, frames * every, scene.dt))
     with torch.no_grad():
         if own:
-            out = _split(simulator, elasticity, plasticity, effects, own, frames, every)
+            out = _rollout_with_kicks(simulator, elasticity, plasticity, effects, own, frames, every)
         else:
             out = simulator.rollout(frames * every, elasticity, plasticity, every=every, effects=effects, mass=mass)
     place, velocity = (t.double().cpu().numpy().reshape(frames + 1, len(bodies), -1, 3).swapaxes(0, 1) for t in (out.x, out.v))
@@ -117,7 +117,7 @@ def move(
     return Motion(place, velocity, interval)
 
 
-OWN = ("dry_drag.", "moving_floor.", "delayed_spring.", "swelling.", "magnet.", "density_gradient.", "spin_decay.")
+OUTSIDE_PREFIXES = ("dry_drag.", "moving_floor.", "delayed_spring.", "swelling.", "magnet.", "density_gradient.", "spin_decay.")
 
 
 def _simulator(solver: Solver, scene: Scene, bodies: Sequence[Body], density: float, device: str) -> Simulator | FiniteElements:
@@ -128,12 +128,12 @@ def _simulator(solver: Solver, scene: Scene, bodies: Sequence[Body], density: fl
     return FiniteElements(scenes, bodies, density=density, device=device, elements=elements, tetrahedra=solver.tetrahedra)
 
 
-def _sorted(values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+def _split_by_library(values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Return the effects of the library by flat names, and those outside it by name and parameter."""
     known: dict[str, float] = {}
     own: dict[str, dict[str, float]] = {}
     for name, value in values.items():
-        if name.startswith(OWN):
+        if name.startswith(OUTSIDE_PREFIXES):
             effect, _, parameter = name.partition(".")
             own.setdefault(effect, {})[parameter] = value
         else:
@@ -141,7 +141,7 @@ def _sorted(values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, di
     return known, own
 
 
-def _graded(simulator: Simulator | FiniteElements, slope: Mapping[str, float]) -> Tensor:
+def _graded_masses(simulator: Simulator | FiniteElements, slope: Mapping[str, float]) -> Tensor:
     """Return masses with a gradient over each body, the same in all."""
     x, mass = simulator.state.x.double(), simulator.mass.double()
     s = torch.tensor([slope[a] for a in "xyz"], dtype=torch.float64, device=x.device)
@@ -150,7 +150,7 @@ def _graded(simulator: Simulator | FiniteElements, slope: Mapping[str, float]) -
     return torch.cat([mass[i:j] * factor[i:j] / (mass[i:j] * factor[i:j]).sum() * mass[i:j].sum() for i, j in parts]).to(simulator.mass)
 
 
-def _shaken(lift: Mapping[str, float], steps: int, dt: float) -> dict[str, Any]:
+def _moving_floor_force(lift: Mapping[str, float], steps: int, dt: float) -> dict[str, Any]:
     """Return the inertia in the frame of a floor at amplitude (1 - cos w t), which starts at rest: velocities agree in both frames."""
     w = 2 * math.pi * lift["frequency"]
     t = torch.arange(steps + 1, dtype=torch.float64) * dt
@@ -159,7 +159,7 @@ def _shaken(lift: Mapping[str, float], steps: int, dt: float) -> dict[str, Any]:
     return {"time_force": force, "time_force_interval": dt}
 
 
-def _split(
+def _rollout_with_kicks(
     simulator: Simulator, elasticity, plasticity, effects: Effects, own: dict[str, dict[str, float]], frames: int, every: int
 ) -> ParticleState:
     """Alternate rollouts and kicks (Strang's splitting); effects of the library beside them must have no memory."""

@@ -128,7 +128,7 @@ def rotation(rng: np.random.Generator, angle: float) -> np.ndarray:
     return np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * K @ K
 
 
-def launched(
+def launched_body(
     points: np.ndarray, volume: float, launch: Launch, *, velocity: np.ndarray | None = None, spin: np.ndarray | None = None
 ) -> Body:
     """Return the body at t = 0; `velocity` [m/s] and `spin` [rad/s] are added to the launch's."""

@@ -233,7 +233,7 @@ def draw_effect(kind: str, rng: np.random.Generator, scales: Scales) -> Drawn:
     )
 
 
-def entry_of(drawn: Drawn, *, free: tuple[str, ...] = ()) -> dict:
+def truth_entry(drawn: Drawn, *, free: tuple[str, ...] = ()) -> dict:
     """Return the key's entry for an effect, in the form of an experiment's `undeclared` list."""
     kind = KINDS[drawn.kind] if drawn.kind in KINDS else OUTSIDE[drawn.kind]
     name = drawn.kind.partition(":")[0]

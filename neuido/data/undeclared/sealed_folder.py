@@ -12,7 +12,7 @@ import yaml
 from tqdm import tqdm
 
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.storage import publish_folder, write
+from neuido.data.files.storage import publish_folder, write_text
 from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.curves import curve_case
@@ -25,7 +25,7 @@ TRIES = 12
 """Draws before a seed is given up."""
 
 
-def make(seed: int, out: str | Path, *, case: Case, device: str, progress: bool) -> Path:
+def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, progress: bool) -> Path:
     """Do the work of `undeclared.make_undeclared`."""
     folder = Path(out).expanduser().absolute()
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", folder.name):
@@ -59,7 +59,7 @@ def make(seed: int, out: str | Path, *, case: Case, device: str, progress: bool)
     write_folder(hidden)
     (hidden / "README.md").write_text(_readme(folder.name, text))
     key.parent.mkdir(exist_ok=True)
-    write(key, text)
+    write_text(key, text)
     publish_folder(hidden, folder)
     return key
 

@@ -14,8 +14,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from neuido.data.files.storage import write
-from neuido.data.files.writing import replacing
+from neuido.data.files.storage import write_text
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import rollout_laws
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
@@ -126,7 +126,7 @@ class Method(nn.Module):
     def write_card(self, folder: Path) -> None:
         """Write `method.json`."""
         folder.mkdir(parents=True, exist_ok=True)
-        write(folder / CARD, json.dumps(self.card(), indent=1) + "\n")
+        write_text(folder / CARD, json.dumps(self.card(), indent=1) + "\n")
 
     def load(self, folder: Path) -> None:
         """Load what `save` wrote.
@@ -162,7 +162,7 @@ class Method(nn.Module):
 
 def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
     """Write a safetensors file atomically."""
-    with replacing(path) as hidden:
+    with atomic_write(path) as hidden:
         save_file(tensors, hidden)
 
 

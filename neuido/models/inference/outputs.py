@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.files.writing import replacing
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.types import ParticleState
 
@@ -46,7 +46,7 @@ def write_video(path: str | os.PathLike, images: Tensor, *, rate: float = 20.0) 
     path = Path(path)
     frames = (255 * images.detach().clamp(0, 1)).round().to(torch.uint8).cpu().numpy()
     height, width = (n - n % 2 for n in frames.shape[1:3])  # the codec requires even sides
-    with replacing(path, keep_suffix=True) as hidden:
+    with atomic_write(path, keep_suffix=True) as hidden:
         writer = cv2.VideoWriter(str(hidden), cv2.VideoWriter_fourcc(*"mp4v"), rate, (width, height))
         if not writer.isOpened():
             raise UserError(f"OpenCV cannot write the video {path}")

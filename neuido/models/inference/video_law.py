@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuido.data.scenes.filmed_scene import VisualScene, load_visual
+from neuido.data.scenes.filmed_scene import VisualScene, load_visual_scene
 from neuido.models.inference.law_file import save_law
 from neuido.models.inference.pipeline import infer_latent, rollout_latent, rollout_with_retries
 from neuido.models.inference.prepared_scene import Laws, PreparedScene, as_device, prepare
@@ -122,7 +122,7 @@ def read_law(
     """Infer a material law from the video of a moving body, zero-shot, as `neuido predict` does.
 
     Args:
-        recording: Folder of a multi-view recording that `neuido reconstruct` has prepared, or a scene of `load_visual`.
+        recording: Folder of a multi-view recording that `neuido reconstruct` has prepared, or a scene of `load_visual_scene`.
         operator: File of the operator, `pretrained`, or an operator.
         encoder: File of the encoder, `pretrained`, `pretrained-small` (few, coarse frames), or an encoder.
         reconstruction: Output folder of `neuido reconstruct`; `<recording>/reconstruction` where absent.
@@ -145,7 +145,7 @@ def read_law(
         scene = recording
     else:
         options: dict[str, Any] = {"recording": recording_name, "views": views, "frame_step": frame_step, "frame_count": frame_count}
-        scene = load_visual(recording, reconstruction=reconstruction, **options)
+        scene = load_visual_scene(recording, reconstruction=reconstruction, **options)
     own_operator = operator if isinstance(operator, IntrinsicDynamicsOperator) else IntrinsicDynamicsOperator.load(operator)
     own_encoder = encoder if isinstance(encoder, DynamicsEncoder) else DynamicsEncoder.load(encoder)
     own_encoder.check_latents(own_operator.latent_dim, f"encoder = {encoder}" if isinstance(encoder, str) else "encoder")

@@ -17,8 +17,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neuido.data.files.missing_weights import how_to_make
-from neuido.data.files.writing import replacing
+from neuido.data.files.missing_weights import weights_hint
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.physics.laws.neural import networks
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
@@ -213,7 +213,7 @@ class IntrinsicDynamicsOperator(nn.Module):
             "latents": json.dumps({"names": self.latent_names, "families": self.latent_families}),
             "card": json.dumps({"date": date.today().isoformat(), **(card or {})}),
         }
-        with replacing(path) as hidden:
+        with atomic_write(path) as hidden:
             save_file(tensors, hidden, metadata=metadata)
 
     @classmethod
@@ -237,7 +237,7 @@ class IntrinsicDynamicsOperator(nn.Module):
         named = PRETRAINED.get(str(path))
         path = named or Path(path)
         if not path.is_file():
-            remedy = "make them: neuido fit --config configs/stage1.yaml, then `save_to`" if named else how_to_make(path)
+            remedy = "make them: neuido fit --config configs/stage1.yaml, then `save_to`" if named else weights_hint(path)
             raise UserError(f"init_from: the weights {path} are missing: {remedy}")
         try:
             with safe_open(path, framework="pt") as file:

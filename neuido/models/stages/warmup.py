@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from neuido.data.bodies.families import laws
 from neuido.data.clips import Clip, FilmDataModule
-from neuido.data.files.writing import replacing
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus
@@ -160,7 +160,7 @@ class WarmupModule(LightningModule):
         pairs = [self.encoder.embed(Velocities(flow, clip.cell, clip.frame_interval)) for flow in seen]
         volume, conditions = torch.stack([volume for volume, _ in pairs]).cpu(), pairs[0][1].cpu()
         if kept is not None:
-            with replacing(kept) as hidden:
+            with atomic_write(kept) as hidden:
                 save_file({"volume": volume, "conditions": conditions}, hidden)
         return volume, conditions
 

@@ -20,9 +20,9 @@ from tqdm import tqdm
 from neuido.data.bodies.families import PARAMETERS, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
-from neuido.data.clips import FORMAT, complete
-from neuido.data.files.storage import claim, write
-from neuido.data.files.writing import replacing
+from neuido.data.clips import FORMAT, is_complete
+from neuido.data.files.storage import claim_folder, write_text
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
 from neuido.models.render.splatting import render
@@ -93,10 +93,10 @@ def generate_clips(
     if batch < 0:
         raise UserError(f"batch must be 0 (automatic) or positive, got {batch}")
     text = json.dumps({"format": FORMAT, "plan": asdict(plan)}, indent=1) + "\n"
-    claim(folder, text, "clips of another set-up", compared="plan")
+    claim_folder(folder, text, "clips of another set-up", compared="plan")
     names = [f"clip-{i:05d}" for i in range(plan.count)]
     own = range(shard, plan.count, shards)
-    missing = [i for i in own if not complete(folder / f"{names[i]}.npz")]
+    missing = [i for i in own if not is_complete(folder / f"{names[i]}.npz")]
     size = batch or (16 if chosen.type == "cuda" else 1)
     kinds, workers = list(plan.families), max(1, (os.cpu_count() or 1) // shards)
     with tqdm(total=len(own), initial=len(own) - len(missing), unit="clip", disable=not progress) as bar:
@@ -108,12 +108,12 @@ def generate_clips(
                     filmed = film_clips(plan, group, chosen)
                     list(pool.map(lambda pair: _write_clip(plan, folder, *pair), zip(group, filmed)))
                 bar.update(len(group))
-    if (missing or not (folder / "index.json").exists()) and all(complete(folder / f"{name}.npz") for name in names):
+    if (missing or not (folder / "index.json").exists()) and all(is_complete(folder / f"{name}.npz") for name in names):
         entries = []
         for i, name in enumerate(names):
             family, parameters = _material(plan, np.random.default_rng([plan.seed, i]), i)
             entries.append({"name": name, "family": family, "parameters": parameters})
-        write(folder / "index.json", json.dumps({"format": FORMAT, "plan": asdict(plan), "clips": entries}, indent=1) + "\n")
+        write_text(folder / "index.json", json.dumps({"format": FORMAT, "plan": asdict(plan), "clips": entries}, indent=1) + "\n")
 
 
 def sample_clip(plan: ClipPlan, number: int) -> ClipSetup:
@@ -183,7 +183,7 @@ def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str,
     options = {"size": plan.flow_size, "preset": plan.flow_preset}
     seen = measure_velocities(filmed.pop("images"), filmed.pop("masks"), times, clip.cameras, clip.body.x.mean(0), **options)
     content = {"flow": seen.flow.half(), "cell": seen.cell, "frame_interval": torch.tensor(seen.frame_interval), **filmed}
-    with replacing(folder / f"{clip.name}.npz") as hidden, hidden.open("wb") as file:
+    with atomic_write(folder / f"{clip.name}.npz") as hidden, hidden.open("wb") as file:
         np.savez(file, **{name: t.numpy() for name, t in content.items()})
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.files.writing import replacing
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.types import Cameras
 
@@ -137,7 +137,7 @@ def measure_velocities(
     if found is None:
         found = _crop_flow(optical_flow(images, preset=preset), masks.cpu(), size)
         if path is not None:
-            with replacing(path) as hidden, hidden.open("wb") as file:
+            with atomic_write(path) as hidden, hidden.open("wb") as file:
                 np.savez(file, flow=found[0].numpy(), side=found[1].numpy())
     flow, side = found
     return Velocities(flow * (pixel / interval)[:, None, None, None, None], pixel * side / size, interval)

@@ -17,8 +17,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neuido.data.files.missing_weights import how_to_make
-from neuido.data.files.writing import replacing
+from neuido.data.files.missing_weights import weights_hint
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 
 FORMAT = "neuido-flow-vae/1"
@@ -185,7 +185,7 @@ def write_weights(
     path: str | os.PathLike, kind: str, config: Mapping[str, Any], tensors: dict[str, Tensor], card: Mapping[str, Any]
 ) -> None:
     """Write a safetensors file with its format, configuration and card atomically."""
-    with replacing(path) as hidden:
+    with atomic_write(path) as hidden:
         save_file(tensors, hidden, metadata={"format": kind, "config": json.dumps(dict(config)), "card": json.dumps(dict(card))})
 
 
@@ -202,7 +202,7 @@ def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -
     """
     path = Path(path)
     if not path.is_file():
-        raise UserError(f"{option}: the weights {path} are missing: {how_to_make(path, option)}")
+        raise UserError(f"{option}: the weights {path} are missing: {weights_hint(path, option)}")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

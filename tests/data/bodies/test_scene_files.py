@@ -164,7 +164,7 @@ def test_scene_from_a_file(ball_folder, monkeypatch):
         ({"format": "neuido-scene/9"}, "format"),
         ({"body": {"particles": "../ball.npz"}}, "leaves the data folder"),
         ({"body": {"particles": "/etc/hostname"}}, "leaves the data folder"),
-        ({"body": {"particles": "bowl.npz"}}, "no bowl.npz"),
+        ({"body": {"particles": "bowl.npz"}}, "has no file bowl.npz"),
         ({"body": {"particles": "scene.yaml"}}, "no archive"),
         ({"body": {"shape": "cube", "lenght": 0.1}}, "lenght"),
         ({"body": {"shape": "torus"}}, "torus"),

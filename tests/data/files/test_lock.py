@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from neuido.data.files.lock import Held, OwnedLock
+from neuido.data.files.lock import LockHeld, OwnedLock
 
 HOLD = """
 import sys
@@ -22,7 +22,7 @@ def test_second_process_is_told_who_holds_it(tmp_path):
     path = tmp_path / "a.lock"
     with subprocess.Popen([sys.executable, "-c", HOLD, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "held\n"
-        with pytest.raises(Held, match=rf"the run a is held by process {process.pid} on {socket.gethostname()}") as error:
+        with pytest.raises(LockHeld, match=rf"the run a is held by process {process.pid} on {socket.gethostname()}") as error:
             OwnedLock(path, "the run a").__enter__()
         assert "\n" not in str(error.value)
         process.communicate("\n")
@@ -53,7 +53,7 @@ def test_child_that_outlives_its_owner_holds_on(tmp_path):
     ) as owner:
         child = int(owner.stdout.readline())
         assert owner.wait() == 0
-        with pytest.raises(Held, match=f"process {child} on"):
+        with pytest.raises(LockHeld, match=f"process {child} on"):
             OwnedLock(tmp_path / "a", "it").__enter__()
         owner.stdin.write("\n")
         owner.stdin.flush()

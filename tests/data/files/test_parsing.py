@@ -96,12 +96,12 @@ def archive(path, member: bytes, name: str = "x.npy"):
             "has 1000000000000 elements, .*NEUIDO_MAX_ARRAY_ELEMENTS",
         ),
         (npy("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }"), "no plain numbers"),
-        (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (4,), }", b"abc"), "is no archive of x: "),
-        (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (4,)"), "is no archive of x: "),
-        (npy("x" * 30000), "is no archive of x: "),
-        (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }"), "is no archive of x: "),
+        (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (4,), }", b"abc"), "is not a valid archive of x: "),
+        (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (4,)"), "is not a valid archive of x: "),
+        (npy("x" * 30000), "is not a valid archive of x: "),
+        (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }"), "is not a valid archive of x: "),
         (npy("", version=b"\x09\x00"), r"version \(9, 0\)"),
-        (b"", "is no archive of x: "),
+        (b"", "is not a valid archive of x: "),
     ],
 )
 def test_arrays_that_cannot_be_read(tmp_path, member, match):
@@ -117,7 +117,7 @@ def test_damaged_archives(tmp_path):
     start = whole.index(b"x.npy") + 40
     for content in (b"", whole[:300], whole[:start] + b"\xff" * 60 + whole[start + 60 :]):
         path.write_bytes(content)
-        refused(lambda p: read_arrays(p, ["x"]), path, "is no archive of x: .")
+        refused(lambda p: read_arrays(p, ["x"]), path, "is not a valid archive of x: .")
     path.write_bytes(whole)
     refused(lambda p: read_arrays(p, ["y"]), path, "lacks the array 'y'; it has x")
     refused(lambda p: read_arrays(p, [], ["y"], others=False), path, "unknown array 'x'; it takes y")

@@ -10,17 +10,17 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from neuido.data.files.storage import write
+from neuido.data.files.storage import write_text
 from neuido.data.files.values import file_name
-from neuido.data.files.writing import check_writable, new_folder, real_folder, remove, replacing
+from neuido.data.files.writing import atomic_write, check_writable, make_real_folder, new_folder, remove
 from neuido.discrepancy import resume
 from neuido.errors import UserError, one_line
 
 
 def test_a_writer_that_fails_leaves_what_was_there(tmp_path):
     path = tmp_path / "a.txt"
-    write(path, "before")
-    with pytest.raises(OSError), replacing(path) as hidden:
+    write_text(path, "before")
+    with pytest.raises(OSError), atomic_write(path) as hidden:
         hidden.write_text("half")
         raise OSError(errno.ENOSPC, "No space left on device")
     assert path.read_text() == "before" and list(tmp_path.iterdir()) == [path]
@@ -32,10 +32,10 @@ def test_a_full_disk_leaves_nothing_that_is_cut(tmp_path):
 import numpy as np, resource, signal, sys
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-from neuido.data.files.writing import replacing
+from neuido.data.files.writing import atomic_write
 from neuido.errors import one_line
 try:
-    with replacing({str(tmp_path / "a.npy")!r}) as hidden, hidden.open("wb") as stream:
+    with atomic_write({str(tmp_path / "a.npy")!r}) as hidden, hidden.open("wb") as stream:
         np.save(stream, np.ones(100_000))
 except OSError as error:
     print(one_line(error))
@@ -51,7 +51,7 @@ def test_many_writers_of_one_file_publish_whole_ones(tmp_path):
     path = tmp_path / "a.npy"
 
     def put(i):
-        with replacing(path) as hidden, hidden.open("wb") as stream:
+        with atomic_write(path) as hidden, hidden.open("wb") as stream:
             np.save(stream, np.full(50_000, i))
         return len(set(np.load(path).tolist()))
 
@@ -67,7 +67,7 @@ def test_what_a_dead_process_left_goes_and_what_a_live_one_writes_stays(tmp_path
     left, held = (tmp_path / f".a.txt.{host}-{pid}-00000000.tmp" for pid in (dead.pid, os.getpid()))
     for path in (left, held):
         path.write_text("half")
-    write(tmp_path / "a.txt", "whole")
+    write_text(tmp_path / "a.txt", "whole")
     assert not left.exists() and held.exists() and (tmp_path / "a.txt").read_text() == "whole"
 
 
@@ -77,7 +77,7 @@ def test_a_link_is_replaced_and_not_followed(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "a.txt").symlink_to(precious)
-    write(out / "a.txt", "new")
+    write_text(out / "a.txt", "new")
     assert precious.read_text() == "mine" and not (out / "a.txt").is_symlink()
 
 
@@ -127,7 +127,7 @@ def test_a_folder_that_cannot_be_written_is_refused_and_nothing_made(tmp_path):
     with pytest.raises(UserError, match="is a file"):
         check_writable(tmp_path / "file" / "out")
     with pytest.raises(UserError, match="is a file"):
-        real_folder(tmp_path / "file", "the folder")
+        make_real_folder(tmp_path / "file", "the folder")
     check_writable(tmp_path / "a" / "b")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
     with pytest.raises(UserError, match="cannot be written"):

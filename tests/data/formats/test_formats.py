@@ -73,7 +73,7 @@ def test_unknown_format(tmp_path):
         read(tmp_path / "empty")
     with pytest.raises(UserError, match="format = 'kitti'"):
         read(tmp_path / "empty", "kitti")
-    with pytest.raises(UserError, match="there is no folder"):
+    with pytest.raises(UserError, match=r"folder .* is missing"):
         read(tmp_path / "nowhere")
     assert set(FORMATS) == {"experiment", "pacnerf", "neuma", "springgaus", "nerfstudio", "colmap"}
 
@@ -159,12 +159,12 @@ def test_names_in_other_files_stay_in_the_folder(tmp_path):
     ("matrix", "message"),
     [
         ([[1, 2], [3, 4]], "must have the shape"),
-        ("none", "must hold numbers"),
+        ("none", "must contain numbers"),
         ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, float("nan"), 0]], "NaN"),
         ([[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]], "singular values"),
         ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]], "reflection"),
-        ([[1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "must hold numbers"),
-        ([[10**400, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "must hold numbers"),
+        ([[1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "must contain numbers"),
+        ([[10**400, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "must contain numbers"),
     ],
 )
 def test_a_wrong_pose(tmp_path, case, matrix, message):
@@ -183,7 +183,7 @@ def test_a_wrong_pose(tmp_path, case, matrix, message):
         (lambda c: c.update(fl_y="wide"), "fl_y must be a finite number"),
         (lambda c: c.update(cx=10**400), "cx must be a finite number, got one that is too large"),
         (lambda c: c.update(w=0), "w must be at least 1"),
-        (lambda c: c.update(camera_model="OPENCV_FISHEYE"), "no pinhole"),
+        (lambda c: c.update(camera_model="OPENCV_FISHEYE"), "pinhole|must be one of PINHOLE"),
         (lambda c: c.pop("frames"), "lacks the key 'frames'"),
         (lambda c: c["frames"][3].pop("file_path"), r"frames\[3\] lacks the key 'file_path'"),
         (lambda c: c["frames"][3].pop("transform_matrix"), r"frames\[3\] lacks the key 'transform_matrix'"),
@@ -191,7 +191,7 @@ def test_a_wrong_pose(tmp_path, case, matrix, message):
         (lambda c: c["frames"][3].update(time=-1), "time must be at least 0"),
         (lambda c: c["frames"][3].update(time=0.0), "two images"),
         (lambda c: c["frames"][3].update(view=1.5), "view must be a whole number"),
-        (lambda c: c["frames"][3].update(w=32), "images of 2 sizes"),
+        (lambda c: c["frames"][3].update(w=32), "images of two sizes"),
         (lambda c: c["frames"][3]["transform_matrix"][0].__setitem__(3, 9.0), "view 0 moves"),
         (lambda c: [frame.pop("time") for frame in c["frames"]], "add `time`"),
         (lambda c: c["frames"][3].update(file_path="images/none.png"), "none.png is missing"),
@@ -248,7 +248,7 @@ def test_colmap_cut_short_anywhere(tmp_path, file):
     whole = path.read_bytes()
     for length in range(0, len(whole), 7):
         path.write_bytes(whole[:length])
-        with pytest.raises(UserError, match="cut short"):
+        with pytest.raises(UserError, match="truncated"):
             read(tmp_path / "colmap")
 
 
@@ -256,7 +256,7 @@ def test_colmap_with_what_it_cannot_mean(tmp_path):
     made(tmp_path, "colmap")
     cameras = tmp_path / "colmap" / "sparse" / "0" / "cameras.bin"
     cameras.write_bytes(struct.pack("<QiiQQ", 1, 1, 5, 24, 16) + struct.pack("<8d", *8 * [1.0]))
-    with pytest.raises(UserError, match="no pinhole"):
+    with pytest.raises(UserError, match="not a pinhole"):
         read(tmp_path / "colmap")
     cameras.write_bytes(struct.pack("<QiiQQ8d", 1, 1, 4, 24, 16, 30, 31, 12, 8, 0.1, 0.2, 0.3, 0.4))
     found = read(tmp_path / "colmap")
@@ -264,7 +264,7 @@ def test_colmap_with_what_it_cannot_mean(tmp_path):
     assert found.cameras.Ks[0].diagonal().tolist() == [30, 31, 1]
     images = tmp_path / "colmap" / "sparse" / "0" / "images.bin"
     images.write_bytes(struct.pack("<Q", 2**60))
-    with pytest.raises(UserError, match="cut short"):
+    with pytest.raises(UserError, match="truncated"):
         read(tmp_path / "colmap")
 
 
@@ -373,14 +373,14 @@ class Harmful:
         ("init.pt", {"init_x": torch.rand(5, 3)}, "lacks the entry 'init_v'"),
         ("init.pt", {"init_x": torch.rand(5, 3), "init_v": torch.rand(4, 3)}, r"must be finite \(P, 3\)"),
         ("init.pt", {"init_x": torch.full((5, 3), torch.nan), "init_v": torch.rand(5, 3)}, "must be finite"),
-        ("init.pt", {"init_x": Harmful(), "init_v": 0}, "no file of tensors"),
-        ("init.pt", None, "no file of tensors"),
+        ("init.pt", {"init_x": Harmful(), "init_v": 0}, "not a torch.save file of tensors"),
+        ("init.pt", None, "not a torch.save file of tensors"),
         (
             "bindings.pt",
             {"bindings_ind": torch.tensor([[0], [7]]), "bindings_val": torch.ones(1), "bindings_size": (3, 5)},
             "outside bindings_size",
         ),
-        ("bindings.pt", {"bindings_ind": torch.tensor([0]), "bindings_val": torch.ones(1), "bindings_size": (3, 5)}, "do not fit"),
+        ("bindings.pt", {"bindings_ind": torch.tensor([0]), "bindings_val": torch.ones(1), "bindings_size": (3, 5)}, "do not match"),
     ],
 )
 def test_malformed_assets(tmp_path, name, content, message):

@@ -45,7 +45,7 @@ def test_rows_that_are_not_finite_are_left_out_and_named(tmp_path, column, value
         vertices[column][[1, 3]] = value
 
     path = write(tmp_path / "a.ply", change=spoil)
-    with pytest.warns(UserWarning, match="2 of 5 Gaussians hold a NaN or an infinity and are left out: rows 1, 3"):
+    with pytest.warns(UserWarning, match="2 of 5 Gaussians contain a NaN or an infinity and are dropped: rows 1, 3"):
         assert len(read_gaussian_vertices(path)) == 3
     refused(write(tmp_path / "b.ply", change=lambda v: v[column].fill(value)), "none of its 5 Gaussians is finite")
 
@@ -58,9 +58,9 @@ def test_normals_may_be_anything(tmp_path):
 
 def test_other_kinds_of_files_are_named(tmp_path):
     packed = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
-    refused(write(tmp_path / "a.ply", names=packed), "compressed PLY file .* export the Gaussians uncompressed")
+    refused(write(tmp_path / "a.ply", names=packed), "compressed PLY file .* export the Gaussians as an uncompressed .ply")
     refused(write(tmp_path / "b.ply", names=[n for n in column_names(0) if n not in ("scale_2",)]), "2D Gaussians")
-    refused(write(tmp_path / "c.ply", names=["x", "y", "z"]), "not a 3DGS file: its vertices lack f_dc_0")
+    refused(write(tmp_path / "c.ply", names=["x", "y", "z"]), "not a 3DGS file: its vertices lack the columns f_dc_0")
     refused(write(tmp_path / "d.ply", names=[*column_names(0), "f_rest_0"]), "1 f_rest columns")
     refused(write(tmp_path / "e.ply", rows=0), "holds no Gaussian")
     whole = write(tmp_path / "f.ply").read_bytes()
@@ -68,12 +68,12 @@ def test_other_kinds_of_files_are_named(tmp_path):
         ("g.ply", gzip.compress(whole), "not a PLY file .a gzip file"),
         ("h.ply", np.arange(64, dtype="f4").tobytes(), "perhaps a .splat file"),
         ("i.ply", whole[:40], "its header has no end"),
-        ("j.ply", whole[:-9], "no PLY file with vertices that can be read"),
-        ("k.ply", whole.replace(b"vertex 5", b"vertex 500000"), "is cut short: element vertex has 500000 rows"),
+        ("j.ply", whole[:-9], "not a valid readable PLY file with vertices"),
+        ("k.ply", whole.replace(b"vertex 5", b"vertex 500000"), "is truncated: element vertex has 500000 rows"),
         ("l.ply", whole.replace(b"vertex 5", b"vertex 99999999999"), "NEUIDO_MAX_PARTICLES"),
         ("m.ply", whole.replace(b"vertex 5", b"vertex -5"), "count '-5', no whole number"),
-        ("n.ply", whole.replace(b"element vertex", b"element points"), "no PLY file with vertices that can be read"),
-        ("o.ply", whole.replace(b"float x", b"quark x"), "no PLY file with vertices that can be read"),
+        ("n.ply", whole.replace(b"element vertex", b"element points"), "not a valid readable PLY file with vertices"),
+        ("o.ply", whole.replace(b"float x", b"quark x"), "not a valid readable PLY file with vertices"),
     ):
         (tmp_path / name).write_bytes(content)
         refused(tmp_path / name, match)

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from neuido.data import cameras as convert
-from neuido.data.files.values import inside
+from neuido.data.files.values import path_inside
 from neuido.data.formats import colmap, nerfstudio
 from neuido.data.scenes.filmed_scene import load_views
 from neuido.data.scenes.multiview import SceneViews
@@ -59,10 +59,10 @@ def test_terms_of_lenses_that_are_not_applied(tmp_path, key, frame):
 def test_list_of_distortion_parameters(tmp_path):
     found = read(folder(tmp_path, root={"distortion_params": [0.1, 0.2, 0.3, 0.0, 0.4, 0.5]}))
     assert found.distortion[0].tolist() == [0.1, 0.2, 0.4, 0.5, 0.3]
-    for values, match in (([0.1, 0, 0, 0.2, 0, 0], "k4 = 0.2"), ([0.1], "shape"), ("x", "must hold numbers")):
+    for values, match in (([0.1, 0, 0, 0.2, 0, 0], "k4 = 0.2"), ([0.1], "shape"), ("x", "must contain numbers")):
         with pytest.raises(UserError, match=match):
             read(folder(tmp_path, root={"distortion_params": values}))
-    with pytest.raises(UserError, match="say different things"):
+    with pytest.raises(UserError, match="contradicts distortion_params"):
         read(folder(tmp_path, root={"distortion_params": [0.1, 0, 0, 0, 0, 0], "k1": 0.2}))
 
 
@@ -71,7 +71,7 @@ def test_transposed_matrix(tmp_path):
     content = json.loads((path / "transforms.json").read_text())
     content["frames"][1]["transform_matrix"] = np.array(content["frames"][1]["transform_matrix"]).T.tolist()
     (path / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(UserError, match=r"frames\[1\].transform_matrix has the last row .*, not 0, 0, 0, 1: .*give the transpose"):
+    with pytest.raises(UserError, match=r"frames\[1\].transform_matrix has the last row .*, not 0, 0, 0, 1: .*write it row by row"):
         read(path)
 
 
@@ -81,7 +81,7 @@ def test_windows_separators_and_byte_order_mark(tmp_path):
     assert [row[0].name for row in read(path).images] == ["0_0.png", "1_0.png", "2_0.png"]
     for name in ("..\\a.png", "C:\\a.png", "\\\\host\\a.png", "images\\..\\..\\a.png"):
         with pytest.raises(UserError, match="leaves the folder"):
-            inside(path, name, "it")
+            path_inside(path, name, "it")
 
 
 @pytest.mark.parametrize("width", [4, 7, 13, 29, 31, 45])
@@ -176,12 +176,12 @@ def test_colmap_text_in_each_layout(tmp_path, place):
 @pytest.mark.parametrize(
     ("line", "match"),
     [
-        (f"1 OPENCV_FISHEYE {WIDTH} {HEIGHT} 40 41 15 10 0 0 0 0", "lens model OPENCV_FISHEYE, no pinhole"),
+        (f"1 OPENCV_FISHEYE {WIDTH} {HEIGHT} 40 41 15 10 0 0 0 0", "camera model OPENCV_FISHEYE, not a pinhole"),
         (f"1 PINHOLE {WIDTH} {HEIGHT} 40 41 15", "line 2: PINHOLE has 4 parameters, got 3"),
-        (f"1 PINHOLE {WIDTH} x 40 41 15 10", "line 2 is not CAMERA_ID MODEL"),
-        ("1", "line 2 is not CAMERA_ID MODEL"),
-        ("", "holds no camera"),
-        (f"2 PINHOLE {WIDTH} {HEIGHT} 40 41 15 10", "names camera 1, which cameras.txt lacks"),
+        (f"1 PINHOLE {WIDTH} x 40 41 15 10", "line 2 must have the form CAMERA_ID MODEL"),
+        ("1", "line 2 must have the form CAMERA_ID MODEL"),
+        ("", "contains no camera"),
+        (f"2 PINHOLE {WIDTH} {HEIGHT} 40 41 15 10", "refers to camera 1, which is not in cameras.txt"),
         (f"1 PINHOLE {WIDTH} {HEIGHT} nan 41 15 10", "focal lengths"),
         ("1 PINHOLE 9999999 9999999 40 41 15 10", "NEUIDO_MAX_IMAGE_PIXELS"),
     ],

@@ -41,14 +41,14 @@ def test_cameras(number, focal):
         assert value is None or torch.allclose(found.cameras.Ks[:, i, i], torch.tensor(value), atol=1e-3)
 
 
-@pytest.mark.parametrize(("number", "match"), [(5, "is_fisheye"), (6, "k4 = 0.3"), (7, "give the transpose"), (12, "frame_interval")])
+@pytest.mark.parametrize(("number", "match"), [(5, "is_fisheye"), (6, "k4 = 0.3"), (7, "write it row by row"), (12, "frame_interval")])
 def test_refused_by_name(number, match):
     with pytest.raises(UserError, match=match):
         read(case(number))
 
 
 @pytest.mark.parametrize(("number", "count"), [(13, 5), (14, 4), (15, 4)])
-@pytest.mark.filterwarnings("ignore:.*left out. rows 1")
+@pytest.mark.filterwarnings("ignore:.*dropped. rows 1")
 def test_gaussians(number, count):
     assert len(read_gaussian_vertices(next(case(number).glob("*.ply")))) == count
 

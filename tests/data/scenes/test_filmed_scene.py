@@ -5,7 +5,16 @@ import pytest
 
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.files.parsing import read_yaml
-from neuido.data.scenes.filmed_scene import Motion, Placing, Setting, read_motion, read_setting, read_truth, write_motion, write_setting
+from neuido.data.scenes.filmed_scene import (
+    Motion,
+    Placement,
+    SceneSetting,
+    read_motion,
+    read_setting,
+    read_truth,
+    write_motion,
+    write_setting,
+)
 from neuido.data.scenes.synthetic import JELLY
 from neuido.errors import UserError
 from neuido.types import AttachedMass, Box, Plane, Scene, Walls
@@ -25,7 +34,7 @@ def test_setting_round_trip(tmp_path):
     walls = (Walls("separate", float("inf"), 1.0), None, Walls())
     for i, wall in enumerate(walls):
         scene = Scene(upper=(1.0, 2.0, 1.0), cells=24, dt=2.5e-4, colliders=(floor,), walls=wall, attached_masses=(mass,))
-        setting = Setting(f"mine {i}", scene, 1000.0, JELLY, Placing(0.5, (0.1, -0.2, 1e-9), "-z"))
+        setting = SceneSetting(f"mine {i}", scene, 1000.0, JELLY, Placement(0.5, (0.1, -0.2, 1e-9), "-z"))
         write_setting(setting, tmp_path / "scene.yaml")
         assert read_setting(tmp_path / "scene.yaml") == setting
 
@@ -44,7 +53,7 @@ def test_setting_round_trip(tmp_path):
 )
 def test_setting_errors(tmp_path, old, new, words):
     path = tmp_path / "scene.yaml"
-    write_setting(Setting("mine", Scene(), 1000.0, JELLY, Placing(0.5, up="z")), path)
+    write_setting(SceneSetting("mine", Scene(), 1000.0, JELLY, Placement(0.5, up="z")), path)
     assert_refused(read_setting, path, old, new, words)
 
 
@@ -81,7 +90,7 @@ def test_truth(tmp_path):
         with pytest.raises(UserError, match=r"truth\.npz"):
             read_truth(tmp_path)
     np.savez(tmp_path / "truth.npz", **{key: value for key, value in arrays.items() if key != "x0"})
-    with pytest.raises(UserError, match=r"truth\.npz is no archive"):
+    with pytest.raises(UserError, match=r"truth\.npz is not a valid archive"):
         read_truth(tmp_path)
     shutil.rmtree(tmp_path)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neuido.data.scenes.filmed_scene_module import Turns, VisualDataModule, train_on
+from neuido.data.scenes.filmed_scene_module import ShuffledScenes, VisualDataModule, select_training_views
 from neuido.errors import UserError
 from neuido.types import Cameras, MultiViewBatch
 
@@ -16,32 +16,32 @@ def epoch(turns, number):
 
 
 def test_every_scene_once_an_epoch_in_another_order():
-    turns = Turns(NAMES)
+    turns = ShuffledScenes(NAMES)
     orders = [epoch(turns, k) for k in range(4)]
     assert all(sorted(order) == NAMES for order in orders)
     assert len({tuple(order) for order in orders}) > 1
-    assert epoch(Turns(NAMES), 2) == orders[2] != epoch(Turns(NAMES, seed=1), 2)
+    assert epoch(ShuffledScenes(NAMES), 2) == orders[2] != epoch(ShuffledScenes(NAMES, seed=1), 2)
 
 
 def test_processes_share_the_scenes():
-    both = [epoch(Turns(NAMES, rank=rank, ranks=2), 3) for rank in (0, 1)]
-    whole = epoch(Turns(NAMES), 3)
+    both = [epoch(ShuffledScenes(NAMES, rank=rank, ranks=2), 3) for rank in (0, 1)]
+    whole = epoch(ShuffledScenes(NAMES), 3)
     assert [len(own) for own in both] == [3, 3]
     assert [both[k % 2][k // 2] for k in range(5)] == whole
     assert both[1][2] == whole[0]  # an odd number: the first scene comes twice
 
 
 def test_it_goes_on_where_it_stopped():
-    turns = Turns(NAMES)
+    turns = ShuffledScenes(NAMES)
     turns.set_epoch(1)
     iterator = iter(turns)
     seen = [next(iterator), next(iterator)]
-    again = Turns(NAMES)
+    again = ShuffledScenes(NAMES)
     again.load_state_dict(turns.state_dict())
-    assert seen + epoch(again, 1) == epoch(Turns(NAMES), 1)
-    assert epoch(again, 2) == epoch(Turns(NAMES), 2)
+    assert seen + epoch(again, 1) == epoch(ShuffledScenes(NAMES), 1)
+    assert epoch(again, 2) == epoch(ShuffledScenes(NAMES), 2)
     with pytest.raises(UserError, match="scenes"):
-        Turns(NAMES[:3]).load_state_dict(turns.state_dict())
+        ShuffledScenes(NAMES[:3]).load_state_dict(turns.state_dict())
 
 
 def test_what_is_missing_is_named(tmp_path):
@@ -69,7 +69,7 @@ def filmed(views: int, held_out: tuple[int, ...]) -> MultiViewBatch:
 )
 def test_training_on_some_of_the_views(given, kept):
     """Held-out views 3 and 9 stay whatever is chosen; the numbers are those of the others."""
-    batch = train_on(filmed(12, (3, 9)), given)
+    batch = select_training_views(filmed(12, (3, 9)), given)
     assert batch.images[:, 0, 0, 0, 0].tolist() == kept
     for part in (batch.masks[:, 0, 0, 0], batch.cameras.viewmats[:, 0, 0], batch.cameras.Ks[:, 0, 0]):
         assert part.tolist() == kept
@@ -79,4 +79,4 @@ def test_training_on_some_of_the_views(given, kept):
 @pytest.mark.parametrize("given", [0, 3, -1, [], [2], [-1]])
 def test_views_that_there_are_not(given):
     with pytest.raises(UserError, match="training_views"):
-        train_on(filmed(3, (1,)), given)
+        select_training_views(filmed(3, (1,)), given)

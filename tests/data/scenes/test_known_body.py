@@ -6,7 +6,7 @@ import torch
 
 from neuido.data.bodies.scene_files import VARIABLE
 from neuido.data.scenes.filmed_scene_module import VisualDataModule
-from neuido.data.scenes.known_body import cropped, load_known
+from neuido.data.scenes.known_body import crop_images, load_known_body
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import render_motion
 from neuido.models.inference.prepared_scene import prepare
@@ -21,7 +21,7 @@ def folder(tmp_path):
 
 
 def test_body_images_and_scene(folder):
-    scene = load_known(folder, dt=2.5e-4)
+    scene = load_known_body(folder, dt=2.5e-4)
     assert scene.name == "soft-cube" and scene.scene.dt == 2.5e-4 and scene.scene.clamps
     assert len(scene.body.x) == 125 and torch.all(scene.body.v == 0.1)
     assert scene.gaussians is None and scene.truth is None and scene.density == 1000.0
@@ -29,8 +29,8 @@ def test_body_images_and_scene(folder):
 
 
 def test_a_crop_moves_the_camera(folder):
-    batch = load_known(folder).batch
-    part = cropped(batch, [3, 5, 20, 15])
+    batch = load_known_body(folder).batch
+    part = crop_images(batch, [3, 5, 20, 15])
     assert part.images.shape[2:] == (10, 17, 3) and (part.cameras.width, part.cameras.height) == (17, 10)
     assert torch.equal(part.images, batch.images[:, :, 5:15, 3:20]) and torch.equal(part.masks, batch.masks[:, :, 5:15, 3:20])
     assert torch.allclose(batch.cameras.Ks[:, :2, 2] - part.cameras.Ks[:, :2, 2], torch.tensor([3.0, 5.0]).to(part.cameras.Ks))
@@ -39,11 +39,13 @@ def test_a_crop_moves_the_camera(folder):
 
 def test_particles_cover_what_the_body_covers(folder):
     """The drawn silhouette of a cube of particles against the same cube finely sampled, cut out of the image or not."""
-    source = load_known(folder)
+    source = load_known_body(folder)
     prepared = prepare(source, None)
     state = prepared.simulator.state
     alphas = render_motion(prepared, ParticleState(*(t[None] for t in state)), [0])[1][0]
-    part = prepare(source._replace(batch=cropped(source.batch, [2, 4, source.batch.images.shape[3], source.batch.images.shape[2]])), None)
+    part = prepare(
+        source._replace(batch=crop_images(source.batch, [2, 4, source.batch.images.shape[3], source.batch.images.shape[2]])), None
+    )
     again = render_motion(part, ParticleState(*(t[None] for t in state)), [0])[1][0]
     assert torch.allclose(again, alphas[:, 4:, 2:], atol=1e-4)
     side = float(source.body.volume.mean()) ** (1 / 3)
@@ -84,13 +86,13 @@ def test_the_data_module_finds_it(folder, monkeypatch):
 )
 def test_impossible_options_are_named(folder, options, word):
     with pytest.raises(UserError, match=word):
-        load_known(folder, **options)
+        load_known_body(folder, **options)
 
 
 def test_a_body_that_is_missing_is_named(folder):
     (folder / "drop" / "particles.npz").unlink()
     with pytest.raises(UserError, match=r"particles\.npz"):
-        load_known(folder)
+        load_known_body(folder)
 
 
 @pytest.mark.parametrize(("key", "value"), [("body", "mesh"), ("reconstruction", "x"), ("colour", "red")])
@@ -109,7 +111,7 @@ def test_the_silicone_video():
         pytest.skip("NEUIDO_DATA is not set")
     if not folder.is_dir():
         pytest.skip(f"{folder} is missing")
-    prepared = prepare(load_known(folder, dt=1.2e-4, crop=[120, 90, 298, 330]), None)
+    prepared = prepare(load_known_body(folder, dt=1.2e-4, crop=[120, 90, 298, 330]), None)
     assert prepared.frames == 13 and prepared.recorded_frames[0] == 0 and len(prepared.recorded_frames) == 13
     times = np.array(prepared.recorded_frames) * prepared.every * 1.2e-4
     assert np.abs(times - prepared.source.batch.times.numpy()).max() < 4e-4

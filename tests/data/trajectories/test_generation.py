@@ -141,7 +141,7 @@ def test_killed_run_leaves_no_broken_file(tmp_path):
     assert made
     assert len(made) < 15
     assert not (tmp_path / "index.json").exists()
-    assert all(storage.complete(path, (400, 64, 27)) for path in made)
+    assert all(storage.is_complete(path, (400, 64, 27)) for path in made)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from neuido.data.sampling import Order
+from neuido.data.sampling import SampleOrder
 from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
 from neuido.errors import UserError
 
@@ -85,16 +85,16 @@ def fit(data, root, *, epochs=3, stop=None, resume=None, every=1, **options) -> 
 
 @pytest.mark.parametrize(("rows", "samples"), [(100, 10), (103, 10), (7, 50)])
 def test_an_epoch_takes_each_sample_of_each_trajectory_once(rows, samples):
-    order = Order(torch.arange(rows) * 3, 4, samples, seed=1)
+    order = SampleOrder(torch.arange(rows) * 3, 4, samples, seed=1)
     for epoch in range(3):
         taken = torch.cat([order(epoch, step, CPU) for step in range(len(order))], dim=1)
         assert taken.shape == (4, rows)
         assert torch.equal(taken.sort(dim=1).values, (torch.arange(rows) * 3).expand(4, -1))
-    assert len(Order(torch.arange(rows), 4, samples, seed=1, drop_last=True)) == max(1, rows // samples)
+    assert len(SampleOrder(torch.arange(rows), 4, samples, seed=1, drop_last=True)) == max(1, rows // samples)
 
 
 def test_order_is_a_function_of_seed_epoch_and_step():
-    orders = [Order(torch.arange(500), 5, 20, seed=seed) for seed in (1, 1, 2)]
+    orders = [SampleOrder(torch.arange(500), 5, 20, seed=seed) for seed in (1, 1, 2)]
     steps = [(2, 3), (0, 0), (2, 4), (1, 24), (2, 3)]
     first = {step: orders[0](*step, CPU).clone() for step in steps}
     assert all(torch.equal(orders[1](*step, CPU), first[step]) for step in reversed(steps))

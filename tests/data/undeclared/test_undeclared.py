@@ -15,8 +15,8 @@ from neuido.data.undeclared import Case, make_undeclared
 from neuido.data.undeclared import random_bodies as bodies
 from neuido.data.undeclared.body_case import draw_kinds
 from neuido.data.undeclared.instruments import WRONG_NUISANCES
-from neuido.data.undeclared.motion import Motion, Solver, move
-from neuido.data.undeclared.random_effects import KINDS, OUTSIDE, Scales, draw_effect, entry_of
+from neuido.data.undeclared.motion import Motion, Solver, simulate_motion
+from neuido.data.undeclared.random_effects import KINDS, OUTSIDE, Scales, draw_effect, truth_entry
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY
 from neuido.physics.fem.meshing import follow
@@ -67,7 +67,7 @@ def test_recorded_motion_is_that_of_the_key(drag):
     seconds = float(t[-1])
     solver = Solver("same", scene.cells, scene.dt)
     for given, low, high in ((values, 0.9, 1.1), ({}, 10.0, 200.0)):
-        motion = move(
+        motion = simulate_motion(
             solver, scene, [r.body for r in experiment.recordings], law, given, seconds=seconds, interval=first.frame_interval / 2
         )
         x, _ = motion.at(t, 0)
@@ -148,7 +148,7 @@ def test_kinds_cover_the_vocabulary_and_what_is_outside_is_outside():
         drawn = draw_effect(kind, np.random.default_rng(0), scales)
         assert set(drawn.sizes) <= set(drawn.values) and any(drawn.values[s] for s in drawn.sizes)
         assert (set(drawn.values) <= known) == (kind in KINDS)
-        assert set(entry_of(drawn)["units"].values()) - {None}
+        assert set(truth_entry(drawn)["units"].values()) - {None}
         twice = drawn.times(2.0)
         assert all(twice.values[s] == 2 * drawn.values[s] for s in drawn.sizes)
 
@@ -166,8 +166,8 @@ def thrown(values, *, velocity=(0.5, 0.0, 0.0), spin=(0.0, 0.0, 0.0), scene=SCEN
     axis = (np.arange(4) - 1.5) * 0.04
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     launch = bodies.Launch(np.eye(3), np.array([0.4, 0.5, 0.5]), np.array(velocity), np.zeros((3, 3)))
-    body = bodies.launched(points, 0.04**3, launch, spin=np.array(spin))
-    return move(Solver("same", scene.cells, scene.dt), scene, [body], LAW, values, seconds=seconds, interval=0.01)
+    body = bodies.launched_body(points, 0.04**3, launch, spin=np.array(spin))
+    return simulate_motion(Solver("same", scene.cells, scene.dt), scene, [body], LAW, values, seconds=seconds, interval=0.01)
 
 
 def test_dry_drag_brakes_at_a_constant_rate():

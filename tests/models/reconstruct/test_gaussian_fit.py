@@ -16,8 +16,8 @@ from neuido.commands.reconstruct import reconstruct
 from neuido.data import cameras as convert
 from neuido.data.formats import nerfstudio
 from neuido.data.scenes.film_options import Film
-from neuido.data.scenes.filmed_scene import load_views, load_visual, read_body, read_setting, read_truth
-from neuido.data.scenes.masks import from_background
+from neuido.data.scenes.filmed_scene import load_views, load_visual_scene, read_body, read_setting, read_truth
+from neuido.data.scenes.masks import masks_from_background
 from neuido.data.scenes.synthetic import make_scenes
 from neuido.errors import UserError
 from neuido.models.reconstruct.gaussian_fit import ReconstructModule
@@ -63,7 +63,7 @@ def test_figures(box):
 
 
 def test_files_are_what_stage_two_reads(box):
-    visual = load_visual(box)
+    visual = load_visual_scene(box)
     truth = read_truth(box)
     assert visual.name == "Box" and visual.density == 1200.0 and visual.scene.cells == 16
     assert visual.model["elasticity"]["young"] == 1e5  # the declared one
@@ -83,7 +83,7 @@ def test_files_are_what_stage_two_reads(box):
     with torch.no_grad():
         x = simulator.rollout(20, *material(truth.law["elasticity"], truth.law["plasticity"]), every=10).x
     assert 1e4 * float(chamfer_distance(x[-1], truth.x[-1])) < 12
-    fewer = load_visual(box, frame_step=2, views=["0", "2"], width=32)
+    fewer = load_visual_scene(box, frame_step=2, views=["0", "2"], width=32)
     assert fewer.batch.images.shape == (2, 2, 32, 32, 3) and len(fewer.truth.x) == 2
 
 
@@ -139,7 +139,7 @@ def test_own_video(box, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["reconstruct", str(tmp_path / "video"), *place, *options])
     assert stop.value.code == 0, capsys.readouterr().err
-    visual = load_visual(tmp_path / "video")
+    visual = load_visual_scene(tmp_path / "video")
     truth = read_truth(box)
     assert visual.truth is None and visual.density == 1000.0
     torch.testing.assert_close(visual.batch.cameras.viewmats, batch.cameras.viewmats, rtol=0, atol=1e-5)
@@ -155,10 +155,10 @@ def test_own_video(box, tmp_path, capsys):
 def test_background_must_be_plain():
     noise = torch.rand(2, 1, 16, 16, 3, generator=torch.Generator().manual_seed(0))
     with pytest.raises(UserError, match="give an alpha channel"):
-        from_background(noise)
+        masks_from_background(noise)
     plain = torch.full((2, 1, 16, 16, 3), 0.25)
     plain[:, :, 4:9, 5:9] = torch.tensor([0.9, 0.2, 0.2])
-    colour, masks = from_background(plain)
+    colour, masks = masks_from_background(plain)
     assert colour.tolist() == [0.25, 0.25, 0.25] and masks.sum().item() == 2 * 20
 
 
@@ -173,17 +173,17 @@ def test_errors(box, tmp_path):
     fails("recording = 'throw'", recording="throw")
     copy = shutil.copytree(box, tmp_path / "copy")
     with pytest.raises(UserError, match="run `neuido reconstruct"):
-        load_visual(copy, reconstruction=tmp_path / "nowhere")
+        load_visual_scene(copy, reconstruction=tmp_path / "nowhere")
     (copy / "reconstruction" / "body.npz").write_bytes(b"PK\x03\x04")
-    with pytest.raises(UserError, match=r"body\.npz is no archive"):
-        load_visual(copy)
+    with pytest.raises(UserError, match=r"body\.npz is not a valid archive"):
+        load_visual_scene(copy)
     np.savez(copy / "reconstruction" / "body.npz", x0=np.zeros((4, 3)), v0=np.zeros((5, 3)), volume=np.ones(4))
     with pytest.raises(UserError, match="one length"):
         read_body(copy / "reconstruction" / "body.npz")
     text = (copy / "reconstruction" / "scene.yaml").read_text()
     (copy / "reconstruction" / "scene.yaml").write_text(text + "colour: red\n")
     with pytest.raises(UserError, match="unknown key 'colour'"):
-        load_visual(copy)
+        load_visual_scene(copy)
     with pytest.raises(UserError, match="max_gaussians = 3"):
         ReconstructModule(initial_gaussians=4, max_gaussians=3)
     assert not (tmp_path / "out" / "report.json").exists()
