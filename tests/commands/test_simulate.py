@@ -70,7 +70,7 @@ def test_help_of_a_scene(capsys, scene):
         (["{scene}", "--out", "{new}", "--law", "absent.safetensors"], ["absent.safetensors", "neuido predict"]),
         (["bouncy-bal", "--out", "{new}"], ["bouncy-bal", "bouncy-ball"]),
         (["six_small", "--out", "{new}"], ["several scenes", "neuido scenes --config six_small"]),
-        (["absent.yaml", "--out", "{new}"], ["no scene file absent.yaml"]),
+        (["absent.yaml", "--out", "{new}"], ["the scene file absent.yaml is missing"]),
         (["{scene}", "--out", "{new}", "--stepz", "3"], ["--stepz", "did you mean 'steps'?"]),
     ],
 )

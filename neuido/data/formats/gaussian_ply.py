@@ -35,7 +35,7 @@ def read_gaussian_vertices(path: Path) -> np.ndarray:
     if not path.is_file():
         raise UserError(f"the PLY file {path} is missing")
     length = _check_header(path)
-    with parser_errors(path, "readable PLY file with vertices"), path.open("rb") as stream:
+    with parser_errors(path, "PLY file with vertices"), path.open("rb") as stream:
         header = stream.read(length)
         stream.seek(0)
         if not header.isascii():  # plyfile accepts ASCII comments alone

@@ -45,11 +45,11 @@ def read(path: str | os.PathLike, format: str = "auto", *, recording: str | None
     """
     folder = Path(path).expanduser()
     if not folder.exists():
-        raise UserError(f"there is no folder {folder}")
+        raise UserError(f"the folder {folder} is missing")
     if format == "auto":
         format = detect(folder)
     if format not in MARKS:
-        raise UserError(f"format = {format!r} is not known; one of auto, {', '.join(FORMATS)}")
+        raise UserError(f"format = {format!r} is unknown: choose from auto, {', '.join(FORMATS)}")
     if frame_interval is not None and not frame_interval > 0:
         raise UserError(f"frame_interval must be positive, got {frame_interval}")
     return READERS[format](folder, recording=recording, frame_interval=frame_interval)

@@ -165,7 +165,7 @@ def test_scene_from_a_file(ball_folder, monkeypatch):
         ({"body": {"particles": "../ball.npz"}}, "leaves the data folder"),
         ({"body": {"particles": "/etc/hostname"}}, "leaves the data folder"),
         ({"body": {"particles": "bowl.npz"}}, "has no file bowl.npz"),
-        ({"body": {"particles": "scene.yaml"}}, "no archive"),
+        ({"body": {"particles": "scene.yaml"}}, "not a valid archive"),
         ({"body": {"shape": "cube", "lenght": 0.1}}, "lenght"),
         ({"body": {"shape": "torus"}}, "torus"),
         ({"body": {"shape": "ball", "radius": 0.1}}, "centre"),

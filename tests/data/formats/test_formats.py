@@ -206,7 +206,7 @@ def test_malformed_transforms(tmp_path, change, message):
 
 def test_other_formats_say_what_is_missing(tmp_path):
     made(tmp_path, "neuma")
-    with pytest.raises(UserError, match="give the option frame_interval"):
+    with pytest.raises(UserError, match="give frame_interval"):
         read(tmp_path / "neuma")
     ball = samples.neuma_synthetic(tmp_path / "BouncyBall", S)
     assert float(read(ball).times[1]) == 1e-3
@@ -237,7 +237,7 @@ def test_other_formats_say_what_is_missing(tmp_path):
     with pytest.raises(UserError, match=r"C0787_101.png is missing"):
         read(real)
     samples.dump(real / "dynamic" / "sequences" / "dog" / "1.json", {"C0733": ["a.jpg"]})
-    with pytest.raises(UserError, match="one of bun/0, dog/1"):
+    with pytest.raises(UserError, match="choose from bun/0, dog/1"):
         read(real)
 
 

@@ -41,13 +41,13 @@ def test_comment_that_is_not_ascii(tmp_path, text):
 @pytest.mark.parametrize("column", ["x", "f_dc_1", "opacity", "rot_0"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_rows_that_are_not_finite_are_left_out_and_named(tmp_path, column, value):
-    def spoil(vertices):
+    def set_rows(vertices):
         vertices[column][[1, 3]] = value
 
-    path = write(tmp_path / "a.ply", change=spoil)
+    path = write(tmp_path / "a.ply", change=set_rows)
     with pytest.warns(UserWarning, match="2 of 5 Gaussians contain a NaN or an infinity and are dropped: rows 1, 3"):
         assert len(read_gaussian_vertices(path)) == 3
-    refused(write(tmp_path / "b.ply", change=lambda v: v[column].fill(value)), "none of its 5 Gaussians is finite")
+    refused(write(tmp_path / "b.ply", change=lambda v: v[column].fill(value)), "all 5 Gaussians contain a NaN or an infinity")
 
 
 def test_normals_may_be_anything(tmp_path):
@@ -62,18 +62,18 @@ def test_other_kinds_of_files_are_named(tmp_path):
     refused(write(tmp_path / "b.ply", names=[n for n in column_names(0) if n not in ("scale_2",)]), "2D Gaussians")
     refused(write(tmp_path / "c.ply", names=["x", "y", "z"]), "not a 3DGS file: its vertices lack the columns f_dc_0")
     refused(write(tmp_path / "d.ply", names=[*column_names(0), "f_rest_0"]), "1 f_rest columns")
-    refused(write(tmp_path / "e.ply", rows=0), "holds no Gaussian")
+    refused(write(tmp_path / "e.ply", rows=0), "contains no Gaussian")
     whole = write(tmp_path / "f.ply").read_bytes()
     for name, content, match in (
         ("g.ply", gzip.compress(whole), "not a PLY file .a gzip file"),
         ("h.ply", np.arange(64, dtype="f4").tobytes(), "perhaps a .splat file"),
-        ("i.ply", whole[:40], "its header has no end"),
-        ("j.ply", whole[:-9], "not a valid readable PLY file with vertices"),
+        ("i.ply", whole[:40], "its header lacks end_header"),
+        ("j.ply", whole[:-9], "not a valid PLY file with vertices"),
         ("k.ply", whole.replace(b"vertex 5", b"vertex 500000"), "is truncated: element vertex has 500000 rows"),
         ("l.ply", whole.replace(b"vertex 5", b"vertex 99999999999"), "NEUIDO_MAX_PARTICLES"),
-        ("m.ply", whole.replace(b"vertex 5", b"vertex -5"), "count '-5', no whole number"),
-        ("n.ply", whole.replace(b"element vertex", b"element points"), "not a valid readable PLY file with vertices"),
-        ("o.ply", whole.replace(b"float x", b"quark x"), "not a valid readable PLY file with vertices"),
+        ("m.ply", whole.replace(b"vertex 5", b"vertex -5"), "count '-5'; it must be a whole number"),
+        ("n.ply", whole.replace(b"element vertex", b"element points"), "not a valid PLY file with vertices"),
+        ("o.ply", whole.replace(b"float x", b"quark x"), "not a valid PLY file with vertices"),
     ):
         (tmp_path / name).write_bytes(content)
         refused(tmp_path / name, match)

@@ -54,7 +54,7 @@ def test_gaussians(number, count):
 
 
 def test_compressed_gaussians():
-    with pytest.raises(UserError, match=r"compressed PLY file .*export the Gaussians uncompressed"):
+    with pytest.raises(UserError, match=r"compressed PLY file .*export the Gaussians as an uncompressed .ply"):
         read_gaussian_vertices(next(case(16).glob("*.ply")))
 
 

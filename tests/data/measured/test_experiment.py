@@ -192,7 +192,7 @@ def wrong(key: str, change):
         (wrong("track", lambda k: k + 1), r"track must lie in -1..124, got 0..125"),
         (wrong("track", lambda k: k[:2]), "track has the shape"),
         (wrong("track", lambda k: k.astype(float)), "track must hold whole numbers"),
-        (wrong("track", lambda k: k.astype(object)), "no archive of arrays"),
+        (wrong("track", lambda k: k.astype(object)), "not a valid archive of arrays"),
     ],
 )
 def test_malformed_particles(folder, change, message):
@@ -214,7 +214,7 @@ def test_what_is_no_yaml(folder, content):
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"\x93NUMPY", b"text"])
 def test_particles_that_are_no_archive(folder, content):
     (folder / "drop" / "particles.npz").write_bytes(content)
-    with pytest.raises(UserError, match="no archive"):
+    with pytest.raises(UserError, match="not a valid archive"):
         read_experiment(folder)
 
 

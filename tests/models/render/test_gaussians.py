@@ -92,7 +92,7 @@ def test_ply_is_read_as_3dgs_writes_it(tmp_path):
 
 
 def test_ply_errors_name_the_file_and_what_it_lacks(tmp_path):
-    with pytest.raises(UserError, match=r"no PLY file .*none\.ply"):
+    with pytest.raises(UserError, match=r"the PLY file .*none\.ply is missing"):
         load_ply(tmp_path / "none.ply")
     (tmp_path / "text.ply").write_text("hello")
     with pytest.raises(UserError, match=r"text\.ply is not a PLY file"):
