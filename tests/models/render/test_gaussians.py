@@ -99,7 +99,7 @@ def test_ply_errors_name_the_file_and_what_it_lacks(tmp_path):
         load_ply(tmp_path / "text.ply")
     vertices = np.zeros(2, [("x", "f4"), ("y", "f4"), ("z", "f4")])
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "points.ply"))
-    with pytest.raises(UserError, match="not a 3DGS file: its vertices lack f_dc_0"):
+    with pytest.raises(UserError, match="not a 3DGS file: its vertices lack the columns f_dc_0"):
         load_ply(tmp_path / "points.ply")
     with pytest.raises(UserError, match="holds one frame"):
         one = gaussians()
