@@ -1,4 +1,4 @@
-"""What a collider does to the velocity that meets it: kinds of contact, and their Warp functions with adjoints.
+"""Kinds of contact: Warp functions for the velocity of a node inside a collider, and their adjoints.
 
 `sticky` sets the velocity to zero, `slip` removes its normal part, `separate` removes an inward normal part and brakes the tangential one
 with Coulomb's friction (Stomakhin et al. 2013, eq. 8).
@@ -11,13 +11,15 @@ import warp as wp
 
 STICKY, SLIP, SEPARATE = 1, 2, 3
 CONTACTS = {"sticky": STICKY, "slip": SLIP, "separate": SEPARATE}
-"""Numbers of the kinds of contact in the tables of the kernels; 0 is none."""
+"""Number of each kind of contact in the tables of the kernels; 0 means no collider."""
 
 
 def functions(real: type, module: str) -> SimpleNamespace:
-    """Return the Warp functions `contact`, `contact_adjoint`, `lose` and `normal_of` of one scalar type, for a Warp module.
+    """Return the Warp functions `contact`, `contact_adjoint`, `damp_contact` and `normal_of`.
 
-    `lose` reads stick and restitution [1/s] from columns 9 and 10 of `Effects.force_table`.
+    Args:
+        real: `wp.float32` or `wp.float64`.
+        module: Name of the Warp module that the functions belong to.
     """
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -25,7 +27,10 @@ def functions(real: type, module: str) -> SimpleNamespace:
 
     @func
     def contact(v: vec3, n: vec3, kind: int, friction: real):
-        """Velocity of a node inside a collider, from its velocity before."""
+        """Return the velocity of a node inside a collider after contact, from the velocity v before.
+
+        n is the unit normal that points out of the collider.
+        """
         vn = wp.dot(v, n)
         out = v
         if kind == wp.static(STICKY):
@@ -44,7 +49,7 @@ def functions(real: type, module: str) -> SimpleNamespace:
 
     @func
     def contact_adjoint(v: vec3, n: vec3, kind: int, friction: real, a: vec3):
-        """Adjoint of `contact`: that of v (first three) and of the friction (last)."""
+        """Return the adjoints of v (first three numbers) and of the friction (last) from the adjoint a of the result of `contact`."""
         vn = wp.dot(v, n)
         out = vec4(a[0], a[1], a[2], real(0.0))
         if kind == wp.static(STICKY):
@@ -69,8 +74,11 @@ def functions(real: type, module: str) -> SimpleNamespace:
         return out
 
     @func
-    def lose(v: vec3, n: vec3, dt: real, force: wp.array2d(dtype=real), row: int):
-        """Stick and restitution: what a node in a collider keeps of its velocity."""
+    def damp_contact(v: vec3, n: vec3, dt: real, force: wp.array2d(dtype=real), row: int):
+        """Return the velocity of a node in contact after the effects stick and restitution.
+
+        `force` is `Effects.force_table`, with the two rates [1/s] in columns 9 and 10.
+        """
         out = wp.exp(-dt * force[row, 9]) * v
         vn = wp.dot(out, n)
         if vn > real(0.0):
@@ -79,6 +87,7 @@ def functions(real: type, module: str) -> SimpleNamespace:
 
     @func
     def normal_of(plane: vec4):
+        """Return the normal of a plane, the first three numbers of its row."""
         return vec3(plane[0], plane[1], plane[2])
 
-    return SimpleNamespace(contact=contact, contact_adjoint=contact_adjoint, lose=lose, normal_of=normal_of)
+    return SimpleNamespace(contact=contact, contact_adjoint=contact_adjoint, damp_contact=damp_contact, normal_of=normal_of)

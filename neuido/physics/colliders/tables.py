@@ -1,8 +1,7 @@
-"""Colliders, walls and clamps of the scenes as the tables that the kernels read.
+"""Tables of the colliders, walls and clamps of scenes, as the kernels read them.
 
-A collider acts on the grid nodes inside it, in the order in which it is listed, the walls last: `sticky` sets the velocity
-to zero, `slip` removes its normal part, `separate` removes an inward normal part and brakes the tangential one with
-Coulomb's friction (Stomakhin et al. 2013, eq. 8). Friction is a differentiable input of the rollout.
+Colliders act on the grid nodes inside them one after the other, in the order of the scene and the walls last. The kinds of contact are
+described in `contact`. Friction is a differentiable input of the rollout.
 """
 
 import math
@@ -17,25 +16,25 @@ from neuido.physics.colliders.contact import CONTACTS
 from neuido.types import Box, Plane, Scene
 
 NEAR = 1e-4
-"""Cells within which a node lies on a face: nodes are placed in the simulation's own precision."""
-NEAREST = 0.5 - NEAR
-"""Cells beyond its faces in which a clamp holds nodes, so that each face lies on the nearest layer.
+"""Distance in cells within which a node counts as lying on a face, since node positions are rounded to the simulation's precision."""
+CLAMP_MARGIN = 0.5 - NEAR
+"""Distance in cells beyond the faces of a clamp in which nodes are held, so that the nearest layer of nodes to each face is held.
 
-Where only the nodes inside are held, the last layer may be almost a cell from the face: the material next to it feels that layer by the
-tail of its stencil alone and slides out, and a beam is 9 % too soft at 20 cells to its length (2.6 % with the nearest layer).
+If only nodes inside the box were held, the last layer could be almost a cell away from the face. The material there would be held by the
+tail of its stencil alone and slide out: a beam of 20 cells along its length would be 9 % too soft (with this margin: 2.6 %).
 """
 
 
 class ColliderTable(NamedTuple):
-    """K planes for each of S scenes; rows that a scene does not use have kind 0."""
+    """The planes of S scenes, K rows each; unused rows have kind 0."""
 
     plane: Tensor
-    """Unit normal n that points to the material, and the offset w: a node at x is inside where n x <= w, (S, K, 4).
+    """Unit normal n that points to the material, and offset w [m]: a node at x is inside the collider if n x <= w, (S, K, 4).
 
-    A node that lies on the plane to 1e-4 of a cell counts as inside; the offset of an unused row is -inf.
+    The offset includes `NEAR`, so that a node on the plane counts as inside. The offset of an unused row is -inf.
     """
     kind: Tensor
-    """1 sticky, 2 slip, 3 separate, 0 none, (S, K) int32."""
+    """Kind of contact: 1 sticky, 2 slip, 3 separate, 0 unused row, (S, K) int32."""
     friction: Tensor
     """Coulomb's coefficient [-], (S, K)."""
 
@@ -44,7 +43,7 @@ def planes_of(scene: Scene) -> tuple[Plane, ...]:
     """Return the colliders of a scene followed by its six walls.
 
     Raises:
-        UserError: Unknown contact, zero normal, negative or NaN friction.
+        UserError: An unknown kind of contact, a normal without length, or a friction that is negative or NaN.
     """
     planes = list(scene.colliders)
     if scene.walls is not None:
@@ -58,15 +57,19 @@ def planes_of(scene: Scene) -> tuple[Plane, ...]:
         if plane.contact not in CONTACTS:
             raise UserError(f"contact is {plane.contact!r}; choose one of {', '.join(CONTACTS)}")
         if not plane.friction >= 0.0:
-            raise UserError(f"friction is {plane.friction}; it must be zero or more")
+            raise UserError(f"friction is {plane.friction}; give zero or more")
         length = math.hypot(*plane.normal)
         if not (length > 0.0 and math.isfinite(length)):
-            raise UserError(f"normal of a collider is {list(plane.normal)}; it must have a length")
+            raise UserError(f"normal of a collider is {list(plane.normal)}; give a vector that is not zero")
     return tuple(planes)
 
 
 def collider_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.device) -> ColliderTable:
-    """Return the planes of all scenes, padded to the largest number of them."""
+    """Collect the planes of all scenes in one table, padded to the largest number of planes in a scene.
+
+    Raises:
+        UserError: As `planes_of`.
+    """
     rows = [planes_of(scene) for scene in scenes]
     count = max(1, *(len(row) for row in rows))
     plane = torch.zeros(len(scenes), count, 4, dtype=torch.float64)
@@ -85,29 +88,38 @@ def collider_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.de
 
 
 def clamp_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Lower and upper corners of what the clamps hold of the grid, (S, B, 3) each [m]; unused rows hold an empty box."""
+    """Collect the boxes in which clamps hold grid nodes, `CLAMP_MARGIN` included.
+
+    Returns:
+        Lower and upper corners [m], (S, B, 3) each, for up to B clamps per scene; unused rows are empty boxes.
+    """
     count = max(len(scene.clamps) for scene in scenes)
     lower = torch.full((len(scenes), count, 3), torch.inf, dtype=torch.float64)
     upper = torch.full((len(scenes), count, 3), -torch.inf, dtype=torch.float64)
     for s, scene in enumerate(scenes):
         for b, box in enumerate(scene.clamps):
-            lower[s, b], upper[s, b] = corners(box, NEAREST * scene.dx)
+            lower[s, b], upper[s, b] = box_corners(box, CLAMP_MARGIN * scene.dx)
     return lower.to(device, dtype), upper.to(device, dtype)
 
 
-def corners(box: Box, margin: float) -> tuple[Tensor, Tensor]:
-    """Lower and upper corner (3,) [m], float64, of a box with a margin [m]."""
+def box_corners(box: Box, margin: float) -> tuple[Tensor, Tensor]:
+    """Return the lower and upper corner of a box enlarged by `margin` [m], (3,) float64 each."""
     return torch.tensor(box.lower, dtype=torch.float64) - margin, torch.tensor(box.upper, dtype=torch.float64) + margin
 
 
 def inside_box(x: Tensor, box: Box, *, name: str) -> Tensor:
-    """Which particles lie in a box, (P,) bool, from x (P, 3) [m].
+    """Return which particles lie in a box, (P,) bool.
+
+    Args:
+        x: Positions [m], (P, 3).
+        box: The box.
+        name: What the box belongs to, for the error.
 
     Raises:
-        UserError: The box picks no particle.
+        UserError: No particle lies in the box.
     """
-    lower, upper = (corner.to(x.device) for corner in corners(box, 0.0))
+    lower, upper = (corner.to(x.device) for corner in box_corners(box, 0.0))
     picked = ((x >= lower) & (x <= upper)).all(dim=-1)
     if not bool(picked.any()):
-        raise UserError(f"{name} {[list(box.lower), list(box.upper)]} picks no particle; move or enlarge the box")
+        raise UserError(f"{name} {[list(box.lower), list(box.upper)]} contains no particle; move or enlarge the box")
     return picked

@@ -1,6 +1,7 @@
-"""From the parameters of the effects to the tables that the kernels and the torch twin read: products with the base law's moduli.
+"""Tables of coefficients that the kernels of the effects read, computed from `Effects` and the moduli of the base law.
 
-A table has one row for each scene. What each column means is said once, here; `effect_kernels` and `constitutive` follow it.
+A table has one row per scene. `Tables` and `Layout` define the columns for the kernels (`stress_kernels`, `history_kernels`,
+`flow_kernels`) and for the implementation in torch (`constitutive`).
 """
 
 import math
@@ -17,74 +18,75 @@ from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, Sta
 from neuido.types import Particles
 
 NO_FLOW, VON_MISES, DRUCKER_PRAGER = classical_kernels.IDENTITY, classical_kernels.VON_MISES, classical_kernels.DRUCKER_PRAGER
-"""Kinds of plastic flow that an effect takes over from the base law."""
+"""Kinds of plastic flow that the kernels of the effects compute in place of the base law."""
 
 BAND = (0.5, 200.0)
-"""Frequencies [Hz] over which `hysteresis` has its loss factor."""
+"""Band of frequencies [Hz] in which `hysteresis` has a constant loss factor."""
 BRANCHES, MARGIN = 6, 1.8
-"""Its Maxwell branches, and how far (in ln of the time) their times reach beyond the band."""
+"""Number of Maxwell branches of `hysteresis`, and how far their relaxation times extend beyond the band, in ln of the time."""
 
 
 class Layout(NamedTuple):
-    """Columns of the history of a particle, (P, width): 6 for each branch, alpha, 6 of the backstress, e_max.
+    """Columns of the history of each particle, (P, width): 6 per Maxwell branch, alpha, 6 for the backstress, e_max.
 
     Symmetric matrices are stored as xx, yy, zz, xy, xz, yz.
     """
 
     branches: int = 0
-    """Maxwell branches."""
+    """Number of Maxwell branches."""
     alpha: bool = False
-    """Whether the accumulated plastic strain is kept."""
+    """Whether the accumulated plastic strain alpha is stored."""
     backstress: bool = False
-    """Whether the backstress is kept."""
+    """Whether the backstress is stored."""
     e_max: bool = False
-    """Whether the largest strain so far is kept."""
+    """Whether e_max, the largest norm of the deviatoric Hencky strain so far, is stored."""
 
     @property
-    def at_alpha(self) -> int:
+    def alpha_column(self) -> int:
         """Column of alpha, -1 where absent."""
         return 6 * self.branches if self.alpha else -1
 
     @property
-    def at_backstress(self) -> int:
+    def backstress_column(self) -> int:
         """First column of the backstress, -1 where absent."""
         return 6 * self.branches + self.alpha if self.backstress else -1
 
     @property
-    def at_e_max(self) -> int:
-        """Column of the largest strain, -1 where absent."""
+    def e_max_column(self) -> int:
+        """Column of e_max, -1 where absent."""
         return 6 * self.branches + self.alpha + 6 * self.backstress if self.e_max else -1
 
     @property
     def width(self) -> int:
+        """Number of columns."""
         return 6 * self.branches + self.alpha + 6 * self.backstress + self.e_max
 
 
 class Tables(NamedTuple):
-    """What the effects of the material need, S rows each; None where nothing needs it."""
+    """Coefficients of the effects that act on the law, one row per scene; a table is None if no effect needs it."""
 
     layout: Layout
     material: Tensor | None
-    """(S, 9): mu k of `strain_stiffening`, mu c of `second_invariant`, 2 mu r of `tension_compression`, `fibre` [Pa], its unit direction
-    x, y, z, the s of damage [-], and the k of `strain_stiffening`, one over the I1bar - 3 at which the body locks [-]."""
+    """(S, 9): mu k of `strain_stiffening`, mu c of `second_invariant`, 2 mu r of `tension_compression`, c of `fibre` [Pa each], the unit
+    direction of the fibres x, y, z [-], s of damage (`softening` without yield) [-], and k of `strain_stiffening` [-]."""
     spectral: bool
     """Whether the stress needs principal strains (`tension_compression`)."""
     branches: Tensor | None
-    """(S, B, 2): 2 g mu [Pa] and time [s] of each Maxwell branch."""
+    """(S, B, 2): 2 g mu [Pa] and relaxation time [s] of each Maxwell branch, with g the branch's share of the shear modulus."""
     flow: Tensor | None
-    """(S, 8): 2 mu [Pa], 1/yield stress [1/Pa] (0: none), H [Pa], s, H_k [Pa], eta [Pa s] of `rate_yield`, and for Drucker and Prager's
-    cone its slope in Hencky strain and the volumetric strain of its tip at full stiffness."""
+    """(S, 8): 2 mu [Pa], 1/yield stress [1/Pa] (0: no yield), H of `hardening` [Pa], s of `softening` [-], H_k of `kinematic_hardening`
+    [Pa], eta of `rate_yield` [Pa s], slope of the Drucker-Prager cone in Hencky strain [-], volumetric strain of the cone's tip [-]."""
     kinds: tuple[int, ...]
-    """Kind of the flow of each scene."""
+    """Kind of plastic flow of each scene: `NO_FLOW`, `VON_MISES` or `DRUCKER_PRAGER`."""
     stiffening: Tensor
-    """What branches, fibres and the like add to the P-wave modulus at rest [Pa], (S,)."""
+    """What the effects add to the P-wave modulus at rest [Pa], (S,); it bounds the time step."""
 
 
 def shear_modulus(law: ElasticLaw) -> Tensor:
-    """Return the law's shear modulus at F = I [Pa], (S,) of the law.
+    """Return the shear modulus of a law at F = I [Pa], one value per scene of the law, differentiable in the law's tensors.
 
-    That of a classical law comes from its parameters. Any other law is asked: the mean of central differences of tau_ij in three pure
-    shears of 1e-4 (1e-2 in float32), differentiable in the law's tensors.
+    For a classical law it is computed from the parameters. For any other law it is the mean of central differences of tau_ij in three
+    pure shears of 1e-4 (1e-2 in float32).
     """
     tensors = law.tensors()
     if isinstance(law, (FixedCorotated, Sigma, NeoHookean, StackedElastic)):
@@ -104,17 +106,17 @@ def shear_modulus(law: ElasticLaw) -> Tensor:
 
 
 def hysteresis_spectrum(loss: Tensor) -> tuple[Tensor, Tensor]:
-    """Six Maxwell branches whose loss factor is nearly constant over `BAND`.
+    """Choose six Maxwell branches whose common loss factor is nearly constant over the frequencies `BAND`.
 
-    The relaxation spectrum of a material of constant loss factor eta is h(T) = (2 eta / pi) G'(1/T), with G' the storage modulus, which
-    must rise as the power (2/pi) atan(eta) of the frequency (Kramers and Kronig; Findley, Lai and Onaran, Creep and Relaxation of
-    Nonlinear Viscoelastic Materials, 1976). Equal weights, which leave that rise out, fall 16-37 % short at eta = 0.1.
+    A material of constant loss factor eta has the relaxation spectrum h(T) = (2 eta / pi) G'(1/T). The storage modulus G' rises as the
+    power (2/pi) atan(eta) of the frequency, by the Kramers-Kronig relations. Equal weights, which neglect this rise, give a loss factor
+    that is 16-37 % too small at eta = 0.1. Source: Findley, Lai and Onaran, Creep and Relaxation of Nonlinear Viscoelastic Materials, 1976.
 
     Args:
-        loss: eta [-], (S,).
+        loss: Loss factor eta [-], (S,).
 
     Returns:
-        Weights as shares of the relaxed shear modulus [-], (S, 6), and times [s], (6,).
+        Weights as shares of the relaxed shear modulus [-], (S, 6), and relaxation times [s], (6,).
     """
     low, high = (math.log(1 / (2 * math.pi * f)) for f in reversed(BAND))
     at = torch.linspace(low - MARGIN, high + MARGIN, BRANCHES, dtype=loss.dtype, device=loss.device)
@@ -125,7 +127,7 @@ def hysteresis_spectrum(loss: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _kinds(plasticity: PlasticLaw | None, scene_count: int) -> tuple[int, ...] | None:
-    """Return the kind of each scene's base plasticity, or None for a law that is not a classical one."""
+    """Return the kind of each scene's base plasticity; None for a law that is not classical."""
     if plasticity is None or plasticity.identity:
         return (NO_FLOW,) * scene_count
     if not hasattr(plasticity, "scene_laws"):
@@ -142,7 +144,7 @@ def _flow(
     like: Tensor,
     mu: Tensor,
 ) -> tuple[Tensor | None, tuple[int, ...]]:
-    """Return the table of the flow and its kinds, or None where the base law does it all."""
+    """Return `Tables.flow` and `Tables.kinds`; None if the base law alone computes the plastic flow."""
     base = _kinds(plasticity, count)
     own = {name: getattr(effects, name) for name in ("hardening", "softening", "kinematic_hardening", "rate_yield")}
     given = [name for name, value in own.items() if value is not None]
@@ -151,12 +153,14 @@ def _flow(
     if base is None:
         if of_yield or effects.cohesion is not None or given:
             name = "yield_inverse" if of_yield else "cohesion" if effects.cohesion is not None else given[0]
-            raise UserError(f"{name} needs a classical plastic law or none, not {type(plasticity).__name__}")
+            raise UserError(
+                f"{name} needs a classical plastic law or none, not {type(plasticity).__name__}; change the law or leave {name} out"
+            )
         return None, ()
     if effects.cohesion is not None and any(kind != DRUCKER_PRAGER for kind in base):
-        raise UserError("cohesion needs a declared drucker_prager plasticity: it moves the tip of its cone")
+        raise UserError("cohesion needs a declared drucker_prager plasticity, whose cone it moves; declare it or leave cohesion out")
     if of_yield and any(kind != NO_FLOW for kind in base):
-        raise UserError("yield_inverse needs an elastic body; the declared plasticity yields already")
+        raise UserError("yield_inverse needs an elastic body, and the declared plasticity yields already; leave one of them out")
     if given and any(kind == DRUCKER_PRAGER for kind in base):
         raise UserError(f"{given[0]} needs a declared von_mises plasticity, or an elastic body")
     flowing = [name for name in given if name != "softening"]
@@ -174,7 +178,7 @@ def _flow(
     is_cone = torch.tensor([kind == DRUCKER_PRAGER for kind in base], device=like.device)
     inverse = torch.where(is_mises, 1 / (2 * mu * torch.where(is_mises, radius, 1.0)), column["yield_inverse"])
     slope = torch.where(is_cone, radius, 0.0)
-    # Mohr and Coulomb's tip, tr tau = 3 c cot phi, on the cone |dev tau| = -alpha (tr tau - 3 c cot phi)
+    # the tip of the Mohr-Coulomb cone |dev tau| = -alpha (tr tau - 3 c cot phi) lies at tr tau = 3 c cot phi
     bulk3 = 3 * elasticity.modulus().to(like).expand(count) - 4 * mu
     a = torch.where(is_cone, radius, 0.1 * bulk3 / mu) * 2 * mu / bulk3 / math.sqrt(2 / 3)
     sine = 3 * a / (2 + a)
@@ -192,25 +196,25 @@ def tables(
     *,
     shear: Tensor | float | None = None,
 ) -> Tables:
-    """Return the tables of the effects of the material, differentiable in the effects and in the parameters of the base laws.
+    """Compute the tables of the effects that act on the law, differentiable in the effects and in the parameters of the base laws.
 
     Args:
         effects: The effects.
-        elasticity: Base law.
-        plasticity: Base law, or None.
-        count: Scenes S.
-        like: Type and device.
-        shear: The base law's shear modulus [Pa], () or (S,); `shear_modulus(elasticity)` where absent.
+        elasticity: Elastic base law.
+        plasticity: Plastic base law, or None.
+        count: Number of scenes S.
+        like: A tensor of the dtype and device of the tables.
+        shear: Shear modulus of the elastic base law [Pa], () or (S,); `shear_modulus(elasticity)` by default.
 
     Raises:
-        UserError: An effect that the base law does not admit (hardening without a yield stress, cohesion without Drucker and Prager's
-            cone), a parameter out of its range, or half of a pair.
+        UserError: An effect that the base law does not admit (hardening without a yield stress, cohesion without a Drucker-Prager
+            law), a parameter out of its range, or one parameter of a pair without the other.
     """
-    if (effects.maxwell_ratio is None) != (effects.maxwell_time is None):
-        raise UserError("maxwell_ratio and maxwell_time come together; one of them is missing")
-    if (effects.fibre is None) != (effects.fibre_direction is None):
-        raise UserError("fibre and fibre_direction come together; one of them is missing")
-    if not effects.of_material:
+    for pair in (("maxwell_ratio", "maxwell_time"), ("fibre", "fibre_direction")):
+        missing = [name for name in pair if getattr(effects, name) is None]
+        if len(missing) == 1:
+            raise UserError(f"{pair[0]} and {pair[1]} come together; give {missing[0]} too")
+    if not effects.changes_law:
         return Tables(Layout(), None, False, None, None, (), like.new_zeros(count))
     mu = torch.as_tensor(shear_modulus(elasticity) if shear is None else shear, dtype=like.dtype, device=like.device)
     mu = mu.reshape(-1).expand(count)
@@ -230,13 +234,13 @@ def tables(
 
 
 def _branches(effects: Effects, count: int, like: Tensor, mu: Tensor) -> Tensor | None:
-    """`Tables.branches`."""
+    """Return `Tables.branches`; None without a Maxwell branch."""
     weights, times = [], []
     if effects.maxwell_ratio is not None:
         ratio, time = (effects.rows(name, count, like)[:, 0] for name in ("maxwell_ratio", "maxwell_time"))
         if bool(((time <= 0) & (ratio != 0)).any()):
             raise UserError(f"maxwell_time is {time.min().item():g} s; it must be positive")
-        time = torch.where(time > 0, time, 1.0)  # of a branch that is not there
+        time = torch.where(time > 0, time, 1.0)  # any time serves a branch of weight zero
         weights.append(ratio[:, None])
         times.append(time[:, None])
     if effects.hysteresis is not None:
@@ -247,7 +251,7 @@ def _branches(effects: Effects, count: int, like: Tensor, mu: Tensor) -> Tensor 
 
 
 def _material(effects: Effects, count: int, like: Tensor, mu: Tensor, flow: Tensor | None, damages: bool) -> tuple[Tensor | None, Tensor]:
-    """`Tables.material`, and what it adds to the P-wave modulus [Pa], (S,)."""
+    """Return `Tables.material`, and what its effects add to the P-wave modulus [Pa], (S,)."""
     names = ("strain_stiffening", "second_invariant", "tension_compression", "fibre")
     zero = like.new_zeros(count)
     if not damages and all(getattr(effects, name) is None for name in names):

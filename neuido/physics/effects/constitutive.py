@@ -1,7 +1,8 @@
-"""A law with effects at material points, in plain torch: the slow twin of `effect_kernels`, differentiable by autograd.
+"""A law with effects at material points, in plain torch and differentiable by autograd.
 
-The order is that of a substep (paper, appendix "Material Point Method"): the stress of F and of the history, then, after the motion
-has given C and F_tr = (I + dt C) F, the corrected gradient and the new history.
+It computes the same as the Warp kernels of this folder, which the tests compare with it. The order is that of a substep (paper, appendix
+"Material Point Method"): first the stress of F and of the history; then, from the velocity gradient C and the trial gradient
+F_tr = (I + dt C) F, the corrected gradient and the new history.
 """
 
 from typing import NamedTuple
@@ -9,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuido.physics.effects import coefficients as effect_tables
+from neuido.physics.effects import coefficients
 from neuido.physics.effects.coefficients import DRUCKER_PRAGER, VON_MISES
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
@@ -20,7 +21,7 @@ from neuido.types import Particles
 
 
 class History(NamedTuple):
-    """What P particles remember, zero at the start. B branches."""
+    """The history of P particles with B Maxwell branches; zero at the start."""
 
     branches: Tensor
     """Deviatoric strain of each Maxwell branch [-], (P, B, 3, 3)."""
@@ -33,7 +34,14 @@ class History(NamedTuple):
 
 
 def spin(C: Tensor, dt: Tensor | float) -> Tensor:
-    """Return the rotation of a step, Cayley's (I - dt W/2)^-1 (I + dt W/2) with W = skew C, (P, 3, 3) (Hughes and Winget 1980, eq. 14)."""
+    """Compute the rotation of a step, (I - dt W/2)^-1 (I + dt W/2) with the spin W = (C - C^T) / 2, (P, 3, 3).
+
+    Source: Hughes and Winget 1980, eq. 14.
+
+    Args:
+        C: Velocity gradient [1/s], (P, 3, 3).
+        dt: Step [s].
+    """
     Q = 0.25 * dt * (C - C.mT)
     size = 0.5 * (Q * Q).sum((-2, -1), keepdim=True)
     eye = torch.eye(3, dtype=C.dtype, device=C.device)
@@ -41,21 +49,21 @@ def spin(C: Tensor, dt: Tensor | float) -> Tensor:
 
 
 def deviator(A: Tensor) -> Tensor:
-    """Return a - tr(A)/3 I, (..., 3, 3)."""
+    """Return the deviator A - tr(A)/3 I, (..., 3, 3)."""
     eye = torch.eye(3, dtype=A.dtype, device=A.device)
     return A - A.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] / 3 * eye
 
 
 def _norm(A: Tensor) -> Tensor:
-    """Frobenius norm (P,), with gradient zero at zero."""
+    """Return the Frobenius norm, (P,); its gradient is zero at A = 0."""
     square = (A * A).sum((-2, -1))
     return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
 
 
 def expm(A: Tensor) -> Tensor:
-    """exp(A) of small matrices (|A| up to 5), (P, 3, 3): Taylor to the tenth degree of A/16, squared four times.
+    """Compute exp(A) of matrices with |A| up to 5, (P, 3, 3), by the Taylor polynomial of degree 10 of A/16, squared four times.
 
-    torch.linalg.matrix_exp of a single matrix of double precision is off by up to 1e-10 near |A| = 0.05.
+    `torch.linalg.matrix_exp` of a single matrix in double precision has errors of up to 1e-10 near |A| = 0.05.
     """
     eye = torch.eye(3, dtype=A.dtype, device=A.device)
     small, out = A / 16, eye
@@ -67,13 +75,13 @@ def expm(A: Tensor) -> Tensor:
 
 
 def hencky(F: Tensor) -> Tensor:
-    """Return the left Hencky strain ln V of F = V R, (P, 3, 3); stretches are bounded below by `classical_kernels.FLOOR`."""
+    """Return the left Hencky strain ln V of F = V R, (P, 3, 3); stretches are bounded below by `warp_functions.FLOOR`."""
     at = linalg.frame(F)
     return linalg.isotropic_stress(F, at, at.sigma.clamp(min=FLOOR).log(), linalg.log_difference(at.sigma, FLOOR))
 
 
 def compressive(F: Tensor) -> Tensor:
-    """Its negative part: sum of min(e_i, 0) n_i n_i, (P, 3, 3)."""
+    """Return the negative part of the left Hencky strain, the sum of min(e_i, 0) n_i n_i over its eigenvalues e_i, (P, 3, 3)."""
     at = linalg.frame(F)
     sigma = at.sigma
     e = sigma.clamp(min=FLOOR, max=1.0).log()
@@ -88,20 +96,20 @@ def compressive(F: Tensor) -> Tensor:
 class Constitutive:
     """Elasticity, plasticity and effects of P particles.
 
-    Parameters of the effects, and the laws, have one row for all particles, one for each particle, or (with `particles`) one for each
-    scene. The effects that are forces (gravity, drag, ...) are not in here.
+    The laws and the parameters of the effects have one row for all particles, or one per scene. Effects that are forces (gravity, drag,
+    ...) are ignored.
 
     Args:
-        elasticity: Base law.
-        plasticity: Base law, or None.
+        elasticity: Elastic base law.
+        plasticity: Plastic base law, or None.
         effects: The effects.
-        count: Particles P.
-        dtype: Of the tables.
-        shear_modulus: The base law's shear modulus [Pa], () or (S,); from the law where absent (`effect_tables.shear_modulus`).
-        particles: Which scene a particle belongs to; where absent each particle is a scene of its own.
+        count: Number of particles P.
+        dtype: Scalar type of the tables.
+        shear_modulus: Shear modulus of the base law [Pa], () or (S,); `coefficients.shear_modulus` by default.
+        particles: The scene of each particle; by default each particle is a scene of its own.
 
     Raises:
-        UserError: As `effect_tables.tables`.
+        UserError: As `coefficients.tables`.
     """
 
     def __init__(
@@ -123,7 +131,7 @@ class Constitutive:
             like = like.to(particles.scene.device)
         self.particles, self.like, self.scene = particles, like, particles.scene.long()
         scenes = len(particles.offsets) - 1
-        self.tables = effect_tables.tables(effects, elasticity, plasticity, scenes, like, shear=shear_modulus)
+        self.tables = coefficients.tables(effects, elasticity, plasticity, scenes, like, shear=shear_modulus)
         self.plasticity = None if self.tables.flow is not None or plasticity is None or plasticity.identity else plasticity
         self._kinds = torch.tensor(self.tables.kinds, device=like.device)[self.scene] if self.tables.kinds else None
         viscosity = effects.viscosity(scenes, like)
@@ -146,7 +154,7 @@ class Constitutive:
         return scale
 
     def stress(self, F: Tensor, C: Tensor, history: History, time: Tensor | float = 0.0) -> Tensor:
-        """Kirchhoff stress tau [Pa], viscosity included.
+        """Compute the Kirchhoff stress [Pa], (P, 3, 3), viscous stress included.
 
         Args:
             F: Elastic deformation gradient, (P, 3, 3).
@@ -180,14 +188,17 @@ class Constitutive:
         return tau
 
     def advance(self, trial: Tensor, C: Tensor, history: History, dt: Tensor | float, time: Tensor | float = 0.0) -> tuple[Tensor, History]:
-        """Return the corrected deformation gradient of a trial one, and the history after the step.
+        """Correct the trial deformation gradient and advance the history by one step.
 
         Args:
             trial: F_tr = (I + dt C) F, (P, 3, 3).
             C: Velocity gradient of the step [1/s], (P, 3, 3).
             history: The history before the step.
             dt: Step [s], a number or (P,).
-            time: Time at the start of the step [s]; only `stiffness_change` of a body that yields asks for it.
+            time: Time at the start of the step [s]; only `stiffness_change` of a body that yields depends on it.
+
+        Returns:
+            The corrected deformation gradient, (P, 3, 3), and the history after the step.
         """
         dt = torch.as_tensor(dt, dtype=self.like.dtype, device=self.like.device).expand(self.count)
         layout = self.tables.layout

@@ -1,9 +1,14 @@
-"""Warp kernels of the plastic flow that effects make, with hand-written adjoints.
+"""Warp kernels of plastic flow with hardening, softening, backstress, rate dependence or cohesion, and their hand-written adjoints.
 
-Von Mises' flow (Simo and Hughes, Computational Inelasticity, chapters 2 and 3, in Hencky strain): xi = 2 mu dev ln V - beta, the yield
-stress is (Y + H alpha) exp(-s alpha), and a step dgamma = <|xi| - yield stress> / (2 mu + H_k + H exp(-s alpha) + eta/dt) along
-n = xi/|xi| gives F = exp(-dgamma n) F_tr, alpha + dgamma and beta + H_k dgamma n. It is exact but for softening, whose step is explicit.
-Drucker and Prager's cone with a tip: |dev ln V| <= slope (tip - tr ln V), and the tip itself beyond it.
+Von Mises (Simo and Hughes, Computational Inelasticity, chapters 2 and 3, in Hencky strain):
+
+    xi = 2 mu dev ln V - beta,   n = xi/|xi|,   yield stress (Y + H alpha) exp(-s alpha)
+    dgamma = max(|xi| - yield stress, 0) / (2 mu + H_k + H exp(-s alpha) + eta/dt)
+    F = exp(-dgamma n) F_tr,   alpha += dgamma,   beta += H_k dgamma n
+
+The step is exact, except that softening is explicit.
+
+Drucker-Prager with cohesion: |dev ln V| <= slope (tip - tr ln V); a strain beyond the tip is returned to the tip.
 """
 
 import functools
@@ -11,7 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.effects.history_functions import tools
+from neuido.physics.effects import history_functions
 from neuido.physics.laws import classical_kernels
 from neuido.physics.linalg import warp_functions
 from neuido.physics.linalg.warp_functions import GAP
@@ -31,7 +36,7 @@ def build(real: type) -> SimpleNamespace:
     own = warp_functions.functions(real)
     frame, compose, eigen, hencky, exp_slope = own.frame, own.compose, own.eigen, own.hencky, own.exp_slope
     inverse_stretch, log_difference = own.inverse_stretch, own.log_difference
-    shared = tools(real, name)
+    shared = history_functions.functions(real, name)
     load, store, gather, spread, deviator = shared.load, shared.store, shared.gather, shared.spread, shared.deviator
     half_turn, rotation, add_spin_adjoint = shared.half_turn, shared.rotation, shared.add_spin_adjoint
     mean_of, bound, scale_of = shared.mean_of, shared.bound, shared.scale_of
@@ -54,7 +59,7 @@ def build(real: type) -> SimpleNamespace:
 
     @func
     def principal(N: mat33, U: mat33, turned: bool):
-        """Values and frame of the flow's direction; without a backstress the frame is that of the strain."""
+        """Return eigenvalues and eigenvectors of the flow direction N; without a backstress the eigenvectors are those of the strain."""
         n = wp.get_diag(wp.transpose(U) * N * U)
         Z = U
         if turned:
@@ -69,15 +74,15 @@ def build(real: type) -> SimpleNamespace:
         table: wp.array2d(dtype=real),
         stiffness: wp.array(dtype=real),
         growth: wp.array(dtype=real),
-        at_alpha: int,
-        at_back: int,
+        alpha_column: int,
+        backstress_column: int,
         F: wp.array(dtype=mat33),
         C: wp.array(dtype=mat33),
         history: wp.array2d(dtype=real),
         F_next: wp.array(dtype=mat33),
         history_next: wp.array2d(dtype=real),
     ):
-        """Plastic flow of a trial F: von Mises with hardening, softening, backstress and overstress, or a cone with a tip."""
+        """Correct a trial F by von Mises or Drucker-Prager flow, and write the history after the step."""
         p = wp.tid()
         s = scene[p]
         Fp = F[p]
@@ -85,12 +90,12 @@ def build(real: type) -> SimpleNamespace:
         out = Fp
         scale = scale_of(p, s, stiffness, growth)
         alpha = zero
-        if at_alpha >= 0:
-            alpha = history[p, at_alpha]
+        if alpha_column >= 0:
+            alpha = history[p, alpha_column]
         beta = mat33()
-        if at_back >= 0:
+        if backstress_column >= 0:
             R = rotation(half_turn(C[p], dt[s]))
-            beta = R * load(history, p, at_back) * wp.transpose(R)
+            beta = R * load(history, p, backstress_column) * wp.transpose(R)
         if kind == MISES:
             two_mu = table[s, 0] * scale
             soft = wp.exp(-table[s, 3] * alpha)
@@ -102,7 +107,7 @@ def build(real: type) -> SimpleNamespace:
                 if q > limit:
                     step = (q - limit) / (two_mu + table[s, 4] + table[s, 2] * soft + table[s, 5] / dt[s])
                     N = N / q
-                    n, Z = principal(N, U, at_back >= 0)
+                    n, Z = principal(N, U, backstress_column >= 0)
                     x = -step * n
                     change = compose(Z, vec3(x[0] * exp_slope(x[0]), x[1] * exp_slope(x[1]), x[2] * exp_slope(x[2])))
                     out = Fp + change * Fp
@@ -124,10 +129,10 @@ def build(real: type) -> SimpleNamespace:
                 c = vec3(x[0] * exp_slope(x[0]), x[1] * exp_slope(x[1]), x[2] * exp_slope(x[2]))
                 out = Fp + U * wp.diag(wp.cw_mul(vec3(wp.exp(e[0]), wp.exp(e[1]), wp.exp(e[2])), c)) * wp.transpose(V)
         F_next[p] = out
-        if at_alpha >= 0:
-            history_next[p, at_alpha] = alpha
-        if at_back >= 0:
-            store(history_next, p, at_back, beta)
+        if alpha_column >= 0:
+            history_next[p, alpha_column] = alpha
+        if backstress_column >= 0:
+            store(history_next, p, backstress_column, beta)
 
     @kernel
     def flow_adjoint(
@@ -137,8 +142,8 @@ def build(real: type) -> SimpleNamespace:
         table: wp.array2d(dtype=real),
         stiffness: wp.array(dtype=real),
         growth: wp.array(dtype=real),
-        at_alpha: int,
-        at_back: int,
+        alpha_column: int,
+        backstress_column: int,
         F: wp.array(dtype=mat33),
         C: wp.array(dtype=mat33),
         history: wp.array2d(dtype=real),
@@ -151,7 +156,7 @@ def build(real: type) -> SimpleNamespace:
         a_stiffness: wp.array(dtype=real),
         a_growth: wp.array(dtype=real),
     ):
-        """Add to all of them; a_F is that of the trial gradient."""
+        """Add to the adjoints of all inputs of `flow`; a_F is the adjoint of the trial gradient."""
         p = wp.tid()
         s = scene[p]
         Fp = F[p]
@@ -161,16 +166,16 @@ def build(real: type) -> SimpleNamespace:
         a_log = zero
         alpha = zero
         a_alpha = zero
-        if at_alpha >= 0:
-            alpha = history[p, at_alpha]
-            a_alpha = a_history_next[p, at_alpha]
+        if alpha_column >= 0:
+            alpha = history[p, alpha_column]
+            a_alpha = a_history_next[p, alpha_column]
         beta = mat33()
         a_beta = mat33()
         R = wp.identity(n=3, dtype=real)
-        if at_back >= 0:
+        if backstress_column >= 0:
             R = rotation(half_turn(C[p], dt[s]))
-            beta = R * load(history, p, at_back) * wp.transpose(R)
-            a_beta = gather(a_history_next, p, at_back)
+            beta = R * load(history, p, backstress_column) * wp.transpose(R)
+            a_beta = gather(a_history_next, p, backstress_column)
         grad = A
         if kind == MISES:
             two_mu = table[s, 0] * scale
@@ -186,7 +191,7 @@ def build(real: type) -> SimpleNamespace:
                     total = two_mu + H_k + table[s, 2] * soft + table[s, 5] / dt[s]
                     step = (q - hard * soft) / total
                     N = X / q
-                    n, Z = principal(N, U, at_back >= 0)
+                    n, Z = principal(N, U, backstress_column >= 0)
                     x = -step * n
                     P = compose(Z, vec3(wp.exp(x[0]), wp.exp(x[1]), wp.exp(x[2])))
                     grad = P * A
@@ -269,11 +274,11 @@ def build(real: type) -> SimpleNamespace:
             a_stiffness[p] = a_stiffness[p] + a_log / stiffness[p]
         if growth:
             wp.atomic_add(a_growth, s, a_log / growth[s])
-        if at_alpha >= 0:
-            a_history[p, at_alpha] = a_history[p, at_alpha] + a_alpha
-        if at_back >= 0:
+        if alpha_column >= 0:
+            a_history[p, alpha_column] = a_history[p, alpha_column] + a_alpha
+        if backstress_column >= 0:
             aR = a_beta * R
-            spread(a_history, p, at_back, wp.transpose(R) * aR)
-            add_spin_adjoint(a_C, p, C[p], dt[s], two * (aR * load(history, p, at_back)))
+            spread(a_history, p, backstress_column, wp.transpose(R) * aR)
+            add_spin_adjoint(a_C, p, C[p], dt[s], two * (aR * load(history, p, backstress_column)))
 
     return SimpleNamespace(flow=flow, flow_adjoint=flow_adjoint)

@@ -1,4 +1,4 @@
-"""Warp functions that the kernels of the history share: symmetric matrices in six columns, the rotation of a step, sizes."""
+"""Warp functions that the kernels of effects share: symmetric matrices in six columns, rotation of a step, bounds of the strain."""
 
 import functools
 from typing import Any, NamedTuple
@@ -9,35 +9,36 @@ from neuido.physics.linalg import warp_functions
 from neuido.physics.runtime.once import cached
 
 
-class Tools(NamedTuple):
-    """Warp functions for one scalar type, in one module."""
+class HistoryFunctions(NamedTuple):
+    """Warp functions for one scalar type, in one Warp module."""
 
     load: Any
     """(history, p, column) -> symmetric matrix from six columns"""
     store: Any
-    """(history, p, column, A): write its symmetric part"""
+    """(history, p, column, A): write the symmetric part of A"""
     gather: Any
     """(a_history, p, column) -> the adjoint of a symmetric matrix from those of its columns"""
     spread: Any
     """(a_history, p, column, A): add the adjoint of a symmetric matrix to those of its columns"""
     deviator: Any
+    """A -> A - tr(A)/3 I"""
     half_turn: Any
     """(C, dt) -> dt/2 times the angular velocity"""
     rotation: Any
     """half turn -> Cayley's rotation"""
     add_spin_adjoint: Any
-    """(a_C, p, C, dt, M): from the adjoint M of the rotation to that of C"""
+    """(a_C, p, C, dt, M): add to the adjoint of C, given the adjoint M of the rotation"""
     mean_of: Any
-    """e -> its mean, three times"""
+    """e -> the mean of e, three times"""
     bound: Any
-    """F -> at least the norm of dev ln V"""
+    """F -> an upper bound of the norm of dev ln V, without a principal frame"""
     scale_of: Any
     """(p, s, stiffness, growth) -> the factor of `stiffness` and `stiffness_change` on the elastic stress"""
 
 
 @cached
-def tools(real: type, module: str) -> Tools:
-    """Build them for `wp.float32` or `wp.float64`."""
+def functions(real: type, module: str) -> HistoryFunctions:
+    """Return the functions for `wp.float32` or `wp.float64`, in the Warp module of this name."""
     vec3 = wp.types.vector(length=3, dtype=real)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
     func = functools.partial(wp.func, module=module)
@@ -92,7 +93,7 @@ def tools(real: type, module: str) -> Tools:
 
     @func
     def half_turn(C: mat33, dt: real):
-        """dt/2 times the angular velocity."""
+        """Return dt/2 times the angular velocity."""
         return (real(0.25) * dt) * axial(C)
 
     @func
@@ -102,7 +103,7 @@ def tools(real: type, module: str) -> Tools:
 
     @func
     def add_spin_adjoint(a_C: wp.array(dtype=mat33), p: int, C: mat33, dt: real, M: mat33):
-        """From the adjoint M of the rotation of a step to that of C."""
+        """Add to the adjoint of C, given the adjoint M of the rotation of a step."""
         q = half_turn(C, dt)
         Q = wp.skew(q)
         s = two / (one + wp.dot(q, q))
@@ -116,7 +117,7 @@ def tools(real: type, module: str) -> Tools:
 
     @func
     def bound(F: mat33):
-        """At least the norm of dev ln V, without a principal frame: the slope of ln(1 + x)/2 is largest at the smallest x."""
+        """Return an upper bound of the norm of dev ln V without a principal frame, from the largest slope of ln(1 + x)/2."""
         E = strain(F)
         r = wp.sqrt(wp.ddot(E, E))
         D = deviator(E)
@@ -134,4 +135,4 @@ def tools(real: type, module: str) -> Tools:
             out = out * growth[s]
         return out
 
-    return Tools(load, store, gather, spread, deviator, half_turn, rotation, add_spin_adjoint, mean_of, bound, scale_of)
+    return HistoryFunctions(load, store, gather, spread, deviator, half_turn, rotation, add_spin_adjoint, mean_of, bound, scale_of)

@@ -1,7 +1,6 @@
-"""Warp kernels of what a particle remembers, Maxwell branches and the largest strain, with hand-written adjoints.
+"""Warp kernels that advance the history of a particle (Maxwell branches, largest strain), with hand-written adjoints.
 
-Plastic flow is in `flow_kernels`. Columns of the history are those of `effect_tables.Layout`, of the tables those of
-`effect_tables.Tables`.
+Plastic flow is in `flow_kernels`. `coefficients.Layout` defines the columns of the history, `coefficients.Tables` those of the tables.
 """
 
 import functools
@@ -9,8 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.effects import flow_kernels
-from neuido.physics.effects.history_functions import tools
+from neuido.physics.effects import flow_kernels, history_functions
 from neuido.physics.linalg import warp_functions
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
@@ -25,7 +23,7 @@ def build(real: type) -> SimpleNamespace:
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     own = warp_functions.functions(real)
     frame, hencky, exp_slope, inverse_stretch = own.frame, own.hencky, own.exp_slope, own.inverse_stretch
-    shared = tools(real, name)
+    shared = history_functions.functions(real, name)
     load, store, gather, spread, deviator = shared.load, shared.store, shared.gather, shared.spread, shared.deviator
     half_turn, rotation, add_spin_adjoint = shared.half_turn, shared.rotation, shared.add_spin_adjoint
     mean_of, bound = shared.mean_of, shared.bound
@@ -38,14 +36,14 @@ def build(real: type) -> SimpleNamespace:
         scene: wp.array(dtype=wp.int32),
         dt: wp.array(dtype=real),
         branches: wp.array3d(dtype=real),
-        idle: bool,
+        all_branches: bool,
         C: wp.array(dtype=mat33),
         history: wp.array2d(dtype=real),
         history_next: wp.array2d(dtype=real),
     ):
-        """e = exp(-dt/T) R e R^T + T (1 - exp(-dt/T)) dev D of each branch: exact for a steady D in the turning frame.
+        """Advance each Maxwell branch: e = exp(-dt/T) R e R^T + T (1 - exp(-dt/T)) dev D, exact for a constant D in the rotating frame.
 
-        `idle`: of those of weight zero too, whose slope with the weight a backward pass asks for. Else nobody reads them.
+        Without `all_branches`, branches of weight zero are skipped. A backward pass needs them for the gradient of the weight.
         """
         p = wp.tid()
         s = scene[p]
@@ -53,7 +51,7 @@ def build(real: type) -> SimpleNamespace:
         R = rotation(half_turn(C[p], h))
         D = deviator(half * (C[p] + wp.transpose(C[p])))
         for b in range(branches.shape[1]):
-            if idle or branches[s, b, 0] != zero:
+            if all_branches or branches[s, b, 0] != zero:
                 x = h / branches[s, b, 1]
                 e = R * load(history, p, 6 * b) * wp.transpose(R)
                 store(history_next, p, 6 * b, wp.exp(-x) * e + (h * exp_slope(-x)) * D)
@@ -102,12 +100,12 @@ def build(real: type) -> SimpleNamespace:
     ):
         """Write the largest norm of the deviatoric Hencky strain so far."""
         p = wp.tid()
-        most = history[p, at]
-        if bound(F[p]) > most:
+        largest = history[p, at]
+        if bound(F[p]) > largest:
             _U, d, _V = frame(F[p])
             e = hencky(d)
-            most = wp.max(most, wp.length(e - mean_of(e)))
-        history_next[p, at] = most
+            largest = wp.max(largest, wp.length(e - mean_of(e)))
+        history_next[p, at] = largest
 
     @kernel
     def remember_adjoint(

@@ -1,7 +1,7 @@
-"""The library of effects: what a model may lack, one entry for each name of the vocabulary of `diagnosis.json`.
+"""The library of effects that a model may lack; `diagnosis.json` uses the names of its entries.
 
-Ranges are physical priors for bodies of centimetres to a metre that move for seconds (stresses: of 1e4 to 1e6 Pa); a value outside is
-a reason to reject an explanation. Confusions are those measured on refitted bodies in a pilot, or seen in recordings.
+The ranges are physical priors for bodies of a centimetre to a metre that move for seconds, with moduli of 1e4 to 1e6 Pa. A diagnosis
+rejects an explanation whose value lies outside. The confusions were measured in a pilot study, or seen in recordings.
 """
 
 from typing import NamedTuple
@@ -12,16 +12,18 @@ class Parameter(NamedTuple):
 
     name: str
     field: str
-    """The field of `Effects` that it sets (or a part of)."""
+    """The field of `Effects` that it sets, or sets a component of."""
     unit: str
     low: float
-    """Physical range, inclusive; signed parameters reach from -high."""
+    """Lower end of the physical range, inclusive."""
     high: float
+    """Upper end of the physical range, inclusive."""
     signed: bool = False
+    """Whether both signs are possible."""
 
 
 class Entry(NamedTuple):
-    """One effect of the vocabulary: its equation, parameters and ranges, where it shows, and what it is mistaken for."""
+    """One effect: its equation, its parameters with ranges, where it shows, and which effects it is confused with."""
 
     name: str
     title: str
@@ -29,11 +31,13 @@ class Entry(NamedTuple):
     equation: str
     parameters: tuple[Parameter, ...]
     stage: str
-    """Where it shows: flight, rotation, internal modes, contact, rest or power."""
+    """The part of a motion in which it shows: flight, rotation, internal modes, contact, rest or power."""
     confusions: tuple[str, ...]
+    """Effects that explain similar data."""
     source: str
+    """Reference of the equation."""
     limits: tuple[str, ...] = ()
-    """Effects with fewer parameters that it becomes at an end of its range."""
+    """Effects with fewer parameters that this one becomes at an end of its range."""
 
 
 def _vector(field: str, unit: str, size: float, names: str = "xyz") -> tuple[Parameter, ...]:
@@ -41,7 +45,7 @@ def _vector(field: str, unit: str, size: float, names: str = "xyz") -> tuple[Par
 
 
 KNOTS = 5
-"""Knots of `time_force` that the library lists; `Effects.of` takes any number."""
+"""Number of knots of `time_force` that the library lists; `Effects.of` accepts any number."""
 
 LIBRARY = (
     Entry(
@@ -310,7 +314,7 @@ LIBRARY = (
         "Lamb, Hydrodynamics, 92",
     ),
 )
-"""One entry for each effect, in the order of the vocabulary by kind."""
+"""One entry for each effect, grouped by kind."""
 
 LIMITS = {entry.name: entry.limits for entry in LIBRARY}
-"""What each effect becomes at an end of its range."""
+"""`Entry.limits` of each effect, by name."""

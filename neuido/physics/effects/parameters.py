@@ -1,8 +1,8 @@
-"""Physical effects beyond the declared law: each is a parameter that is zero (here: None or 0) when the effect is absent.
+"""Physical effects beyond the declared law. Each is a parameter that is None or zero when the effect is absent.
 
-Models with fewer effects are nested: their parameters are zero, so the gradient at zero is a score test for a candidate effect. A
+A model with fewer effects is thus a special case of one with more, and the gradient at zero tests a candidate effect (score test). A
 rollout takes the parameters as differentiable inputs and skips absent effects. Forces, contact and inertia act on the grid. Material
-effects act on the stress and on a history (`coefficients`, `stress_kernels`, and a torch implementation in `constitutive`).
+effects act on the stress and on a history (`coefficients`, `stress_kernels`, and an implementation in torch, `constitutive`).
 `LIBRARY` gives for each effect its equation, parameters, prior range, where it shows and what it is confused with.
 """
 
@@ -39,7 +39,7 @@ _MATERIAL = (
     "rate_yield",
     "cohesion",
 )
-_AT_LEAST = {
+_LOWER_BOUNDS = {
     "added_mass": (-1.0, ""),
     "drag_linear": (0.0, " 1/s"),
     "drag_quadratic": (0.0, " 1/m"),
@@ -62,7 +62,10 @@ _AT_LEAST = {
 
 
 class Effects(NamedTuple):
-    """Parameters of the effects; each a float or a tensor of shape () or (S,), vectors (3,) or (S, 3). None: absent."""
+    """Parameters of the physical effects of S scenes.
+
+    Each is a number or a tensor of shape () or (S,), a vector (3,) or (S, 3). None: the effect is absent. `LIBRARY` has the equations.
+    """
 
     uniform_acceleration: Triple = None
     """A uniform acceleration added to gravity [m/s^2], (3,) or (S, 3): a tilt or a steady wind."""
@@ -134,7 +137,7 @@ class Effects(NamedTuple):
 
     @classmethod
     def of(cls, values: Mapping[str, Tensor | float], *, x: Tensor | None = None, scene: Tensor | None = None) -> "Effects":
-        """Make effects from the flat names of `LIBRARY`: "viscosity_shear.eta", "uniform_acceleration.x", "time_force.y2", ...
+        """Create effects from the parameter names of `LIBRARY`: "viscosity_shear.eta", "uniform_acceleration.x", "time_force.y2", ...
 
         Args:
             values: Numbers or tensors (S,).
@@ -147,8 +150,8 @@ class Effects(NamedTuple):
         return cls(**_fields(values, x, scene))
 
     @property
-    def of_material(self) -> bool:
-        """Whether an effect other than viscosity acts on the law."""
+    def changes_law(self) -> bool:
+        """Whether an effect other than viscosity acts on the stress or the plastic flow."""
         return any(getattr(self, name) is not None for name in _MATERIAL)
 
     def rows(self, name: str, scene_count: int, like: Tensor) -> Tensor:
@@ -165,7 +168,7 @@ class Effects(NamedTuple):
         rows = rows.reshape((1, width) if rows.numel() == width else (-1, width))
         if rows.shape[0] not in (1, scene_count):
             raise UserError(f"{name} has {rows.shape[0]} rows for {scene_count} scenes; give one value or one for each scene")
-        least, unit = _AT_LEAST.get(name, (-math.inf, ""))
+        least, unit = _LOWER_BOUNDS.get(name, (-math.inf, ""))
         if bool((~(rows >= least)).any()):
             worst = rows[~(rows >= least)][0].item()
             bound = "zero" if least == 0.0 else f"{least:g}"
@@ -307,7 +310,7 @@ _FIELDS = {
     for parameter in entry.parameters
     if parameter.field in Effects._fields
 }
-"""Flat names and the field of `Effects` that each sets, as a whole or as its component x, y or z."""
+"""The field of `Effects` that each parameter name of `LIBRARY` sets, whole or as its component x, y or z."""
 
 
 def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tensor | None) -> dict[str, Tensor | float]:
@@ -324,11 +327,12 @@ def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tenso
         elif effect == "stiffness_gradient" and name in _NAMES:
             gradient[part] = value
         elif name not in _FIELDS:
-            raise UserError(f"{name} is not a parameter of an effect; see LIBRARY, for example {', '.join(_of(effect)) or 'drag_linear.k'}")
+            known = ", ".join(_parameter_names(effect)) or "drag_linear.k"
+            raise UserError(f"{name} is not a parameter of an effect; use a name of LIBRARY, for example {known}")
         elif name == "time_force.interval":
             intervals = _tensor(value).detach().reshape(-1)
             if bool((intervals != intervals[0]).any()):
-                raise UserError(f"time_force.interval is {intervals.tolist()}; all scenes of a launch share one")
+                raise UserError(f"time_force.interval is {intervals.tolist()}; all scenes share one, so give one value")
             out["time_force_interval"] = intervals[0].item()
         elif part in ("x", "y", "z"):
             vectors.setdefault(_FIELDS[name], {})[part] = value
@@ -356,7 +360,10 @@ def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tenso
 
 
 def _stiffness(part: Mapping[str, Tensor | float], x: Tensor | None, scene: Tensor | None) -> Tensor:
-    """Return the factor of each particle from the parameters of `stiffness_gradient`; each scene has its own mean and length."""
+    """Return the stiffness factor of each particle, (P,), from the parameters of `stiffness_gradient`.
+
+    Mean and length are those of each scene's own body.
+    """
     if x is None:
         raise UserError("stiffness_gradient needs the particles' reference positions: Effects.of(values, x=...)")
     index = torch.zeros(len(x), dtype=torch.long, device=x.device) if scene is None else scene.long()
@@ -382,5 +389,5 @@ def _stiffness(part: Mapping[str, Tensor | float], x: Tensor | None, scene: Tens
 _NAMES = {f"{entry.name}.{parameter.name}" for entry in LIBRARY for parameter in entry.parameters}
 
 
-def _of(effect: str) -> list[str]:
+def _parameter_names(effect: str) -> list[str]:
     return [name for name in sorted(_NAMES) if name.startswith(effect + ".")]

@@ -1,7 +1,7 @@
-"""Warp kernels of the effects that act on the stress, with hand-written adjoints; those of the history are in `history_kernels`.
+"""Warp kernels of the effects that act on the stress, with hand-written adjoints.
 
-Columns of the tables are those of `effect_tables.Tables`; an absent array is None. Every term but one is a rational function
-of E = F F^T - I and needs no principal frame.
+`coefficients.Tables` defines the columns of the tables; an absent table is None. All terms except `tension_compression` are rational
+functions of E = F F^T - I and need no principal frame.
 """
 
 import functools
@@ -9,8 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.effects import history_kernels
-from neuido.physics.effects.history_functions import tools
+from neuido.physics.effects import history_functions, history_kernels
 from neuido.physics.laws.classical_kernels import LOCKED
 from neuido.physics.linalg import warp_functions
 from neuido.physics.linalg.warp_functions import GAP
@@ -39,12 +38,12 @@ def build(real: type) -> SimpleNamespace:
     six = wp.constant(real(6.0))
     locked = wp.constant(real(LOCKED))
     gap = wp.constant(real(GAP))
-    shared = tools(real, name)
+    shared = history_functions.functions(real, name)
     load, spread, deviator, scale_of = shared.load, shared.spread, shared.deviator, shared.scale_of
 
     @func
     def volume_factor(F: mat33):
-        """J^(-2/3) - 1"""
+        """Return J^(-2/3) - 1."""
         x = -two / three * log1p(volume_change(F))
         return x * exp_slope(x)
 
@@ -54,7 +53,7 @@ def build(real: type) -> SimpleNamespace:
 
     @func
     def negative_difference(x: real, y: real):
-        """(min(ln(1 + y), 0) - min(ln(1 + x), 0)) / (y - x)"""
+        """Return (min(ln(1 + y), 0) - min(ln(1 + x), 0)) / (y - x)."""
         out = zero
         if x < zero and y < zero:
             out = log_difference(x, y)
@@ -66,9 +65,9 @@ def build(real: type) -> SimpleNamespace:
 
     @func
     def extra_stress(F: mat33, material: wp.array2d(dtype=real), s: int, spectral: bool):
-        """Return what strain stiffening, the second invariant, fibres and the asymmetry add [Pa].
+        """Return the stress of strain stiffening, second invariant, fibres and tension-compression asymmetry [Pa].
 
-        One that is zero is not computed: an inverted body, which the base law may bear, has no logarithm of its stretches.
+        A term with a coefficient of zero is skipped: the stretches of an inverted body have no logarithm, but the base law may admit it.
         """
         tau = mat33()
         k = material[s, 0]
@@ -91,7 +90,7 @@ def build(real: type) -> SimpleNamespace:
         return tau
 
     @func
-    def undamaged(
+    def unscaled_stress(
         p: int,
         s: int,
         base: wp.array(dtype=mat33),
@@ -99,33 +98,36 @@ def build(real: type) -> SimpleNamespace:
         material: wp.array2d(dtype=real),
         branches: wp.array3d(dtype=real),
         spectral: bool,
-        idle: bool,
+        all_branches: bool,
         history: wp.array2d(dtype=real),
     ):
-        """Return the stress before `worn_scale` [Pa]: of the base law, extra(F) and the branches; `idle` as of `history_kernels.relax`."""
+        """Return the sum of the stresses of the base law, `extra_stress` and the Maxwell branches [Pa], before any factor.
+
+        `all_branches` is as in `history_kernels`.
+        """
         out = base[p]
         if material:
             out = out + extra_stress(F[p], material, s, spectral)
         if branches:
             for b in range(branches.shape[1]):
-                if idle or branches[s, b, 0] != zero:
+                if all_branches or branches[s, b, 0] != zero:
                     out = out + branches[s, b, 0] * load(history, p, 6 * b)
         return out
 
     @func
-    def worn_scale(
+    def total_scale(
         p: int,
         s: int,
         stiffness: wp.array(dtype=real),
         growth: wp.array(dtype=real),
         material: wp.array2d(dtype=real),
         history: wp.array2d(dtype=real),
-        at_e_max: int,
+        e_max_column: int,
     ):
-        """`scale_of` times the factor of damage."""
+        """Return the factor on the stress: stiffness, growth and damage."""
         out = scale_of(p, s, stiffness, growth)
-        if at_e_max >= 0 and material[s, 7] != zero:
-            out = out * wp.exp(-material[s, 7] * history[p, at_e_max])
+        if e_max_column >= 0 and material[s, 7] != zero:
+            out = out * wp.exp(-material[s, 7] * history[p, e_max_column])
         return out
 
     @kernel
@@ -136,17 +138,17 @@ def build(real: type) -> SimpleNamespace:
         material: wp.array2d(dtype=real),
         branches: wp.array3d(dtype=real),
         spectral: bool,
-        at_e_max: int,
-        idle: bool,
+        e_max_column: int,
+        all_branches: bool,
         F: wp.array(dtype=mat33),
         history: wp.array2d(dtype=real),
         tau: wp.array(dtype=mat33),
     ):
-        """tau = scale (tau + extra(F) + sum of the branches)."""
+        """Add the stresses of the effects to tau, and scale the sum: tau = scale (tau + extra stress + Maxwell branches)."""
         p = wp.tid()
         s = scene[p]
-        t = undamaged(p, s, tau, F, material, branches, spectral, idle, history)
-        tau[p] = worn_scale(p, s, stiffness, growth, material, history, at_e_max) * t
+        t = unscaled_stress(p, s, tau, F, material, branches, spectral, all_branches, history)
+        tau[p] = total_scale(p, s, stiffness, growth, material, history, e_max_column) * t
 
     @kernel
     def add_effect_stress_adjoint(
@@ -156,7 +158,7 @@ def build(real: type) -> SimpleNamespace:
         material: wp.array2d(dtype=real),
         branches: wp.array3d(dtype=real),
         spectral: bool,
-        at_e_max: int,
+        e_max_column: int,
         F: wp.array(dtype=mat33),
         history: wp.array2d(dtype=real),
         base: wp.array(dtype=mat33),
@@ -168,22 +170,25 @@ def build(real: type) -> SimpleNamespace:
         a_material: wp.array2d(dtype=real),
         a_branches: wp.array3d(dtype=real),
     ):
-        """Turn a_tau into the adjoint of the base law's stress and adds to the others; `base`, that stress, is read if scaled."""
+        """Turn a_tau into the adjoint of the base law's stress, and add to the other adjoints.
+
+        `base`, the stress of the base law, is read only with stiffness, growth or damage.
+        """
         p = wp.tid()
         s = scene[p]
         A = a_tau[p]
-        scale = worn_scale(p, s, stiffness, growth, material, history, at_e_max)
+        scale = total_scale(p, s, stiffness, growth, material, history, e_max_column)
         G = (real(0.5) * scale) * (A + wp.transpose(A))
-        if stiffness or growth or at_e_max >= 0:
-            t = undamaged(p, s, base, F, material, branches, spectral, True, history)
+        if stiffness or growth or e_max_column >= 0:
+            t = unscaled_stress(p, s, base, F, material, branches, spectral, True, history)
             a_log = scale * wp.ddot(A, t)
             if stiffness:
                 a_stiffness[p] = a_stiffness[p] + a_log / stiffness[p]
             if growth:
                 wp.atomic_add(a_growth, s, a_log / growth[s])
-            if at_e_max >= 0:
-                wp.atomic_add(a_material, s, 7, -a_log * history[p, at_e_max])
-                a_history[p, at_e_max] = a_history[p, at_e_max] - a_log * material[s, 7]
+            if e_max_column >= 0:
+                wp.atomic_add(a_material, s, 7, -a_log * history[p, e_max_column])
+                a_history[p, e_max_column] = a_history[p, e_max_column] - a_log * material[s, 7]
         if branches:
             for b in range(branches.shape[1]):
                 wp.atomic_add(a_branches, s, b, 0, wp.ddot(G, load(history, p, 6 * b)))

@@ -1,7 +1,7 @@
-"""What a finite-element rollout runs on: the meshes of some scenes in one set of arrays, and its frames.
+"""The arrays of a finite-element rollout: the meshes of some scenes side by side, and their ties to the particles.
 
-Order of an inner step as in the material point method: stress of F, nodal forces, motion and contact of the nodes, F_tr = (I + dt C) F,
-its plastic correction and the history.
+An inner step has the order of the material point method: stress of F, nodal forces, motion and contact of the nodes, F_tr = (I + dt C) F,
+plastic correction, history.
 """
 
 from collections.abc import Sequence
@@ -12,34 +12,34 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuido.physics.colliders.tables import NEAR, ColliderTable, corners
+from neuido.physics.colliders.tables import NEAR, ColliderTable, box_corners
 from neuido.physics.effects.coefficients import Tables
-from neuido.physics.fem.meshing import Mesh, follow, locate, steepest
+from neuido.physics.fem.meshing import Mesh, follow, locate, stiffness_bound
 from neuido.types import Particles, ParticleState, Scene
 
 DENSE = 3.0
-"""Times the median density above which a particle's mass counts as attached to the body."""
+"""Factor on the median density of a body; particle mass above that density counts as an attached mass."""
 
 
 @dataclass(frozen=True)
 class SolverArrays:
-    """What all assemblies of a solver share: scenes, particles and how the elements are computed."""
+    """The arrays and settings that all assemblies of a solver share."""
 
     scenes: tuple[Scene, ...]
     device: torch.device
     dtype: torch.dtype
     kernels: SimpleNamespace
-    """Of `element_kernels.build`."""
+    """The result of `element_kernels.build`."""
     smoothing: str
     """`none` or `nodal`."""
     colliders: ColliderTable
     particles: Particles
     state: ParticleState
-    """The start of the particles."""
+    """Initial state of the particles."""
     volume: Tensor
-    """Of the particles [m^3], (P,)."""
+    """Volume of each particle [m^3], (P,)."""
     held: Tensor
-    """Particles in a clamp, (P,) bool."""
+    """Which particles lie in a clamp, (P,) bool."""
 
     @property
     def scene_count(self) -> int:
@@ -48,28 +48,36 @@ class SolverArrays:
 
 
 class BodyMesh(NamedTuple):
-    """The mesh of one body with its ties to the particles; tensors of the solver's type and device."""
+    """The mesh of one body and its ties to the particles, in the dtype and on the device of the solver."""
 
     nodes: Tensor
     """Positions at t = 0 [m], (N, 3)."""
     elements: Tensor
-    """(E, 4) int64."""
+    """Nodes of each element, (E, 4) int64."""
     volume: Tensor
-    """(E,) [m^3]."""
+    """Volume of each element [m^3], (E,), scaled so that the sum is the volume of the particles."""
     element_of: Tensor
-    """Element of each particle, (P,)."""
+    """Element that contains each particle, (P,)."""
     weights: Tensor
-    """Barycentric weights of each particle in it, (P, 4)."""
+    """Barycentric weights of each particle in that element, (P, 4)."""
     to_nodes: tuple[Tensor, Tensor]
-    """Particles and weights (N, k) that take an affine field to the nodes exactly."""
+    """Particles and weights, (N, k) each, that interpolate a field to the nodes; exact for affine fields."""
     to_elements: tuple[Tensor, Tensor]
-    """Particles and positive weights (E, k) for means over the particles around an element."""
-    steepest: Tensor
-    """Of each element, `meshing.steepest` [1/m^2], (E,) float64."""
+    """Particles and positive weights, (E, k) each, for the mean over the particles near an element."""
+    stiffness_bound: Tensor
+    """`meshing.stiffness_bound` of each element [1/m^2], (E,) float64."""
 
 
 def body_mesh(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype: torch.dtype) -> BodyMesh:
-    """Return the ties of a mesh to the particles x (P, 3) of the given volumes (P,)."""
+    """Tie a mesh to the particles of a body.
+
+    Args:
+        mesh: The mesh.
+        x: Positions of the particles at t = 0 [m], (P, 3).
+        volume: Volumes of the particles [m^3], (P,).
+        device: Device of the result.
+        dtype: Scalar type of the result.
+    """
     nodes, own = mesh.nodes, mesh.volume
     element_of, weights = locate(mesh, x)
     centroid = nodes[mesh.elements].mean(dim=1)
@@ -87,12 +95,12 @@ def body_mesh(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype
         real(weights),
         (to_nodes[0].to(device), real(to_nodes[1])),
         (to_elements[0].to(device), real(to_elements[1])),
-        steepest(mesh).to(device),
+        stiffness_bound(mesh).to(device),
     )
 
 
 class Assembly:
-    """Scenes a to b - 1 of a solver in one set of arrays."""
+    """The meshes of scenes a to b - 1 of a solver, concatenated."""
 
     def __init__(self, solver: SolverArrays, meshes: Sequence[BodyMesh], a: int, b: int) -> None:
         self.solver, self.meshes, self.a, self.b = solver, tuple(meshes), a, b
@@ -128,12 +136,16 @@ class Assembly:
         self.scene_of_particle = solver.particles.scene[own].long() - a
 
     def _held(self, particles: Tensor) -> Tensor:
-        """Nodes in a clamp's box; where it holds particles and no node, those of the particles' elements."""
+        """Return which nodes are held by clamps, (N,) bool.
+
+        These are the nodes in the box of a clamp. If the box contains particles but no node, they are the nodes of the elements of
+        those particles.
+        """
         held = torch.zeros(len(self.nodes), dtype=torch.bool, device=self.nodes.device)
         for s, scene in enumerate(self.solver.scenes[self.a : self.b]):
             own = self.node_scene == s
             for box in scene.clamps:
-                lower, upper = (corner.to(self.nodes) for corner in corners(box, NEAR * scene.dx))
+                lower, upper = (corner.to(self.nodes) for corner in box_corners(box, NEAR * scene.dx))
                 inside = own & ((self.nodes >= lower) & (self.nodes <= upper)).all(dim=1)
                 if not bool(inside.any()):
                     picked = particles & ((self.x0 >= lower) & (self.x0 <= upper)).all(dim=1)
@@ -144,7 +156,7 @@ class Assembly:
         return held
 
     def rows(self, tables: Tables) -> Tables:
-        """Return the rows of this assembly's scenes."""
+        """Return the rows of the tables that belong to the scenes of this assembly."""
 
         def part(t: Tensor | None) -> Tensor | None:
             return None if t is None else t[self.a : self.b].contiguous()
@@ -157,7 +169,11 @@ class Assembly:
         )
 
     def node_mass(self, mass: Tensor) -> Tensor:
-        """Lumped masses: the density of the particles around an element, and what attached masses have beyond it at their corners."""
+        """Compute the lumped masses of the nodes [kg], (N,), from the masses of the particles [kg], (P,).
+
+        An element has the mean density of the particles around it. The excess of attached masses (`DENSE`) goes to the corners of the
+        elements that contain them.
+        """
         out = torch.zeros(len(self.nodes), dtype=torch.float64, device=mass.device)
         mass, volume = mass.double(), self.particle_volume.double()
         density, scene = mass / volume, self.scene_of_particle
@@ -175,10 +191,10 @@ class Assembly:
         return out.to(self.nodes)
 
     def start(self, state: ParticleState) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Positions and velocities of the nodes, C and F of the elements, for a state of the particles.
+        """Convert a state of the particles to x and v of the nodes and C and F of the elements.
 
-        Only the difference from a known start is interpolated: from the end of the last rollout where the particles are still there
-        (so that a motion may be run in meshes), else from the body as loaded.
+        Only the difference from a known state is interpolated. That is the end of the last rollout if the particles still have the
+        positions of that end, so that a rollout can be continued without loss; else it is the body as loaded.
         """
         index, weight = self.to_nodes
         around, mean = self.to_elements
@@ -198,10 +214,11 @@ class Assembly:
 
     @property
     def is_part(self) -> bool:
-        """Whether the solver has scenes beside these."""
+        """Whether the solver has more scenes than this assembly."""
         return self.b - self.a < self.solver.scene_count
 
     def frame(self, frames: ParticleState, n: int, x: Tensor, v: Tensor, C: Tensor, F: Tensor) -> None:
+        """Write frame n at the particles, from x and v of the nodes and C and F of the elements."""
         for out, t in ((frames.x, x), (frames.v, v)):
             out[n] = torch.einsum("pk,pkc->pc", self.weights, t[self.corners])
         for out, t in ((frames.C, C), (frames.F, F)):

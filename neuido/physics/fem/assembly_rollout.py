@@ -1,4 +1,4 @@
-"""A finite-element rollout of one assembly: from the inputs of its scenes to frames at the particles."""
+"""The rollout of one assembly of meshes, from the inputs of its scenes to frames at the particles."""
 
 from collections.abc import Hashable, Sequence
 from typing import NamedTuple
@@ -14,32 +14,40 @@ from neuido.physics.laws.base import ElasticLaw, Law, PlasticLaw
 from neuido.types import ParticleState
 
 CAPACITY = 8
-"""Captured loops that an assembly keeps; each holds its memory."""
+"""Number of captured loops in the cache of an assembly; each owns its memory."""
 
 
 class Inputs(NamedTuple):
-    """What a rollout of some scenes reads, their rows alone."""
+    """The inputs of a rollout for the S scenes and P particles of one assembly."""
 
     state: ParticleState
+    """Initial state of the particles."""
     mass: Tensor
+    """Mass of each particle [kg], (P,)."""
     pull: Tensor
-    """(1 or T, S, 3), T over the inner steps."""
+    """Gravity and other uniform accelerations [m/s^2], (1, S, 3), or (T, S, 3) over T inner steps."""
     force: Tensor
+    """`Effects.force_table` of the scenes."""
     friction: Tensor
+    """Friction coefficients of the colliders [-], (S, K)."""
     viscosity: Tensor | None
+    """`Effects.viscosity` [Pa s], (S, 2)."""
     tables: Tables | None
+    """Tables of the effects that act on the law."""
     stiffness: Tensor | None
+    """Factor of each particle's elastic stress [-], (P,)."""
     growth: Tensor | None
+    """`Effects.growth` over the inner steps [-], (T, S)."""
     dt: Tensor
     """Inner step of each scene [s], (S,)."""
 
 
 class AssemblyRollout:
-    """Runs an assembly, and keeps its captured loops.
+    """Run rollouts of one assembly, with a cache of captured loops.
 
     Args:
         assembly: Meshes of some scenes.
-        graphs: Capture the launches between two frames (CUDA alone).
+        graphs: Whether to capture the launches between two frames as a CUDA graph; CUDA only.
     """
 
     def __init__(self, assembly: Assembly, graphs: bool) -> None:
@@ -56,7 +64,17 @@ class AssemblyRollout:
         given: Inputs,
         frames: ParticleState,
     ) -> None:
-        """Fill the frames; launches alone but for the frames."""
+        """Simulate and write the frames.
+
+        Args:
+            steps: Number of steps, a multiple of `every`.
+            every: Steps between two frames.
+            inner: Inner steps per step.
+            elasticity: Elastic law.
+            plasticity: Plastic law, or None.
+            given: Inputs of the scenes.
+            frames: Frames of the particles, steps / every + 1 of them; overwritten.
+        """
         count, assembly = every * inner, self.assembly
         if plasticity is not None and (plasticity.identity or (given.tables is not None and given.tables.flow is not None)):
             plasticity = None
@@ -74,13 +92,13 @@ class AssemblyRollout:
         assembly.last = (ParticleState(*(t[-1].clone() for t in frames)), *(t.clone() for t in loop.state))
 
     def _rows(self, law: Law) -> list[Tensor]:
-        """Return the tensors of a law, the rows of these scenes."""
+        """Return the tensors of a law, restricted to the scenes of the assembly."""
         assembly = self.assembly
         tensors = [t.detach().to(assembly.solver.device, assembly.solver.dtype) for t in law.tensors()]
         return [t if len(t) == 1 or not assembly.is_part else t[assembly.a : assembly.b] for t in tensors]
 
     def _fields(self, given: Inputs, count: int) -> Fields:
-        """Return what the first of the intervals reads."""
+        """Return the arrays that the launches of the first interval of `count` inner steps read."""
         stiffness = None
         if given.stiffness is not None:
             index, weight = self.assembly.to_elements
@@ -107,7 +125,7 @@ class AssemblyRollout:
         laws: Sequence[Sequence[Tensor]],
         count: int,
     ) -> Loop:
-        """Return a loop for these launches; captured ones are kept, the least recently used dropped first."""
+        """Return a loop for these launches, from the cache if it can be captured; the least recently used is dropped first."""
         assembly = self.assembly
         elastic: Law = elasticity.single_scene(assembly.a) if assembly.is_part else elasticity
         plastic: Law | None = plasticity.single_scene(assembly.a) if assembly.is_part and plasticity is not None else plasticity

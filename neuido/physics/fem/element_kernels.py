@@ -1,8 +1,8 @@
 """Warp kernels of linear tetrahedra: kinematics, nodal forces, motion and contact of the nodes, average nodal volume change.
 
-Elements keep the gradients of their shape functions in space as G = Ds^-1, Ds = [x1 - x0, x2 - x0, x3 - x0]. The nodal force is
--V0 tau grad N with the Kirchhoff stress and the initial volume (Belytschko, Liu and Moran, Nonlinear Finite Elements, sec. 4.5).
-A node gathers the forces of its corners, so that sums have one order and no atomics.
+The gradients of an element's shape functions are stored as G = Ds^-1 with Ds = [x1 - x0, x2 - x0, x3 - x0]. The nodal force is
+-V0 tau grad N, with the Kirchhoff stress tau and the initial volume V0 (Belytschko, Liu and Moran, Nonlinear Finite Elements, sec. 4.5).
+Each node sums the forces of its elements itself: the order of the sum is fixed, and no atomics are needed.
 """
 
 import functools
@@ -11,14 +11,14 @@ from types import SimpleNamespace
 import warp as wp
 
 from neuido.physics.colliders import contact as contact_functions
-from neuido.physics.mpm import grid as grid_kernels
+from neuido.physics.mpm import grid as mpm_grid
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """Return the kernels for `wp.float32` or `wp.float64`; contact and body forces are those of `grid_kernels`."""
+    """Return the kernels for `wp.float32` or `wp.float64`; body forces are those of `mpm.grid`."""
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -26,10 +26,10 @@ def build(real: type) -> SimpleNamespace:
     module = f"neuido.elements.{real.__name__}"
     func = functools.partial(wp.func, module=module)
     kernel = functools.partial(wp.kernel, module=module, enable_backward=False)
-    grid = grid_kernels.build(real)
+    grid = mpm_grid.build(real)
     push = grid.functions.push
     met = contact_functions.functions(real, module)
-    contact, lose = met.contact, met.lose
+    contact, damp_contact = met.contact, met.damp_contact
     zero = wp.constant(real(0.0))
 
     @func
@@ -39,7 +39,7 @@ def build(real: type) -> SimpleNamespace:
 
     @kernel
     def reference(elements: wp.array(dtype=wp.vec4i), x: wp.array(dtype=vec3), gradients: wp.array(dtype=mat33)):
-        """G of the start."""
+        """Write G of the initial positions."""
         e = wp.tid()
         gradients[e] = wp.inverse(edges(elements[e], x))
 
@@ -54,10 +54,10 @@ def build(real: type) -> SimpleNamespace:
         C: wp.array(dtype=mat33),
         F: wp.array(dtype=mat33),
     ):
-        """G, F = Ds `shape`, and C where it is asked for.
+        """Write G, F = Ds `shape`, and with `rate` the velocity gradient C.
 
-        C is the gradient of the new velocity over the old places, and so F is (I + dt C) of the last one; its error does not grow where
-        an element is turned inside out and G is large for a moment.
+        C is the gradient of the new velocity at the old positions, so that F is (I + dt C) times the last F. F is not accumulated from
+        C: its error stays bounded where an element is nearly inverted and G is large for a moment.
         """
         i = wp.tid()
         e = elements[i]
@@ -69,7 +69,7 @@ def build(real: type) -> SimpleNamespace:
 
     @kernel
     def reshape(trial: wp.array(dtype=mat33), F: wp.array(dtype=mat33), gradients: wp.array(dtype=mat33), shape: wp.array(dtype=mat33)):
-        """Write the shape without stress, G F, of elements that flowed."""
+        """Write the stress-free shape G F of the elements whose F was corrected by plastic flow."""
         i = wp.tid()
         change = F[i] - trial[i]
         if wp.ddot(change, change) != zero:
@@ -82,7 +82,7 @@ def build(real: type) -> SimpleNamespace:
         tau: wp.array(dtype=mat33),
         force: wp.array(dtype=vec3),
     ):
-        """Force of each element on its four corners [N]."""
+        """Write the force of each element on its four nodes [N]."""
         i = wp.tid()
         H = (-volume[i]) * (tau[i] * wp.transpose(gradients[i]))
         a = vec3(H[0, 0], H[1, 0], H[2, 0])
@@ -104,7 +104,7 @@ def build(real: type) -> SimpleNamespace:
         friction: wp.array2d(dtype=real),
         force: wp.array2d(dtype=real),
     ):
-        """Return the velocity with which a node ends its step on a plane and not behind it."""
+        """Return the velocity of a node after contact, such that it ends its step on a plane and not behind it."""
         v = v0
         for c in range(kind.shape[1]):
             if kind[s, c] > 0:
@@ -114,7 +114,7 @@ def build(real: type) -> SimpleNamespace:
                     reach = (-wp.max(gap, zero) / h) * n
                     v = contact(v - reach, n, kind[s, c], friction[s, c]) + reach
                     if force.shape[1] > 6:
-                        v = lose(v, n, h, force, s)
+                        v = damp_contact(v, n, h, force, s)
         return v
 
     @kernel
@@ -134,7 +134,7 @@ def build(real: type) -> SimpleNamespace:
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
     ):
-        """Symplectic Euler of the nodes: the new velocity from the forces here, then the new place with it."""
+        """Advance the nodes by symplectic Euler: the velocity from the forces, then the position from the new velocity."""
         i = wp.tid()
         if held[i] == wp.uint8(1):
             v[i] = vec3(zero, zero, zero)
@@ -158,7 +158,7 @@ def build(real: type) -> SimpleNamespace:
         value: wp.array(dtype=real),
         out: wp.array(dtype=real),
     ):
-        """Sum over the elements around a node of weight times value, over the sum of the weights (the volumes)."""
+        """Write the mean of a value over the elements around each node, weighted by their volumes."""
         i = wp.tid()
         total = zero
         around = zero
@@ -170,6 +170,7 @@ def build(real: type) -> SimpleNamespace:
 
     @kernel
     def volume_change(F: wp.array(dtype=mat33), J: wp.array(dtype=real)):
+        """Write J = det F."""
         i = wp.tid()
         J[i] = wp.determinant(F[i])
 
@@ -182,7 +183,7 @@ def build(real: type) -> SimpleNamespace:
         J_mean: wp.array(dtype=real),
         F_mean: wp.array(dtype=mat33),
     ):
-        """F with the mean of its corners' volume changes in place of its own."""
+        """Write F with the mean volume change of the element's nodes in place of its own."""
         i = wp.tid()
         e = elements[i]
         m = real(0.25) * (nodal[e[0]] + nodal[e[1]] + nodal[e[2]] + nodal[e[3]])
@@ -191,7 +192,7 @@ def build(real: type) -> SimpleNamespace:
 
     @kernel
     def pressure(tau: wp.array(dtype=mat33), J_mean: wp.array(dtype=real), out: wp.array(dtype=real)):
-        """Write the derivative of the energy with the mean volume change [Pa]."""
+        """Write the derivative of the energy with respect to the mean volume change [Pa]."""
         i = wp.tid()
         out[i] = wp.trace(tau[i]) / (real(3.0) * J_mean[i])
 
@@ -202,7 +203,7 @@ def build(real: type) -> SimpleNamespace:
         J: wp.array(dtype=real),
         tau: wp.array(dtype=mat33),
     ):
-        """Write the stress whose forces are the slope of the smoothed energy: the deviator, and the pressure of the corners."""
+        """Write the stress whose forces are the gradient of the smoothed energy: the deviator, and the mean pressure of the nodes."""
         i = wp.tid()
         e = elements[i]
         p = J[i] * real(0.25) * (nodal[e[0]] + nodal[e[1]] + nodal[e[2]] + nodal[e[3]])

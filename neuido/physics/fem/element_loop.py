@@ -1,7 +1,7 @@
-"""The inner steps of a finite-element rollout between two frames: launches alone, run eagerly or replayed from a CUDA graph.
+"""The inner steps of a finite-element rollout between two frames, as kernel launches that run eagerly or as a CUDA graph.
 
-A graph spans one interval between frames and not the whole rollout: it is captured in the time of one interval, and serves rollouts of any
-length. What changes from one interval to the next (pulls and growth over time) is copied into the loop's memory before each.
+A graph spans the interval between two frames and not the whole rollout. It takes the time of one interval to capture, and serves rollouts
+of any length. Inputs that change over time (accelerations, growth) are copied into the loop's memory before each interval.
 """
 
 from collections.abc import Hashable, Sequence
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuido.physics.effects import stress_kernels as effect_kernels
+from neuido.physics.effects import stress_kernels
 from neuido.physics.effects.coefficients import Layout, Tables
 from neuido.physics.fem.assembly import Assembly
 from neuido.physics.laws.base import ElasticLaw, Engine, Law, PlasticLaw
@@ -20,42 +20,45 @@ from neuido.physics.runtime.launches import LaunchRecordings
 
 
 class Fields(NamedTuple):
-    """What the launches of an interval of T inner steps read; None where absent."""
+    """The arrays that the launches of an interval of T inner steps read; None where absent."""
 
     mass: Tensor
-    """Of the nodes [kg], (N,)."""
+    """Mass of each node [kg], (N,)."""
     force: Tensor
     """`Effects.force_table`, (S, ...)."""
     friction: Tensor
-    """(S, K)."""
+    """Friction coefficients of the colliders [-], (S, K)."""
     dt: Tensor
     """Inner step of each scene [s], (S,)."""
     pull: Tensor
-    """[m/s^2], (1 or T, S, 3)."""
+    """Gravity and other uniform accelerations [m/s^2], (1 or T, S, 3)."""
     growth: Tensor | None
-    """(T, S)."""
+    """`Effects.growth` [-], (T, S)."""
     viscosity: Tensor | None
-    """[Pa s], (S, 2)."""
+    """`Effects.viscosity` [Pa s], (S, 2)."""
     stiffness: Tensor | None
-    """Factor of each element, (E,)."""
+    """Factor of each element's elastic stress [-], (E,)."""
     material: Tensor | None
+    """`Tables.material`."""
     branches: Tensor | None
+    """`Tables.branches`."""
     flow: Tensor | None
-    """Columns of `effect_tables.Tables`."""
+    """`Tables.flow`."""
 
 
 class Loop:
-    """The inner steps of one interval, over memory of its own.
+    """The inner steps between two frames, with memory of its own.
 
     Args:
         assembly: Meshes of the scenes.
         elasticity: Elastic law of these scenes.
         plasticity: Plastic law, or None.
-        tables: What the effects of the material need; of it the loop keeps what decides its launches.
-        fields: What the launches read; the loop owns copies.
-        laws: Tensors of the elastic and of the plastic law; likewise.
+        tables: Tables of the effects that act on the law, or None; they determine which kernels are launched.
+        fields: The arrays that the launches read; copied.
+        laws: Tensors of the elastic and of the plastic law; copied.
         count: Inner steps of an interval.
-        captured: Replay a CUDA graph from the third interval on. On the CPU the second one is recorded and repeated.
+        captured: Whether to capture the second interval as a CUDA graph and replay it from then on. On the CPU the second interval is
+            always recorded and repeated (`launches`).
     """
 
     def __init__(
@@ -77,7 +80,7 @@ class Loop:
         self.spectral = tables is not None and tables.spectral
         self.flows = fields.flow is not None
         self.changes = plasticity is not None or self.flows
-        self.material = None if tables is None else effect_kernels.build(real_of(solver.dtype))
+        self.material = None if tables is None else stress_kernels.build(real_of(solver.dtype))
         self.kinds = torch.tensor(() if tables is None else tables.kinds, dtype=torch.int32, device=solver.device)
         self.plane, self.kind = (t[assembly.a : assembly.b].contiguous() for t in (solver.colliders.plane, solver.colliders.kind))
         elements, nodes = len(assembly.elements), len(assembly.nodes)
@@ -96,11 +99,17 @@ class Loop:
 
     @property
     def state(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """x and v of the nodes, C and F of the elements, in memory that the next interval overwrites."""
+        """x and v of the nodes, C and F of the elements; the next interval overwrites them."""
         return self.x, self.v, self.C, self.F
 
     def begin(self, state: Sequence[Tensor], fields: Fields, laws: Sequence[Sequence[Tensor]]) -> None:
-        """Start a rollout from x, v, C and F, with new values of what the loop was made for."""
+        """Start a rollout.
+
+        Args:
+            state: x and v of the nodes, C and F of the elements.
+            fields: New values of the constructor's `fields`.
+            laws: New values of the constructor's `laws`.
+        """
         given = [*state, *fields, *(t for tensors in laws for t in tensors)]
         own = [*self.state, *self.fields, *(t for tensors in self.laws for t in tensors)]
         for t, value in zip(own, given, strict=True):
@@ -113,11 +122,16 @@ class Loop:
         torch.matmul(self.gradients, self.F, out=self.shape)
 
     def advance(self, pull: Tensor | None = None, growth: Tensor | None = None) -> None:
-        """Run an interval, with its rows of what changes over time."""
+        """Run one interval.
+
+        Args:
+            pull: Accelerations of this interval, (count, S, 3); None: as before.
+            growth: Growth of this interval, (count, S); None: as before.
+        """
         for own, value in ((self.fields.pull, pull), (self.fields.growth, growth)):
             if value is not None:
                 own.copy_(value)
-        if not self.warm:  # the first one compiles and loads the kernels
+        if not self.warm:  # the first interval compiles and loads the kernels
             self.run()
             self.warm = True
         elif self.assembly.solver.device.type == "cpu":
@@ -128,11 +142,14 @@ class Loop:
             if self.graph is None:
                 self.graph, _ = capture(self.run)
             self.graph.replay()
-        if self.count % 2 and self.layout.width > 0:  # the next one begins where this one began
+        if self.count % 2 and self.layout.width > 0:  # the next interval reads the same buffer as this one
             self.history.copy_(self.history_next)
 
     def run(self) -> None:
-        """Launch an interval; the last history is where an odd number of swaps leaves it."""
+        """Launch the kernels of one interval.
+
+        The two history buffers swap roles in each inner step; after an odd number of steps the result is in `history_next`.
+        """
         begun = self.history, self.history_next
         with torch_stream(self.assembly.solver.device):
             elastic, plastic = self._engines()
@@ -143,7 +160,7 @@ class Loop:
                 if plastic is not None:
                     plastic.forward(self.trial, self.F)
                 if self.layout.width > 0 or self.flows:
-                    self._remember(growth)
+                    self._update_history(growth)
                     self.history, self.history_next = self.history_next, self.history
                 if self.changes:
                     self._launch(self.assembly.solver.kernels.reshape, len(self.F), self.trial, self.F, self.gradients, self.shape)
@@ -155,7 +172,7 @@ class Loop:
         return elastic, None if self.plasticity is None else self.plasticity.engine(self.laws[1], particles)
 
     def _stress(self, elastic: Engine, growth: Tensor | None) -> None:
-        """tau of F."""
+        """Compute the stress of each element, tau, with effects, viscosity and smoothing."""
         k, a, f, scene = self.assembly.solver.kernels, self.assembly, self.fields, self.assembly.particles.scene
         elements, nodes = len(self.F), len(self.x)
         if self.nodal:
@@ -165,7 +182,7 @@ class Loop:
         elastic.forward(self.smoothed, self.tau)
         if self.material is not None:
             self._launch(self.material.add_effect_stress, elements, scene, f.stiffness, growth, f.material, f.branches, self.spectral,
-                         self.layout.at_e_max, False, self.smoothed, self.history, self.tau)  # fmt: skip
+                         self.layout.e_max_column, False, self.smoothed, self.history, self.tau)  # fmt: skip
         if f.viscosity is not None:
             self._launch(k.add_viscous_stress, elements, scene, f.viscosity, self.C, self.smoothed, self.tau)
         if self.nodal:
@@ -174,7 +191,7 @@ class Loop:
             self._launch(k.spread_pressure, elements, a.elements, self.at_node, self.J, self.tau)
 
     def _move(self, pull: Tensor, *, last: bool) -> None:
-        """Nodes by their forces, and the trial F of the elements (F itself where nothing corrects it)."""
+        """Move the nodes, and compute the trial F of the elements (F itself if nothing corrects it)."""
         k, a, f = self.assembly.solver.kernels, self.assembly, self.fields
         rates = last or f.viscosity is not None or self.layout.width > 0
         self._launch(k.corner_forces, len(self.F), a.volume, self.gradients, self.tau, self.force)
@@ -183,16 +200,16 @@ class Loop:
         self._launch(k.kinematics, len(self.F), a.elements, self.x, self.v, self.shape, rates, self.gradients, self.C,
                      self.trial if self.changes else self.F)  # fmt: skip
 
-    def _remember(self, growth: Tensor | None) -> None:
-        """Write the history after a step, and F where an effect makes it of the trial one."""
+    def _update_history(self, growth: Tensor | None) -> None:
+        """Advance the history by a step, and correct the trial F if a plastic effect is present."""
         f, scene, layout, k = self.fields, self.assembly.particles.scene, self.layout, self.material
         if f.branches is not None:
             self._launch(k.relax, len(self.F), scene, f.dt, f.branches, False, self.C, self.history, self.history_next)
         if self.flows:
-            self._launch(k.flow, len(self.F), scene, f.dt, self.kinds, f.flow, f.stiffness, growth, layout.at_alpha, layout.at_backstress,
-                         self.trial, self.C, self.history, self.F, self.history_next)  # fmt: skip
+            self._launch(k.flow, len(self.F), scene, f.dt, self.kinds, f.flow, f.stiffness, growth, layout.alpha_column,
+                         layout.backstress_column, self.trial, self.C, self.history, self.F, self.history_next)  # fmt: skip
         if layout.e_max:
-            self._launch(k.remember, len(self.F), self.F, layout.at_e_max, self.history, self.history_next)
+            self._launch(k.remember, len(self.F), self.F, layout.e_max_column, self.history, self.history_next)
 
     def _launch(self, kernel, dim: int, *arguments) -> None:
         launch(kernel, dim, arguments, self.assembly.solver.device)
@@ -201,7 +218,7 @@ class Loop:
 def key(
     elasticity: Law, plasticity: Law | None, tables: Tables | None, fields: Fields, laws: Sequence[Sequence[Tensor]], count: int
 ) -> Hashable | None:
-    """Return what decides the launches of a loop; None where they may not be captured."""
+    """Return a key that is equal for loops with the same launches; None if the launches must not be captured."""
     elastic = elasticity.key(laws[0])
     plastic = "none" if plasticity is None else plasticity.key(laws[1])
     if elastic is None or plastic is None:

@@ -92,7 +92,7 @@ class FiniteElements:
         if meshes is not None:
             meshes = (meshes,) * len(bodies) if isinstance(meshes, Mesh) else tuple(meshes)
             if len(meshes) != len(bodies):
-                raise UserError(f"{len(meshes)} meshes for {len(bodies)} bodies; give one mesh a body, or one for all")
+                raise UserError(f"{len(meshes)} meshes for {len(bodies)} bodies; give one mesh per body, or one for all")
         made: dict[tuple[int, ...], tuple[Mesh, BodyMesh]] = {}
         tied_meshes = []
         self.meshes: tuple[Mesh, ...] = ()
@@ -178,12 +178,12 @@ class FiniteElements:
         for assembly in self.assemblies:
             for s in range(assembly.a, assembly.b):
                 modulus, density = bounds[s]
-                steep = float(assembly.meshes[s - assembly.a].steepest.max())
-                omega = 2.0 * math.sqrt(modulus / density * steep)
+                bound = float(assembly.meshes[s - assembly.a].stiffness_bound.max())
+                omega = 2.0 * math.sqrt(modulus / density * bound)
                 damping = 0.0
                 if viscosity is not None:
                     eta, zeta = viscosity.detach()[s].double().tolist()
-                    damping = 4.0 * steep * (4.0 / 3.0 * eta + zeta) / density
+                    damping = 4.0 * bound * (4.0 / 3.0 * eta + zeta) / density
                 # the root of (omega dt)^2 + 2 damping dt = 4
                 step = 4.0 / (damping + math.sqrt(damping**2 + 4.0 * omega**2)) if omega + damping > 0 else math.inf
                 out.append(self.scenes[s].dt / (SAFETY * step))

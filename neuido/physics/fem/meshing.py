@@ -1,8 +1,9 @@
-"""From a body of particles to a mesh of linear tetrahedra: a lattice of cells in the body's own axes, five or six tetrahedra a cell.
+"""Meshing of a body of particles by linear tetrahedra: a lattice of cells along the axes of the body, with 5 or 6 tetrahedra per cell.
 
-Particles on a regular lattice give its cells. Others are spread over cubes of their volume, and a cell that is half full belongs to
-the body; the number of cells along each axis is the one that leaves the fewest cells half full, so that plane faces stay planes. Where
-many are half full all the same the body is curved, and the outer nodes move to its surface.
+If the particles lie on a regular lattice, the mesh has the cells of that lattice. Else each particle fills a cube of its volume, and a cell
+belongs to the body if it is at least half full. The number of cells along each axis is chosen so that few cells are partly full; plane
+faces of the body then stay plane. If many cells are partly full all the same, the body is curved, and the outer nodes are moved onto the
+surface.
 """
 
 import itertools
@@ -15,23 +16,24 @@ from torch import Tensor
 from neuido.errors import UserError
 
 PER_PARTICLE = 1.0
-"""Elements a particle where no number of elements is given."""
+"""Elements per particle if no number of elements is given."""
 LOOSE = 1.1
-"""Where the mesh's volume and that of the particles differ by more than this factor, each keeps its own."""
+"""Ratio of the volumes of mesh and particles up to which the mesh is scaled to the volume of the particles."""
 CURVED = 0.12
-"""Share of cells half full above which a body is taken to be curved, and the stairs of its surface are smoothed."""
-STEEP = 2.5
-"""How much `steepest` may rise by that: the square of the cost in inner steps."""
-EVEN = ((0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1))
+"""Share of partly full cells above which a body counts as curved, and the steps of its surface are smoothed."""
+STIFFENING = 2.5
+"""Largest factor by which the smoothing may raise `stiffness_bound`; the number of inner steps rises by its square root."""
+EVEN_CORNERS = ((0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1))
+"""Corners of a cell whose coordinates have an even sum, the corners of the inner tetrahedron of five."""
 
 
 class Mesh(NamedTuple):
-    """Linear tetrahedra: nodes, elements and volumes."""
+    """A mesh of N nodes and E linear tetrahedra."""
 
     nodes: Tensor
-    """Positions in the body at t = 0 [m], (N, 3) float64."""
+    """Positions at t = 0 [m], (N, 3) float64."""
     elements: Tensor
-    """Nodes of each element, positively oriented, (E, 4) int64."""
+    """Nodes of each element, ordered so that its volume is positive, (E, 4) int64."""
 
     @property
     def volume(self) -> Tensor:
@@ -41,7 +43,7 @@ class Mesh(NamedTuple):
 
     @property
     def gradients(self) -> Tensor:
-        """Gradients of the shape functions of each element's corners [1/m], (E, 4, 3)."""
+        """Gradients of the four shape functions of each element [1/m], (E, 4, 3)."""
         corners = self.nodes[self.elements]
         last = torch.linalg.inv(corners[:, 1:] - corners[:, :1]).mT
         return torch.cat([-last.sum(dim=1, keepdim=True), last], dim=1)
@@ -51,10 +53,20 @@ class Mesh(NamedTuple):
 
 
 def tetrahedra_of(cells: np.ndarray, kind: int) -> np.ndarray:
-    """Corners of the tetrahedra of lattice cells, (n, kind, 4, 3) int, from the cells' indices (n, 3).
+    """Divide lattice cells into tetrahedra.
 
-    Five: a large one inside and one on each of four corners, mirrored from cell to cell so that faces fit. Six: Kuhn's, all around
-    one diagonal (Freudenthal 1942).
+    With five, a large tetrahedron lies inside and one on each of four corners; neighbouring cells are mirror images, so that their faces
+    match. With six, all share a diagonal of the cell (Freudenthal 1942).
+
+    Args:
+        cells: Indices of the cells, (n, 3).
+        kind: Tetrahedra per cell, 5 or 6.
+
+    Returns:
+        Lattice indices of the corners, (n, kind, 4, 3).
+
+    Raises:
+        UserError: Another kind.
     """
     if kind == 6:
         rows = []
@@ -66,14 +78,15 @@ def tetrahedra_of(cells: np.ndarray, kind: int) -> np.ndarray:
             rows.append(path)
         pattern = np.repeat(np.stack(rows)[None], 2, axis=0)
     elif kind == 5:
-        pattern = np.stack([_five(parity) for parity in (0, 1)])
+        pattern = np.stack([_five_tetrahedra(parity) for parity in (0, 1)])
     else:
-        raise UserError(f"tetrahedra is {kind}; a cell is cut into 5 or 6")
+        raise UserError(f"tetrahedra is {kind}; give 5 or 6")
     return pattern[cells.sum(axis=1) % 2] + cells[:, None, None]
 
 
-def _five(parity: int) -> np.ndarray:
-    inner = [tuple((c + parity) % 2 for c in corner) for corner in EVEN]
+def _five_tetrahedra(parity: int) -> np.ndarray:
+    """Return the corners of five tetrahedra in a unit cell, (5, 4, 3); `parity` 0 or 1 selects one of two mirror images."""
+    inner = [tuple((c + parity) % 2 for c in corner) for corner in EVEN_CORNERS]
     rows = [inner]
     for corner in itertools.product((0, 1), repeat=3):
         if corner not in inner:
@@ -81,20 +94,23 @@ def _five(parity: int) -> np.ndarray:
     return np.array(rows)
 
 
-def steepest(mesh: Mesh) -> Tensor:
-    """Largest eigenvalue of sum grad N grad N^T of each element [1/m^2], (E,): what bounds the stable step."""
+def stiffness_bound(mesh: Mesh) -> Tensor:
+    """Return the largest eigenvalue of the sum of grad N grad N^T of each element [1/m^2], (E,).
+
+    Times P-wave modulus over density, and times four, it bounds the square of the element's highest frequency, hence the stable step.
+    """
     gradients = mesh.gradients
     return torch.linalg.eigvalsh(gradients.mT @ gradients)[:, -1]
 
 
 def mesh_of_cells(cells: np.ndarray, origin: np.ndarray, axes: np.ndarray, kind: int = 5) -> Mesh:
-    """Return the mesh of lattice cells.
+    """Mesh the cells of a lattice.
 
     Args:
         cells: Indices of the cells, (n, 3).
-        origin: Of the lattice [m], (3,).
+        origin: Position of the corner of cell (0, 0, 0) [m], (3,).
         axes: Edge vectors of a cell as rows [m], (3, 3).
-        kind: Tetrahedra a cell, 5 or 6.
+        kind: Tetrahedra per cell, 5 or 6.
     """
     corners = tetrahedra_of(cells - cells.min(axis=0), kind).reshape(-1, 3)
     places, index = np.unique(corners, axis=0, return_inverse=True)
@@ -103,40 +119,46 @@ def mesh_of_cells(cells: np.ndarray, origin: np.ndarray, axes: np.ndarray, kind:
 
 
 def oriented(nodes: Tensor, elements: Tensor) -> Mesh:
-    """Return a mesh whose elements are turned where their volume is negative.
+    """Create a mesh, and reorder the nodes of elements with a negative volume.
+
+    Args:
+        nodes: Positions [m], (N, 3).
+        elements: Nodes of each element, (E, 4).
 
     Raises:
-        UserError: An element without volume, or a node that is in no element.
+        UserError: An element without volume, or a node that belongs to no element.
     """
     nodes, elements = nodes.double(), elements.long()
     volume = Mesh(nodes, elements).volume
     flat = volume.abs() <= 1e-6 * volume.abs().mean()
     if bool(flat.any()):
-        raise UserError(f"element {int(flat.nonzero()[0])} of the mesh has no volume; mesh the body again, or take the element out")
+        raise UserError(f"element {int(flat.nonzero()[0])} of the mesh has no volume; mesh the body again, or remove the element")
     if len(torch.unique(elements)) != len(nodes):
-        raise UserError(f"{len(nodes) - len(torch.unique(elements))} nodes of the mesh belong to no element; take them out")
+        raise UserError(f"{len(nodes) - len(torch.unique(elements))} nodes of the mesh belong to no element; remove them")
     return Mesh(nodes, torch.where((volume < 0)[:, None], elements[:, [0, 1, 3, 2]], elements))
 
 
 def mesh_body(x: Tensor, volume: Tensor, *, elements: int | None = None, kind: int = 5) -> Mesh:
-    """Return a mesh of the body that particles fill. Its volume is theirs, unless theirs leave gaps between them (`LOOSE`).
+    """Mesh the body that particles fill.
+
+    The mesh has the volume of the particles, unless these leave gaps between them (`LOOSE`).
 
     Args:
         x: Positions [m], (P, 3).
         volume: Volumes [m^3], (P,).
-        elements: About how many elements; where absent `PER_PARTICLE` times the particles, and the particles' own cells where they
-            lie on a lattice and there are no more of them than that.
-        kind: Tetrahedra a cell, 5 or 6.
+        elements: Approximate number of elements; by default `PER_PARTICLE` times the number of particles. If the particles lie on a
+            lattice whose cells give no more elements than that, the mesh has these cells.
+        kind: Tetrahedra per cell, 5 or 6.
 
     Raises:
-        UserError: No particles, or a body that is no volume.
+        UserError: No particles, too few elements, or particles that fill no cell.
     """
     points, weight = x.double().cpu().numpy(), volume.double().cpu().numpy()
     if not len(points):
-        raise UserError("a body without particles has no mesh")
+        raise UserError("a body without particles cannot be meshed; give at least one")
     wanted = PER_PARTICLE * len(points) if elements is None else float(elements)
     if not wanted >= kind:
-        raise UserError(f"elements is {elements}; a mesh needs at least {kind}")
+        raise UserError(f"elements is {elements}; give at least {kind}, the tetrahedra of one cell")
     total = weight.sum()
     edge = (kind * total / wanted) ** (1 / 3)
     lattice = lattice_of(points)
@@ -150,7 +172,7 @@ def mesh_body(x: Tensor, volume: Tensor, *, elements: int | None = None, kind: i
         spread = np.broadcast_to(size, points.shape)
     else:
         turn = box_axes(points)
-        # where cells are hardly larger than particles, wider cubes keep their number of particles even
+        # if cells are hardly larger than particles, larger cubes keep the fill of the cells uniform
         wide = min(max(2.2 - 0.8 * edge / np.cbrt(weight.mean()), 1.0), 2.0)
         spread = np.repeat(wide * np.cbrt(weight)[:, None], 3, axis=1)
         lower, upper = _faces(points @ turn.T, weight)
@@ -158,19 +180,19 @@ def mesh_body(x: Tensor, volume: Tensor, *, elements: int | None = None, kind: i
     counts, filled, misfit = _best_counts(q, weight, spread, lower, upper, edge)
     size = (upper - lower) / counts
     occupied = filled.sum() * size.prod()
-    if occupied > LOOSE * total:  # particles whose volumes leave gaps between them: half of their density inside, not half of one
+    if occupied > LOOSE * total:  # the particles leave gaps between them: a cell is full at half of their mean density
         counts, filled, misfit = _best_counts(q, weight, spread, lower, upper, edge, level=0.5 * total / occupied)
         size = (upper - lower) / counts
     cells = np.argwhere(filled)
     mesh = mesh_of_cells(cells, lower @ turn, size[:, None] * turn, kind)
     if misfit > CURVED:
         level = 0.5 * min(total / occupied, 1.0) if occupied > LOOSE * total else 0.5
-        mesh = _onto_surface(mesh, torch.from_numpy(points), torch.from_numpy(weight), level, float(size.max()))
+        mesh = _fit_surface(mesh, torch.from_numpy(points), torch.from_numpy(weight), level, float(size.max()))
     return _scaled(mesh, total)
 
 
-def _onto_surface(mesh: Mesh, x: Tensor, volume: Tensor, level: float, edge: float) -> Mesh:
-    """Move the outer nodes to where the density of the particles, smoothed over half a cell, is `level`: stairs become slopes."""
+def _fit_surface(mesh: Mesh, x: Tensor, volume: Tensor, level: float, edge: float) -> Mesh:
+    """Move the outer nodes to where the density of the particles, smoothed over half a cell, equals `level`."""
     order = mesh.elements[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3).sort(dim=1).values
     face, count = torch.unique(order, dim=0, return_counts=True)
     outer = torch.unique(face[count == 1])
@@ -185,10 +207,10 @@ def _onto_surface(mesh: Mesh, x: Tensor, volume: Tensor, level: float, edge: flo
             place[own] += move * (0.25 * edge / move.norm(dim=1, keepdim=True)).clamp(max=1.0)
     shift = torch.zeros_like(mesh.nodes)
     shift[outer] = (place - start) * (0.7 * edge / (place - start).norm(dim=1, keepdim=True)).clamp(max=1.0)
-    limit = STEEP * steepest(mesh).max()
-    for _ in range(12):  # no element may be flattened for it, which would cost inner steps
+    limit = STIFFENING * stiffness_bound(mesh).max()
+    for _ in range(12):  # flat elements would need more inner steps, so the shift of their nodes is reduced
         moved = mesh._replace(nodes=mesh.nodes + shift)
-        thin = (steepest(moved) > limit) | (moved.volume <= 0)
+        thin = (stiffness_bound(moved) > limit) | (moved.volume <= 0)
         if not bool(thin.any()):
             return moved
         shift[torch.unique(mesh.elements[thin])] *= 0.6
@@ -196,7 +218,7 @@ def _onto_surface(mesh: Mesh, x: Tensor, volume: Tensor, level: float, edge: flo
 
 
 def _scaled(mesh: Mesh, total: float) -> Mesh:
-    """Scale the mesh about its centre to the given volume; as it is where that is far from its own."""
+    """Scale the mesh about its centre to the volume `total`; unchanged if its own volume differs by more than `LOOSE`."""
     volume = mesh.volume
     if not 1 / LOOSE <= float(volume.sum()) / total <= LOOSE:
         return mesh
@@ -205,9 +227,13 @@ def _scaled(mesh: Mesh, total: float) -> Mesh:
 
 
 def lattice_of(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return the rectangular lattice on which points lie to 2 % of its spacing, or None.
+    """Find the rectangular lattice on which all points lie, to 2 % of its spacing.
 
-    Its origin (3,), its axes as rows (3, 3), and the indices of the points (P, 3).
+    Args:
+        x: Points [m], (P, 3).
+
+    Returns:
+        Origin [m], (3,), edge vectors as rows [m], (3, 3), and lattice indices of the points, (P, 3); None without such a lattice.
     """
     if len(x) < 8:
         return None
@@ -224,7 +250,7 @@ def lattice_of(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | Non
         return None
     basis, origin = np.stack(axes), middle
     order = np.argsort((d**2).sum(axis=1))
-    for share in (0.02, 0.2, 1.0):  # first near the middle, where rounding to the lattice is safe
+    for share in (0.02, 0.2, 1.0):  # first near the middle, where rounding to lattice indices is safe
         own = order[: max(27, int(share * len(x)))]
         index = np.rint((x[own] - origin) @ np.linalg.inv(basis))
         if np.linalg.matrix_rank(index - index.mean(axis=0)) < 3:
@@ -243,11 +269,18 @@ def lattice_of(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | Non
 
 
 def box_axes(x: np.ndarray) -> np.ndarray:
-    """Orthonormal rows along the smallest box around points, (3, 3), by turning about one axis at a time from several starts."""
+    """Find the axes of the smallest box around points, by rotations about one axis at a time from several starts.
+
+    Args:
+        x: Points [m], (P, 3).
+
+    Returns:
+        The axes as orthonormal rows, (3, 3).
+    """
     generator = np.random.default_rng(0)
     d = x - x.mean(axis=0)
     starts = [np.eye(3), np.linalg.svd(d.T @ d)[2], *(np.linalg.qr(generator.standard_normal((3, 3)))[0] for _ in range(6))]
-    if len(d) > 4000:  # only the outermost count
+    if len(d) > 4000:  # the box depends on the outermost points alone
         directions = generator.standard_normal((2000, 3))
         d = d[np.unique(np.argmax(d @ directions.T, axis=0))]
     best, smallest = np.eye(3), np.inf
@@ -271,7 +304,10 @@ def box_axes(x: np.ndarray) -> np.ndarray:
 
 
 def _faces(q: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the body begins and ends along each axis: the volume beyond a place, extended from the outer layer down to nothing."""
+    """Estimate the lower and upper face of the body along each axis [m], (3,) each.
+
+    A line is fitted to the volume beyond a position within the outer layer of particles; the face is where the line reaches zero.
+    """
     out = np.empty((2, 3))
     h = np.cbrt(weight.mean())
     for a in range(3):
@@ -292,7 +328,23 @@ def _faces(q: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _best_counts(
     q: np.ndarray, weight: np.ndarray, spread: np.ndarray, lower: np.ndarray, upper: np.ndarray, edge: float, level: float = 0.5
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Cells along each axis, which of them are full: near `edge`, and with the fewest cells half full."""
+    """Choose the number of cells along each axis so that cells are near `edge` [m] in size and few are partly full.
+
+    Args:
+        q: Positions along the axes of the body [m], (P, 3).
+        weight: Volume of each particle [m^3], (P,).
+        spread: Edges of the cube that each particle fills [m], (P, 3).
+        lower: Lower faces of the body [m], (3,).
+        upper: Upper faces [m], (3,).
+        edge: Wanted size of a cell [m].
+        level: Fill from which a cell belongs to the body [-].
+
+    Returns:
+        Numbers of cells (3,), which cells are full (nx, ny, nz), and the share of partly full cells.
+
+    Raises:
+        UserError: No cell is full.
+    """
     steps = (np.arange(4) + 0.5) / 4 - 0.5
     offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     points = (q[:, None] + offsets * spread[:, None]).reshape(-1, 3)
@@ -317,7 +369,7 @@ def _best_counts(
 
 
 def _without_holes(full: np.ndarray) -> np.ndarray:
-    """Cells with five or six full neighbours are full: where particles are sparse a cell inside may hold less than half its share."""
+    """Fill cells with five or six full neighbours: where particles are sparse, a cell inside the body may be less than half full."""
     padded = np.pad(full, 1).astype(np.int64)
     middle = slice(1, -1)
     around = sum(
@@ -327,13 +379,16 @@ def _without_holes(full: np.ndarray) -> np.ndarray:
 
 
 def locate(mesh: Mesh, points: Tensor, *, near: int = 24, chunk: int = 1024) -> tuple[Tensor, Tensor]:
-    """Return the element of each point and its barycentric weights: (n,), (n, 4); a point outside is extrapolated from the nearest element.
+    """Find the element that contains each point, and the barycentric weights of the point.
 
     Args:
         mesh: The mesh.
-        points: Places in the body at t = 0 [m], (n, 3).
-        near: Elements that are tried, those of the nearest centroids.
-        chunk: Points at a time.
+        points: Positions at t = 0 [m], (n, 3).
+        near: Number of elements that are tried for each point, those with the nearest centroids.
+        chunk: Number of points that are processed at a time.
+
+    Returns:
+        Elements, (n,), and weights, (n, 4). For a point outside the mesh, the weights extrapolate from a near element.
     """
     corners = mesh.nodes[mesh.elements]
     centroid, gradients = corners.mean(dim=1), mesh.gradients
@@ -349,15 +404,18 @@ def locate(mesh: Mesh, points: Tensor, *, near: int = 24, chunk: int = 1024) -> 
 
 
 def follow(x: Tensor, places: Tensor, *, near: int = 16, degree: int = 1, falloff: float = 3.0, chunk: int = 1024) -> tuple[Tensor, Tensor]:
-    """Particles (n, k) and weights (n, k) for each place; their sums take a field from the particles there.
+    """Compute weights that interpolate a field from particles to places.
 
     Args:
-        x: Particles [m], (P, 3).
-        places: [m], (n, 3).
-        near: Particles k that take part, at most.
-        degree: 1 reproduces every affine field (moving least squares); 0 is a positive mean.
-        falloff: Weights fall as exp(-falloff (d / s)^2) with the distance d, s that of the last of the k.
-        chunk: Places at a time.
+        x: Positions of the particles [m], (P, 3).
+        places: Positions to interpolate to [m], (n, 3).
+        near: Largest number k of particles for each place.
+        degree: 1: exact for affine fields (moving least squares). 0: a mean with positive weights.
+        falloff: The weight at distance d is exp(-falloff (d / s)^2), with s the distance of the k-th particle.
+        chunk: Number of places that are processed at a time.
+
+    Returns:
+        Particles and weights, (n, k) each.
     """
     k = min(near, len(x))
     out = []

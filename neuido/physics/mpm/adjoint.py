@@ -113,7 +113,7 @@ def update_history_adjoint(
     setup, k = plan.setup, plan.effects
     a_C, a_F, a_history_next = a_next[2:]
     if plan.layout.e_max:
-        plan.launch(k.remember_adjoint, len(F), [F, plan.layout.at_e_max, history, a_history_next, a_F, a_history])
+        plan.launch(k.remember_adjoint, len(F), [F, plan.layout.e_max_column, history, a_history_next, a_F, a_history])
     if material.flow is not None:
         adjoints = [a_F, a_history_next, a_trial, a_C, a_history, a_material.flow, a_material.stiffness, a_material.growth]
         plan.launch(k.flow_adjoint, len(F), [*flow_inputs(plan, material), trial, C, history, *adjoints])

@@ -29,7 +29,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     adjoint_kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
 
     met = contact_functions.functions(real, name)
-    contact, contact_adjoint, lose, normal_of = met.contact, met.contact_adjoint, met.lose, met.normal_of
+    contact, contact_adjoint, damp_contact, normal_of = met.contact, met.contact_adjoint, met.damp_contact, met.normal_of
 
     @kernel
     def add_viscous_stress(
@@ -138,7 +138,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                 out = contact(out, n, kind[s, c], friction[s, c])
                 if force.shape[1] > 6:
                     if kind[s, c] > 0:
-                        out = lose(out, n, dt, force, s)
+                        out = damp_contact(out, n, dt, force, s)
         return out
 
     @kernel

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics.colliders.tables import ColliderTable
-from neuido.physics.effects import coefficients as effect_tables
+from neuido.physics.effects import coefficients
 from neuido.physics.effects.coefficients import Tables
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
@@ -113,8 +113,8 @@ def prepare(
     if effects.relative_density is not None:
         mass = mass * effects.particle_factor("relative_density", len(mass), mass)
     tables = stiffness = growth = None
-    if effects.of_material:
-        tables = effect_tables.tables(effects, elasticity, plasticity, count, like)
+    if effects.changes_law:
+        tables = coefficients.tables(effects, elasticity, plasticity, count, like)
         stiffness = effects.particle_stiffness(len(mass), mass)
         growth = effects.growth(solver.dt, steps)
     return RolloutInputs(

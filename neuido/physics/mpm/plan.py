@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from neuido.physics.effects import stress_kernels as effect_kernels
+from neuido.physics.effects import stress_kernels
 from neuido.physics.effects.coefficients import Layout, Tables
 from neuido.physics.laws.base import ElasticLaw, Engine, PlasticLaw
 from neuido.physics.mpm.state import Setup
@@ -71,7 +71,7 @@ class Plan:
             plasticity = None
         self.plasticity = plasticity
         self.kinds = torch.tensor(self.flow_kinds, dtype=torch.int32, device=setup.device)
-        self.effects = None if tables is None else effect_kernels.build(real_of(setup.dtype))
+        self.effects = None if tables is None else stress_kernels.build(real_of(setup.dtype))
         self.block = 32 if len(setup.mass) < LARGE else 256
 
     def law_tensors(self) -> tuple[Tensor, ...]:

@@ -154,13 +154,13 @@ def stress(
 
 
 def stress_inputs(plan: Plan, material: Material) -> list:
-    return [plan.setup.particles.scene, *material[:4], plan.spectral, plan.layout.at_e_max]
+    return [plan.setup.particles.scene, *material[:4], plan.spectral, plan.layout.e_max_column]
 
 
 def flow_inputs(plan: Plan, material: Material) -> list:
     setup, layout = plan.setup, plan.layout
     table = [setup.particles.scene, setup.dt, plan.kinds, material.flow, material.stiffness, material.growth]
-    return [*table, layout.at_alpha, layout.at_backstress]
+    return [*table, layout.alpha_column, layout.backstress_column]
 
 
 def update_history(plan: Plan, material: Material, trial: Tensor, C: Tensor, history: Tensor, F: Tensor, history_next: Tensor) -> None:
@@ -171,7 +171,7 @@ def update_history(plan: Plan, material: Material, trial: Tensor, C: Tensor, his
     if material.flow is not None:
         plan.launch(k.flow, len(F), [*flow_inputs(plan, material), trial, C, history, F, history_next])
     if plan.layout.e_max:
-        plan.launch(k.remember, len(F), [F, plan.layout.at_e_max, history, history_next])
+        plan.launch(k.remember, len(F), [F, plan.layout.e_max_column, history, history_next])
 
 
 def node_range(plan: Plan, x: Tensor | None) -> slice:
