@@ -3,6 +3,7 @@
 import inspect
 import re
 import shlex
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -18,13 +19,16 @@ from neuido.commands.latents import latents
 from neuido.commands.simulation.scenes import scenes
 from neuido.commands.simulation.trajectories import trajectories
 from neuido.data.files.score_tables import read_rows
+from neuido.data.files.yaml_files import chain, places, read_configuration
+from neuido.errors import UserError
 
 ROOT = neuido.configs_root()
 CONFIGS = sorted(ROOT.rglob("*.yaml"))
 
 
 def content(path) -> dict:
-    return yaml.safe_load(path.read_text())
+    """What a configuration says, that of its base included."""
+    return read_configuration(path)
 
 
 def command_of(path) -> str | None:
@@ -50,8 +54,8 @@ def test_there_are_configurations():
 
 
 def of_a_command(path) -> bool:
-    """A file of one scene, of conditions, of loggers alone, or of a sweep, is for no command of its own."""
-    whole = not {"loggers", "conditions"} & set(path.parts) and "parameters" not in content(path)
+    """A file of one scene, of conditions, of loggers alone, a base of others, or a sweep, is for no command of its own."""
+    whole = not {"loggers", "conditions", "bases"} & set(path.parts) and "parameters" not in content(path)
     return whole and (path.parent.name != "scenes" or "scenes" in content(path))
 
 
@@ -69,6 +73,68 @@ def test_command_line_accepts(path, capsys):
     for key, value in content(path).items():
         if not isinstance(value, dict | list):
             assert printed[key] == value
+
+
+def told(path) -> Counter:
+    """The lines of a file without its comments, and how often each stands there."""
+    lines = (re.sub(r"(^|\s)#.*", "", line).strip() for line in path.read_text().splitlines())
+    return Counter(line for line in lines if line)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.stem)
+def test_no_file_repeats_another(path):
+    for other in CONFIGS[: CONFIGS.index(path)]:
+        assert (told(path) & told(other)).total() <= 30, f"{path.name} and {other.name}: give them a base"
+
+
+def test_a_base_is_taken_by_a_configuration():
+    taken = {file for path in CONFIGS for file in chain(path)[:-1]}
+    assert taken >= {path for path in CONFIGS if path.parent.name == "bases"}
+
+
+def write_all(folder, **files) -> None:
+    for name, text in files.items():
+        (folder / f"{name}.yaml").write_text(text)
+
+
+def test_a_base_is_merged_and_the_keys_beside_it_win(tmp_path):
+    write_all(
+        tmp_path,
+        far="a: 1\nb: {c: 1, d: [1, 2]}\nm: {class_path: x.One, init_args: {p: 1}}\n",
+        near="base: far.yaml\nb: {d: [3]}\n",
+        own="base: [near.yaml, quickstart]\na: 2\nm: {class_path: x.Two, init_args: {q: 2}}\n",
+    )
+    found = read_configuration(tmp_path / "own.yaml")
+    assert (found["a"], found["b"], found["m"]) == (2, {"c": 1, "d": [3]}, {"class_path": "x.Two", "init_args": {"q": 2}})
+    assert found["trainer"]["max_epochs"] == 2  # of the one that comes with neuido
+    assert "base" not in found
+    where = places(tmp_path / "own.yaml")
+    assert (where["b", "c"].file.name, where["b", "c"].line) == ("far.yaml", 2)
+    assert (where["b", "d"].file.name, where["a",].file.name) == ("near.yaml", "own.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a: 1\nbase: own.yaml\n", "circle"),
+        ("base: other.yaml\n", "circle"),
+        ("a: 1\nbase: nowhere\n", "own.yaml:2: base = 'nowhere'"),
+        ("base: {a: 1}\n", "it must be the path"),
+    ],
+)
+def test_a_base_that_cannot_be_read(tmp_path, text, words):
+    write_all(tmp_path, own=text, other="base: [own.yaml]\n")
+    with pytest.raises(UserError, match=words):
+        read_configuration(tmp_path / "own.yaml")
+
+
+def test_print_config_shows_what_a_base_says(tmp_path, capsys):
+    write_all(tmp_path, own="base: films_small\ncount: 3\n")
+    with pytest.raises(SystemExit):
+        cli.main(["film", "--config", str(tmp_path / "own.yaml"), "--out", "nowhere", "--print_config"])
+    printed, base = yaml.safe_load(capsys.readouterr().out), content(ROOT / "films_small.yaml")
+    assert printed["count"] == 3 and "base" not in printed
+    assert all(printed[key] == value for key, value in base.items() if key not in ("count", "out"))
 
 
 SWEEPS = [path for path in CONFIGS if "parameters" in content(path)]

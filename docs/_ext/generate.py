@@ -158,7 +158,10 @@ def config_page() -> str:
         "# Configuration files\n",
         "Each YAML file below comes with neuido; `--config` takes its path or its name. A later `--config` wins over an",
         "earlier one, and an option",
-        "on the command line over both. `--print_config` writes all keys with their values, and [the command",
+        "on the command line over both. `base: FILE` in a file takes what another file says, by its path beside the file",
+        "or by the name of one that comes with neuido; the keys beside it win, and of a list of bases the later wins.",
+        "Mappings are merged key by key; lists are replaced, and another `class_path` drops the `init_args` of the base.",
+        "`--print_config` writes all keys with their values, and [the command",
         "line](commands.md) explains each.",
         "Keys of the models and the data modules stand under `model.init_args` and `data.init_args`.\n",
     ]

@@ -19,7 +19,7 @@ from typing import Any
 
 import neuido
 from neuido.commands import interruption
-from neuido.commands.cli.config_files import expanded, find_configs
+from neuido.commands.cli.config_files import find_configs
 from neuido.commands.cli.functions import run_function
 from neuido.commands.cli.suggestions import refuse_abbreviations, suggest
 from neuido.commands.cli.trainer import run_lightning
@@ -113,7 +113,6 @@ def _dispatch(args: list[str]) -> int:
     if name in HEAVY and wants_help(args):
         print(help_text(args))
         return 0
-    args = expanded(args)
     os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # lightning's own calls, lightning issue 21900
     refuse_abbreviations()
     if name in LIGHT:

@@ -4,9 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
-import yaml
 
 import neuido
+from neuido.data.files.yaml_files import read_configuration
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.video.encoder import PRETRAINED, DynamicsEncoder
@@ -27,14 +27,14 @@ def weights_of(node) -> list[str]:
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.yaml")), ids=lambda p: p.stem)
 def test_weights_come_with_neuido_or_a_command_makes_them(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in weights_of(yaml.safe_load(path.read_text())):
+    for name in weights_of(read_configuration(path)):
         if name in PRETRAINED:
             assert PRETRAINED[name].is_file()
             continue
         with pytest.raises(UserError, match=r"`neuido fit --config configs/[\w/]+\.yaml` makes them") as error:
             DynamicsEncoder.load(name)
         maker = ROOT / re.search(r"configs/([\w/]+\.yaml)", str(error.value))[1]
-        assert yaml.safe_load(maker.read_text())["model"]["init_args"]["save_to"] == name
+        assert read_configuration(maker)["model"]["init_args"]["save_to"] == name
 
 
 @pytest.mark.parametrize("read", [DynamicsEncoder.load, IntrinsicDynamicsOperator.load, open_vae])

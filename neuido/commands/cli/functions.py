@@ -8,6 +8,7 @@ import re
 from argparse import ArgumentError
 from typing import get_origin
 
+from neuido.commands.cli.config_files import expanded
 from neuido.commands.cli.suggestions import suggest
 from neuido.errors import UserError
 
@@ -24,7 +25,7 @@ def run_function(name: str, module: str, function: str, args: list[str]) -> int:
     elif alone:
         args = [f"--{first.name}", *args]
     try:
-        status = auto_cli(component, args=args, as_positional=False, prog=f"neuido {name}", exit_on_error=False)
+        status = auto_cli(component, args=expanded(args), as_positional=False, prog=f"neuido {name}", exit_on_error=False)
     except ArgumentError as error:
         explained = _explained(error, name, list(inspect.signature(component).parameters))
         if explained is error:

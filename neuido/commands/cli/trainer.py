@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import neuido
 from neuido.commands import interruption
+from neuido.commands.cli.config_files import expanded
 from neuido.commands.cli.console import quiet_lightning
 from neuido.commands.cli.signatures import MODULES
 from neuido.commands.cli.trainer_help import HEAVY
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 def run_lightning(args: list[str]) -> "LightningCLI":
     """Run a command of the trainer; the model, the data module and the trainer are attributes of what it returns."""
     quiet_lightning()
-    return _cli_class()(args=rename_in_arguments(args, "model.method", MODULES), **_settings())
+    return _cli_class()(args=rename_in_arguments(expanded(args), "model.method", MODULES), **_settings())
 
 
 def trainer_parser() -> "LightningArgumentParser":
