@@ -107,7 +107,9 @@ def free_memory(device: str) -> None:
 
 def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: float = 0.0) -> str:
     """Diagnose a folder into `out` within a time limit [min] (0: none); return an empty string, or the reason of the failure."""
-    from neuido.discrepancy import answer, attribution, workflow
+    from neuido.discrepancy import workflow
+    from neuido.discrepancy.inference import attribution
+    from neuido.discrepancy.report import answer
 
     target = Path(out)
     try:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from neuido.data.measured.material_test import read_material_tests as read_material_tests
     from neuido.data.measured.track import read_tracks as read_tracks
     from neuido.data.scenes.readers import read as read_recording
-    from neuido.discrepancy.diagnosis import Diagnosis as Diagnosis
+    from neuido.discrepancy.report.diagnosis import Diagnosis as Diagnosis
     from neuido.discrepancy.workflow import diagnose as diagnose
     from neuido.errors import UserError as UserError
     from neuido.export.particles import export as export
@@ -46,7 +46,7 @@ _PLACES = {  # name: its module, and after a colon its name there; a module alon
         name: f"types:{name}"
         for name in ("AttachedMass", "Body", "Box", "Cameras", "Gaussians", "ParticleState", "Plane", "Scene", "Walls")
     },
-    "Diagnosis": "discrepancy.diagnosis:Diagnosis",
+    "Diagnosis": "discrepancy.report.diagnosis:Diagnosis",
     "Encoder": "models.video.encoder:DynamicsEncoder",
     "FiniteElements": "physics.fem.finite_elements:FiniteElements",
     "Frames": "physics.runtime.frames:Frames",

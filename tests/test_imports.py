@@ -1,6 +1,7 @@
 """The package imports in one direction, and little at its start."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -44,6 +45,7 @@ def imports(source: str, module: str = "neuido.test") -> set[str]:
     return found
 
 
+@functools.cache
 def imports_of(module: str) -> set[str]:
     path = PACKAGE.parent / (module.replace(".", "/") + ".py")
     return imports(path.read_text(), module)
@@ -101,9 +103,9 @@ def test_light_modules_load_neither_torch_nor_lightning(module):
 # The drawn structure. The front doors (`__init__.py`), which import public names lazily, are drawn with what they lead to left out.
 
 FLOORS, FOLDER_FLOORS, FILES, LINES = 9, 12, 14, 450
+LARGER = {PACKAGE / "discrepancy" / "inference": 18}
+"""Folders that may hold more files: two decisions stand side by side here until the older one is deleted."""
 COMMANDS = {path.stem for path in (PACKAGE / "commands").glob("*.py")}
-INSIDE = "neuido.discrepancy"
-"""Its files are moved by themselves, later; its folder, lengths and stems are not held yet."""
 
 
 def drawn() -> dict[str, set[str]]:
@@ -131,12 +133,12 @@ def circles(graph: dict[str, set[str]]) -> list[set[str]]:
     return [set(group) for group in groups]
 
 
-def by_folder(graph: dict[str, set[str]]) -> dict[str, set[str]]:
-    """Return the same between folders; a file of a room's top stands for itself, but for commands and the inside of a diagnosis."""
+def by_folder(graph: dict[str, set[str]], whole: tuple[str, ...] = ("neuido.commands",)) -> dict[str, set[str]]:
+    """Return the same between folders; a file of a room's top stands for itself, but for those that count as a `whole`."""
 
     def folder(module: str) -> str:
-        whole = next((room for room in (INSIDE, "neuido.commands") if within(module, (room,))), None)
-        return whole or (module if module.count(".") < 3 else module.rpartition(".")[0])
+        own = next((room for room in whole if within(module, (room,))), None)
+        return own or (module if module.count(".") < 3 else module.rpartition(".")[0])
 
     out: dict[str, set[str]] = {}
     for module, others in graph.items():
@@ -176,22 +178,21 @@ def test_few_floors():
         rooms.setdefault(own, set()).update(room for other in others if (room := ".".join(other.split(".")[:2])) != own)
     assert circles(rooms) == []
     assert floors(rooms) <= FLOORS
-    assert floors(graph) <= FOLDER_FLOORS
+    assert floors(by_folder(drawn(), ("neuido.commands", "neuido.discrepancy"))) <= FOLDER_FLOORS
 
 
 def test_folders_and_files_are_small():
     for folder in {path.parent for path in PACKAGE.rglob("*.py")}:
-        if folder.name != "discrepancy":
-            assert len(list(folder.glob("*.py"))) <= FILES, folder
+        assert len(list(folder.glob("*.py"))) <= LARGER.get(folder, FILES), folder
     for module in MODULES:
         lines = len((PACKAGE.parent / (module.replace(".", "/") + ".py")).read_text().splitlines())
-        assert lines <= LINES or within(module, (INSIDE,)), f"{module} has {lines} lines"
+        assert lines <= LINES, f"{module} has {lines} lines"
 
 
 def test_no_stem_twice_but_a_commands():
     stems: dict[str, list[str]] = {}
     for module in MODULES:
         stem = module.rpartition(".")[2]
-        if stem not in ("__init__", "__main__") and not within(module, (INSIDE,)):
+        if stem not in ("__init__", "__main__"):
             stems.setdefault(stem, []).append(module)
     assert {stem: own for stem, own in stems.items() if len(own) > 1 and stem not in COMMANDS} == {}

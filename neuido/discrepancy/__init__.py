@@ -4,19 +4,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neuido.discrepancy.diagnosed import DiagnosedEffects as DiagnosedEffects
-    from neuido.discrepancy.diagnosis import Diagnosis as Diagnosis
-    from neuido.discrepancy.diagnosis import Effect as Effect
-    from neuido.discrepancy.diagnosis import ErrorChange as ErrorChange
-    from neuido.discrepancy.diagnosis import Quantity as Quantity
+    from neuido.discrepancy.applied_model import DiagnosedEffects as DiagnosedEffects
+    from neuido.discrepancy.report.diagnosis import Diagnosis as Diagnosis
+    from neuido.discrepancy.report.diagnosis import Effect as Effect
+    from neuido.discrepancy.report.diagnosis import ErrorChange as ErrorChange
+    from neuido.discrepancy.report.diagnosis import Quantity as Quantity
     from neuido.discrepancy.workflow import diagnose as diagnose
 
 _PUBLIC = {
-    "DiagnosedEffects": ("diagnosed", "DiagnosedEffects"),
-    "Diagnosis": ("diagnosis", "Diagnosis"),
-    "Effect": ("diagnosis", "Effect"),
-    "ErrorChange": ("diagnosis", "ErrorChange"),
-    "Quantity": ("diagnosis", "Quantity"),
+    "DiagnosedEffects": ("applied_model", "DiagnosedEffects"),
+    "Diagnosis": ("report.diagnosis", "Diagnosis"),
+    "Effect": ("report.diagnosis", "Effect"),
+    "ErrorChange": ("report.diagnosis", "ErrorChange"),
+    "Quantity": ("report.diagnosis", "Quantity"),
     "diagnose": ("workflow", "diagnose"),
 }
 __all__ = ["DiagnosedEffects", "Diagnosis", "Effect", "ErrorChange", "Quantity", "diagnose"]

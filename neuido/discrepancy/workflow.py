@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuido.data.files.writing import check_writable
-from neuido.discrepancy.diagnosis import Diagnosis
+from neuido.discrepancy.report.diagnosis import Diagnosis
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
     from neuido.data.measured.experiment import Experiment
     from neuido.data.measured.material_test import MaterialTests
     from neuido.data.measured.track import Tracks
-    from neuido.discrepancy.body import BodyProblem
-    from neuido.discrepancy.memo import Work
-    from neuido.discrepancy.problem import Problem
+    from neuido.discrepancy.problems.body import BodyProblem
+    from neuido.discrepancy.problems.problem import Problem
+    from neuido.discrepancy.store import Work
 
 DATA = ("auto", "points", "video")
 SOLVERS = ("both", "material_points", "finite_elements")
@@ -85,9 +85,9 @@ def diagnose(
     if out is not None:
         check_writable(Path(out).expanduser())
 
-    from neuido.discrepancy import answer
-    from neuido.discrepancy import resume as store
-    from neuido.discrepancy.attribution import diagnose as infer
+    from neuido.discrepancy import store
+    from neuido.discrepancy.inference.attribution import diagnose as infer
+    from neuido.discrepancy.report import answer
 
     chosen = choose_device(device)
     if folder is None:
@@ -172,7 +172,7 @@ def problems_of(
     """
     if data not in DATA:
         raise UserError(f"data = {data!r} is not known; use {', '.join(DATA)}")
-    from neuido.discrepancy.believed import read_model_file, with_law
+    from neuido.discrepancy.problems.declared_model import read_model_file, with_law
 
     given = dict(model) if isinstance(model, Mapping) else None if model is None else read_model_file(os.fspath(model))
     if kind == "experiment":
@@ -184,11 +184,11 @@ def problems_of(
         raise UserError(f"{'law' if law is not None else 'data'} is for experiments, and {folder} is a {kind}: leave it out")
     if kind == "material test":
         from neuido.data.measured.material_test import read_material_tests
-        from neuido.discrepancy.material import MaterialProblem
+        from neuido.discrepancy.problems.material import MaterialProblem
 
         return [MaterialProblem(read_material_tests(folder, model=given))]
     from neuido.data.measured.track import read_tracks
-    from neuido.discrepancy.track import TrackProblem, track_problems
+    from neuido.discrepancy.problems.tracks import TrackProblem, track_problems
 
     if given is None or set(given) != {"bodies"}:
         return track_problems(read_tracks(folder, model=given))
@@ -217,16 +217,16 @@ def problems_of_data(
     if data not in DATA:
         raise UserError(f"data = {data!r} is not known; use {', '.join(DATA)}")
     if isinstance(source, Experiment):
-        from neuido.discrepancy.believed import with_law
+        from neuido.discrepancy.problems.declared_model import with_law
 
         return "experiment", [experiment_problem(source if law is None else with_law(source, os.fspath(law)), data, device)]
     if law is not None or data != "auto":
         raise UserError(f"{'law' if law is not None else 'data'} is for experiments, not {type(source).__name__}: leave it out")
     if isinstance(source, MaterialTests):
-        from neuido.discrepancy.material import MaterialProblem
+        from neuido.discrepancy.problems.material import MaterialProblem
 
         return "material test", [MaterialProblem(source)]
-    from neuido.discrepancy.track import track_problems
+    from neuido.discrepancy.problems.tracks import track_problems
 
     return "track", track_problems(source)
 
@@ -237,14 +237,14 @@ def experiment_problem(experiment: "Experiment", data: str, device: str) -> "Bod
     Raises:
         UserError: Recordings that lack what is asked for.
     """
-    from neuido.discrepancy.body import body_problem
+    from neuido.discrepancy.problems.body import body_problem
 
     if data == "auto":
         tracked = [r.x is not None for r in experiment.recordings]
         data = "points" if all(tracked) or all(r.video is None for r in experiment.recordings) else "video"
     if data == "points":
         return body_problem(experiment, device=device)
-    from neuido.discrepancy.video import video_problem
+    from neuido.discrepancy.problems.video import video_problem
 
     return video_problem(experiment, device=device)
 
@@ -261,7 +261,7 @@ def solved_by(problem: "Problem", solver: str) -> "Problem":
         return problem
     if problem.settings == 1:
         raise UserError(f"solver = {solver}: {problem.name} is no body, and nothing is discretised; leave it out")
-    from neuido.discrepancy.rollouts import SETTINGS
+    from neuido.discrepancy.problems.settings import SETTINGS
 
     own = tuple(i for i in problem.solvers if SETTINGS[i].solver == solver)
     if solver == "material_points":  # the other settings come after these

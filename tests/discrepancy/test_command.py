@@ -16,8 +16,8 @@ import yaml
 import neuido
 from neuido.commands.main import main
 from neuido.data.measured.experiment import read_experiment
-from neuido.discrepancy.body import body_problem
-from neuido.discrepancy.rollouts import SETTINGS
+from neuido.discrepancy.problems.body import body_problem
+from neuido.discrepancy.problems.settings import SETTINGS
 from neuido.discrepancy.workflow import solved_by
 from tests import command
 from tests.discrepancy import made
@@ -337,7 +337,7 @@ def test_experiment_closes_the_loop(folders, tmp_path, capsys):
 def test_declared_effects_are_simulated_and_are_the_candidates_start(folders):
     """What the model declares is in every prediction, as if the point had it; and a candidate of that name starts from it."""
     from neuido.data.measured.experiment import read_experiment
-    from neuido.discrepancy.body import body_problem
+    from neuido.discrepancy.problems.body import body_problem
 
     plain = read_experiment(folders["experiment"])
     for effects in (

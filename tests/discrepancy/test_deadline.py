@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuido.discrepancy import attribution, next_experiment
-from neuido.discrepancy.attribution import diagnose
-from neuido.discrepancy.body import body_problem
-from neuido.discrepancy.deadline import AFTER, LEAST, SEARCH, Deadline
-from neuido.discrepancy.rounds import Inference
+from neuido.discrepancy.inference import attribution
+from neuido.discrepancy.inference.attribution import diagnose
+from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.problems.body import body_problem
+from neuido.discrepancy.report import next_experiment
+from neuido.discrepancy.store import AFTER, LEAST_SEARCH, SEARCH, Deadline
 from neuido.discrepancy.workflow import restricted
 from tests import command
 from tests.discrepancy import made
@@ -47,7 +48,7 @@ def test_the_search_has_a_share_and_the_end_the_rest():
 def test_where_a_simulation_is_slow_the_search_ends_earlier():
     """So that what follows it has the time that it takes there."""
     clock = Clock(0.0)
-    for pace, share in ((0.01, SEARCH), (0.15, 1.0 - AFTER * 0.15 / 100.0), (1.0, LEAST)):
+    for pace, share in ((0.01, SEARCH), (0.15, 1.0 - AFTER * 0.15 / 100.0), (1.0, LEAST_SEARCH)):
         limit = Deadline(100.0, clock=clock, pace=lambda pace=pace: pace)
         assert limit.share == pytest.approx(share)
         limit.conclude()

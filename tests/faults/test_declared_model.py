@@ -4,9 +4,9 @@ import pytest
 import yaml
 
 from neuido.data.measured.experiment import read_experiment
-from neuido.discrepancy.attribution import diagnose
-from neuido.discrepancy.body import body_problem
-from neuido.discrepancy.fit import Covariance, NotFinite
+from neuido.discrepancy.inference.attribution import diagnose
+from neuido.discrepancy.inference.least_squares import Covariance, NotFinite
+from neuido.discrepancy.problems.body import body_problem
 from neuido.errors import UserError
 
 

@@ -20,7 +20,7 @@ MODULES = (  # so that their class names resolve without a path
     "neuido.data.trajectories.trajectory_module",
     "neuido.data.clips",
     "neuido.data.scenes.filmed_scene_module",
-    "neuido.discrepancy.diagnosed",
+    "neuido.discrepancy.applied_model",
 )
 
 BASES = {  # the key of a configuration that takes a class: the class that it must be derived from

@@ -21,7 +21,7 @@ def replay(folder: str, *, out: str, model: str | None = None, device: str = "au
         UserError: No experiment, a model that cannot run, a folder that is in use.
     """
     check_writable(Path(out))
-    from neuido.discrepancy.replay import replay
+    from neuido.discrepancy.applied_model import replay
 
     replay(folder, out, model=model, device=device, progress=progress)
     print(f"results in {out}: `neuido diagnose {out} --out FOLDER` reads it")

@@ -140,7 +140,7 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
         for key, figure in value.items():
             flat[f"{name}.{key}"] = number(figure, f"{where}.{name}.{key}")
     try:
-        later = [f"time_force.{key}" for key in WAVES]  # `discrepancy.library` makes knots of them; a gradient needs a body
+        later = [f"time_force.{key}" for key in WAVES]  # `discrepancy.problems.candidates` makes knots of them; a gradient needs a body
         Effects.of({key: figure for key, figure in flat.items() if not key.startswith("stiffness_gradient.") and key not in later})
     except UserError as error:
         raise UserError(f"{where}: {error}") from error

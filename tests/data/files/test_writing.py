@@ -13,7 +13,7 @@ import pytest
 from neuido.data.files.storage import write_text
 from neuido.data.files.values import file_name
 from neuido.data.files.writing import atomic_write, check_writable, make_real_folder, new_folder, remove
-from neuido.discrepancy import resume
+from neuido.discrepancy import store
 from neuido.errors import UserError, one_line
 
 
@@ -88,14 +88,14 @@ def test_the_work_of_a_diagnosis_is_no_link(tmp_path):
     (elsewhere / "precious.txt").write_text("mine")
     (out / ".work").symlink_to(elsewhere)
     with pytest.raises(UserError, match=r"\.work is a link"):
-        resume.workplace(out, "plan", resume=True)
-    resume.clear(out)
+        store.workplace(out, "plan", resume=True)
+    store.clear(out)
     assert (elsewhere / "precious.txt").read_text() == "mine" and not (out / ".work").is_symlink()
     (out / ".work").mkdir()
     (out / ".work" / "plan").symlink_to(elsewhere)
     with pytest.raises(UserError, match="is a link"):
-        resume.workplace(out, "plan", resume=True)
-    resume.workplace(out, "other", resume=True)
+        store.workplace(out, "plan", resume=True)
+    store.workplace(out, "other", resume=True)
     assert (elsewhere / "precious.txt").exists()
 
 

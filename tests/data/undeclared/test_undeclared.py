@@ -112,7 +112,7 @@ def test_null_with_wrong_nuisances(tmp_path):
 
 
 def test_wrong_nuisances_are_those_that_a_diagnosis_expects():
-    from neuido.discrepancy.body import NUISANCES
+    from neuido.discrepancy.problems.body import NUISANCES
 
     expected = {(name.removesuffix("_x"), unit, prior) for name, unit, prior in NUISANCES if not name.endswith(("_y", "_z"))}
     assert expected == set(WRONG_NUISANCES)

@@ -1,0 +1,377 @@
+"""From a residual to a name: grow the model by one effect at a time, drop what became needless, and say how sure the answer is."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from neuido.discrepancy.inference.choosing import first_rounds, told_exactly
+from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, score, split, times_over
+from neuido.discrepancy.inference.intervals import Hidden, blind_to_settings, findings, hidden, intervals, unable
+from neuido.discrepancy.inference.judging import ALPHA, CLASS_RATIO, STANDS_OUT, WITHIN
+from neuido.discrepancy.inference.laboratory import LEAST_GAIN, Tell
+from neuido.discrepancy.inference.least_squares import Fit, NotFinite
+from neuido.discrepancy.inference.pairs import by_growing, neighbours, simpler, two_effects
+from neuido.discrepancy.inference.rounds import UNEXPLAINED, Inference
+from neuido.discrepancy.problems.problem import Point, Problem
+from neuido.discrepancy.store import Deadline, Memo, Work
+from neuido.errors import UserError
+
+
+def widen(inference: Inference, r: Round, at: Stand, others: Iterable[Round]) -> None:
+    """Put into the class of a round what another method named that leaves about as much, where that is more than noise.
+
+    The methods differ there by as much as the effects do, so that the data tell neither apart.
+    """
+    if inference.is_settled(at.errors):
+        return
+    for other in others:
+        if other.chosen is None or other.chosen.score > score(at.errors) + 2.0 * math.log(CLASS_RATIO):
+            continue
+        for t in other.members:
+            if t.candidate.name not in {m.candidate.name for m in r.members}:
+                r.trials = sorted([*(o for o in r.trials if o.candidate.key != t.candidate.key), t], key=lambda t: t.score)
+                r.members = [*r.members, t]
+
+
+def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:
+    """Weigh each class of effects again beside all others that were found: the best one of each stays, with those near it.
+
+    So are simpler candidates that came close: before the others were found a force of many parameters may have stood for two effects. And
+    where all of them together leave more than noise, the others that came close: a neighbour of the true one may have led alone.
+    """
+    for r in rounds:
+        if r.chosen not in found:
+            continue
+        rest = [t for t in found if t is not r.chosen]
+        beside = tuple(p for t in rest for p in t.candidate.parameters)
+        own = {p.name for p in r.chosen.candidate.parameters}
+        without = {k: v for k, v in base.point.items() if k not in own}
+        left = inference.mean_squares([base.point], floor)[0]
+        rivals = simpler(r, r.chosen) + ([] if inference.is_noise(left) else neighbours(r, r.chosen))
+        taken = {o.candidate.name for o in rest}
+        members = [t for t in dict.fromkeys((*r.members, *rivals)) if t.candidate.name not in taken]
+        if len(members) == 1:
+            continue
+        requests = []
+        for t in members:
+            start = base.point if t is r.chosen else without | {p.name: t.fit.point[p.name] for p in t.candidate.parameters}
+            requests.append(inference.request((*inference.problem.declared, *beside, *t.candidate.parameters), start))
+        fits = inference.fits(requests, floor)
+        squares = inference.mean_squares([fit.point for fit in fits], floor)
+        weighed = [replace(t, stand=Stand(fit, floor, square)) for t, fit, square in zip(members, fits, squares, strict=True)]
+        at = min(range(len(weighed)), key=lambda i: weighed[i].penalised)
+        for t, new in zip(members, weighed, strict=True):
+            above = math.exp(0.5 * (new.score - weighed[at].score))
+            near = new is weighed[at] or inference.as_good(new, weighed[at])
+            t.reason = "" if near else f"with all effects that were found it leaves {above:.1f} times the error of the best"
+        found[found.index(r.chosen)] = members[at]
+        base, r.chosen, r.members = fits[at], members[at], [t for t in members if not t.reason]
+    return base, found
+
+
+def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:
+    """Leave out effects that the others make needless, from where all of them together brought the fit, the most needless one first.
+
+    What is held out says so: what fits the fitted recordings alone as well may foretell nothing.
+    """
+    while len(found) > 1:
+        declared, requests = inference.problem.declared, []
+        rests = [[t for t in found if t is not trial] for trial in found]
+        for trial, rest in zip(found, rests, strict=True):
+            free = (*declared, *(p for t in rest for p in t.candidate.parameters))
+            requests.append(inference.request(free, trial.candidate.without(base.point)))
+        fits = inference.fits(requests, floor)
+        with_all, *squares = inference.mean_squares([base.point, *(fit.point for fit in fits)], floor)
+        lost = [inference.foretold(without, with_all) for without in squares]
+        least = min(range(len(found)), key=lambda i: lost[i])
+        if lost[least] > LEAST_GAIN / 2:
+            break
+        base, found = fits[least], rests[least]
+    return base, found
+
+
+__all__ = [
+    "ALPHA",
+    "MOST",
+    "UNEXPLAINED",
+    "WITHIN",
+    "Diagnosis",
+    "Floor",
+    "Inference",
+    "Part",
+    "Round",
+    "Stand",
+    "Trial",
+    "diagnose",
+    "split",
+]
+
+MOST = 3
+"""Effects that a growth may add."""
+FURTHER = 1.5
+"""Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
+
+
+@dataclass(eq=False)
+class Diagnosis:
+    """What `diagnose` found; the folder `report` writes it."""
+
+    problem: Problem
+    answer: str
+    rounds: list[Round]
+    before: Point
+    after: Point
+    parts: list[Part]
+    errors: dict[str, dict[str, float]]
+    """`before` and `after`: error of each recording by name, with the differences of the settings that the fitted recordings hold."""
+    one_setting: dict[str, dict[str, float]]
+    """The same of a simulation under one setting alone."""
+    amounts: dict[str, np.ndarray]
+    """`before` and `after`: how much of each difference that is."""
+    final: dict[str, Floor]
+    """`before` and `after`: noise and discretisation there."""
+    floors: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
+    declared_intervals: dict[str, tuple[float, float]]
+    setting: int
+    work: Mapping[str, Work]
+    """What each step ran."""
+    deadline: Deadline = field(default_factory=Deadline)
+    """When it has to come to its end."""
+    sealed: list[Part] = field(default_factory=list)
+    """Recordings that took no part in the search: theirs is a test error."""
+    leads: list[Trial] = field(default_factory=list)
+    """What leads in a search that was cut off; nothing of it is named."""
+    why: list[str] = field(default_factory=list)
+    """Why the recordings say too little, or what is wrong with them."""
+    over: dict[str, float] = field(default_factory=dict)
+    """How far what is left after is above the `floor` and above the `noise`: ratios of errors."""
+    hidden: list[Hidden] = field(default_factory=list)
+    """Sizes up to which the other effects would not have been seen."""
+    unable: Mapping[str, list[str]] = field(default_factory=dict)
+    """The other settings that did not run, by recording."""
+    noise_from: dict[str, str] = field(default_factory=dict)
+    """`stated`, `estimated` or `assumed`, by recording."""
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """What there was no time for."""
+        return tuple(self.deadline.left_out)
+
+    @property
+    def evaluations(self) -> int:
+        """Simulations in all."""
+        return sum(w.simulations for w in self.work.values())
+
+    @property
+    def effects(self) -> list[Trial]:
+        return [r.chosen for r in self.rounds if r.chosen is not None]
+
+
+def diagnose(
+    problem: Problem,
+    *,
+    keep: int = 7,
+    draws: int = 199,
+    seed: int = 0,
+    most: int = MOST,
+    tell: Tell | None = None,
+    seconds: float = math.inf,
+) -> Diagnosis:
+    """Fit the declared model, look for effects that it lacks, and say what was found.
+
+    Args:
+        problem: Model and data.
+        keep: Candidates that get a full fit in each round, at the least.
+        draws: Of the parametric bootstrap of the largest gain.
+        seed: Of the draws.
+        most: Effects that may be added.
+        tell: Called with a line of progress.
+        seconds: After which it comes to its end; see `Deadline`.
+
+    Raises:
+        UserError: No method can predict the declared model; the line of its simulator.
+    """
+    memo = Memo(problem)
+    deadline = Deadline(seconds, pace=lambda: memo.pace)
+    tried: list[Inference] = []
+    starts: list[Stand] = []
+    for n in problem.solvers:
+        inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo, deadline=deadline)
+        if starts and (tried[-1].is_settled(starts[-1].errors) or deadline.skips(problem.setting_name(n))):
+            continue
+        if len(starts) == 1 and told_exactly(tried[0], starts[0]):
+            break
+        # the problem's own parameters are about the other method
+        near = {name: starts[0].fit.point[name] for name in inference.as_declared} if starts else None
+        try:
+            start = inference.start(near)
+        except NotFinite as error:
+            raise UserError(problem.refusal(n)) from error
+        if start is not None:
+            tried.append(inference)
+            starts.append(start)
+    chosen, firsts = first_rounds(tried, starts)
+    inference, rounds = tried[chosen], firsts[chosen]
+    start = rounds[0].plain or starts[chosen]
+    if len(tried) > 1:
+        inference.tell(f"solver: {problem.setting_name(inference.setting)}")
+    at = start
+    found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
+    others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
+    hurried, grown = False, None
+    while rounds[-1].chosen is not None:
+        step = rounds[-1].chosen
+        found.append(step)
+        # near the noise too: what leaves that alone in one simulation is told by it, however little it gains
+        settled = len(found) == most or inference.is_noise(step.errors)
+        hurried = deadline.over
+        if hurried and not settled:
+            deadline.skips("a further effect")
+        if hurried:  # what is left of the time is for the last fit
+            deadline.conclude()
+        at = inference.finished(step.stand)
+        if settled or hurried or inference.is_noise(at.errors):
+            break
+        if problem.together and len(found) == 1 and (grown := by_growing(inference, rounds[0], at, others)):
+            break
+        if problem.settings > 1 and not inference.is_settled(at.errors) and inference.over(at) < FURTHER:
+            break
+        rounds.append(inference.round(at.fit, at.floor, found))
+    # where every point costs pairs grow after what takes less, and where nothing was named last of all
+    if not hurried and (not found or (len(found) == 1 and not problem.together)):
+        grown = by_growing(inference, rounds[0], at, others)
+    if hurried and 0 < len(found) < MOST and not inference.is_settled(at.errors):
+        deadline.skips("two effects at once")
+    if grown or (0 < len(found) < 3 and not hurried):
+        by, pair = grown or two_effects(inference, rounds, found, at, others)
+        if by is not inference:
+            inference, start = by, pair[0].plain or starts[tried.index(by)]
+        if pair:
+            rounds = pair
+            found = [r.chosen for r in pair if r.chosen is not None]
+            at = inference.finished(found[-1].stand)
+    if len(found) == 1:
+        widen(inference, rounds[0], at, others.values())
+    deadline.conclude()
+    if len(found) > 1:
+        floor = inference.floor(at.fit.point)
+        fit, found = drop(inference, at.fit, floor, found)
+        fit, found = narrow(inference, fit, floor, found, rounds)
+        at = inference.finished(Stand(fit, floor, inference.mean_squares([fit.point], floor)[0]))
+    return conclude(inference, start, at, found, rounds)
+
+
+def conclude(inference: Inference, before: Stand, after: Stand, found: list[Trial], rounds: list[Round]) -> Diagnosis:
+    """The answer and its figures, each stand with the floor that its effects were weighed with."""
+    first, problem = rounds[0], inference.problem
+    cut = inference.deadline.cut and (bool(found) or not inference.is_noise(before.errors))
+    kept = {t.candidate.key for t in found}
+    steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
+    leads = leading(rounds) if cut else []
+    over = inference.over(after) if found and not cut else first.over
+    answer, why = decided(inference, before, after, found, steps, cut=cut)
+    if found and answer not in ("effect", "class"):  # nothing is named, and nothing added
+        after, found, over = before, [], first.over
+        steps = [replace(first, chosen=None, members=[])]
+    stands = {"before": before, "after": after}
+    alone = {when: inference.mean_squares([s.fit.point], s.floor, plain=True)[0] for when, s in stands.items()}
+    own = intervals(inference, after.fit, after.floor, after.errors)
+    declared = {}
+    if problem.declared:
+        stated = Fit(before.fit.point, tuple(p.name for p in problem.declared), 0.0, np.empty(0), 0, True)
+        declared = intervals(inference, stated, before.floor, before.errors)
+    scale, floor = inference.scale, after.floor
+    looked = [] if cut or not any(r.trials for r in rounds) else hidden(inference, after, rounds[-1], found)
+    amounts = {when: inference.amounts(s.fit.point, s.floor) for when, s in stands.items()}
+    final, errors, single = tested(inference, stands, amounts, alone)
+    return Diagnosis(
+        problem,
+        answer,
+        steps,
+        before.fit.point,
+        after.fit.point,
+        inference.parts,
+        errors,
+        single,
+        amounts,
+        final,
+        {
+            "noise": scale * math.sqrt(np.mean([v**2 for v in floor.noise.values()])),
+            "discretisation": scale * math.sqrt(np.mean([np.mean(v**2) for v in floor.spread.values()])),
+        },
+        own,
+        declared,
+        inference.setting,
+        inference.memo.work,
+        inference.deadline,
+        sealed=list(inference.sealed),
+        leads=leads,
+        why=why,
+        over={"floor": over, "noise": times_over(after.errors, inference.noise_squares)},
+        hidden=looked,
+        unable=unable(inference),
+        noise_from={r.name: inference.noise_from(n) for n, r in enumerate(problem.recordings)},
+    )
+
+
+def decided(
+    inference: Inference, before: Stand, after: Stand, found: Sequence[Trial], steps: Sequence[Round], *, cut: bool
+) -> tuple[str, list[str]]:
+    """The answer, and why the recordings say too little or what is wrong with them; `cut`: the search ended for lack of time."""
+    first = steps[0]
+    if cut:
+        return "unfinished", []
+    wrong = findings(inference, after)
+    if wrong:
+        return "insufficient", wrong
+    missing = bool(found) or first.unsure or inference.is_unexplained(first)
+    inference.floor(after.fit.point, like=after.floor)  # which settings run there
+    if missing and blind_to_settings(inference):
+        return "insufficient", ["no other setting of the simulation runs there, so that its own error is not known"]
+    if found:
+        several = any(len({t.candidate.name for t in r.members}) > 1 for r in steps if r.chosen is not None)
+        return "class" if several else "effect", []
+    if missing:
+        return "unknown", []
+    if not enough(inference):
+        return "insufficient", ["there are few data for the figures that are free"]
+    noisy = times_over(before.errors, inference.noise_squares)
+    if noisy > STANDS_OUT:
+        return "insufficient", [f"what is left is {noisy:.0f} times the noise, and the discretisation alone may make as much"]
+    return "none", []
+
+
+def leading(rounds: Sequence[Round]) -> list[Trial]:
+    """What leads in a search that was cut off: the effects that would be named, and else the best fit."""
+    chosen = [r.chosen for r in rounds if r.chosen is not None]
+    return chosen or [t for r in rounds[:1] for t in r.trials[:1] if t.gain > 0]
+
+
+def tested(
+    inference: Inference, stands: Mapping[str, Stand], amounts: Mapping[str, np.ndarray], alone: Mapping[str, np.ndarray]
+) -> tuple[dict[str, Floor], dict[str, dict[str, float]], dict[str, dict[str, float]]]:
+    """The floors, errors and errors under one setting, `before` and `after`, with those of the recordings that were sealed until now."""
+    floors, errors, single = {}, {}, {}
+    for when, stand in stands.items():
+        floors[when], point = stand.floor, stand.fit.point
+        errors[when], single[when] = _by_recording(inference, stand.errors), _by_recording(inference, alone[when])
+        for part in inference.sealed:
+            there = inference.floor(point, of=[part.recording])
+            floors[when] = floors[when].joined(there)
+            residual = {part.recording: inference.residual(point, part.recording)}
+            for out, own in ((errors, amounts[when]), (single, None)):
+                left = there.settle(residual[part.recording], part, own)
+                out[when][part.name] = inference.scale * math.sqrt(float(np.mean(left**2)))
+    return floors, errors, single
+
+
+def enough(inference: Inference) -> bool:
+    """Whether there are many more data than parameters in every part."""
+    return all(int(p.rows.sum()) > 3 * len(inference.problem.declared) + 10 for p in inference.parts)
+
+
+def _by_recording(inference: Inference, squares: np.ndarray) -> dict[str, float]:
+    return {p.name: inference.scale * math.sqrt(float(v)) for p, v in zip(inference.parts, squares, strict=True)}

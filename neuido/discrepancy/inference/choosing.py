@@ -1,0 +1,164 @@
+"""Which method of prediction a diagnosis goes by, where several can move the body, and the first round of each that is asked."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from neuido.discrepancy.inference.floors import Round, Stand, score
+from neuido.discrepancy.inference.judging import WITHIN
+from neuido.discrepancy.inference.laboratory import LEAST_GAIN
+from neuido.discrepancy.inference.pairs import WORSE, look_ahead
+from neuido.discrepancy.inference.refining import BEYOND
+from neuido.discrepancy.inference.rounds import Inference
+
+CLEARLY = 1.5
+"""Times the error of another method's first fits at which those of the suggested one are refined first all the same."""
+LOOKS = (0.5, 0.8)
+"""Shares of the time for the search at which the first fits by the first method end, and those by others: the rest is for refining."""
+AS_SURE = 2.0
+"""Times the noise up to which what a named effect leaves is no reason to ask another method: in five blind seeds none of eight that were
+asked there took its place, of three that left 2.3 to 2.4 times as much all."""
+EARLY = 1.5
+"""Times its floor above which what the suggested method leaves is searched before another method has its declared model fitted."""
+UNASKED = math.log(3.0)
+"""Gain from which an effect is named although there was no time to refine by another method: of the searches of a blind seed that were cut
+off there a false alarm gained 2.4, half of a pair 2.7, what was right or near 3.3 to 9."""
+
+
+def told_exactly(inference: Inference, start: Stand) -> bool:
+    """Whether a method names an effect with which one simulation leaves nothing but noise: no other one is asked then.
+
+    Looked for where the residual is above the floor, and the first fits come down to noise; `first_rounds` takes the round that it took.
+    Where every point costs, none grow before the other method was asked: by the wrong one all leave much.
+    """
+    if inference.problem.settings == 1 or inference.over(start) < EARLY:
+        return False
+    look = inference.look(start.fit, start.floor, until=LOOKS[0], grows=inference.problem.together)
+    if not look.least or not inference.is_noise(look.least[0]):
+        return False
+    first = inference.round(start.fit, start.floor, [])
+    if first.chosen is None or inference.deadline.ends():
+        return False
+    return inference.is_exact(replace(first.chosen, stand=inference.finished(first.chosen.stand)))
+
+
+def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[int, dict[int, list[Round]]]:
+    """Which of the methods goes on, and the first round of each that was asked, or two where it takes two effects to gain enough.
+
+    The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for.
+    """
+    settled = [i for i, start in enumerate(starts) if tried[i].is_noise(start.errors)]
+    if settled:
+        chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
+        return chosen, {chosen: [unsearched(starts[chosen], tried[chosen].noise_squares)]}
+    # another method must do clearly better before it takes the place of the suggested one
+    handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
+    base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
+    order = sorted(range(len(tried)), key=lambda i: base[i])
+    # what is left of the declared model says little of the methods where an effect is missing: unless it is far worse, the suggested one
+    suggested = base[0] - base[order[0]] < 2.0 * math.log(WORSE)
+    seen = by_first_fits(tried, starts, sorted(order, key=lambda i: i > 0) if suggested else order, handicap)
+    order = sorted(order, key=lambda i: seen.get(i, math.inf) + 2.0 * math.log(CLEARLY) * (i > 0))
+    firsts: dict[int, list[Round]] = {}
+    unasked = False
+    for i in order:
+        named = [rounds[0] for rounds in firsts.values() if rounds[0].chosen]
+        if firsts and not named and at_best(tried[i], starts[i]) + handicap[i] - base[order[0]] > 2.0 * math.log(WORSE):
+            continue
+        at_first = -math.inf if waits(tried[i]) else seen.get(i, -math.inf)
+        if any(r.chosen and at_first > r.chosen.score + handicap[i] + 2.0 * math.log(BEYOND) for r in named):
+            continue
+        if firsts and tried[i].deadline.skips("effects by the other method"):
+            unasked = True
+            continue
+        first = tried[i].asked or tried[i].round(starts[i].fit, starts[i].floor, [], named[0] if named else None)
+        least = min((t.score for t in first.trials), default=math.inf)
+        beaten = any(r.chosen and r.chosen.score <= least for r in named)
+        firsts[i] = [first] if beaten else look_ahead(tried[i], first)
+        last = firsts[i][-1]
+        if last.trials and tried[i].is_noise(last.trials[0].errors):
+            break
+        if last.chosen is not None and tried[i].is_noise(last.chosen.errors / AS_SURE**2):
+            break
+        if last.chosen is None and last.over < WITHIN:
+            break
+    best = {
+        i: min([t.score for r in rounds for t in r.trials if not t.reason or t in r.members] + [score(rounds[0].errors)])
+        for i, rounds in firsts.items()
+    }
+    # by a method whose declared model is not the best one an effect must leave clearly less than that one does without any
+    bare = min(range(len(tried)), key=lambda i: base[i])
+    alone = bare not in firsts or firsts[bare][0].chosen is None
+    sure = {i: 2.0 * LEAST_GAIN * (i != bare and firsts[i][0].chosen is not None and alone) for i in firsts}
+    weighed = {i: best[i] + handicap[i] + sure[i] for i in firsts}
+    chosen = min(firsts, key=lambda i: weighed[i])
+    if bare not in firsts and firsts[chosen][0].chosen is not None and weighed[chosen] > base[bare]:
+        start, there = starts[bare], tried[bare]  # it was not asked, and no effect does better than that
+        floors = there.floors(start.fit.point, there.problem.declared, start.floor)
+        chosen, firsts[bare] = bare, [unsearched(start, floors)]
+    first = firsts[chosen][0]
+    if unasked and len(firsts[chosen]) == 1 and first.chosen is not None and first.chosen.gain < UNASKED:
+        for t in first.members:
+            t.reason = t.too_little(UNASKED, "with no time for the other method")
+        firsts[chosen] = [replace(first, chosen=None, members=[], unsure=True)]
+    return chosen, firsts
+
+
+def unsearched(start: Stand, floors: np.ndarray) -> Round:
+    """The round of a declared model beside which no effect was looked for."""
+    return Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)
+
+
+def waits(inference: Inference) -> bool:
+    """Whether most of the first fits by a method were put off: what the others leave says little of it."""
+    return inference.seen is not None and inference.seen.contest.put_off is not None
+
+
+def at_best(inference: Inference, start: Stand) -> float:
+    """Score of what the declared model leaves, or the first fits of effects beside it, where these were made already and leave less."""
+    look = inference.seen
+    fits = look.least if look is not None and look.base is start.fit else []
+    return min(score(squares) for squares in [start.errors, *fits])
+
+
+def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Sequence[int], handicap: Sequence[float]) -> dict[int, float]:
+    """Score of what the first fits of effects leave by each method, its handicap included.
+
+    Asked of another one where the first in the order promises an effect, or its residual is above the floor, and its fits leave more than
+    what may be noise once it is refined: what a method leaves of the declared model says little of how well it fits with the effect, and
+    to refine by the wrong one takes long. By another one those are fitted that led by the first, from where their fits ended too, and the
+    few that its own directions add. Where every point costs, fits grow after these alone, by the method that leaves least, and by the
+    others while that leaves much.
+    """
+    first, *others = order
+    at_once = tried[first].problem.together
+    limit = score(starts[first].errors) + handicap[first] + 2.0 * math.log(WORSE)
+    others = [i for i in others if at_best(tried[i], starts[i]) + handicap[i] <= limit]
+    if not others:
+        return {}
+    look = tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0], grows=at_once)
+    least = min([*look.least, starts[first].errors], key=score)
+    if tried[first].gain(starts[first].errors, least) < LEAST_GAIN and tried[first].over(starts[first]) < 1.0:
+        return {}
+    left = {first: score(least) + handicap[first]}
+
+    def least_by(i: int, **options: Any) -> list[np.ndarray]:
+        """What a look by a method leaves at the least, which is put down."""
+        there = tried[i].look(starts[i].fit, starts[i].floor, until=LOOKS[1], **options).least
+        left[i] = score(there[0]) + handicap[i] if there else math.inf
+        return there
+
+    if tried[first].may_be_noise(least):
+        return left
+    for i in others:
+        if tried[i].deadline.skips("first fits by the other method", LOOKS[1]):
+            break
+        beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
+        least_by(i, led=look.led, beyond=beyond, grows=at_once)
+    for i in [] if at_once else sorted(left, key=lambda i: left[i]):
+        if not tried[i].leaves_much(least_by(i)):
+            break
+    return left

@@ -1,0 +1,338 @@
+"""First fits that read more and more of the recordings, and the best fits once more from where they and others stand."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from neuido.discrepancy.inference.base_fits import ELSEWHERE, HORIZONS
+from neuido.discrepancy.inference.contests import FAR, IN_REACH, MANY, SMALL, Contests, better
+from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial, score
+from neuido.discrepancy.inference.least_squares import Fit, Race
+from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
+
+ABOVE = 2.5
+"""Times the noise of the fitted recordings that the best first fit leaves, from which on fits grow."""
+SIDE_BY_SIDE, ONE_BY_ONE = 8, 4
+"""Candidates that grow, where a launch of several points costs as one, one of them of more than `MANY` parameters, and where every point
+costs, none of those."""
+
+
+class Breadth(NamedTuple):
+    """How many pairs of effects grow."""
+
+    firsts: int
+    """Candidates beside which a second one grows."""
+    seconds: int
+    """Beside each of these."""
+    pairs: int
+    """That go on past the second horizon."""
+    parameters: int
+    """Of a candidate, at the most."""
+
+
+PAIRS, PAIRS_ONE_BY_ONE = Breadth(10, 4, 12, MANY), Breadth(5, 3, 4, 4)
+"""Where a launch of several points costs as one, and where every point costs."""
+
+
+class Pair(NamedTuple):
+    """Two effects that were fitted together."""
+
+    candidates: tuple[Candidate, Candidate]
+    fit: Fit
+
+
+POLISHED = 4
+"""Candidates whose fits are refined from further starts."""
+NEARBY = 2.5
+"""Times the least error, that of what is held out too, up to which a fit is worth refining."""
+BEYOND = 8.0
+"""Times the error of what another solver named beyond which fits are not refined: that has gained up to 7-fold."""
+MEASURED, NEAR = 6, 4.0
+"""Fits whose errors are measured with the differences of the settings where they end: so many of the best, or all, within this factor of
+their errors."""
+BY_FAR = 0.5
+"""Share of the least cost of a candidate of few parameters below which one of many is refined."""
+ONWARD = 3
+"""Further fits of a candidate, each with the differences of the settings where the last one ended: while each gains `SOME_GAIN` or has
+not come to its end."""
+SOME_GAIN = math.log(1.2)
+"""Smaller gains are no reason to look further."""
+
+Onset = tuple[Sequence[Parameter], Fit, Sequence[Point]]
+"""What is fitted, a fit of it, and where further ones begin."""
+
+
+class Refining(Contests):
+    """Fits by growing horizons, and what becomes of the best fits."""
+
+    def leaves_much(self, errors: Sequence[np.ndarray]) -> bool:
+        """Whether the least of what fits leave of all parts, mean squares, is far above noise: they may have missed a valley."""
+        if self.problem.settings == 1 or not self.problem.declared:
+            return False
+        noise = score(self.noise_squares[self.fitted])
+        return all(score(squares[self.fitted]) - noise > 2.0 * math.log(ABOVE) for squares in errors)
+
+    def is_astray(self, base: Fit, floor: Floor) -> bool:
+        """Whether the base fit leaves much and stands elsewhere than the declared model fits the first part of the recordings."""
+        if self.begun is None or not self.leaves_much(self.mean_squares([base.point], floor)):
+            return False
+        return self.apart(base.point, self.begun) > ELSEWHERE
+
+    def growing(
+        self, base: Fit, floor: Floor, candidates: Sequence[Candidate], found: Sequence[Trial] = (), *, until: float = 1.0
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of the candidates that promise most in the first part of the fitted recordings, by growing horizons, by their keys.
+
+        They are screened where the declared model, with the effects that were found, fits the first part of the recordings, by what they
+        would take off a little more of it, and the start of each that does best is the one that grows. What falls behind at a horizon is
+        given up. One of many parameters grows where a launch of several points costs as one.
+        """
+        free = (*self.problem.declared, *(p for t in found for p in t.candidate.parameters))
+        at = self.at_first(free, self.at_declared(base.point), floor, found)
+        starts = self.leading(at, candidates, self.early(floor, HORIZONS[1]), free)
+        # where every point costs one of many parameters takes five times as long as the others together
+        large = [entry for entry in starts if len(entry[0].parameters) > MANY][: 1 if self.problem.together else 0]
+        live = [entry for entry in starts if entry in large or len(entry[0].parameters) <= MANY]
+        live = live[: SIDE_BY_SIDE if self.problem.together else ONE_BY_ONE]
+        self.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
+        entries = [((*free, *c.parameters), point) for c, point in live]
+        ended = [(live[i][0], fit) for i, fit in self.grown(entries, floor, until=until, reach=IN_REACH)]
+        costs = self.costs([fit.point for _, fit in ended], floor) if ended else []  # the time may have ended them at an earlier horizon
+        return {c.key: (c, replace(fit, cost=cost)) for (c, fit), cost in zip(ended, costs, strict=True) if np.isfinite(cost)}
+
+    def growing_pairs(self, base: Point, floor: Floor) -> list[Pair]:
+        """Fits of two effects at once by growing horizons, the least cost first.
+
+        In the first part of the recordings many a single effect does about as well as the right ones, whichever they are; a little later
+        the second one shows beside it. What one effect alone leaves of the whole says little of that.
+        """
+        free, breadth = self.problem.declared, PAIRS if self.problem.together else PAIRS_ONE_BY_ONE
+        small = [c for c in self.problem.candidates if len(c.parameters) <= breadth.parameters]
+        wide = self.early(floor, HORIZONS[1])
+        firsts = self.leading(self.at_first(free, self.at_declared(base), floor), small, wide, free)[: breadth.firsts]
+        self.tell(f"growing pairs beside {', '.join(c.key for c, _ in firsts)}")
+        requests = [self.request((*free, *c.parameters), point, iterations=self.stepwise) for c, point in firsts]
+        fits = self.fits(requests, self.early(floor, HORIZONS[0]))
+        begun: dict[frozenset[str], tuple[tuple[Candidate, Candidate], Point]] = {}
+        for (c, _), fit in zip(firsts, fits, strict=True):
+            if np.isfinite(fit.cost):
+                beside = [other for other in small if other.name != c.name]
+                for other, point in self.leading(fit.point, beside, wide, (*free, *c.parameters))[: breadth.seconds]:
+                    begun.setdefault(frozenset((c.key, other.key)), ((c, other), point))
+        live = list(begun.values())
+        entries = [((*free, *c.parameters, *other.parameters), point) for (c, other), point in live]
+        sizes = [[p.name for p in other.size_parameters] if other.linear else [] for (_, other), _ in live]
+        ended = self.grown(entries, floor, reach=IN_REACH, most=breadth.pairs, sizes=sizes)
+        return [Pair(live[i][0], fit) for i, fit in ended if np.isfinite(fit.cost)]
+
+    def at_first(self, free: Sequence[Parameter], point: Point, floor: Floor, found: Sequence[Trial] = ()) -> Point:
+        """`first_part`, which is kept where no effect was found yet."""
+        if found:
+            return self.first_part(free, point, floor)
+        if self.begun is None:
+            self.begun = self.first_part(free, point, floor)
+        return self.begun
+
+    def leading(self, at: Point, candidates: Sequence[Candidate], floor: Floor, free: Sequence[Parameter]) -> list[tuple[Candidate, Point]]:
+        """Candidates, those first that would take most off there past the free parameters, each with the start that does best."""
+        ranked, _ = self.screen(at, candidates, floor, self.slopes(free, at, self.fitted_recordings))
+        starts: dict[str, tuple[Candidate, Point]] = {}
+        for _, c, _, begin in ranked:
+            starts.setdefault(c.key, (c, begin))
+        return list(starts.values())
+
+    def polish(
+        self,
+        free: Sequence[Parameter],
+        best: Mapping[str, tuple[Candidate, Fit]],
+        base: Fit,
+        floor: Floor,
+        rival: Round | None = None,
+        other: tuple[Candidate, Fit] | None = None,
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """The best fits once more, from where they ended, from the declared values, and from those of the very best one.
+
+        The base fit may have led all of them astray, and its weights too, for the settings differ most where the model is wrong: each is
+        weighed by the floor where it stands. Which end is the best one is said by the errors, for weights differ. Where `rival`, the round
+        of another solver, named an effect that leaves far less than any of them, none is refined. `other`, the leading candidate's fit of
+        the other sign, is refined beside it.
+        """
+        ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
+        within = [entry for entry in ranked if entry[1].cost < IN_REACH * ranked[0][1].cost]
+        top = [entry for entry in within if len(entry[0].parameters) <= MANY][:POLISHED]
+        if not top:
+            return {}
+        before, *squares = self.mean_squares([base.point, *(fit.point for _, fit in top)], floor)
+        near = min(map(score, squares)) + 2.0 * math.log(NEARBY)
+        top, squares = zip(*((t, s) for t, s in zip(top, squares, strict=True) if t is top[0] or score(s) < near), strict=True)
+        if rival is not None and rival.chosen is not None and min(map(score, squares)) > rival.chosen.score + 2.0 * math.log(BEYOND):
+            return {}
+        gains = max(self.gain(before, square) for square in squares)
+        if (top[0][1].cost > 0.7 * self.costs([base.point], floor)[0] and gains < SOME_GAIN) or self.is_noise(squares[0]):
+            return {}
+        ends = (f"{c.key} ({self.typical(square):.3g})" for (c, _), square in zip(top, squares, strict=True))
+        self.tell(f"refining {', '.join(ends)} of {self.typical(before):.3g} {self.problem.unit}")
+        leading = ranked[0][1].point
+        out: dict[str, tuple[Candidate, Fit]] = {}
+        least: dict[str, float] = {}
+        if other is not None and other[1].cost < IN_REACH * ranked[0][1].cost:
+            top = (*top, other)
+        able = self.able(top)  # elsewhere there is no floor
+        entries = []
+        for c, fit in able:
+            starts = [fit.point, self.at_declared(fit.point)]
+            if fit is not ranked[0][1]:
+                starts.append({**fit.point, **{name: leading[name] for name in self.as_declared}})
+            entries.append(((*free, *c.parameters), fit, starts))
+        for (c, _), (found, own) in zip(able, self.onward(entries, floor), strict=True):
+            left = score(self.mean_squares([found.point], own, fitted=True)[0])
+            if left < least.get(c.key, math.inf):
+                least[c.key] = left
+                out[c.key] = (c, replace(found, cost=self.costs([found.point], floor)[0]))
+        return out
+
+    def widened(
+        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """The fit of many parameters that leads all of few by far, once more with the floor where it stands, as `polish` does for those.
+
+        What another grid does where the model is wrong is then in its many parameters: a force in time came to the noise by the weights of
+        the base, 53 mm off, and left more than a uniform one of what was held out.
+        """
+        ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
+        few = min((fit.cost for c, fit in ranked if len(c.parameters) <= MANY), default=math.inf)
+        if self.problem.settings == 1 or not ranked or ranked[0][1].cost >= BY_FAR * few or len(ranked[0][0].parameters) <= MANY:
+            return {}
+        lead, fit = ranked[0]
+        if not self.runs(fit.point) or self.deadline.skips(f"refining {lead.key}"):
+            return {}
+        self.tell(f"refining {lead.key}")
+        ((found, own),) = self.onward([((*free, *lead.parameters), fit, [fit.point])], floor)
+        left, there = (score(self.mean_squares([point], own, fitted=True)[0]) for point in (fit.point, found.point))
+        return {lead.key: (lead, replace(found, cost=self.costs([found.point], floor)[0]))} if there < left else {}
+
+    def able(self, fits: Sequence[tuple[Candidate, Fit]]) -> list[tuple[Candidate, Fit]]:
+        """Those that end where every recording runs."""
+        return [entry for entry, ok in zip(fits, self.which_run([fit.point for _, fit in fits]), strict=True) if ok]
+
+    def onward(self, entries: Sequence[Onset], floor: Floor) -> list[tuple[Fit, Floor]]:
+        """What `from_here` makes of each entry, and further from where that ends, up to `ONWARD` times."""
+        ends = self.from_here(entries, floor)
+        going = list(range(len(ends)))
+        for _ in range(ONWARD):
+            if self.deadline.ends():
+                break
+            run = self.which_run([ends[i][0].point for i in going])
+            left = {i: self.mean_squares([ends[i][0].point], ends[i][1], fitted=True)[0] for i in going}
+            going = [i for i, ok in zip(going, run, strict=True) if ok and not self.is_noise(left[i], fitted=True)]
+            if not going:
+                break
+            made = self.from_here([(entries[i][0], ends[i][0], [ends[i][0].point]) for i in going], floor)
+            further = []
+            for i, (fit, there) in zip(going, made, strict=True):
+                gained = score(left[i]) - score(self.mean_squares([fit.point], there, fitted=True)[0])
+                if gained > 0:
+                    ends[i] = (fit, there)
+                    further += [i] * (not fit.converged or gained >= 2.0 * SOME_GAIN)
+            going = further
+        return ends
+
+    def from_here(self, entries: Sequence[Onset], like: Floor) -> list[tuple[Fit, Floor]]:
+        """Of each entry the best of its fit and of those from its starts, and the floor of all of them: that where the fit stands.
+
+        The fits of all entries run side by side.
+        """
+        self.foresee([fit.point for _, fit, _ in entries], fitted=True)
+        owns, requests, of = [], [], []
+        for k, (free, fit, starts) in enumerate(entries):
+            (own, _), race = self.stand(fit.point, like=like, fitted=True), Race()
+            moved = self.recentred(fit.point, own)
+            follow = {name: value for name, value in moved.items() if value != fit.point.get(name)}
+            begins = [{**start, **follow} if set(start) == set(fit.point) else start for start in starts]
+            requests += [self.request(free, begin, race=race) for begin in begins]
+            of += [k] * len(begins)
+            owns.append(own)
+        made = self.fits(requests, [owns[k] for k in of])
+        out = []
+        for k, (_, fit, _) in enumerate(entries):
+            ends = [fit, *(end for end, its in zip(made, of, strict=True) if its == k)]
+            left = [score(squares) for squares in self.mean_squares([end.point for end in ends], owns[k], fitted=True)]
+            out.append((ends[int(np.argmin(left))], owns[k]))
+        return out
+
+    def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor, *, every: bool = False) -> list[Stand]:
+        """Each fit, in their order, with what it leaves by `floor`, or for the leading ones by that where they end, if it leaves less.
+
+        What another grid does moves with the law: the differences at the base say little of it where a fit has gone far. By these the
+        truth of a blind case, a yield stress that grows with the rate, was behind twenty others. `every`: not the leading ones alone.
+        """
+        fits, points = [fit for _, fit in best.values()], [fit.point for _, fit in best.values()]
+        squares: dict[int, np.ndarray] = {}
+        for setting in {fit.setting for fit in fits}:  # those that came close have the own one
+            own = [i for i, fit in enumerate(fits) if fit.setting == setting]
+            with self.under(setting):
+                squares |= zip(own, self.mean_squares([points[i] for i in own], floor), strict=True)
+        found = [Stand(fit, floor, squares[i]) for i, fit in enumerate(fits)]
+        if self.problem.settings == 1 or not points:
+            return found
+        order = sorted(range(len(points)), key=lambda i: score(found[i].errors))
+        order = order if every else order[:MEASURED]
+        limit = score(found[order[0]].errors) + 2.0 * math.log(NEAR)
+        leading = [i for i in order if score(found[i].errors) < limit and not self.is_noise(found[i].errors)]
+        self.foresee([points[i] for i in leading])
+        for i in leading:
+            if self.runs(points[i]):
+                there = Stand(found[i].fit, *self.stand(points[i], like=floor))
+                found[i] = min(found[i], there, key=lambda stand: score(stand.errors))
+        return found
+
+    def elsewhere(
+        self, base: Fit, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Fits of one size once more, from the declared values and a larger size: the slope at zero may have led into a side valley."""
+        begins: list[tuple[Candidate, Point]] = []
+        for key, (c, fit) in best.items():
+            if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
+                continue
+            p = c.size_parameters[0]
+            for sign in p.signs:
+                size = p.within(sign * FAR * abs(starts[key][p.name]))
+                begins.append((c, dict(fit.point) | self.as_declared | {p.name: size}))
+        self.tell(f"again from elsewhere: {', '.join(dict.fromkeys(c.key for c, _ in begins))}")
+        with self.quickly(base.point, floor):
+            race = Race(min((fit.cost for _, fit in best.values() if fit.setting == self.setting), default=np.inf))
+            requests = [self.request((*self.problem.declared, *c.parameters), begin, race=race) for c, begin in begins]
+            ended = list(zip((c for c, _ in begins), self.fits(requests, floor), strict=True))
+        found = better((entry for entry in ended if entry[1].setting == self.own), best)  # the costs of quick ones are of another motion
+        return found | self.ahead(ended, {**best, **found}, floor)
+
+    def ahead(
+        self, ended: Sequence[tuple[Candidate, Fit]], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
+    ) -> dict[str, tuple[Candidate, Fit]]:
+        """Ends of fits once more with the floor where they stand, those that leave least: candidates that then leave less than their best.
+
+        Any will do for one that has none. What another grid does there may be another thing than at the base, and by the weights of that
+        the truth stays behind.
+        """
+        ended = [entry for entry in ended if np.isfinite(entry[1].cost)]
+        if self.problem.settings == 1 or not ended or self.deadline.ends():
+            return {}
+
+        def left_there(fit: Fit, there: Floor) -> float:
+            return score(self.mean_squares([fit.point], there, fitted=True)[0])
+
+        with self.under(ended[0][1].setting):
+            left = [score(squares) for squares in self.mean_squares([fit.point for _, fit in ended], floor)]
+        out: dict[str, tuple[Candidate, Fit]] = {}
+        ends = self.able([ended[i] for i in np.argsort(left)[:POLISHED]])
+        made = self.from_here([((*self.problem.declared, *c.parameters), fit, [fit.point]) for c, fit in ends], floor)
+        for (c, _), (further, own) in zip(ends, made, strict=True):
+            rival, its = out.get(c.key) or best.get(c.key), math.inf
+            if rival is not None:
+                its = left_there(rival[1], self.stand(rival[1].point, like=floor, fitted=True)[0])
+            if left_there(further, own) < its:
+                out[c.key] = (c, replace(further, cost=self.costs([further.point], floor)[0]))
+        return out

@@ -1,0 +1,312 @@
+"""One step of a diagnosis: screen every candidate, fit the best, and test the best one's gain against chance and floors.
+
+The order is that of protocols for model discrepancy: the base fit with its nuisances; the discretisation error from several settings;
+every candidate's direction in the data and its gain once the declared parameters are refitted; full fits of the best; the gain on
+recordings that were held out against a parametric bootstrap of the largest gain.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from neuido.discrepancy.inference import evidence
+from neuido.discrepancy.inference.contests import MANY, Contest, better
+from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, score, times_over
+from neuido.discrepancy.inference.judging import LED_AWAY, WITHIN
+from neuido.discrepancy.inference.laboratory import Tell
+from neuido.discrepancy.inference.least_squares import Fit
+from neuido.discrepancy.inference.prospects import LED_BY, Promising, Prospects
+from neuido.discrepancy.inference.refining import MEASURED, NEAR
+from neuido.discrepancy.problems.problem import Candidate, Problem
+from neuido.discrepancy.store import Deadline, Memo
+
+CONFIRMED = 0.8
+"""Share of the time for the search at which the first fits of a method end that is asked after another one named an effect: what is left is
+for a second one."""
+PLAIN, AS_WELL = 2, 1.2
+"""Places where fits with an effect ended at which the model is weighed without it, and times the error of the base fit in the fitted
+recordings up to which it stands there instead."""
+MEMBERS = 3
+"""Members of a class where whose fits ended the model is weighed without them."""
+UNEXPLAINED = 2.0
+"""Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
+UNEXPLAINED_EXACT = 3.0
+"""The same where nothing is discretised: the noise that a folder states is an estimate."""
+
+
+class Look(NamedTuple):
+    """The first fits of a step."""
+
+    base: Fit
+    asked: Promising
+    contest: Contest
+    least: list[np.ndarray]
+    """What the best of them leaves, mean squares of the parts; empty where nothing runs."""
+    grown: bool = False
+    """Whether some grew with the recordings."""
+
+    @property
+    def led(self) -> Led:
+        """The candidates of the least costs, and after them what was put off."""
+        fits = sorted(self.contest.best.values(), key=lambda entry: entry[1].cost)
+        begun = self.contest.put_off
+        waiting = begun.keys if begun else []
+        return Led([*(c.key for c, _ in fits), *waiting][:LED_BY], {c.key: fit.point for c, fit in fits}, self.asked.chosen)
+
+
+class Inference(Prospects):
+    """The steps of a diagnosis on one problem.
+
+    Args:
+        problem: What to diagnose.
+        setting: Setting of the discretisation that predicts; the others tell its error.
+        keep: Candidates that get a full fit by their place in the screening, at the least; in the first round all small ones do beside.
+        draws: Of the bootstrap.
+        seed: Of the draws.
+        tell: Called with a line of progress.
+        memo: Predictions that are shared with the inferences of other settings.
+        deadline: When the search ends.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        setting: int = 0,
+        keep: int = 7,
+        draws: int = 199,
+        seed: int = 0,
+        tell: Tell | None = None,
+        memo: Memo | None = None,
+        deadline: Deadline | None = None,
+    ) -> None:
+        super().__init__(problem, setting=setting, tell=tell, memo=memo, deadline=deadline)
+        self.keep, self.draws, self.seed = keep, draws, seed
+        self.seen: Look | None = None
+        """The last look for a first effect."""
+        self.asked: Round | None = None
+        """The last round for a first effect."""
+
+    @property
+    def unexplained(self) -> float:
+        """Times its floor above which a residual that no effect explains is called unknown."""
+        unsure = max(self.noise_uncertainty(n) for n in self.scored_recordings)  # a residual of a noise that is not known may be noise
+        return (UNEXPLAINED if self.problem.settings > 1 else UNEXPLAINED_EXACT) * (1.0 + 2.0 * unsure)
+
+    def round(self, base: Fit, floor: Floor, found: Sequence[Trial], rival: Round | None = None, *, most: float = math.inf) -> Round:
+        """Look for one more effect beside those that were found.
+
+        Args:
+            base: Where the model stands.
+            floor: Noise and discretisation there, as `stand` gives them.
+            found: The effects so far.
+            rival: That of another solver which named an effect: what led there and the first of the screening get a fit.
+            most: Parameters that a candidate may have.
+        """
+        first = rival is None and not found
+        led, until = (None, 1.0) if rival is None else (rival.led, CONFIRMED)
+        look = self.look(base, floor, found, led, most=most, until=until)
+        candidates, free, slopes, columns, chosen, *_ = look.asked
+        best, other, errors = dict(look.contest.best), look.contest.other, self.mean_squares([base.point], floor)[0]
+        if not self.deadline.skips("refining the best fits"):
+            best |= self.limits(free, best, candidates, floor)
+            best |= self.polish(free, best, base, floor, rival, other)
+            best |= self.alike(free, best, candidates, chosen, columns, slopes, floor)
+            best |= self.widened(free, best, floor)
+            if not found:
+                best |= self.instead(free, best, candidates, base, floor)
+        floors = self.floors(base.point, free, floor)
+        model = self._linear(base.point, floor, floors - self.noise_squares, slopes, columns, chosen, candidates)
+        null, unfitted = model.null(errors, self.draws), look.contest.unfitted
+        empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=null, unfitted=unfitted)
+        every = self.problem.together
+
+        def judged(step: Round) -> Round:
+            result = self.judge(step, best, model, every=every)
+            self.tell(self.verdict(result))
+            return result
+
+        result = judged(empty)
+        promising = result.over > WITHIN and any(t.gain > self.by_chance(result) for t in result.trials)
+        again = first and result.chosen is None and (promising or result.over > 1.0)
+        if again and not self.deadline.skips("fits from elsewhere"):
+            best |= self.elsewhere(base, best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
+            result = judged(empty)
+        if again and result.chosen is None and not every and not self.deadline.skips("measuring every fit where it ends"):
+            every = True
+            result = judged(empty)
+        missed = again and result.chosen is None and not look.grown and self.is_led_away(base, result)
+        if missed and not self.deadline.skips("growing fits"):
+            with self.quickly(base.point, floor):
+                grown = list(self.growing(base, floor, candidates).values())
+            best |= self.ahead(grown, best, floor)
+            result = judged(empty)
+        plain = self.without_effect(result, base, floor)
+        if plain is not None:
+            result = judged(replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain))
+        if not found:
+            self.asked = result
+        return result
+
+    def without_effect(self, result: Round, base: Fit, floor: Floor) -> Stand | None:
+        """The model without the effect of a round, where fits with one ended, if it does better there than where it was fitted.
+
+        Where the settings' differences can do much, the fitted recordings say little of a modulus, and each fit with an effect ends at
+        another one: what that alone does to the held-out recordings is no effect's. It must fit the fitted ones about as well. Where no
+        effect explains what is left, it is fitted from there: the base may stand in a side valley. Where those that are named ended it is
+        weighed with the floor there: the differences of the settings at the base may have led the base fit, and hide what is better.
+        """
+        if self.problem.settings == 1 or not result.trials:
+            return None
+        lost = result.chosen is None
+        if lost and not self.is_unexplained(result):
+            return None
+        limit = (result.chosen or result.trials[0]).score + 2.0 * math.log(NEAR)
+        places = [t.candidate.without(t.fit.point) for t in result.trials if t.score < limit][:MEASURED]
+        left = [score(squares) for squares in self.mean_squares(places, floor)]
+        here, as_well = score(result.errors), self.fitted_score(result.errors) + 2.0 * math.log(AS_WELL)
+        wanted = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < (math.inf if lost else here)]
+        if result.chosen is not None:  # by the floor of the base alone it may look worse there than it is
+            own = [t.candidate.without(t.fit.point) for t in result.members[:MEMBERS]]
+            wanted = own + [place for place in wanted if place not in own][: max(PLAIN - len(own), 0)]
+        if not wanted:
+            return None
+        self.foresee(wanted)
+        stands = [Stand(replace(base, point=place), *self.stand(place, like=floor)) for place in wanted]
+        if lost and not self.deadline.skips("the declared model again from where effects were fitted"):
+            free = [self.problem.parameter(name) for name in base.names]
+            able = [(s.fit.point, s.floor) for s, runs in zip(stands, self.which_run(wanted), strict=True) if runs]
+            fits = self.fits([self.request(free, point) for point, _ in able], [own for _, own in able])
+            ends = [fit.point for fit in fits]
+            stands += [Stand(f, *self.stand(f.point, like=floor)) for f, ok in zip(fits, self.which_run(ends), strict=True) if ok]
+        found = [s for s in stands if score(s.errors) < here and self.fitted_score(s.errors) < as_well]
+        return min(found, key=lambda s: score(s.errors), default=None)
+
+    def is_led_away(self, base: Fit, r: Round) -> bool:
+        """Whether the base fit of a motion leaves more than noise of what is fitted, at declared values far from those stated."""
+        far = self.problem.settings > 1 and self.moved(base.point) > LED_AWAY
+        return far and not self.is_noise(r.errors[self.fitted], fitted=True)
+
+    def is_unexplained(self, r: Round) -> bool:
+        """Whether the residual of a round's base is above what noise and discretisation would leave, by so much that it is not none."""
+        held_out = r.held_out_over(self.fitted) if self.problem.settings > 1 else 0.0
+        return r.over > self.unexplained or held_out > UNEXPLAINED
+
+    def look(
+        self,
+        base: Fit,
+        floor: Floor,
+        found: Sequence[Trial] = (),
+        led: Led | None = None,
+        *,
+        most: float = math.inf,
+        beyond: float = math.inf,
+        until: float = 1.0,
+        grows: bool = True,
+    ) -> Look:
+        """Screen the candidates, and fit the best; arguments as those of `round`. A base that was looked at last is not looked at again.
+
+        `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
+        which there are no others; `until`: share of the search's time past which there are none; `grows`: whether fits grow where these
+        leave much, in a base that was looked at without as well.
+        """
+        if not found and self.seen is not None and self.seen.base is base:
+            if grows:
+                self.seen = self.grown_on(self.whole(self.seen, floor, until), floor, found, until)
+            return self.seen
+        with self.quickly(base.point, floor):
+            asked = self.promising(base, floor, found, led, most=most, until=until)
+            candidates, free, *_, starts, _ = asked
+            self.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
+            without = partial(self.without_own, base.point, starts, found)
+            grown: list[tuple[Candidate, Fit]] = []
+
+            def between(remains: np.ndarray) -> Sequence[tuple[Candidate, Fit]]:
+                astray = grows and not found and self.is_astray(base, floor) and self.leaves_much([remains])
+                if astray and not self.deadline.skips("growing fits", until):
+                    grown.extend(self.growing(base, floor, candidates, until=until).values())
+                return grown
+
+            options = {"beyond": beyond, "until": until, "between": between, "puts_off": not grows}
+            contest = self.contest(free, starts, floor, asked.hopeful, without, **options)
+            left = self.left_by(contest.best, floor)
+        look = Look(base, asked, contest, left[:1], bool(grown))
+        if grows and len(found) < 2:
+            look = self.grown_on(look, floor, found, until)
+        if not found:
+            self.seen = look
+        return look
+
+    def whole(self, look: Look, floor: Floor, until: float) -> Look:
+        """A look for a first effect with the fits that were put off."""
+        begun = look.contest.put_off
+        if begun is None or self.deadline.skips(f"fits of {', '.join(begun.keys)}", until):
+            return look
+        asked, point = look.asked, look.base.point
+        without = partial(self.without_own, point, asked.starts, ())
+        with self.quickly(point, floor):
+            contest = self.contest(asked.free, begun.starts, floor, asked.hopeful, without, until=until, before=begun.ended)
+            left = self.left_by(contest.best, floor)
+        return look._replace(contest=contest, least=left[:1])
+
+    def grown_on(self, look: Look, floor: Floor, found: Sequence[Trial], until: float) -> Look:
+        """A look with fits that grow, once more under the own setting, where none did and its own leave much."""
+        if look.grown or not self.leaves_much(look.least) or self.deadline.skips("growing fits", until):
+            return look
+        with self.quickly(look.base.point, floor):
+            further = list(self.growing(look.base, floor, look.asked.candidates, found, until=until).values())
+            whole = self.wholly(look.asked.free, further, floor, until)
+            best = {**look.contest.best, **better(whole, look.contest.best)}
+            left = self.left_by(best, floor)
+        return look._replace(contest=look.contest._replace(best=best), least=left[:1], grown=True)
+
+    def left_by(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[np.ndarray]:
+        """What the fits under the own setting leave, mean squares of the parts, the least first."""
+        ends = [fit.point for _, fit in best.values() if fit.setting == self.own]
+        with self.under(self.own):
+            return sorted(self.mean_squares(ends, floor), key=score)
+
+    def over(self, at: Stand) -> float:
+        """How far the residual there is above what noise and discretisation would leave after a refit: a ratio of errors."""
+        free = [self.problem.parameter(name) for name in at.fit.names]
+        return times_over(at.errors, self.floors(at.fit.point, free, at.floor))
+
+    def promised(self, at: Stand, beside: Trial) -> float:
+        """The least share of the misfit there that an effect of few parameters would leave, predicted or by one simulation."""
+        with self.quickly(at.fit.point, at.floor):
+            return min(self.promising(at.fit, at.floor, [beside], most=MANY).promise.values(), default=1.0)
+
+    def _linear(self, point, floor, left, slopes, columns, chosen, candidates) -> evidence.LinearModel:
+        """The linear model of the fits; `left` is what the discretisation leaves after a refit, mean squares of the parts.
+
+        Of all candidates, or once the time for the search is over of those that got a fit.
+        """
+        held = [p.recording for p in self.parts if not p.fitted]
+        by_key = {c.key: c for c in candidates}
+        best = dict(chosen) if chosen and self.deadline.ends() else {c.key: 0 for c in candidates} | chosen
+        one = [replace(by_key[key], starts=(by_key[key].starts[i],)) for key, i in best.items()]
+        new = [n for n in held if n not in self.fitted_recordings]
+        with self.quickly(point, floor):
+            there = self.columns(point, one, new) if new else {}
+        nuisances = floor.nuisances or {n: np.empty((len(self.problem.recordings[n].y), 0)) for n in self.scored_recordings}
+        made = []
+        for part, square in zip(self.parts, left, strict=True):
+            n, rows = part.recording, part.rows
+            own = {}
+            for key, i in best.items():
+                c = columns[key, i][n] if n in columns[key, i] else there[key, 0][n]
+                if np.isfinite(c).all():
+                    own[key] = c[rows]
+            over_time = floor.spread[n][rows]
+            scale = over_time * math.sqrt(square / max(float(np.mean(over_time**2)), 1e-300))
+            smooth = scale[:, None] * self.problem.directions(n)[rows]
+            settings = floor.differences[n][rows]
+            made.append(evidence.Columns(floor.weight[n][rows], floor.noise[n], slopes[n][rows], nuisances[n][rows], settings, smooth, own))
+        common = set.intersection(*(set(c.candidates) for c in made))
+        made = [replace(c, candidates={k: v for k, v in c.candidates.items() if k in common}) for c in made]
+        return evidence.LinearModel([c for c, p in zip(made, self.parts, strict=True) if p.fitted],
+                                    [c for c, p in zip(made, self.parts, strict=True) if not p.fitted], seed=self.seed)  # fmt: skip

@@ -1,0 +1,1 @@
+"""What inference may ask of measured data and a model: parameters, recordings, candidates, predictions."""

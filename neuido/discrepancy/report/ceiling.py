@@ -1,0 +1,184 @@
+"""How much of a residual is reproducible at all: a small network, fitted to the residual of the fitted recordings, scored on the others.
+
+It is the ceiling of what any further effect could explain, and the detector of an effect that no candidate is: a share well above
+zero on held-out recordings means that something lawful is left. It corrects the state only; it is no explanation.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neuido.discrepancy.inference.attribution import Diagnosis
+from neuido.discrepancy.inference.floors import Part
+from neuido.physics.runtime.threads import one_thread_each
+
+WIDTH = 32
+ROWS = 12_000
+"""Samples that are drawn for the training, at the most."""
+STEPS = 400
+PATIENCE = 6
+"""Checks without a better figure that end the training; one check every 20 steps."""
+BLOCK = 0.2
+"""Share of the time of each recording, one block in its middle, by which the training stops."""
+
+
+@dataclass(frozen=True)
+class Ceiling:
+    """Shares of the residual's mean square that the network explains, beyond its mean noise; at most 1, below 0 where it does harm."""
+
+    fit: float
+    held_out: float
+    steps: int
+    by_part: Mapping[str, float] = field(default_factory=dict)
+
+
+def of(d: Diagnosis, when: str, *, seed: int = 0) -> Ceiling:
+    """The ceiling of a problem's residual; `when`: before or after. NaN where a part is not predicted."""
+    floor = d.final[when]
+    rows = []
+    for part in d.parts:
+        n = part.recording
+        seen = as_seen(d, when, n)
+        if not np.isfinite(seen[part.rows]).all():
+            return Ceiling(float("nan"), float("nan"), 0)
+        features, target, weight = _samples(d, part, seen, d.problem.recordings[n].y - seen, floor.weight[n])
+        rows.append((part.name, part.fitted, features, target, weight, floor.noise[n]))
+    return train([row[1:5] for row in rows], noises=[row[5] for row in rows], names=[row[0] for row in rows], seed=seed)
+
+
+def as_seen(d: Diagnosis, when: str, n: int) -> np.ndarray:
+    """What is predicted of recording n, as the errors of a diagnosis count it, (n,); `when`: before or after.
+
+    The nuisances are at their most probable values, and the other settings take part in the amounts that the fitted recordings hold.
+    """
+    point, floor = {"before": d.before, "after": d.after}[when], d.final[when]
+    predicted, y = d.problem.predict([point], n, d.setting)[0], d.problem.recordings[n].y
+    out = predicted.copy()
+    for part in (*d.parts, *d.sealed):
+        if part.recording == n:
+            out[part.rows] = (y + floor.settle(predicted - y, part, d.amounts[when]))[part.rows]
+    return out
+
+
+def _samples(
+    d: Diagnosis, part: Part, predicted: np.ndarray, left: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Features (n, k), residuals (n, c) and weights (n,) of a part."""
+    problem, n = d.problem, part.recording
+    r = problem.recordings[n]
+    if not getattr(problem, "tracked", hasattr(problem, "motion")):
+        velocity = _slope(predicted, r.times, r.groups)
+        channels = r.groups[:, None] == np.unique(r.groups)[None]
+        features = np.concatenate([r.times[:, None], predicted[:, None], velocity[:, None], channels], axis=1)
+        return features[part.rows], left[part.rows, None], weight[part.rows]
+    x, place, speed = (v.reshape(-1, 3) for v in (predicted, *_body_features(d, n, predicted)))
+    rows = part.rows.reshape(-1, 3).all(axis=1)
+    features = np.concatenate([place, x, speed, r.times.reshape(-1, 3)[:, :1]], axis=1)
+    return features[rows], left.reshape(-1, 3)[rows], weight.reshape(-1, 3)[rows].mean(axis=1)
+
+
+def _body_features(d: Diagnosis, n: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place in the body at t = 0 and predicted velocity of each datum."""
+    r = d.problem.recordings[n]
+    first = d.problem.measured[n].x.double().numpy()
+    whole = d.problem.measured[n].body.x.double().numpy()
+    point = r.groups.reshape(-1, 3)[:, 0] // 3
+    start = np.where(np.isfinite(first[0]), first[0], whole.mean(axis=0))
+    return (start - whole.mean(axis=0))[point], _slope(predicted, r.times, r.groups)
+
+
+def _slope(values: np.ndarray, times: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Differences in the order of time within each group."""
+    order = np.lexsort((times, groups))
+    v, t, g = values[order], times[order], groups[order]
+    out = np.zeros_like(values)
+    step = np.where(g[1:] == g[:-1], (v[1:] - v[:-1]) / np.maximum(t[1:] - t[:-1], 1e-12), np.nan)
+    ahead, behind = np.append(step, np.nan), np.insert(step, 0, np.nan)
+    both = np.where(np.isnan(ahead), behind, np.where(np.isnan(behind), ahead, 0.5 * (ahead + behind)))
+    out[order] = np.where(np.isnan(both), 0.0, both)
+    return out
+
+
+def train(parts: list[tuple[bool, np.ndarray, np.ndarray, np.ndarray]], *, noises: list[float], names: list[str], seed: int = 0) -> Ceiling:
+    """Fit a network to the fitted parts and score it on all.
+
+    Args:
+        parts: (fitted, features (n, k), residuals (n, c), weights (n,)) of each, its rows in the order of time.
+        noises: Standard deviation of each part's noise, which no network can explain.
+        names: Of the parts.
+        seed: Of the first weights and of the samples.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    fitted = [p for p in parts if p[0]]
+    features = np.concatenate([p[1] for p in fitted])
+    mean, std = features.mean(axis=0), features.std(axis=0)
+    std = np.where(std > 1e-12, std, 1.0)
+
+    def inputs(f: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.clip((f - mean) / std, -4.0, 4.0)).float()
+
+    x, y, w = (
+        inputs(features),
+        torch.from_numpy(np.concatenate([p[2] for p in fitted])),
+        torch.from_numpy(np.concatenate([p[3] for p in fitted])),
+    )
+    size = float(torch.sqrt((y**2).mean())) or 1.0
+    y, w = (y / size).float(), (w / w.mean()).float()
+    block = torch.cat([_block(len(p[1])) for p in fitted])
+    own, aside = torch.nonzero(~block)[:, 0], torch.nonzero(block)[:, 0]
+    own, aside = (i[torch.randperm(len(i), generator=generator)[:ROWS]] for i in (own, aside))
+    net, steps = _fit(x, y, w, own, aside, generator)
+    shares = {}
+    for name, (_, f, r, _), noise in zip(names, parts, noises, strict=True):
+        with torch.no_grad():
+            left = r - size * net(inputs(f)).double().numpy()
+        over = max(float(np.mean(r**2)) - noise**2, 1e-300)
+        shares[name] = min((float(np.mean(r**2)) - float(np.mean(left**2))) / max(over, 1e-3 * float(np.mean(r**2))), 1.0)
+
+    def joined(which: bool) -> float:
+        own = [(len(p[1]), shares[n]) for n, p in zip(names, parts, strict=True) if p[0] == which]
+        return float(np.average([s for _, s in own], weights=[c for c, _ in own])) if own else float("nan")
+
+    return Ceiling(joined(True), joined(False), steps, shares)
+
+
+def _block(count: int) -> Tensor:
+    """The middle fifth of the rows, which are in the order of time."""
+    at = torch.arange(count) / max(count, 1)
+    return (at - 0.5).abs() < BLOCK / 2
+
+
+@one_thread_each()
+def _fit(x: Tensor, y: Tensor, w: Tensor, own: Tensor, aside: Tensor, generator: torch.Generator) -> tuple[nn.Module, int]:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
+        net = nn.Sequential(nn.Linear(x.shape[1], WIDTH), nn.SiLU(), nn.Linear(WIDTH, WIDTH), nn.SiLU(), nn.Linear(WIDTH, y.shape[1]))
+    nn.init.zeros_(net[-1].weight)
+    nn.init.zeros_(net[-1].bias)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=5e-3, weight_decay=1e-2)
+
+    def loss(rows: Tensor) -> Tensor:
+        return ((net(x[rows]) - y[rows]).square().mean(dim=1) * w[rows] ** 2).mean()
+
+    best, kept, since, steps = float("inf"), None, 0, 0
+    for step in range(STEPS + 1):
+        if step % 20 == 0:
+            with torch.no_grad():
+                value = float(loss(aside))
+            if value < best * (1 - 1e-4):
+                best, since, steps = value, 0, step
+                kept = {name: tensor.clone() for name, tensor in net.state_dict().items()}
+            else:
+                since += 1
+                if since >= PATIENCE:
+                    break
+        rows = own[torch.randint(len(own), (min(2048, len(own)),), generator=generator)]
+        optimizer.zero_grad()
+        loss(rows).backward()
+        optimizer.step()
+    if kept is not None:
+        net.load_state_dict(kept)
+    return net, steps

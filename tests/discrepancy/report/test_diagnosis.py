@@ -1,0 +1,148 @@
+"""Diagnosis from Python: the command's answer, on a folder and on data that are read already, and what can be asked of it."""
+
+import json
+
+import matplotlib as mpl
+import pytest
+import yaml
+
+from neuido.data.measured.material_test import read_material_tests
+from neuido.data.measured.track import read_tracks
+from neuido.discrepancy.report.diagnosis import Diagnosis
+from neuido.discrepancy.workflow import diagnose
+from neuido.errors import UserError
+from tests import command
+from tests.discrepancy import made
+
+DRAGS = "drag_linear,drag_quadratic,gravity"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "track"
+    made.track(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def found(folder, tmp_path_factory) -> Diagnosis:
+    return diagnose(folder, out=tmp_path_factory.mktemp("out") / "own", effects=DRAGS.split(","), draws=39, device="cpu")
+
+
+def without_time(path) -> dict:
+    content = json.loads((path / "diagnosis.json").read_text())
+    content.pop("seconds")
+    return content
+
+
+@pytest.mark.slow
+def test_answer_is_that_of_the_command(folder, found, tmp_path, capsys):
+    options = ["--effects", DRAGS, "--draws", "39", "--device", "cpu", "--progress", "false"]
+    status, out, _ = command.run(capsys, "diagnose", folder, "--out", tmp_path / "by-command", *options)
+    assert status == 0
+    assert out.splitlines()[0] == found.line
+    assert str(tmp_path / "by-command") in out.splitlines()[1]
+    assert without_time(found.folder) == without_time(tmp_path / "by-command")
+
+
+def test_effects_and_error_are_those_of_the_file(found):
+    content = found.to_dict()
+    assert found.answer == content["answer"] in ("effect", "class")
+    (effect,), (own,) = found.effects, content["effects"]
+    assert (effect.name, *effect.alternatives) == tuple(own["class"])
+    assert "drag_quadratic" in own["class"]
+    low, high = effect.interval
+    assert low <= effect.value <= high
+    assert effect.unit == own["parameters"][effect.parameter]["unit"]
+    assert found.error.held_out
+    assert (found.error.before, found.error.after) == (content["error"]["before"]["held_out"], content["error"]["after"]["held_out"])
+    assert found.error.after < 0.2 * found.error.before
+    assert found.model_after == found.folder / "model_after.yaml"
+    assert yaml.safe_load(found.model_after.read_text())["effects"]
+
+
+def test_words_name_effect_figure_and_errors(found):
+    (effect,) = found.effects
+    words = found.summary()
+    for part in (effect.name, f"{effect.value:.3g}", f"{found.error.before:.3g}", f"{found.error.after:.3g}", found.error.unit):
+        assert part in words
+        assert part in repr(found)
+
+
+def test_plot_has_a_panel_for_each_recording(found):
+    figure = found.plot()
+    assert isinstance(figure, mpl.figure.Figure)
+    assert len(figure.axes) == len(found.to_dict()["error"]["after"]["by_recording"])
+    assert all(ax.lines for ax in figure.axes)
+
+
+def test_report_is_copied(found, tmp_path):
+    assert found.report() == found.folder / "report.html"
+    path = found.report(tmp_path / "new" / "page.html")
+    assert path.read_text() == found.report().read_text()
+    assert found.report(tmp_path) == tmp_path / "report.html"
+
+
+def test_read_again(found):
+    again = Diagnosis.read(found.folder)
+    assert (again.line, again.effects, again.error) == (found.line, found.effects, found.error)
+
+
+def test_data_that_are_read_already(folder, found):
+    again = diagnose(read_tracks(folder), effects=DRAGS, draws=39, device="cpu")
+    assert without_time(again.folder) == without_time(found.folder)
+    assert not (again.folder / ".work").exists()
+
+
+def test_temporary_folder_goes_with_the_diagnosis(tmp_path):
+    made.material_test(tmp_path / "test")
+    tests = read_material_tests(tmp_path / "test")
+    found = diagnose(tests, effects="strain_stiffening", draws=39)
+    place = found.folder
+    assert "strain_stiffening" in found.line
+    assert len(found.plot().axes) == 3
+    del found
+    assert not place.exists()
+
+
+def test_model_after_closes_the_loop(folder, found):
+    """As a file and as its content."""
+    again = diagnose(folder, model=found.model_after, effects=DRAGS, draws=39)
+    assert (again.answer, again.effects) == ("none", ())
+    content = yaml.safe_load(found.model_after.read_text())
+    assert diagnose(folder, model=content, effects=DRAGS, draws=39).line == again.line
+    assert "nothing is missing" in again.summary()
+
+
+@pytest.mark.slow
+def test_bodies_are_told_apart(tmp_path):
+    made.track(tmp_path / "balls", bodies=2)
+    found = diagnose(tmp_path / "balls", effects="drag_linear,drag_quadratic", draws=39)
+    assert list(found.bodies) == ["ball-0", "ball-1"]
+    assert found.answer == "several"
+    assert {effect.body for effect in found.effects} == {"ball-0"}
+    assert len(found.line.splitlines()) == 2
+    assert found.bodies["ball-1"].error.before == pytest.approx(found.bodies["ball-1"].error.after, rel=0.2)
+    assert found.error.after < found.error.before
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [({"model": "model.yaml"}, "folder"), ({"law": "law.safetensors"}, "law"), ({"data": "video"}, "data"), ({"data": "sound"}, "sound")],
+)
+def test_options_that_data_do_not_take(folder, options, word):
+    with pytest.raises(UserError, match=word):
+        diagnose(read_tracks(folder), **options)
+
+
+def test_other_objects_and_folders_are_refused(tmp_path):
+    with pytest.raises(UserError, match="list"):
+        diagnose([1, 2])
+    with pytest.raises(UserError, match=r"diagnosis\.json"):
+        Diagnosis.read(tmp_path)
+    (tmp_path / "diagnosis.json").write_text("{")
+    with pytest.raises(UserError, match="JSON"):
+        Diagnosis.read(tmp_path)
+    (tmp_path / "diagnosis.json").write_text('{"format": "other/1"}')
+    with pytest.raises(UserError, match="format"):
+        Diagnosis.read(tmp_path)
