@@ -194,7 +194,7 @@ def schemas() -> dict[str, Schema]:
                 "discretisation": GRID,
                 "steps": {"type": "integer", "minimum": 1},
             },
-            {"source": {"type": "string"}},
+            {"source": {"type": "string"}, "on_inversion": one_of(["report", "error"])},
         ),
         "neuido-diagnosis-1": _diagnosis(names),
     }

@@ -85,3 +85,19 @@ def test_what_cannot_be_run_is_one_line(words, told, scene, tmp_path, capsys):
         assert part in err
     assert not (tmp_path / "new").exists()
     assert scene.read_text() == SCENE and (used / "mine.txt").read_text() == "kept"
+
+
+def test_a_body_that_collapses_is_told_of_or_refused(scene, tmp_path, capsys):
+    """A fixed-corotated body that hits faster than its own wave is crushed to nothing: half its wave modulus is all the work it takes."""
+    scene.write_text(SCENE.replace("-2.0", "-6.0").replace("3.0e+4", "3.0e+3").replace("steps: 30", "steps: 300"))
+    status, printed, err = run(capsys, "simulate", scene, "--out", tmp_path / "told", "--device", "cpu")
+    assert status == 0, err
+    assert "note: scene 0:" in printed and "det F" in printed
+    status, _, err = run(capsys, "simulate", scene, "--out", tmp_path / "refused", "--device", "cpu", "--on_inversion", "error")
+    assert status == 2 and "det F" in err and "on_inversion" in err and not (tmp_path / "refused").exists()
+    scene.write_text(scene.read_text() + "on_inversion: error\n")
+    status, _, err = run(capsys, "simulate", scene, "--out", tmp_path / "refused", "--device", "cpu")
+    assert status == 2 and "det F" in err and not (tmp_path / "refused").exists()
+    scene.write_text(scene.read_text().replace("on_inversion: error", "on_inversion: maybe"))
+    status, _, err = run(capsys, "simulate", scene, "--out", tmp_path / "refused", "--device", "cpu")
+    assert status == 2 and "on_inversion must be report or error" in err

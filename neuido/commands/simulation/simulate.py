@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from typing import Literal
 
 from neuido import configs_root
 from neuido.errors import UserError
@@ -19,6 +20,7 @@ def simulate(
     every: int | None = None,
     data_root: str | None = None,
     device: str = "auto",
+    on_inversion: Literal["report", "error"] | None = None,
 ) -> None:
     """Simulate the body of a scene file and write its motion: `neuido simulate SCENE --out FOLDER`.
 
@@ -33,6 +35,8 @@ def simulate(
         every: Write a frame every so many substeps, a divisor of `steps`; such that at most 100 frames follow the first where absent.
         data_root: Folder of the particles that a scene names; that of NEUIDO_DATA where absent.
         device: auto, cpu or cuda.
+        on_inversion: Where matter turns inside out or collapses (det F below 0.001): report it, or end with an error and write nothing;
+            what the scene file says where absent, else report.
 
     Raises:
         UserError: An impossible scene or option, a folder that is in use, a step above the stability limit.
@@ -49,7 +53,8 @@ def simulate(
         raise UserError(f"steps is {count}; it must be a positive whole number")
     spacing = next(k for k in range(-(-count // FRAMES), count + 1) if count % k == 0) if every is None else every
     laws = material(setup.info["elasticity"], setup.info["plasticity"]) if law is None else load_law(law)
-    simulator = Simulator(setup.scene, setup.body, density=setup.info["density"], device=device)
+    asked = on_inversion or setup.info["on_inversion"]
+    simulator = Simulator(setup.scene, setup.body, density=setup.info["density"], device=device, on_inversion=asked)
     start = time.perf_counter()
     frames = simulator.rollout(count, *laws, every=spacing)
     seconds = time.perf_counter() - start
@@ -64,6 +69,8 @@ def simulate(
         f"{len(frames.x)} frames, on {simulator.device}, {seconds:.1f} s"
     )
     print(f"law: {told}; density {setup.info['density']:g} kg/m^3")
+    for event in frames.events:
+        print(f"note: {event}")
     print(
         f"results in {folder}: frames.npz opens with numpy.load (x, v, C, F, times), "
         "ply/frame_0000.ply and on in ParaView, MeshLab or Blender"

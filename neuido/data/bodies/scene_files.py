@@ -21,6 +21,7 @@ from neuido.physics.laws.classical import material
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
 
 FORMAT = "neuido-scene/1"
+KEYS = ("format", "name", "source", "scene", "model", "body", "discretisation", "steps", "on_inversion")
 VARIABLE = "NEUIDO_DATA"
 CONTACTS = ("sticky", "slip", "separate")
 
@@ -31,7 +32,7 @@ class SceneSetup(NamedTuple):
     scene: Scene
     body: Body
     info: dict[str, Any]
-    """name, source, steps, density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them)."""
+    """name, source, steps, on_inversion, density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them)."""
 
 
 def data_root(option: str | os.PathLike | None = None) -> Path:
@@ -75,7 +76,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         raise UserError(f"the scene file {path} is missing{known}")
     content = read_yaml(path)
     try:
-        check_keys(content, "the file", ("format", "name", "source", "scene", "model", "body", "discretisation", "steps"), ("source",))
+        check_keys(content, "the file", KEYS, ("source", "on_inversion"))
         if content["format"] != FORMAT:
             raise UserError(f"format = {content['format']!r} must be {FORMAT!r}")
         for key in ("name", "source"):
@@ -84,6 +85,9 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         steps = content["steps"]
         if not isinstance(steps, int) or steps < 1:
             raise UserError(f"steps must be a positive whole number, got {steps!r}")
+        on_inversion = content.get("on_inversion", "report")
+        if on_inversion not in ("report", "error"):
+            raise UserError(f"on_inversion must be report or error, got {on_inversion!r}")
         scene = scene_from_dict(content["scene"], content["discretisation"])
         model = model_from_dict(content["model"])
         body = body_from_dict(content["body"], root)
@@ -92,7 +96,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
             raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain: enlarge the domain or move the body")
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    info = {"name": content["name"], "source": content.get("source", ""), "steps": steps, **model}
+    info = {"name": content["name"], "source": content.get("source", ""), "steps": steps, "on_inversion": on_inversion, **model}
     return SceneSetup(scene, body, info)
 
 
@@ -225,10 +229,14 @@ def _particles(relative: str, root: Path) -> Body:
         raise UserError(f"body.particles: {error}") from error
     x, v = arrays["x"], arrays["v"]
     check_limit(len(x) if x.ndim else 0, "NEUIDO_MAX_PARTICLES", f"body.particles: {path} has {len(x) if x.ndim else 0} particles")
-    if x.ndim != 2 or x.shape[1] != 3 or v.shape != x.shape or len(x) < 2:
-        raise UserError(f"body.particles: {path} has x of shape {x.shape} and v of shape {v.shape}, ; both must be (P, 3)")
+    if x.ndim != 2 or x.shape[1] != 3 or v.shape != x.shape:
+        raise UserError(f"body.particles: {path} has x of shape {x.shape} and v of shape {v.shape}; both must be (P, 3)")
     if not (np.isfinite(x).all() and np.isfinite(v).all()):
         raise UserError(f"body.particles: {path} contains a NaN or an infinity")
+    if len(x) < 2 or not np.ptp(x, axis=0).any():
+        raise UserError(
+            f"body.particles: {path} has {len(x)} particles in one place, which fill no volume; give two or more in different places"
+        )
     volume = body_volume(x) / len(x)
     return Body(torch.from_numpy(x).float(), torch.from_numpy(v).float(), torch.full((len(x),), volume))
 

@@ -1,6 +1,7 @@
 """Law files: the effective networks of one material as safetensors, with its description beside it as JSON."""
 
 import json
+import math
 import os
 from collections.abc import Mapping
 from datetime import date
@@ -26,7 +27,8 @@ def save_law(path: str | os.PathLike, operator: IntrinsicDynamicsOperator, z: Te
         path: File to write, ending in .safetensors; the JSON file has the same stem.
         operator: The operator.
         z: Latent, (d,).
-        card: Further entries of the JSON file, for example the origin of the law.
+        card: Further entries of the JSON file, for example the origin of the law, or `strain_limit`, the largest logarithmic stretch that
+            it was trained on.
     """
     with torch.no_grad():
         elastic, plastic = operator.laws(z)
@@ -48,7 +50,7 @@ def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
     Raises:
         UserError: There is no such file, or it is not a law file.
     """
-    config, tensors, _ = read_weights(path, (FORMAT,), "law")
+    config, tensors, card = read_weights(path, (FORMAT,), "law")
     if config.get("trunk") not in LAWS:
         raise UserError(f"law: {path} has the trunk {config.get('trunk')!r}; one of {', '.join(LAWS)}")
     elastic, plastic = LAWS[config["trunk"]]
@@ -56,4 +58,10 @@ def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
         parts = [[tensors[f"{kind}.{name}"] for name in WEIGHTS] for kind in ("elastic", "plastic")]
     except KeyError as error:
         raise UserError(f"law: {path} lacks the tensor {error}") from error
-    return elastic(*parts[0], scale=config["elastic_scale"]), plastic(*parts[1], scale=config["plastic_scale"])
+    laws = elastic(*parts[0], scale=config["elastic_scale"]), plastic(*parts[1], scale=config["plastic_scale"])
+    if (limit := card.get("strain_limit")) is not None:
+        if isinstance(limit, bool) or not isinstance(limit, int | float) or not 0 < limit < math.inf:
+            raise UserError(f"law: {path} has the strain_limit {limit!r}; it must be a positive number")
+        for law in laws:
+            law.strain_limit = float(limit)
+    return laws

@@ -13,6 +13,7 @@ import warp as wp
 from neuido.physics.colliders import contact as contact_functions
 from neuido.physics.mpm import grid as mpm_grid
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.events import COLLAPSED
 from neuido.physics.runtime.once import cached
 
 
@@ -53,18 +54,29 @@ def build(real: type) -> SimpleNamespace:
         gradients: wp.array(dtype=mat33),
         C: wp.array(dtype=mat33),
         F: wp.array(dtype=mat33),
+        step: int,
+        lowest: wp.array(dtype=real),
+        since: wp.array(dtype=wp.int32),
     ):
         """Write G, F = Ds `shape`, and with `rate` the velocity gradient C.
 
         C is the gradient of the new velocity at the old positions, so that F is (I + dt C) times the last F. F is not accumulated from
         C: its error stays bounded where an element is nearly inverted and G is large for a moment.
+
+        An element whose det F is below `COLLAPSED` leaves the smallest one in `lowest` and the first such step in `since`.
         """
         i = wp.tid()
         e = elements[i]
         D = edges(e, x)
         if rate:
             C[i] = edges(e, v) * gradients[i]
-        F[i] = D * shape[i]
+        f = D * shape[i]
+        F[i] = f
+        J = wp.determinant(f)
+        if J < wp.static(real(COLLAPSED)):
+            lowest[i] = wp.min(lowest[i], J)
+            if since[i] < 0:
+                since[i] = step
         gradients[i] = wp.inverse(D)
 
     @kernel

@@ -4,6 +4,7 @@ A graph spans the interval between two frames and not the whole rollout. It take
 of any length. Inputs that change over time (accelerations, growth) are copied into the loop's memory before each interval.
 """
 
+import math
 from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
@@ -93,6 +94,8 @@ class Loop:
         self.smoothed = torch.empty_like(self.F) if self.nodal else self.F
         self.J, self.J_mean, self.pressure = (like.new_empty(elements if self.nodal else 0) for _ in range(3))
         self.at_node = like.new_empty(nodes if self.nodal else 0)
+        self.lowest = like.new_empty(elements)
+        self.since = torch.empty(elements, dtype=torch.int32, device=like.device)
         self.graph: torch.cuda.CUDAGraph | None = None
         self.warm = False
         self.recordings = LaunchRecordings()
@@ -116,18 +119,20 @@ class Loop:
             if t is not None and value is not None:
                 t.copy_(value)
         self.history.zero_()
+        self.lowest.fill_(math.inf)
         assembly = self.assembly
         with torch_stream(assembly.solver.device):
             self._launch(assembly.solver.kernels.reference, len(self.F), assembly.elements, self.x, self.gradients)
         torch.matmul(self.gradients, self.F, out=self.shape)
 
     def advance(self, pull: Tensor | None = None, growth: Tensor | None = None) -> None:
-        """Run one interval.
+        """Run one interval; `since` counts from its start.
 
         Args:
             pull: Accelerations of this interval, (count, S, 3); None: as before.
             growth: Growth of this interval, (count, S); None: as before.
         """
+        self.since.fill_(-1)
         for own, value in ((self.fields.pull, pull), (self.fields.growth, growth)):
             if value is not None:
                 own.copy_(value)
@@ -156,7 +161,7 @@ class Loop:
             for n in range(self.count):
                 growth = None if self.fields.growth is None else self.fields.growth[n]
                 self._stress(elastic, growth)
-                self._move(self.fields.pull[n if len(self.fields.pull) > 1 else 0], last=n == self.count - 1)
+                self._move(self.fields.pull[n if len(self.fields.pull) > 1 else 0], n)
                 if plastic is not None:
                     plastic.forward(self.trial, self.F)
                 if self.layout.width > 0 or self.flows:
@@ -190,15 +195,15 @@ class Loop:
             self._launch(k.node_mean, nodes, a.first, a.corner, a.volume, self.pressure, self.at_node)
             self._launch(k.spread_pressure, elements, a.elements, self.at_node, self.J, self.tau)
 
-    def _move(self, pull: Tensor, *, last: bool) -> None:
-        """Move the nodes, and compute the trial F of the elements (F itself if nothing corrects it)."""
+    def _move(self, pull: Tensor, n: int) -> None:
+        """Move the nodes in inner step n, and compute the trial F of the elements (F itself if nothing corrects it)."""
         k, a, f = self.assembly.solver.kernels, self.assembly, self.fields
-        rates = last or f.viscosity is not None or self.layout.width > 0
+        rates = n == self.count - 1 or f.viscosity is not None or self.layout.width > 0
         self._launch(k.corner_forces, len(self.F), a.volume, self.gradients, self.tau, self.force)
         self._launch(k.move, len(self.x), a.first, a.corner, a.node_scene, a.held, f.mass, f.dt, pull, f.force, self.plane, self.kind,
                      f.friction, self.force, self.x, self.v)  # fmt: skip
         self._launch(k.kinematics, len(self.F), a.elements, self.x, self.v, self.shape, rates, self.gradients, self.C,
-                     self.trial if self.changes else self.F)  # fmt: skip
+                     self.trial if self.changes else self.F, n, self.lowest, self.since)  # fmt: skip
 
     def _update_history(self, growth: Tensor | None) -> None:
         """Advance the history by a step, and correct the trial F if a plastic effect is present."""

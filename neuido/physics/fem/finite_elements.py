@@ -18,11 +18,12 @@ from neuido.physics.fem import element_kernels
 from neuido.physics.fem.assembly import Assembly, BodyMesh, SolverArrays, body_mesh
 from neuido.physics.fem.assembly_rollout import AssemblyRollout, Inputs
 from neuido.physics.fem.meshing import Mesh, mesh_body
-from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw, strain_limit
 from neuido.physics.mpm import inputs
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.deprecated import renamed_option
 from neuido.physics.runtime.device import real_of
+from neuido.physics.runtime.events import Marks, Notes, OnInversion, checked_option, raise_inversions
 from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.threads import one_thread_each, scene_pool
@@ -51,6 +52,7 @@ class FiniteElements:
             of nearly incompressible bodies (average nodal pressure, Bonet and Burton 1998).
         meshes: Meshes to use instead of generated ones, one per body or one for all.
         max_inner_steps: Largest number of inner steps per step; a scene that needs more is an error.
+        on_inversion: What a rollout does where an element turns inside out or collapses, as for `mpm.Simulator`.
 
     Raises:
         UserError: As `mpm.Simulator`, or a body that cannot be meshed.
@@ -78,9 +80,11 @@ class FiniteElements:
         smoothing: Literal["none", "nodal"] = "none",
         meshes: Mesh | Sequence[Mesh] | None = None,
         max_inner_steps: int = MAX_INNER_STEPS,
+        on_inversion: OnInversion = "report",
     ) -> None:
         if smoothing not in ("none", "nodal"):
             raise UserError(f"smoothing is {smoothing!r}; choose none or nodal")
+        self.on_inversion = checked_option(on_inversion)
         loaded = Simulator(scenes, bodies, density=density, device=device, dtype=dtype, threads=False, graphs=False)
         self.scenes, self.device, self.dtype, self.smoothing = loaded.scenes, loaded.device, loaded.dtype, smoothing
         self.particles, self.state, self.mass, self.volume = loaded.particles, loaded.state, loaded.mass, loaded.volume
@@ -282,9 +286,10 @@ class FiniteElements:
             *(t.new_empty(steps // every + 1, *t.shape) for t in state),
             dt=[scene.dt * every for scene in self.scenes],
             particles=self.particles,
+            strain_limit=strain_limit(elasticity, plasticity),
         )
 
-        def one(run: AssemblyRollout) -> None:
+        def one(run: AssemblyRollout) -> Notes:
             assembly = run.assembly
             a, b = assembly.a, assembly.b
             n = inner_of[a]
@@ -303,24 +308,39 @@ class FiniteElements:
                 None if growth is None else growth[:, scenes].contiguous(),
                 dt.contiguous(),
             )
-            run.run(steps, every, n, elasticity, plasticity, part, ParticleState(*(t[:, own] for t in frames)))
+            return run.run(steps, every, n, elasticity, plasticity, part, ParticleState(*(t[:, own] for t in frames)))
 
         if self.pool is None:
-            for run in self.runs:
-                one(run)
+            notes = [one(run) for run in self.runs]
         else:
             with one_thread_each():
-                list(self.pool.map(one, self.runs))
+                notes = list(self.pool.map(one, self.runs))
+        frames.marks = self._marks(notes, every, inner_of)
         scene = self.particles.scene.long()
         dt = self.dt / torch.tensor(inner_of).to(self.dt)
         limit = (torch.tensor(self.sizes).to(self.dt) / dt)[scene]  # a point must not cross an element within an inner step
         fine = torch.isfinite(frames.x).all(dim=2) & (frames.v.norm(dim=2) <= limit)
         if nan_on_failure:
             refusing = torch.tensor([s in refused for s in range(self.scene_count)], device=self.device)
-            invalidate(frames, refusing[scene] | ~fine.all(dim=0), scene)
-        elif not bool(fine.all()):
-            self._raise(fine, steps, every, inner_of)
+            failed = refusing[scene] | ~fine.all(dim=0)
+            if self.on_inversion == "error":
+                inverted = torch.zeros(self.scene_count, dtype=torch.bool, device=self.device)
+                inverted[frames.marks.scene[frames.marks.since >= 0].long()] = True
+                failed = failed | inverted[scene]
+            invalidate(frames, failed, scene)
+        else:
+            if self.on_inversion == "error":
+                raise_inversions(frames.marks)
+            if not bool(fine.all()):
+                self._raise(fine, steps, every, inner_of)
         return frames
+
+    def _marks(self, notes: Sequence[Notes], every: int, inner: Sequence[int]) -> Marks:
+        """Return what was noted of the elements of all scenes; a step is an inner one."""
+        scene = torch.cat([assembly.particles.scene + assembly.a for assembly in self.assemblies])
+        dt = tuple(own.dt / n for own, n in zip(self.scenes, inner))
+        lowest, since = (torch.cat([getattr(note, name) for note in notes]) for name in ("lowest", "since"))
+        return Marks(lowest, since, scene, dt, tuple(every * n for n in inner), "elements")
 
     def _raise(self, fine: Tensor, steps: int, every: int, inner: list[int]) -> NoReturn:
         """Raise for the first particle whose motion is not finite or too fast; `fine` (K, P) says where the motion is valid."""

@@ -25,6 +25,8 @@ STIFFENING = 2.5
 """Largest factor by which the smoothing may raise `stiffness_bound`; the number of inner steps rises by its square root."""
 EVEN_CORNERS = ((0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1))
 """Corners of a cell whose coordinates have an even sum, the corners of the inner tetrahedron of five."""
+TOGETHER = 1e-3
+"""Distance, as a share of their size, below which particles count as being in one place."""
 
 
 class Mesh(NamedTuple):
@@ -156,6 +158,10 @@ def mesh_body(x: Tensor, volume: Tensor, *, elements: int | None = None, kind: i
     points, weight = x.double().cpu().numpy(), volume.double().cpu().numpy()
     if not len(points):
         raise UserError("a body without particles cannot be meshed; give at least one")
+    apart = len(np.unique(np.round((points - points[0]) / (TOGETHER * np.cbrt(weight.mean()))), axis=0))
+    if apart < kind:
+        raise UserError(f"a body of {apart} particle{'s' if apart > 1 else ''} in different places has no mesh, which needs {kind}: "
+                        "give more particles or a mesh, or use material points")  # fmt: skip
     wanted = PER_PARTICLE * len(points) if elements is None else float(elements)
     if not wanted >= kind:
         raise UserError(f"elements is {elements}; give at least {kind}, the tetrahedra of one cell")

@@ -21,6 +21,9 @@ Parameter = float | Tensor
 class Law:
     """Base class of elastic and plastic laws for S scenes."""
 
+    strain_limit: float | None = None
+    """Largest logarithmic stretch up to which the law is known to hold; None: any."""
+
     def tensors(self) -> tuple[Tensor, ...]:
         """Return the differentiable inputs of `forward`, each with a leading axis of S scenes.
 
@@ -83,6 +86,12 @@ class Law:
             particles: The scene of each particle; needed with several scenes.
         """
         raise NotImplementedError
+
+
+def strain_limit(*laws: Law | None) -> float | None:
+    """Return the smallest `strain_limit` of the laws; None where none has one."""
+    limits = [law.strain_limit for law in laws if law is not None and law.strain_limit is not None]
+    return min(limits, default=None)
 
 
 class Engine:

@@ -89,6 +89,7 @@ class _Segments(torch.autograd.Function):
         frames = tuple(t.new_empty(ctx.count * length + 1, *t.shape) for t in inputs[:STATES])
         starts = [inputs[:STATES]]
         for i in range(ctx.count):
+            ctx.part.offset = i * segment
             rest = [_own(t, kind, i, segment) for t, kind in zip(inputs[STATES:], _kinds(inputs))]
             for frame, part in zip(frames, _frames(ctx.part, cache, (*starts[i], *rest))):
                 frame[i * length : (i + 1) * length + 1] = part

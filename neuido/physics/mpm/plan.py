@@ -13,6 +13,7 @@ from neuido.physics.effects.coefficients import Layout, Tables
 from neuido.physics.laws.base import ElasticLaw, Engine, PlasticLaw
 from neuido.physics.mpm.state import Setup
 from neuido.physics.runtime.device import launch, real_of
+from neuido.physics.runtime.events import Notes
 
 STATES = 5
 """Number of inputs that form the initial state: x, v, C, F and the history (no columns if no effect has a history)."""
@@ -49,6 +50,11 @@ class Plan:
         every: Substeps between frames.
         tables: Tables of the material effects, if any; they decide which kernels are launched.
         nan_on_failure: Set the frames of a failed scene to NaN instead of raising.
+        notes: Where the events of the run are noted, the particles in the order of the kernels.
+
+    Attributes:
+        offset: Substeps of the whole rollout before those of this plan.
+        total: Substeps of the whole rollout.
     """
 
     def __init__(
@@ -60,7 +66,10 @@ class Plan:
         every: int,
         tables: Tables | None = None,
         nan_on_failure: bool = False,
+        notes: Notes | None = None,
     ) -> None:
+        self.notes = Notes(len(setup.mass), setup.mass) if notes is None else notes
+        self.offset, self.total = 0, steps
         self.setup, self.elasticity, self.steps, self.every = setup, elasticity, steps, every
         self.nan_on_failure = nan_on_failure
         self.layout = Layout() if tables is None else tables.layout
@@ -103,7 +112,7 @@ class Plan:
         plastic = None if self.plasticity is None else self.plasticity.single_scene(s)
         tables = None if self.tables is None else self.tables._replace(kinds=self.flow_kinds[s : s + 1])
         elastic = self.elasticity.single_scene(s)
-        plan = Plan(self.setup.single_scene(s), elastic, plastic, self.steps, self.every, tables, self.nan_on_failure)
+        plan = Plan(self.setup.single_scene(s), elastic, plastic, self.steps, self.every, tables, self.nan_on_failure, self.notes)
         plan.split = self.split
         return plan
 

@@ -30,6 +30,10 @@ class Tape(NamedTuple):
     history: Tensor
     status: Tensor
     """Code, particle and substep of the first failure of each scene, (3 S,) int32."""
+    lowest: Tensor
+    """Smallest det F of each particle, of those below `COLLAPSED`, (P,)."""
+    since: Tensor
+    """First substep in which it was below, (P,) int32; -1: never."""
     tau: Tensor | None
     """Stress of each substep, (T, P, 3, 3), or None."""
     trial: Tensor | None
@@ -53,11 +57,12 @@ def new_tape(plan: Plan, keep_all: bool) -> Tape:
     history = setup.mass.new_empty(len(setup.mass), plan.layout.width)
     states = (t.new_empty(count + 1, *t.shape) for t in (*setup.state, history))
     status = torch.zeros(3 * setup.scene_count, dtype=torch.int32, device=setup.device)
+    lowest, since = torch.empty_like(setup.mass), torch.empty(len(setup.mass), dtype=torch.int32, device=setup.device)
     more = keep_all and setup.keep_grid
     tau = setup.state.F.new_empty(plan.steps, *setup.state.F.shape) if more else None
     trial = torch.empty_like(tau) if tau is not None and plan.corrects else None
     nodal = [setup.mass.new_empty(plan.steps, setup.node_count, 4) if more else None for _ in range(2)]
-    return Tape(*states, status, tau, trial, *nodal, keep_all)
+    return Tape(*states, status, lowest, since, tau, trial, *nodal, keep_all)
 
 
 def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
@@ -77,6 +82,8 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
     recordings = LaunchRecordings()
     steady = all(len(t) <= 1 for t in (pull, inputs[STATES + 6]))  # neither pull nor growth has a row for each substep
     tape.status.zero_()
+    tape.lowest.fill_(math.inf)
+    tape.since.fill_(-1)
     with torch_stream(setup.device):
         elastic, plastic = plan.engines(inputs)
         for n in range(plan.steps if steps is None else steps):
@@ -95,7 +102,7 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
                 grid.zero_()
             to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid)
             on_nodes = partial(update_nodes, plan, grid, pull_now, force, friction, velocity, reach, clears)
-            to_particles = partial(gather, plan, n, now, then, material, plastic, velocity, trial, tape.status)
+            to_particles = partial(gather, plan, n, now, then, material, plastic, velocity, trial, tape)
             if same is None:
                 to_nodes()
                 on_nodes()
@@ -128,14 +135,14 @@ def gather(
     plastic: Engine | None,
     velocity: Tensor,
     trial: Tensor,
-    status: Tensor,
+    tape: Tape,
 ) -> None:
     """Write the particles of the next substep from the nodal velocities (G2P), then correct F and advance the history."""
     setup = plan.setup
     x, _, _, F, history = now
     plan.launch(setup.kernels.grid_to_particles, len(x),
                 [setup.particles.scene, setup.sorted_held, setup.origin, setup.dx, setup.dt, setup.nodes, velocity, x, F, *then[:3],
-                 trial if plan.corrects else then[3], n, status, setup.span], plan.block)  # fmt: skip
+                 trial if plan.corrects else then[3], n, tape.status, setup.span, tape.lowest, tape.since], plan.block)  # fmt: skip
     if plastic is not None:
         plastic.forward(trial, then[3])
     if material is not None:
@@ -242,7 +249,7 @@ def grid_inputs(plan: Plan, pull: Tensor, force: Tensor, friction: Tensor, reach
 
 
 def check(plan: Plan, tape: Tape) -> None:
-    """Raise the earliest failure that the kernels reported, or raise if the last frame is not finite.
+    """Note the events of a run, and raise the earliest failure that the kernels reported, or that the last frame is not finite.
 
     With `nan_on_failure` the frames of failed scenes are set to NaN instead.
 
@@ -250,6 +257,7 @@ def check(plan: Plan, tape: Tape) -> None:
         UserError: A particle lost, too fast, or not finite.
     """
     setup, found = plan.setup, tape.status.view(-1, 3)
+    plan.notes.add(tape.lowest, tape.since, setup.first_particle, plan.offset)
     finite = torch.isfinite(tape.F[-1]).all(dim=(1, 2))
     if bool(finite.all()) and not bool(found.any()):
         return
@@ -269,4 +277,4 @@ def check(plan: Plan, tape: Tape) -> None:
         kernels.FAST: f"moved by more than a cell ({scene.dx:.4g} m) or became NaN; lower `dt` (now {scene.dt:g} s) or the stiffness",
         0: f"has a deformation gradient that is not finite; lower `dt` (now {scene.dt:g} s) or check the law",
     }[code]
-    raise UserError(f"particle {p} of scene {s} {what} (substep {step + 1} of {plan.steps})")
+    raise UserError(f"particle {p} of scene {s} {what} (substep {plan.offset + step + 1} of {plan.total})")

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
-from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw, strain_limit
 from neuido.physics.mpm import inputs
 from neuido.physics.mpm.differentiable import run
 from neuido.physics.mpm.graphs import RolloutCache
@@ -22,6 +22,7 @@ from neuido.physics.mpm.plan import Plan
 from neuido.physics.mpm.state import Setup
 from neuido.physics.runtime.deprecated import renamed_option
 from neuido.physics.runtime.device import as_device
+from neuido.physics.runtime.events import Marks, OnInversion, checked_option, raise_inversions
 from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.threads import scene_pool
@@ -54,6 +55,8 @@ class Simulator:
         store: What a forward pass stores of each substep for the backward pass. `state`: x, v, C, F (96 bytes a particle in
             float32); stress, trial gradient and grid are recomputed. `all`: these too (72 bytes more a particle, 32 a node), which is
             faster. `auto`: `all` if there are at most four nodes per particle, else `state`.
+        on_inversion: What a rollout does where matter turns inside out or collapses (det F below 0.001). `report`: `Frames.events` has
+            it. `error`: it raises, or makes the scene NaN with `nan_on_failure`.
         keep: Deprecated name of `store`.
 
     Raises:
@@ -77,11 +80,13 @@ class Simulator:
         threads: bool = True,
         graphs: bool = True,
         store: Literal["state", "all", "auto"] = "auto",
+        on_inversion: OnInversion = "report",
         keep: Literal["state", "all", "auto"] | None = None,
     ) -> None:
         store = renamed_option("store", store, "keep", keep)
         if store not in ("state", "all", "auto"):
             raise UserError(f"store is {store!r}; choose state, all or auto")
+        self.on_inversion = checked_option(on_inversion)
         self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
         bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
         if len(bodies) != len(self.scenes) or not bodies:
@@ -260,11 +265,18 @@ class Simulator:
         with self.cache.lock:
             frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, self.pool)
             x, v, C, F, history = (t[:, self.inverse] for t in frames)
-        out = Frames(x, v, C, F, [scene.dt * every for scene in self.scenes], self.particles, history)
+        dts = tuple(scene.dt for scene in self.scenes)
+        notes = plan.notes
+        marks = Marks(notes.lowest[self.inverse], notes.since[self.inverse], self.particles.scene, dts, (every,) * len(dts))
+        limit = strain_limit(elasticity, plasticity)
+        out = Frames(x, v, C, F, [dt * every for dt in dts], self.particles, history, marks=marks, strain_limit=limit)
         if nan_on_failure:
             refusing = torch.tensor([bool(why) for why in refused], device=self.device)
             scene = self.particles.scene.long()
-            invalidate(out, refusing[scene] | ~torch.isfinite(out.x[-1]).all(dim=1), scene)
+            failed = refusing[scene] | ~torch.isfinite(out.x[-1]).all(dim=1)
+            invalidate(out, failed | (marks.since >= 0) if self.on_inversion == "error" else failed, scene)
+        elif self.on_inversion == "error":
+            raise_inversions(marks)
         return out
 
 

@@ -27,9 +27,7 @@ def affine_velocity(x: Tensor, v: Tensor, neighbours: int = 32, chunk: int = 204
     """
     dx = x - x.mean(dim=0)
     dv = v - v.mean(dim=0)
-    spread = dx.T @ dx
-    ridge = 1e-9 * spread.trace() * torch.eye(3, dtype=x.dtype, device=x.device)
-    gradient = torch.linalg.solve(spread + ridge, dx.T @ dv).T
+    gradient = _affine_fit(dx, dv, 1e-9)
     residual = (dv - dx @ gradient.T).detach().norm(dim=1).max()
     if residual <= 1e-3 * v.detach().norm(dim=1).max() or x.shape[0] <= neighbours:
         return gradient.expand(x.shape[0], 3, 3).contiguous()
@@ -38,10 +36,26 @@ def affine_velocity(x: Tensor, v: Tensor, neighbours: int = 32, chunk: int = 204
         near = torch.cdist(x[start : start + chunk], x).topk(neighbours, largest=False).indices
         nx, nv = x[near], v[near]
         nx, nv = nx - nx.mean(dim=1, keepdim=True), nv - nv.mean(dim=1, keepdim=True)
-        normal = nx.transpose(1, 2) @ nx
-        ridge = 1e-6 * normal.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] * torch.eye(3, dtype=x.dtype, device=x.device)
-        out.append(torch.linalg.solve(normal + ridge, nx.transpose(1, 2) @ nv).transpose(1, 2))
+        out.append(_affine_fit(nx, nv, 1e-6))
     return torch.cat(out).contiguous()
+
+
+def _affine_fit(x: Tensor, v: Tensor, ridge: float) -> Tensor:
+    """Return the velocity gradient (..., 3, 3) of v (..., n, 3) over x (..., n, 3), both about their means.
+
+    It is zero across directions in which the particles do not differ.
+
+    Args:
+        x: Positions [m]; particles in one place, or one particle, give zero.
+        v: Velocities [m/s].
+        ridge: Share of the trace that keeps the fit of flat bodies solvable.
+    """
+    spread = x.mT @ x
+    size = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    apart = size > 0
+    eye = torch.eye(3, dtype=x.dtype, device=x.device)
+    gradient = torch.linalg.solve(spread + torch.where(apart, ridge * size, 1.0) * eye, x.mT @ v).mT
+    return torch.where(apart, gradient, 0.0)
 
 
 class Setup:

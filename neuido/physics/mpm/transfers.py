@@ -22,6 +22,7 @@ import warp as wp
 from neuido.physics.mpm import grid as grid_kernels
 from neuido.physics.mpm import stencil as stencil_functions
 from neuido.physics.runtime.device import start_warp
+from neuido.physics.runtime.events import COLLAPSED
 from neuido.physics.runtime.once import cached
 
 PAD = 2
@@ -209,10 +210,13 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         step: int,
         status: wp.array(dtype=wp.int32),
         span: wp.array(dtype=real),
+        lowest: wp.array(dtype=real),
+        since: wp.array(dtype=wp.int32),
     ):
         """Gather; the first particle of a scene that is lost, too fast or not finite leaves its code, index and step in `status`.
 
-        Where `span` has room for two figures, it is widened to the x of all particles.
+        Where `span` has room for two figures, it is widened to the x of all particles. A particle whose trial det F is below
+        `COLLAPSED` leaves the smallest one in `lowest` and the first such step in `since`.
         """
         p = wp.tid()
         s = scene[p]
@@ -240,7 +244,13 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         widen(span, y[0])
         v_next[p] = v
         C_next[p] = C
-        F_trial[p] = F[p] + dt[s] * (C * F[p])
+        trial = F[p] + dt[s] * (C * F[p])
+        F_trial[p] = trial
+        J = wp.determinant(trial)
+        if J < wp.static(real(COLLAPSED)):
+            lowest[p] = wp.min(lowest[p], J)
+            if since[p] < 0:
+                since[p] = step
         code = int(0)
         if not (wp.length(v) * dt[s] < h):
             code = wp.static(FAST)

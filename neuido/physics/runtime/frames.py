@@ -1,5 +1,6 @@
 """What a rollout returns: the frames of its particles, with their times, to unpack, to look at and to save."""
 
+import functools
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -11,7 +12,9 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.runtime import events
 from neuido.physics.runtime.atomic_files import whole_file
+from neuido.physics.runtime.events import Event, Marks
 from neuido.types import Particles, ParticleState
 
 
@@ -28,16 +31,21 @@ class Frames(ParticleState):
         dt: Time between two frames [s], a number or one for each scene, (S,).
         particles: Scene of each particle; none: one scene.
         history: What the effects remember, (K, P, width); width 0 where none does, None where the solver does not tell.
+        marks: What the kernels noted of det F in every step; None: `events` looks at the frames alone.
+        strain_limit: Largest logarithmic stretch that the law knows; None: any.
 
     Attributes:
         dt: Time between two frames [s], (S,).
         particles: As given.
         history: As given.
+        events: What makes the result doubtful, a tuple of `Event`.
     """
 
     dt: Tensor
     particles: Particles | None
     history: Tensor | None
+    marks: Marks | None
+    strain_limit: float | None
 
     def __new__(
         cls,
@@ -48,11 +56,14 @@ class Frames(ParticleState):
         dt: Tensor | Sequence[float] | float = 1.0,
         particles: Particles | None = None,
         history: Tensor | None = None,
+        *,
+        marks: Marks | None = None,
+        strain_limit: float | None = None,
     ) -> "Frames":
         """Make frames; see the class."""
         frames = super().__new__(cls, x, v, C, F)
         frames.dt = torch.as_tensor(dt, dtype=torch.float64).detach().cpu().reshape(-1)
-        frames.particles, frames.history = particles, history
+        frames.particles, frames.history, frames.marks, frames.strain_limit = particles, history, marks, strain_limit
         return frames
 
     @classmethod
@@ -65,6 +76,22 @@ class Frames(ParticleState):
         at = torch.arange(len(self.x), dtype=torch.float64)
         each = torch.unique(self.dt)
         return at * each if len(each) == 1 else self.dt[:, None] * at
+
+    @functools.cached_property
+    def events(self) -> tuple[Event, ...]:
+        """What makes the result doubtful: matter that turned inside out or collapsed, a law asked beyond its training.
+
+        Found when first asked for. Of det F every substep counts where the simulator made the frames, else the frames do; of the law's
+        strains the frames count.
+        """
+        if self.F is None or not self.F.numel():
+            return ()
+        scene = torch.zeros(self.F.shape[1], dtype=torch.int32) if self.particles is None else self.particles.scene
+        scene, each = scene.to(self.F.device), self.dt.tolist()
+        each = each if len(each) > 1 else each * (int(scene.max()) + 1)
+        marks = events.marks_of_frames(self.F, scene, each) if self.marks is None else self.marks
+        beyond = [] if self.strain_limit is None else events.outside(self.F, self.strain_limit, scene, each)
+        return (*marks.events(), *beyond)
 
     def __repr__(self) -> str:
         frames, count = self.x.shape[:2]

@@ -38,6 +38,9 @@ STRESS_SCALE = 1e5
 RAW_STRESS_SCALE = 1e4
 """Unit of the raw elastic outputs [Pa]."""
 
+STRAIN_LIMIT = 0.5
+"""Largest logarithmic stretch of the objective networks: their series of ln V is right to 3e-4 there, and at 1.6 has the wrong sign."""
+
 STRAIN_SCALE = 1e-2
 """Unit of the yield radii and of the raw plastic correction [-]."""
 
@@ -282,6 +285,8 @@ class _Raw(_Network):
 
 
 class _Objective(_Network):
+    strain_limit = STRAIN_LIMIT
+
     def _features(self, F: Tensor, out: Tensor) -> None:
         launch(kernels(F).features, F, F, out)
 

@@ -74,6 +74,7 @@ class SymbolicEngine(Engine):
 
 
 class _Symbolic(EngineLaw):
+    strain_limit = networks.STRAIN_LIMIT
     elastic: bool
     outputs: int
     columns: int
