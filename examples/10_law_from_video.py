@@ -12,9 +12,6 @@ import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import yaml
-
-import neuido
 
 
 def run(command):
@@ -24,11 +21,8 @@ def run(command):
 
 
 # %%
-# One scene of the six small ones that come with neuido. Its film is a folder of images and cameras, with the truth beside it.
-film = yaml.safe_load((neuido.configs_root() / "scenes" / "six_small.yaml").read_text())
-film["scenes"] = film["scenes"][:1]
-Path("ball.yaml").write_text(yaml.safe_dump(film))
-run("scenes --config ball.yaml --out film --device cpu")
+# One small scene that comes with neuido. Its film is a folder of images and cameras, with the truth beside it.
+run("scenes --config small_ball --out film --device cpu")
 run("reconstruct film/Ball --steps 200 --start 800 --gaussians 1500 --particles 1500 --device cpu")
 run("predict --config predict.yaml --model.init_from pretrained-small --model.out law --data.root film --data.scenes [Ball]")
 

@@ -3,14 +3,9 @@
 import subprocess
 import sys
 
-import yaml
-
 import neuido
 
-film = yaml.safe_load((neuido.configs_root() / "scenes" / "six_small.yaml").read_text())
-with open("ball.yaml", "w") as file:
-    yaml.safe_dump(film | {"scenes": film["scenes"][:1]}, file)
-for command in ("scenes --config ball.yaml --out film", "reconstruct film/Ball --steps 100 --start 800 --gaussians 800 --particles 600"):
+for command in ("scenes --config small_ball --out film", "reconstruct film/Ball --steps 100 --start 800 --gaussians 800 --particles 600"):
     subprocess.run([sys.executable, "-m", "neuido", *command.split(), "--device", "cpu", "--progress", "false"], check=True)
 law = neuido.read_law("film/Ball", encoder="pretrained-small", device="cpu")
 law.save("law.safetensors")

@@ -78,6 +78,9 @@ def test_command(command, folder, monkeypatch, capsys):
         assert found.answer in ("effect", "class")
         assert found.error.after < found.error.before
         assert (folder / "runs" / "rubber" / "report.html").is_file()
+    if "predict" in command:
+        young = float(re.search(r"E = ([\d.]+) kPa", capsys.readouterr().out)[1])
+        assert 15 <= young <= 60, "the README says a factor of two of 30 kPa"
     if "demo" in command:
         assert neuido.Diagnosis.read(folder / "runs" / "demo" / "loop" / "diagnosis").effects[0].name == "drag_linear"
 
