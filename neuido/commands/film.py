@@ -1,5 +1,8 @@
 """The `film` command: signature and help alone, so that `--help` loads no torch."""
 
+from pathlib import Path
+
+from neuido.data.files.writing import check_writable
 from neuido.data.trajectories.options import FAMILIES, Range
 
 
@@ -72,4 +75,10 @@ def film(
         samples=samples,
         seed=seed,
     )
+    check_writable(Path(out))
     generate_clips(plan, out, device=device, batch=batch, shard=shard, shards=shards, progress=progress)
+    there = sum((Path(out) / f"clip-{i:05d}.npz").is_file() for i in range(count))
+    print(
+        f"{there} of {count} clips are there: {views} views, {frames} frames, flow of {flow_size} x {flow_size} px; {', '.join(families)}"
+    )
+    print(f"results in {out}: `neuido fit --config flow_vae --data.root {out}` learns from them")

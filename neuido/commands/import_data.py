@@ -1,4 +1,4 @@
-"""The `import` and `check` commands."""
+"""The `import` command: tables of a testing machine or a tracker become a folder to diagnose."""
 
 
 def import_data(
@@ -95,33 +95,4 @@ def import_data(
         held_out=[name for name in held_out.split(",") if name],
     )
     print("\n".join(lines))
-
-
-def check(folder: str) -> None:
-    """Read measured data and say whether they are plausible: units, signs, times, order, markers.
-
-    Args:
-        folder: A folder with experiment.yaml, test.yaml or track.yaml.
-
-    Raises:
-        UserError: What is wrong, with the file and the key to change.
-    """
-    from pathlib import Path
-
-    from neuido.errors import UserError
-
-    given = Path(folder).expanduser()
-    here = given.name if given.is_file() else next((n for n in ("experiment.yaml", "test.yaml", "track.yaml") if (given / n).is_file()), "")
-    if here == "experiment.yaml":
-        from neuido.data.measured.experiment import read_experiment as read
-    elif here == "test.yaml":
-        from neuido.data.measured.material_test import read_material_tests as read
-    elif here == "track.yaml":
-        from neuido.data.measured.track import read_tracks as read
-    else:
-        raise UserError(f"{folder} has none of experiment.yaml, test.yaml, track.yaml: `neuido import` makes such a folder")
-    found = read(given)
-    entries = found.tests if here == "test.yaml" else found.recordings
-    for entry in entries:
-        print(f"{entry.name}: {entry.role}")
-    print(f"{found.name} is plausible: {len(entries)} recordings")
+    print(f"results in {out}" if out is not None and not dry_run else "nothing is written (--dry_run)")

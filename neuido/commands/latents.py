@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuido.data.progress import Progress
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
@@ -53,11 +54,15 @@ def latents(
 
     opened, folder = IntrinsicDynamicsOperator.load(operator), Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    if "space" in parts:
-        _space(opened, folder, perplexity, seed)
-    if "interpolation" in parts:
-        _interpolation(opened, folder, ends, family, count, device)
-    print(f"results: {folder}")
+    with Progress("latents", len(parts), unit="parts") as work:
+        if "space" in parts:
+            work.say("silhouettes, t-SNE and directions")
+            _space(opened, folder, perplexity, seed)
+            work.update()
+        if "interpolation" in parts:
+            work.say("rollouts between two latents")
+            _interpolation(opened, folder, ends, family, count, device)
+    print(f"results in {folder}: tables (.csv), pictures (.png) and, of the interpolation, its motion (.npz)")
 
 
 def _space(operator: "IntrinsicDynamicsOperator", folder: Path, perplexity: float, seed: int) -> None:

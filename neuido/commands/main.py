@@ -35,7 +35,7 @@ LIGHT = {  # name: (module, function, one line for the list); the module must im
     "replay": ("neuido.commands.simulation.replay", "replay", "Simulate the recordings of an experiment under a model."),
     "reconstruct": ("neuido.commands.reconstruct", "reconstruct", "Gaussians and particles of a filmed body's first frame."),
     "import": ("neuido.commands.import_data", "import_data", "Turn tables of a testing machine or a tracker into a folder to diagnose."),
-    "check": ("neuido.commands.import_data", "check", "Say whether measured data are plausible."),
+    "check": ("neuido.commands.check", "check", "Say whether measured data are plausible."),
     "diagnose": ("neuido.commands.diagnose", "diagnose", "Find the effect that a model lacks, from measured motion."),
     "sweep": ("neuido.commands.sweep", "sweep", "Run a wandb sweep file without a server, offline, into one CSV."),
     "report": ("neuido.commands.report", "report", "One page of several runs: tables, curves, videos side by side."),

@@ -103,7 +103,7 @@ def reconstruct(
         raise UserError(f"{target} holds a reconstruction with other options: give another out, or remove the folder")
     write_text(target / SETUP, text)
     if (target / REPORT).is_file():
-        print((target / REPORT).read_text(), end="")
+        _tell(target)
         return
     torch.manual_seed(seed)
     module = _optimise(batch, around, target, chosen, options)
@@ -118,7 +118,25 @@ def reconstruct(
     report = json.dumps({key: float(f"{value:.5g}") for key, value in figures.items()}, indent=1) + "\n"
     write_text(target / REPORT, report)
     (target / RESUME).unlink(missing_ok=True)
-    print(report, end="")
+    _tell(target)
+
+
+def _tell(target: Path) -> None:
+    """Print the figures of a reconstruction and where its files are."""
+    from neuido.data.files.parsing import read_json
+
+    found = read_json(target / REPORT)
+    print(f"{found['gaussians']:.0f} Gaussians, {found['particles']:.0f} particles that fill {found['volume']:.4g} m^3")
+    for key, words in (("train", "views that it was fitted to"), ("held_out", "views that were held out")):
+        if f"psnr_{key}" in found:
+            figures = (found[f"psnr_{key}"], found[f"psnr_{key}_object"], found[f"ssim_{key}"])
+            print("{}: PSNR {:.2f} dB ({:.2f} dB on the body), SSIM {:.4f}".format(words, *figures))
+    if "volume_error" in found:
+        print(
+            f"against the truth: volume {100 * found['volume_error']:+.1f} %, Chamfer distance {found['chamfer_1e4']:.3g}e-4 "
+            f"(other particles of the true body: {found['chamfer_floor_1e4']:.3g}e-4)"
+        )
+    print(f"results in {target}: gaussians.ply, body.npz, scene.yaml, all figures in report.json; look at comparison.png")
 
 
 def _setting(source: Path, file: str | None, recording: str | None, scale: float, shift: "Vector", up: str) -> "SceneSetting":
@@ -147,6 +165,7 @@ def _optimise(batch: "MultiViewBatch", around: "SceneSetting", target: Path, dev
     from lightning.pytorch.loggers import CSVLogger
 
     from neuido.commands.cli.console import quiet_lightning
+    from neuido.commands.cli.plain_progress import needs_plain_lines, plain_progress
     from neuido.commands.interruption import stop_at_step
     from neuido.models.reconstruct.gaussian_fit import ReconstructModule
 
@@ -172,12 +191,13 @@ def _optimise(batch: "MultiViewBatch", around: "SceneSetting", target: Path, dev
     saved = ModelCheckpoint(
         target, Path(RESUME).stem, every_n_train_steps=options["save_every"], save_top_k=1, enable_version_counter=False
     )
+    bars = [plain_progress() if needs_plain_lines({}) else TQDMProgressBar(refresh_rate=20)] if options["progress"] else []
     trainer = Trainer(
         accelerator="gpu" if device.type == "cuda" else "cpu",
         devices=1,
         max_steps=steps,
         max_epochs=-1,
-        callbacks=[stop_at_step(target / RESUME), saved, *([TQDMProgressBar(refresh_rate=20)] if options["progress"] else [])],
+        callbacks=[stop_at_step(target / RESUME), saved, *bars],
         logger=CSVLogger(target, name="log"),
         log_every_n_steps=max(1, min(20, steps // 20)),
         enable_progress_bar=options["progress"],

@@ -70,7 +70,7 @@ def report(
     target = Path(out)
     target.parent.mkdir(parents=True, exist_ok=True)
     write_text(target, page(title, "\n".join(parts)))
-    print(f"report: {target}")
+    print(f"{len(entries)} runs, {len(scenes_of(entries))} scenes\nresults in {target}")
 
 
 class Line(NamedTuple):

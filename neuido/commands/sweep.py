@@ -18,6 +18,7 @@ from neuido.commands.interruption import SIGNALS, STATE
 from neuido.data.files.lock import LockHeld, OwnedLock
 from neuido.data.files.score_tables import read_rows, write_rows
 from neuido.data.files.sweep_run import FOLDER, FORMAT, read_status, write_status
+from neuido.data.progress import Progress
 from neuido.errors import UserError
 
 
@@ -59,14 +60,17 @@ def sweep(
     folder = Path(out or f"runs/sweeps/{plan.name}").absolute()
     folder.mkdir(parents=True, exist_ok=True)
     own = runs[shard::shards]
-    for i, run in enumerate(own, 1):
-        print(f"[{i}/{len(own)}] {run.name}: ", end="", flush=True)
-        print(_one(plan, run, folder / run.name), flush=True)
-        collect(plan, runs, folder)
+    with Progress("sweep", len(own), unit="runs") as work:
+        for i, run in enumerate(own, 1):
+            work.say(run.name)
+            work.print(f"[{i}/{len(own)}] {run.name}: {_one(plan, run, folder / run.name)}")
+            work.update()
+            collect(plan, runs, folder)
     rows = collect(plan, runs, folder)
     _summarise(rows, plan.metric, folder)
     if report and any(name.startswith("scores/") for row in rows for name in row):
         _report(folder, path)
+    print(f"results in {folder}: results.csv, and a folder a run")
     return int(any(row["status"] in ("failed", "interrupted") for row in rows if row["run"] in {run.name for run in own}))
 
 
@@ -208,7 +212,7 @@ def _summarise(rows: list[dict[str, Any]], metric: Metric | None, folder: Path) 
         elif any(row["status"] == "done" for row in rows):
             print(f"no run logged the metric {metric.name} into a metrics.csv below {folder}", file=sys.stderr)
     counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "interrupted", "started")}
-    print(f"{', '.join(f'{n} {status}' for status, n in counts.items() if n) or 'no run'}; results: {folder / 'results.csv'}")
+    print(f"{', '.join(f'{n} {status}' for status, n in counts.items() if n) or 'no run'}")
 
 
 def _report(folder: Path, path: Path) -> None:

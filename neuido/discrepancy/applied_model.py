@@ -4,10 +4,9 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from tqdm import tqdm
-
 from neuido.data.files.writing import new_folder
-from neuido.data.measured.experiment import read_experiment, write_experiment
+from neuido.data.measured.experiment import Recording, read_experiment, write_experiment
+from neuido.data.progress import Progress
 from neuido.discrepancy.problems.declared_model import beside, read_model_file, ready
 from neuido.discrepancy.workflow import choose_device, experiment_problem
 from neuido.errors import UserError
@@ -17,7 +16,9 @@ from neuido.physics.effects.parameters import Effects
 from neuido.physics.mpm.simulator import Simulator
 
 
-def replay(folder: str, out: str | os.PathLike, *, model: str | None = None, device: str = "auto", progress: bool = True) -> None:
+def replay(
+    folder: str, out: str | os.PathLike, *, model: str | None = None, device: str = "auto", progress: bool = True
+) -> dict[str, float | None]:
     """Simulate the recordings of an experiment under a model, and write them as an experiment's folder without noise.
 
     The tracked points are those of the experiment; of a video, whose points nobody tracked, they are all particles.
@@ -29,6 +30,9 @@ def replay(folder: str, out: str | os.PathLike, *, model: str | None = None, dev
         device: auto, cpu or cuda.
         progress: Show a progress bar.
 
+    Returns:
+        The RMS distance of each recording's points from the measured ones [m]; none where no points were tracked.
+
     Raises:
         UserError: What readers and rollouts refuse, or a folder that is there already.
     """
@@ -37,12 +41,23 @@ def replay(folder: str, out: str | os.PathLike, *, model: str | None = None, dev
         raise UserError(f"out = {out} is there already: give another folder")
     experiment = read_experiment(folder, model=None if model is None else read_model_file(model))
     problem = experiment_problem(experiment, "auto", choose_device(device))
-    names = tqdm(range(len(problem.measured)), unit="recording", disable=not progress)
-    recordings = tuple(problem.simulated(n) for n in names)
+    recordings = []
+    with Progress("recordings", len(problem.measured), shown=progress) as work:
+        for n in range(len(problem.measured)):
+            recordings.append(problem.simulated(n))
+            work.update()
 
     with new_folder(target) as hidden:
-        write_experiment(replace(experiment, model=beside(hidden, experiment.model), recordings=recordings), hidden)
+        write_experiment(replace(experiment, model=beside(hidden, experiment.model), recordings=tuple(recordings)), hidden)
         read_experiment(hidden)  # what cannot be read again is not published
+    return {r.name: _distance(r, experiment[r.name]) for r in recordings}
+
+
+def _distance(simulated: Recording, measured: Recording) -> float | None:
+    """Return the RMS distance of the points of a recording from those of another [m]."""
+    if measured.x is None or simulated.x is None or measured.x.shape != simulated.x.shape:
+        return None
+    return float((simulated.x - measured.x)[measured.seen].square().sum(-1).mean().sqrt())
 
 
 class DiagnosedEffects(EffectSource):

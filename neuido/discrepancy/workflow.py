@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuido.data.files.writing import check_writable
+from neuido.data.progress import Progress
 from neuido.discrepancy.report.diagnosis import Diagnosis
 from neuido.errors import UserError
 
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 DATA = ("auto", "points", "video")
 SOLVERS = ("both", "material_points", "finite_elements")
 KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}
-PLAIN_SECONDS = 30.0
-"""Seconds between two lines of progress where there is no terminal."""
 
 
 def diagnose(
@@ -108,24 +107,24 @@ def diagnose(
     work = store.workplace(target, plan, resume=resumes)
     if not any(work.iterdir()):  # a run that continues keeps its log
         (target / "log.csv").unlink(missing_ok=True)
-    log = Log(target / "log.csv", shown=progress, begun=begun)
     if outdated:
         print(f"{target / '.work'}: stored predictions of other data, options or code are ignored", file=sys.stderr)
     found = []
-    for i, problem in enumerate(problems):
-        started = time.monotonic()
-        cached = store.CachedProblem(problem, work / str(i), tick=log.tick)
-        log.name = problem.name if len(problems) > 1 else ""
-        log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
-        seconds = 60.0 * minutes or math.inf
-        found.append((infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds), time.monotonic() - started))
-    log.name = ""
-    answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
-    if not any(own.left_out or own.deadline.cut for own, _ in found):  # otherwise a run with more minutes continues from what is kept
-        store.clear(target)
-    for own, _ in found:
-        log.work(own.work)
-    log.close()
+    with Log(target / "log.csv", shown=progress, begun=begun) as log:
+        for i, problem in enumerate(problems):
+            started = time.monotonic()
+            cached = store.CachedProblem(problem, work / str(i), tick=log.tick)
+            log.name = problem.name if len(problems) > 1 else ""
+            log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
+            seconds = 60.0 * minutes or math.inf
+            found.append((infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds), time.monotonic() - started))
+        log.name = ""
+        answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
+        if not any(own.left_out or own.deadline.cut for own, _ in found):  # otherwise a run with more minutes continues from what is kept
+            store.clear(target)
+        for own, _ in found:
+            log.work(own.work)
+        log("written")
     return Diagnosis.read(target, keep=temporary)
 
 
@@ -311,8 +310,6 @@ def choose_device(device: str) -> str:
 class Log:
     """Show progress on stderr, and write each stage as a row of log.csv.
 
-    A terminal has one line that is updated; elsewhere a plain line comes every half minute.
-
     Args:
         path: The CSV file; a resumed run adds to it.
         shown: Whether progress is shown.
@@ -320,49 +317,37 @@ class Log:
     """
 
     def __init__(self, path: Path, *, shown: bool, begun: float) -> None:
-        self.begun, self.count, self.stage, self.name, self.last = begun, 0, "", "", 0.0
-        self.shown, self.terminal, self.printed = shown, sys.stderr.isatty(), begun
+        self.begun, self.count, self.stage, self.name = begun, 0, "", ""
+        self.progress = Progress("diagnosis", unit="simulations", shown=shown)
         fresh = not path.is_file() or not path.stat().st_size
         self.file = path.open("a", newline="")
         self.rows = csv.writer(self.file)
         if fresh:
             self.rows.writerow(["seconds", "body", "stage", "simulations"])
 
+    def __enter__(self) -> "Log":
+        self.progress.__enter__()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.file.close()
+        self.progress.close()
+
     def tick(self, count: int) -> None:
         """Count further simulations."""
         self.count += count
-        if time.monotonic() - self.last > 0.2:
-            self._show()
+        self.progress.update(count)
 
     def __call__(self, stage: str) -> None:
         if not stage.endswith(" simulations") and stage != self.stage:  # counts are shown anyway
             self.stage = stage
             self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, stage, self.count])
             self.file.flush()
-            self._show()
+            self.progress.say(f"{self.name}{': ' if self.name else ''}{self.stage}")
 
     def work(self, steps: "Mapping[str, Work]") -> None:
         """Write what each step of a diagnosis ran, the most expensive first."""
         for step, w in sorted(steps.items(), key=lambda item: -item[1].effort):
             line = f"{step}: {w.simulations} simulations, {w.reused} reused, {w.effort:.3g} particle-substeps or data, {w.seconds:.1f} s"
             self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, line, self.count])
-            if self.shown and self.terminal:
-                print(f"\r\x1b[K{line}", file=sys.stderr)
-
-    def _show(self) -> None:
-        self.last = time.monotonic()
-        if not self.shown:
-            return
-        line = f"{self.last - self.begun:6.0f} s  {self.count:5d} simulations  {self.name}{': ' if self.name else ''}{self.stage}"
-        if self.terminal:
-            print(f"\r\x1b[K{line[:118]}", end="", file=sys.stderr, flush=True)
-        elif self.last - self.printed > PLAIN_SECONDS:
-            self.printed = self.last
-            print(line.strip(), file=sys.stderr, flush=True)
-
-    def close(self) -> None:
-        """End the log and the line of progress."""
-        self("written")
-        self.file.close()
-        if self.shown and self.terminal:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+            self.progress.note(line)

@@ -14,6 +14,7 @@ import neuido
 from neuido.commands import interruption
 from neuido.commands.cli.config_files import expanded
 from neuido.commands.cli.console import quiet_lightning
+from neuido.commands.cli.plain_progress import needs_plain_lines, plain_progress
 from neuido.commands.cli.signatures import MODULES
 from neuido.commands.cli.trainer_help import HEAVY
 from neuido.data.files.renamed_options import rename_in_arguments, rename_in_configuration
@@ -105,6 +106,8 @@ def _cli_class() -> type["LightningCLI"]:
                 if self.subcommand == "fit" and options.get("ckpt_path") is None and kept.is_file():  # a run of a sweep is taken up again
                     options["ckpt_path"] = str(kept)
             self.trainer_defaults["callbacks"] = [interruption.stop_at_step(folder and folder / interruption.STATE)]
+            if needs_plain_lines(options.trainer):
+                self.trainer_defaults["callbacks"].append(plain_progress())
 
     return NeuidoCLI
 

@@ -50,7 +50,7 @@ def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "
             sections.append(f'{body}<p class="note">{spent:.0f} s.</p>')
     target = folder / "report.html"
     _write(target, "\n".join(sections))
-    print(f"report: {target}")
+    print(f"results in {folder}: open {target}")
 
 
 def _laws(folder: Path, settings: str) -> str:

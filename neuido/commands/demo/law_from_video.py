@@ -73,16 +73,16 @@ def demo_video(
     chosen = [scene for scene in settings["scenes"] if scene["name"] in (*TRAINING, *UNSEEN)]
     print("[video 1/5] filming three small bodies", flush=True)
     film = {key: tuple(value) if isinstance(value, list) else value for key, value in settings["film"].items()}
-    make_scenes(chosen, Film(**film), folder / "scenes", draw=rasterize, device="cpu", progress=False)
+    make_scenes(chosen, Film(**film), folder / "scenes", draw=rasterize, device="cpu")
     print("[video 2/5] reconstructing them from their first frame", flush=True)
     for name in (*TRAINING, *UNSEEN):
-        reconstruct(str(folder / "scenes" / name), device="cpu", progress=False, **RECONSTRUCTION)
+        reconstruct(str(folder / "scenes" / name), device="cpu", **RECONSTRUCTION)
     print("[video 3/5] Stage II: learning from the images of two", flush=True)
     encoder, results = folder / "encoder.safetensors", folder / "results"
     data = ["--data.root", str(folder / "scenes"), "--data.scenes", _listed(TRAINING), "--data.unseen", _listed(UNSEEN)]
     common = ["--config", find_config("stage2_small"), *data, "--model.cache", str(folder / "flow"), "--model.out", str(results)]
     common += ["--trainer.default_root_dir", str(folder), "--trainer.logger.init_args.save_dir", str(folder)]
-    common += ["--trainer.enable_progress_bar", "false", "--trainer.log_every_n_steps", "1"]
+    common += ["--trainer.log_every_n_steps", "1"]
     start = ["--model.init_from", init_from or "null", "--model.save_to", str(encoder)]
     length = ["--trainer.max_epochs", str(epochs), "--trainer.limit_val_batches", "0"]
     fitted = run_lightning(["fit", *common, *start, *length])
@@ -110,7 +110,6 @@ def _adapt(folder: Path, encoder: Path, steps: int) -> Adapted:
     common = ["--config", find_config("adapt_small"), "--data.root", str(folder / "scenes"), "--data.scenes", _listed(UNSEEN)]
     common += ["--model.method.init_args.init_from", str(encoder), "--model.cache", str(folder / "flow"), "--model.out", str(results)]
     common += ["--trainer.default_root_dir", str(folder), "--trainer.logger.init_args.save_dir", str(folder)]
-    common += ["--trainer.enable_progress_bar", "false"]
     run_lightning(["fit", *common, "--model.steps", str(steps)])
     run_lightning(["predict", *common, "--model.adapter", str(results)])
     with (results / "scores.csv").open() as file:

@@ -35,8 +35,13 @@ def scenes(
         UserError: An impossible material or option, a step above the stability limit, a folder that holds other scenes.
     """
     check_writable(Path(out))
+    from neuido.data.files.parsing import read_json
     from neuido.data.scenes.synthetic import make_scenes
     from neuido.models.render.splatting import rasterize
 
     make_scenes(scenes, film, out, draw=rasterize, data_root=data_root, device=device, progress=progress)
-    print(f"results in {out}")
+    for entry in read_json(Path(out) / "index.json")["scenes"]:
+        laws = " and ".join(law["law"] for key, law in entry["law"].items() if key != "density" and law["law"] != "identity")
+        print(f"{entry['name']}: {laws}, {entry['particles']} particles{' (unseen)' if entry['split'] == 'unseen' else ''}")
+    print(f"{film.frames} frames of {film.width} x {film.height} px from {film.views} views, {len(set(film.held_out))} of them held out")
+    print(f"results in {out}: one folder a scene, each with preview.png; `neuido reconstruct {out}/NAME` goes on")

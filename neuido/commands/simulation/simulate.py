@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from neuido import configs_root
+from neuido.data.progress import Progress
 from neuido.errors import UserError
 
 FRAMES = 100
@@ -21,6 +22,7 @@ def simulate(
     data_root: str | None = None,
     device: str = "auto",
     on_inversion: Literal["report", "error"] | None = None,
+    progress: bool = True,
 ) -> None:
     """Simulate the body of a scene file and write its motion: `neuido simulate SCENE --out FOLDER`.
 
@@ -37,10 +39,13 @@ def simulate(
         device: auto, cpu or cuda.
         on_inversion: Where matter turns inside out or collapses (det F below 0.001): report it, or end with an error and write nothing;
             what the scene file says where absent, else report.
+        progress: Show progress on stderr.
 
     Raises:
         UserError: An impossible scene or option, a folder that is in use, a step above the stability limit.
     """
+    import torch
+
     from neuido.data.bodies.scene_files import load_scene
     from neuido.models.inference.law_file import load_law
     from neuido.physics.laws.classical import material
@@ -56,7 +61,8 @@ def simulate(
     asked = on_inversion or setup.info["on_inversion"]
     simulator = Simulator(setup.scene, setup.body, density=setup.info["density"], device=device, on_inversion=asked)
     start = time.perf_counter()
-    frames = simulator.rollout(count, *laws, every=spacing)
+    with Progress(f"simulating {setup.info['name']}, {count} substeps in one run", shown=progress):
+        frames = simulator.rollout(count, *laws, every=spacing)
     seconds = time.perf_counter() - start
     try:
         frames.save(folder / "frames.npz")
@@ -69,6 +75,12 @@ def simulate(
         f"{len(frames.x)} frames, on {simulator.device}, {seconds:.1f} s"
     )
     print(f"law: {told}; density {setup.info['density']:g} kg/m^3")
+    fall, share = float(frames.x[-1, :, 1].mean() - frames.x[0, :, 1].mean()), torch.linalg.det(frames.F[-1].double())
+    speed = float(frames.v[-1].norm(dim=1).max())
+    print(
+        f"after {float(frames.times[-1]):.4g} s: the centre is {abs(fall):.3g} m {'lower' if fall < 0 else 'higher'}, "
+        f"the fastest particle has {speed:.3g} m/s, det F is {float(share.min()):.3g} to {float(share.max()):.3g}"
+    )
     for event in frames.events:
         print(f"note: {event}")
     print(

@@ -1,5 +1,6 @@
 """The `trajectories` command: the training data of Stage I. `--help` loads no torch."""
 
+from collections import Counter
 from pathlib import Path
 
 from neuido.data.files.writing import check_writable
@@ -56,4 +57,25 @@ def trajectories(
         batch=batch,
         progress=progress,
     )
-    print(f"results in {out}")
+    print("\n".join(_summary(Path(out))))
+    print(f"results in {out}: `neuido fit --config stage1 --data.root {out}` learns from them")
+
+
+def _summary(folder: Path) -> list[str]:
+    """Return what a folder of trajectories holds; of one that other shards still write only how much."""
+    from neuido.data.files.parsing import read_json
+
+    index = folder / "index.json"
+    entries = read_json(index if index.is_file() else folder / "plan.json")["trajectories"]
+    if not index.is_file():
+        there = sum((folder / f"{entry['name']}.npy").is_file() for entry in entries)
+        return [f"{there} of {len(entries)} trajectories are there; index.json comes with the last"]
+    setup = read_json(index)["setup"]
+    counts = Counter(entry["family"] for entry in entries)
+    held, frames = sum(entry["split"] == "held_out" for entry in entries), setup["steps"] // setup["record_every"]
+    stress = sorted(entry["stress_rms"] for entry in entries)
+    return [
+        f"{len(entries)} trajectories ({', '.join(f'{n} {family}' for family, n in counts.items())}), {held} of them held out: "
+        f"{frames} frames {1e3 * setup['dt'] * setup['record_every']:g} ms apart, {setup['particles_per_side'] ** 3} particles",
+        f"Kirchhoff stress, RMS: {stress[0]:.3g} to {stress[-1]:.3g} Pa",
+    ]

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from neuido.commands.check import contents
 from neuido.data.files.writing import check_writable
 from neuido.data.undeclared import Case, make_undeclared
 
@@ -47,4 +48,6 @@ def undeclared(
     check_writable(Path(out))
     case = Case(measured, kind, solver, nuisances, separation, particles, seconds)
     key = make_undeclared(seed, out, case=case, device=device, progress=progress)
-    print(f"results in {out}: `neuido diagnose {out} --out FOLDER` reads it; the sealed answer is {key}")
+    print("\n".join(contents(out)))
+    print(f"the sealed answer is {key}")
+    print(f"results in {out}: `neuido diagnose {out} --out FOLDER` looks for what its model lacks")

@@ -20,7 +20,6 @@ import numpy as np
 import torch
 import yaml
 from torch import Tensor
-from tqdm import tqdm
 
 from neuido.data import cameras as convert
 from neuido.data.bodies import scene_files as scenes
@@ -30,6 +29,7 @@ from neuido.data.files.storage import claim_folder, publish_folder, write_text
 from neuido.data.files.values import check_keys, mapping, vector
 from neuido.data.formats import nerfstudio
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
+from neuido.data.progress import Progress
 from neuido.data.scenes.film_options import Film
 from neuido.data.scenes.filmed_scene import Motion, write_motion
 from neuido.errors import UserError
@@ -182,13 +182,13 @@ def make_scenes(
     paths = [folder / plan.name for plan in plans]
     missing = [(plan, path) for plan, path in zip(plans, paths) if not (path / "experiment.yaml").is_file()]
     images = film.views * film.frames
-    with tqdm(total=images * len(plans), initial=images * (len(plans) - len(missing)), unit="image", disable=not progress) as bar:
+    with Progress("scenes", images * len(plans), unit="images", done=images * (len(plans) - len(missing)), shown=progress) as work:
         for plan, path in missing:
-            bar.set_description(plan.name)
+            work.say(plan.name)
             hidden = folder / f".{plan.name}.tmp"
             shutil.rmtree(hidden, ignore_errors=True)
             try:
-                make_scene(plan, film, hidden, draw=draw, device=chosen, advance=bar.update)
+                make_scene(plan, film, hidden, draw=draw, device=chosen, advance=work.update)
             except UserError as error:
                 raise UserError(f"scenes: {plan.name}: {error}") from error
             publish_folder(hidden, path)

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import cube
 from neuido.data.files.storage import COLUMNS, FORMAT, claim_folder, is_complete, write_text
 from neuido.data.files.writing import atomic_write
+from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm.simulator import Simulator
@@ -120,13 +120,13 @@ def generate(
     mine = [instance for i, instance in enumerate(everything) if i % shards == shard]
     missing = [instance for instance in mine if not is_complete(files[instance.name], setup.shape)]
     size = batch or (10 if chosen.type == "cuda" else 1)
-    with tqdm(total=len(mine), initial=len(mine) - len(missing), unit="trajectory", disable=not progress) as bar:
+    with Progress("trajectories", len(mine), done=len(mine) - len(missing), shown=progress) as work:
         for family in PARAMETERS:
             wanted = [instance for instance in missing if instance.family == family]
             for start in range(0, len(wanted), size):
                 group = wanted[start : start + size]
                 _simulate(setup, group, [files[instance.name] for instance in group], chosen)
-                bar.update(len(group))
+                work.update(len(group))
 
     if missing or not (folder / "index.json").exists():
         if all(is_complete(path, setup.shape) for path in files.values()):

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from tqdm import tqdm
 
 from neuido.data.files.parsing import read_yaml
 from neuido.data.files.storage import publish_folder, write_text
+from neuido.data.progress import Progress
 from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.curves import curve_case
@@ -39,15 +39,15 @@ def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, pro
         raise UserError(f"out = {folder} exists and is not the case of seed {seed} with these options: give another folder")
     maker = body_case if case.measured == "body" else curve_case
     chosen = str(choose_device(device))
-    with tqdm(desc=folder.name, unit=" simulations", disable=not progress) as bar:
+    with Progress(f"case {folder.name}", unit="simulations", shown=progress) as work:
         for attempt in range(TRIES):
             rng = np.random.default_rng([int(seed), attempt])
             try:
-                write_folder, truth = maker(rng, case, folder.name, chosen, bar.update)
+                write_folder, truth = maker(rng, case, folder.name, chosen, work.update)
                 break
             except Redraw as again:
                 reason = str(again)
-                bar.set_postfix_str(f"drawn again: {reason}")
+                work.say(f"drawn again: {reason}")
         else:
             raise UserError(f"no case of seed {seed} with these options in {TRIES} draws (the last: {reason}); give another seed or kind")
     text = yaml.safe_dump(

@@ -21,7 +21,7 @@ from neuido.models.inference.law_file import save_law
 from neuido.models.inference.pipeline import infer_latent
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.operator.law_properties import implausibility, p_wave_modulus
+from neuido.models.operator.law_properties import Moduli, implausibility, p_wave_modulus, small_strain_moduli
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import read_weights
 
@@ -152,6 +152,11 @@ class LowRankAdaptation(Method):
         modulus = p_wave_modulus(self.operator, torch.stack([self.origin, self.z]))
         moved = float((self.z - self.origin).norm())
         return {"modulus": float(modulus[1]), "latent_moved": moved, "rank": self.rank, "latent": self.z.tolist()}
+
+    def summary(self) -> str:
+        with torch.no_grad():
+            young, poisson = small_strain_moduli(self.operator, self.z.detach()[None])
+        return str(Moduli(float(young[0]), float(poisson[0])))
 
     def save(self, folder: Path) -> None:
         """Write the two PEFT files, z, the law (`law_file.save_law`), and `method.json`."""

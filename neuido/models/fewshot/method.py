@@ -19,12 +19,16 @@ from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import rollout_laws
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
+from neuido.models.operator.law_properties import with_prefix
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.physics.effects.parameters import Effects
 from neuido.types import ParticleState
 
 FORMAT = "neuido-method/1"
 PARAMETERS, CARD = "parameters.safetensors", "method.json"
+PASCALS = ("modulus", "young", "yield_stress")
+"""Names of quantities in Pa."""
+UNITS = {"friction_angle": " degrees", "viscosity": " Pa s"}
 
 
 class Method(nn.Module):
@@ -112,6 +116,17 @@ class Method(nn.Module):
     def describe(self) -> dict[str, Any]:
         """Return the identified quantities as numbers, strings and lists: parameters in SI units, moduli, the latent."""
         return {}
+
+    def summary(self) -> str:
+        """Return the law that was found in one line, with units."""
+        parts = []
+        for name, value in self.describe().items():
+            if isinstance(value, str):
+                parts.append(value if name in ("elasticity", "plasticity", "base") else f"{name} = {value}")
+            elif isinstance(value, int | float):
+                figure = with_prefix(value, "Pa") if name in PASCALS else f"{value:.4g}{UNITS.get(name, '')}"
+                parts.append(f"{name} = {figure}")
+        return ", ".join(parts)
 
     def save(self, folder: Path) -> None:
         """Write the fit to a folder: the parameters as safetensors, and `describe` as JSON."""

@@ -422,6 +422,7 @@ class AdaptModule(ImageModule):
         prepared, fit = self.load_fit(scene)
         folder = folder_of(self.hparams.out, scene.name)
         fit.save(folder / "fit")
+        self.print(f"{scene.name}: {fit.method.summary()}")
         try:
             motion, _ = rollout_with_retries(prepared, lambda refined: fit.rollout(refined, prepared.frames))
         except UserError as error:
@@ -430,7 +431,7 @@ class AdaptModule(ImageModule):
         write_prediction(folder, prepared, motion)
         if self.hparams.condition_files:
             self._predicted.append((prepared, fit.method.laws(prepared)))
-        self.print(f"{scene.name}: {folder}")
+        self.print(f"{scene.name}: results in {folder}")
         return {"scene": scene.name, "folder": str(folder)}
 
     @without_gradients

@@ -1,6 +1,5 @@
 """Scores of the operator on constitutive data (Stage I): responses and their errors, latents of unseen materials, metrics."""
 
-import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -8,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import MeanSquaredError, MetricCollection
 
+from neuido.data.progress import Progress
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.scoring.losses import relative_errors
 from neuido.models.scoring.metrics import MedianRelativeError
@@ -88,7 +88,7 @@ def fit_latents(
         lr: Initial learning rate.
         samples: Samples of each material in a step; successive steps cycle through all of them.
         plastic_target: As for `evaluate_operator`. The loss that trained the operator gives the best fit.
-        progress: Print the error to stderr ten times.
+        progress: Show progress on stderr.
 
     Returns:
         Latents (M, d), detached.
@@ -114,14 +114,16 @@ def fit_latents(
         z = candidates.detach()[scores.argmin(0)].clone().requires_grad_(True)
         optimizer = torch.optim.AdamW([z], lr=lr, weight_decay=0.0)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-        for step in range(steps):
-            optimizer.zero_grad()
-            error = errors(z, step)
-            error.sum().backward()
-            optimizer.step()
-            schedule.step()
-            if progress and (step + 1) % max(1, steps // 10) == 0:
-                print(f"held-out instances: latent step {step + 1}/{steps}, error {error.mean().item():.4f}", file=sys.stderr)
+        with Progress("latents of held-out materials", steps, unit="steps", shown=progress) as work:
+            for step in range(steps):
+                optimizer.zero_grad()
+                error = errors(z, step)
+                error.sum().backward()
+                optimizer.step()
+                schedule.step()
+                work.update()
+                if (step + 1) % max(1, steps // 10) == 0:
+                    work.say(f"error {error.mean().item():.4f}")
     finally:
         for parameter in trainable:
             parameter.requires_grad_(True)

@@ -14,11 +14,11 @@ import torch
 from lightning.pytorch import LightningModule
 from safetensors.torch import load_file, save_file
 from torch import Tensor
-from tqdm import tqdm
 
 from neuido.data.bodies.families import laws
 from neuido.data.clips import Clip, FilmDataModule
 from neuido.data.files.writing import atomic_write
+from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus
@@ -130,17 +130,17 @@ class WarmupModule(LightningModule):
             name: [] for name in ("volume", "conditions", "trial", "corrected", "stress", "modulus", "elastic")
         }
         cache = None if self.hparams.cache is None else Path(self.hparams.cache) / f"clips-{self._key(data)}"
-        shown = tqdm(range(len(data.clips)), unit="clip", desc="flow latents", disable=not self.trainer.is_global_zero, leave=False)
-        for number in shown:
-            clip = data.read(number)
-            volume, conditions = self._embed(clip, None if cache is None else cache / f"{data.clips[number]['name']}.safetensors")
-            parts["volume"].append(volume)
-            parts["conditions"].append(conditions)
-            for name in ("trial", "corrected", "stress"):
-                parts[name].append(getattr(clip, name))
-            entry = data.clips[number]
-            parts["elastic"].append(torch.tensor(entry["family"] == "elastic"))
-            parts["modulus"].append(laws(entry["family"], [entry["parameters"]])[0].modulus().float()[0])
+        with Progress("flow latents", len(data.clips), unit="clips", shown=self.trainer.is_global_zero) as work:
+            for number, entry in enumerate(data.clips):
+                clip = data.read(number)
+                volume, conditions = self._embed(clip, None if cache is None else cache / f"{entry['name']}.safetensors")
+                parts["volume"].append(volume)
+                parts["conditions"].append(conditions)
+                for name in ("trial", "corrected", "stress"):
+                    parts[name].append(getattr(clip, name))
+                parts["elastic"].append(torch.tensor(entry["family"] == "elastic"))
+                parts["modulus"].append(laws(entry["family"], [entry["parameters"]])[0].modulus().float()[0])
+                work.update()
         self._clips = {name: torch.stack(rows).to(self.device) for name, rows in parts.items()}
 
     def _key(self, data: FilmDataModule) -> str:

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from neuido.data.bodies.families import PARAMETERS, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import rigid_velocity
@@ -23,6 +22,7 @@ from neuido.data.cameras import intrinsics, look_at
 from neuido.data.clips import FORMAT, is_complete
 from neuido.data.files.storage import claim_folder, write_text
 from neuido.data.files.writing import atomic_write
+from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
 from neuido.models.render.splatting import render
@@ -99,7 +99,7 @@ def generate_clips(
     missing = [i for i in own if not is_complete(folder / f"{names[i]}.npz")]
     size = batch or (16 if chosen.type == "cuda" else 1)
     kinds, workers = list(plan.families), max(1, (os.cpu_count() or 1) // shards)
-    with tqdm(total=len(own), initial=len(own) - len(missing), unit="clip", disable=not progress) as bar:
+    with Progress("clips", len(own), done=len(own) - len(missing), shown=progress) as work:
         for k in range(len(kinds)):
             wanted = [i for i in missing if i % len(kinds) == k]
             for start in range(0, len(wanted), size):
@@ -107,7 +107,7 @@ def generate_clips(
                     group = list(pool.map(lambda i: sample_clip(plan, i), wanted[start : start + size]))
                     filmed = film_clips(plan, group, chosen)
                     list(pool.map(lambda pair: _write_clip(plan, folder, *pair), zip(group, filmed)))
-                bar.update(len(group))
+                work.update(len(group))
     if (missing or not (folder / "index.json").exists()) and all(is_complete(folder / f"{name}.npz") for name in names):
         entries = []
         for i, name in enumerate(names):

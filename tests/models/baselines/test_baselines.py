@@ -146,6 +146,13 @@ def test_a_known_law_finds_its_parameter(tmp_path, name, truth, start, plasticit
     assert len(own.trainable()) == 1
 
 
+def test_a_law_is_told_with_units(tmp_path):
+    prepared = prepare(tiny_scene(tmp_path, plasticity=SAND), None)
+    own = KnownLaw(young=5e4, poisson=0.25, friction_angle=30.0).for_scene(prepared)
+    for words in ("drucker_prager", "young = 50 kPa", "poisson = 0.25", "friction_angle = 30 degrees"):
+        assert words in own.summary()
+
+
 SPRINGS = {"anchors": 60, "neighbours": 12, "full_stiffness_neighbours": 4, "binding": 6, "stiffness_rate": 0.05}
 METHODS = {
     "known": (lambda weights: KnownLaw(young=2e5), 12, 0.5),

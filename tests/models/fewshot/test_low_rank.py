@@ -87,6 +87,7 @@ def test_files_are_those_of_peft(prepared, tmp_path):
     for laws in (by_peft.laws(fit.z), again.laws(prepared), load_law(tmp_path / "law.safetensors")):
         for a, b in zip(answers(laws, some_F()), expected):
             assert torch.allclose(a, b, rtol=1e-4, atol=1e-5 * float(b.detach().abs().max()))
+    assert again.summary() == fit.summary() and fit.summary().startswith("E = ") and "Pa, nu = 0." in fit.summary()
     assert again.describe()["latent"] == pytest.approx(fit.describe()["latent"])
 
 

@@ -1,0 +1,49 @@
+"""The `check` command: whether measured data are plausible."""
+
+from pathlib import Path
+
+from neuido.errors import UserError
+
+KINDS = ("experiment.yaml", "test.yaml", "track.yaml")
+
+
+def check(folder: str) -> None:
+    """Read measured data and say whether they are plausible: units, signs, times, order, markers.
+
+    Args:
+        folder: A folder with experiment.yaml, test.yaml or track.yaml.
+
+    Raises:
+        UserError: What is wrong, with the file and the key to change.
+    """
+    print("\n".join(contents(folder)))
+    print(f"plausible: `neuido diagnose {folder} --out FOLDER` goes on with it")
+
+
+def contents(folder: str) -> list[str]:
+    """Return what measured data hold, a line a recording or a test.
+
+    Args:
+        folder: A folder with experiment.yaml, test.yaml or track.yaml.
+
+    Raises:
+        UserError: What cannot be read, or is not plausible.
+    """
+    given = Path(folder).expanduser()
+    here = given.name if given.is_file() else next((name for name in KINDS if (given / name).is_file()), "")
+    if here == "experiment.yaml":
+        from neuido.data.measured.experiment import read_experiment as read
+    elif here == "test.yaml":
+        from neuido.data.measured.material_test import read_material_tests as read
+    elif here == "track.yaml":
+        from neuido.data.measured.track import read_tracks as read
+    else:
+        raise UserError(f"{folder} has none of {', '.join(KINDS)}: `neuido import` makes such a folder")
+    found = read(given)
+    entries = found.tests if here == "test.yaml" else found.recordings
+    kind = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}[here]
+    count = f"{len(entries)} recording{'s' * (len(entries) > 1)}"
+    return [f"{kind} {found.name}, {count}", *(f"  {entry.name}: {ROLES[entry.role]}" for entry in entries)]
+
+
+ROLES = {"fit": "to fit", "held_out": "held out, for scores alone"}
