@@ -20,7 +20,7 @@ from torch.nn import functional
 from neuido.data.files.missing_weights import weights_hint
 from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
-from neuido.physics.laws.neural import networks
+from neuido.physics.laws.neural import networks, readouts
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 
 FORMAT = "neuido-operator/1"
@@ -164,7 +164,7 @@ class IntrinsicDynamicsOperator(nn.Module):
             return networks.raw_features(F)
         if F.requires_grad:
             return networks.strain_features(*networks.hencky_strain(F))
-        return networks.compute_strain_features(F.reshape(-1, 3, 3)).view(*F.shape[:-2], 9)
+        return readouts.compute_strain_features(F.reshape(-1, 3, 3)).view(*F.shape[:-2], 9)
 
     def basis(self, F: Tensor) -> tuple[Tensor, Tensor]:
         """Evaluate the elastic and the plastic basis functions at F (..., 3, 3), (..., D, n) each."""
@@ -178,7 +178,7 @@ class IntrinsicDynamicsOperator(nn.Module):
             return networks.RAW_STRESS_SCALE * y.unflatten(-1, (3, 3))
         if F.requires_grad:
             return networks.isotropic_stress(F, y)
-        return networks.StressReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRESS_SCALE).view(F.shape)
+        return readouts.StressReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRESS_SCALE).view(F.shape)
 
     def plastic(self, z: Tensor, F: Tensor) -> Tensor:
         """Return the plastically corrected trial deformation gradients (S, n, 3, 3) for S latents z (S, d)."""
@@ -187,7 +187,7 @@ class IntrinsicDynamicsOperator(nn.Module):
             return F + networks.STRAIN_SCALE * y.unflatten(-1, (3, 3))
         if F.requires_grad:
             return networks.return_map(F, y)
-        return networks.CorrectionReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRAIN_SCALE).view(F.shape)
+        return readouts.CorrectionReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRAIN_SCALE).view(F.shape)
 
     def _outputs(self, trunk: Trunk, coefficients: Tensor, F: Tensor) -> Tensor:
         weight, bias = trunk.contract(coefficients)

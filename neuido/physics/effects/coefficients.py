@@ -83,10 +83,16 @@ class Tables(NamedTuple):
 
 
 def shear_modulus(law: ElasticLaw) -> Tensor:
-    """Return the shear modulus of a law at F = I [Pa], one value per scene of the law, differentiable in the law's tensors.
+    """Compute the shear modulus of an elastic law at F = I, differentiable in the tensors of the law.
 
-    For a classical law it is computed from the parameters. For any other law it is the mean of central differences of tau_ij in three
-    pure shears of 1e-4 (1e-2 in float32).
+    For a classical law it comes from the parameters. For any other law it is the mean of central differences of tau_ij in three pure
+    shears of 1e-4 (1e-2 in float32).
+
+    Args:
+        law: The elastic law.
+
+    Returns:
+        Shear modulus [Pa], one value per scene of the law.
     """
     tensors = law.tensors()
     if isinstance(law, (FixedCorotated, Sigma, NeoHookean, StackedElastic)):

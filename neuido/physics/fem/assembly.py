@@ -100,7 +100,14 @@ def body_mesh(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype
 
 
 class Assembly:
-    """The meshes of scenes a to b - 1 of a solver, concatenated."""
+    """The meshes of some scenes of a solver in common arrays.
+
+    Args:
+        solver: The arrays and settings that all assemblies share.
+        meshes: The mesh of each scene.
+        a: First scene.
+        b: Last scene plus one.
+    """
 
     def __init__(self, solver: SolverArrays, meshes: Sequence[BodyMesh], a: int, b: int) -> None:
         self.solver, self.meshes, self.a, self.b = solver, tuple(meshes), a, b

@@ -97,9 +97,15 @@ def _five_tetrahedra(parity: int) -> np.ndarray:
 
 
 def stiffness_bound(mesh: Mesh) -> Tensor:
-    """Return the largest eigenvalue of the sum of grad N grad N^T of each element [1/m^2], (E,).
+    """Compute the largest eigenvalue of the sum of grad N grad N^T over the corners of each element.
 
-    Times P-wave modulus over density, and times four, it bounds the square of the element's highest frequency, hence the stable step.
+    Four times it, times P-wave modulus over density, bounds the square of the highest frequency of the element and so its stable step.
+
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        Eigenvalues [1/m^2], (E,).
     """
     gradients = mesh.gradients
     return torch.linalg.eigvalsh(gradients.mT @ gradients)[:, -1]

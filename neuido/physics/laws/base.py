@@ -95,7 +95,13 @@ def strain_limit(*laws: Law | None) -> float | None:
 
 
 class Engine:
-    """A law bound to its tensors and particles for one rollout."""
+    """A law bound to its tensors and particles for one rollout.
+
+    Args:
+        law: The law.
+        tensors: Result of `law.tensors()`, in the dtype and on the device of the rollout.
+        particles: The scene of each particle.
+    """
 
     def __init__(self, law: Law, tensors: Sequence[Tensor], particles: Particles):
         self.law, self.tensors, self.particles = law, list(tensors), particles

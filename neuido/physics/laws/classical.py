@@ -4,8 +4,7 @@ A rollout runs them by the Warp kernels of `classical_kernels`; `twin` is the sa
 """
 
 import math
-import numbers
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -14,10 +13,9 @@ from torch import Tensor
 from neuido.errors import UserError
 from neuido.physics.laws import classical_kernels
 from neuido.physics.laws.base import AutogradElastic, AutogradLaw, AutogradPlastic, ElasticLaw, Law, Parameter, PlasticLaw
+from neuido.physics.laws.parametric import ParametricLaw, checked_parameters, lame
 from neuido.physics.linalg import decompositions as linalg
 from neuido.physics.linalg.warp_functions import FLOOR
-from neuido.physics.runtime.device import launch, real_of, torch_stream
-from neuido.types import Particles, brief
 
 __all__ = [
     "AutogradElastic",
@@ -40,158 +38,7 @@ __all__ = [
 ]
 
 
-def lame(young: Tensor, poisson: Tensor) -> tuple[Tensor, Tensor]:
-    """Convert Young's modulus [Pa] and Poisson's ratio [-] to Lamé's parameters mu and lambda [Pa]."""
-    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
-
-
-# the open interval in which each parameter must lie, and its unit
-_RANGES = {
-    "young": (0.0, math.inf, " Pa"),
-    "poisson": (-1.0, 0.5, ""),
-    "yield_stress": (0.0, math.inf, " Pa"),
-    "friction_angle": (0.0, 90.0, " degrees"),
-}
-
-
-def _parameters(law: type, **values: Parameter) -> tuple[Tensor, ...]:
-    """Validate the parameters and expand them to one shape (S,); numbers become float64 tensors on the device of the others."""
-    tensors = []
-    device = next((value.device for value in values.values() if isinstance(value, Tensor)), None)
-    for name, value in values.items():
-        low, high, unit = _RANGES[name]
-        if not isinstance(value, Tensor):
-            if isinstance(value, bool) or not isinstance(value, numbers.Real):
-                hint = " (YAML reads 1e5 as text: write 1.0e+5)" if isinstance(value, str) else ""
-                raise UserError(f"{law.__name__}: {name} = {value!r} is not a number{hint}")
-            value = torch.tensor(float(value), dtype=torch.float64, device=device)
-        if value.dtype not in (torch.float32, torch.float64) or value.ndim > 1 or value.numel() == 0:
-            raise UserError(
-                f"{law.__name__}: {name} is a {value.dtype} tensor of shape {tuple(value.shape)}; give float32 or float64, (S,)"
-            )
-        value = value.reshape(-1)
-        bad = ~((value > low) & (value < high)).detach()
-        if bad.any():
-            allowed = f"{name} > {low:g}" if high == math.inf else f"{low:g} < {name} < {high:g}"
-            finite = " and finite" if high == math.inf else ""
-            raise UserError(f"{law.__name__}: {name} = {value.detach()[bad][0].item():g}{unit} is out of range: need {allowed}{finite}")
-        tensors.append(value)
-    sizes = {name: t.shape[0] for name, t in zip(values, tensors)}
-    scenes = max(sizes.values())
-    if any(size not in (1, scenes) for size in sizes.values()):
-        raise UserError(f"{law.__name__}: parameters have different lengths {sizes}; give one value, or one for each scene")
-    return tuple(t.expand(scenes) for t in tensors)
-
-
-class _Classical(Law):
-    """Base class of the classical laws: one (S, n) tensor of parameters, and the number of a law for each scene."""
-
-    kind: int
-    """Number of the law in `classical_kernels`."""
-    _plastic: bool
-    """Whether the law is plastic."""
-
-    def scene_laws(self) -> tuple[type["_Classical"], ...]:
-        """Return the class of each scene's law, S of them."""
-        return (type(self),) * self.tensors()[0].shape[0]
-
-    @staticmethod
-    def twin(F: Tensor, parameters: Tensor) -> Tensor:
-        """Evaluate the law in plain torch.
-
-        Args:
-            F: Deformation gradient [-], (..., 3, 3).
-            parameters: The row of `tensors()` of each F, (..., n), broadcast against the leading axes of F.
-        """
-        raise NotImplementedError
-
-    def _kinds(self, device: torch.device) -> Tensor:
-        cache = self.__dict__.setdefault("_kind_cache", {})
-        if device not in cache:  # recorded launches refer to the tensor by its address, so two threads must share one
-            cache.setdefault(device, torch.tensor([law.kind for law in self.scene_laws()], dtype=torch.int32, device=device))
-        return cache[device]
-
-    def _launch(
-        self, name: str, tensors: Sequence[Tensor], arrays: Sequence[Tensor], parameters: Tensor | None, particles: Particles
-    ) -> None:
-        F = arrays[0]
-        kernel = getattr(classical_kernels.kernels(real_of(F.dtype)), name)
-        row = tensors[0].detach().to(F).contiguous()
-        inputs: list[Any] = [F, self._kinds(F.device), row, particles.scene, *arrays[1:]]
-        if name.endswith("adjoint"):
-            inputs.append(parameters)
-        with torch_stream(F.device):
-            launch(kernel, len(F), inputs, F.device)
-
-    def single_scene(self, s: int) -> Law:
-        laws = self.scene_laws()
-        return _SingleScene(laws[min(s, len(laws) - 1)], self._plastic)
-
-    def key(self, tensors: Sequence[Tensor]) -> Hashable:
-        return tuple(law.__name__ for law in self.scene_laws())
-
-    def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
-        self._launch("correct" if self._plastic else "stress", tensors, [F, out], None, particles)
-
-    def adjoint(
-        self,
-        tensors: Sequence[Tensor],
-        F: Tensor,
-        grad_out: Tensor,
-        grad_F: Tensor,
-        grad_tensors: Sequence[Tensor | None],
-        particles: Particles,
-    ) -> None:
-        name = "correct_adjoint" if self._plastic else "stress_adjoint"
-        wanted = grad_tensors[0]
-        direct = wanted is None or (wanted.dtype == F.dtype and wanted.device == F.device and wanted.is_contiguous())
-        sink = wanted if direct else torch.zeros(wanted.shape, dtype=F.dtype, device=F.device)
-        self._launch(name, tensors, [F, grad_out, grad_F], sink, particles)
-        if not direct:
-            wanted += sink.to(wanted)
-
-    def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
-        (parameters,), laws = self.tensors(), self.scene_laws()
-        parameters = parameters.to(F)
-        if len(laws) == 1:
-            return laws[0].twin(F, parameters[0])
-        if particles is None:
-            raise UserError(f"{type(self).__name__} has {len(laws)} scenes: give `particles`, the scene of each F")
-        out = torch.zeros_like(F)
-        scene = particles.scene.long()
-        kinds = self._kinds(F.device)[scene]
-        for law in dict.fromkeys(laws):
-            (index,) = torch.nonzero(kinds == law.kind, as_tuple=True)
-            out = out.index_copy(0, index, law.twin(F[index], parameters[scene[index]]))
-        return out
-
-    def __repr__(self) -> str:
-        parts = []
-        for name, t in self._named().items():
-            one = len(t.unique()) == 1
-            parts.append(f"{name} {brief(t[0]) if one else f'{t.min():.4g} to {t.max():.4g}'}{_RANGES[name][2]}")
-        scenes = len(self.scene_laws())
-        values = ", ".join(parts if scenes == 1 else [*parts, f"{scenes} scenes"])
-        return f"{type(self).__name__}({values})"
-
-    def _named(self) -> dict[str, Tensor]:
-        """Return the parameters that the constructor was given, by name."""
-        return {name: t.detach() for name in _RANGES if isinstance(t := getattr(self, name, None), Tensor)}
-
-
-class _SingleScene(_Classical):
-    """The law of one scene out of several; its tensors are passed to `forward`."""
-
-    identity = False
-
-    def __init__(self, law: type[_Classical], correct: bool):
-        self._law, self._plastic = law, correct
-
-    def scene_laws(self) -> tuple[type[_Classical], ...]:
-        return (self._law,)
-
-
-class _ClassicalElastic(_Classical, ElasticLaw):
+class _ClassicalElastic(ParametricLaw, ElasticLaw):
     _plastic = False
 
     def __init__(self, young: Parameter, poisson: Parameter):
@@ -203,7 +50,7 @@ class _ClassicalElastic(_Classical, ElasticLaw):
         Raises:
             UserError: A parameter out of its range.
         """
-        self.young, self.poisson = _parameters(type(self), young=young, poisson=poisson)
+        self.young, self.poisson = checked_parameters(type(self), young=young, poisson=poisson)
 
     def tensors(self) -> tuple[Tensor, ...]:
         """Return Lamé's parameters mu and lambda [Pa], one tensor (S, 2)."""
@@ -267,7 +114,7 @@ class NeoHookean(_ClassicalElastic):
         return mu * (F @ F.mT - eye) + lam * J.log() * eye
 
 
-class _ClassicalPlastic(_Classical, PlasticLaw):
+class _ClassicalPlastic(ParametricLaw, PlasticLaw):
     _plastic = True
 
 
@@ -317,7 +164,9 @@ class VonMises(_ClassicalPlastic):
         Raises:
             UserError: A parameter out of its range.
         """
-        self.yield_stress, self.young, self.poisson = _parameters(type(self), yield_stress=yield_stress, young=young, poisson=poisson)
+        self.yield_stress, self.young, self.poisson = checked_parameters(
+            type(self), yield_stress=yield_stress, young=young, poisson=poisson
+        )
 
     def tensors(self) -> tuple[Tensor, ...]:
         """Return the strain at yield tau_Y / (2 mu) [-], one tensor (S, 1)."""
@@ -351,7 +200,9 @@ class DruckerPrager(_ClassicalPlastic):
         Raises:
             UserError: A parameter out of its range.
         """
-        self.friction_angle, self.young, self.poisson = _parameters(type(self), friction_angle=friction_angle, young=young, poisson=poisson)
+        self.friction_angle, self.young, self.poisson = checked_parameters(
+            type(self), friction_angle=friction_angle, young=young, poisson=poisson
+        )
 
     def tensors(self) -> tuple[Tensor, ...]:
         """Return the slope of the cone in Hencky strain, alpha (3 lambda + 2 mu) / (2 mu) [-], one tensor (S, 1)."""
@@ -373,14 +224,14 @@ class DruckerPrager(_ClassicalPlastic):
         return torch.where(expanding[..., None, None], rotation, _return(F, at, radius, strain, elastic))
 
 
-class _Stacked(_Classical):
-    def __init__(self, laws: Sequence[_Classical]):
+class _Stacked(ParametricLaw):
+    def __init__(self, laws: Sequence[ParametricLaw]):
         self.laws = tuple(laws)
 
     def tensors(self) -> tuple[Tensor, ...]:
         return (torch.cat([law.tensors()[0] for law in self.laws]),)
 
-    def scene_laws(self) -> tuple[type[_Classical], ...]:
+    def scene_laws(self) -> tuple[type[ParametricLaw], ...]:
         return sum((law.scene_laws() for law in self.laws), ())
 
     def __repr__(self) -> str:
@@ -388,7 +239,11 @@ class _Stacked(_Classical):
 
 
 class StackedElastic(_Stacked, ElasticLaw):
-    """Elastic laws of several scenes in one object; made by `stack`."""
+    """Elastic laws of several scenes as one law, so that the scenes run in one kernel launch; made by `stack`.
+
+    Args:
+        laws: Classical elastic laws, each for one or several scenes.
+    """
 
     _plastic = False
 
@@ -397,11 +252,15 @@ class StackedElastic(_Stacked, ElasticLaw):
 
 
 class StackedPlastic(_Stacked, PlasticLaw):
-    """Plastic laws of several scenes in one object; made by `stack`."""
+    """Plastic laws of several scenes as one law, so that the scenes run in one kernel launch; made by `stack`.
+
+    Args:
+        laws: Classical plastic laws, each for one or several scenes.
+    """
 
     _plastic = True
 
-    def __init__(self, laws: Sequence[_Classical]):
+    def __init__(self, laws: Sequence[ParametricLaw]):
         super().__init__(laws)
         self.identity = all(law.identity for law in self.laws)
 
@@ -419,7 +278,7 @@ def stack(laws: Sequence[Law]) -> StackedElastic | StackedPlastic:
         UserError: No laws, elastic and plastic laws together, or a law that is not classical.
     """
     names = [type(law).__name__ for law in laws]
-    if not laws or not all(isinstance(law, _Classical) for law in laws):
+    if not laws or not all(isinstance(law, ParametricLaw) for law in laws):
         raise UserError(f"stack() takes one or more classical laws, got {names}; run other laws in a simulator of their own")
     if all(isinstance(law, ElasticLaw) for law in laws):
         return StackedElastic(laws)

@@ -65,7 +65,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     log1p, exp_slope, strain, volume_change, cofactor = own.log1p, own.exp_slope, own.strain, own.volume_change, own.cofactor
     frame, compose, bounded, hencky = own.frame, own.compose, own.bounded, own.hencky
     inverse_stretch, log_difference, stretch = own.inverse_stretch, own.log_difference, own.stretch
-    slight, log_stretch, exp_excess = own.slight, own.log_stretch, own.exp_excess
+    series_limit, log_stretch, exp_minus_one = own.series_limit, own.log_stretch, own.exp_minus_one
 
     @wp.func
     def corotated_in_frame(Fp: mat, mu: real, lam: real):
@@ -100,7 +100,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
         """Return tau = 2 mu ln V + lambda ln(J) I; small strains need no principal frame."""
         E = strain(Fp)
         out = mat()
-        if wp.ddot(E, E) <= slight * slight:
+        if wp.ddot(E, E) <= series_limit * series_limit:
             out = (two * mu) * log_stretch(E) + (lam * log1p(volume_change(Fp))) * wp.identity(n=3, dtype=real)
         else:
             out = hencky_in_frame(Fp, mu, lam)
@@ -242,7 +242,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
         """Return the corrected gradient; small strains need no frame: F + (exp(X) - 1) F with X the plastic increment of -ln V."""
         E = strain(Fp)
         out = Fp
-        if wp.ddot(E, E) <= slight * slight:
+        if wp.ddot(E, E) <= series_limit * series_limit:
             L = log_stretch(E)
             dJ = volume_change(Fp)
             trace = log1p(dJ)
@@ -250,9 +250,9 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
             q = wp.sqrt(wp.ddot(D, D))
             state, radius = limit(q, trace, kind, param)
             if state == 1:
-                out = Fp + exp_excess((radius / q - one) * D) * Fp
+                out = Fp + exp_minus_one((radius / q - one) * D) * Fp
             if state == 2:
-                out = Fp + exp_excess(-L) * Fp
+                out = Fp + exp_minus_one(-L) * Fp
         else:
             out = return_in_frame(Fp, kind, param)
         return out

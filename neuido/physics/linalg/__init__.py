@@ -1,4 +1,4 @@
-"""Decompositions of 3x3 matrices with derivatives that hold at repeated singular values, and nearest points.
+"""Decompositions of 3x3 matrices with derivatives that are valid at repeated singular values, and nearest points.
 
 The names of `__all__` are imported when they are first used.
 """

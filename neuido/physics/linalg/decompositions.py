@@ -1,9 +1,9 @@
-"""Singular value and polar decompositions of (..., 3, 3) matrices, with derivatives that hold at repeated singular values.
+"""Singular value and polar decompositions of (..., 3, 3) matrices, with derivatives that are valid at repeated singular values.
 
 Convention throughout: F = U diag(sigma) V^T with rotations U and V, sigma_1 >= sigma_2 >= |sigma_3|; sigma_3 carries the sign of det F.
 In the frame P = U^T dF V the derivatives split into a symmetric part, divided by sigma_j - sigma_i, and a skew part, divided by
 sigma_i + sigma_j. Only the first is singular at repeated singular values, and for an isotropic function it is a divided difference.
-Everything here is plain torch, float32 or float64, the slow twin of `classical_kernels`; on CUDA the frame itself comes from there.
+Everything is plain torch in float32 or float64, but on CUDA the decomposition is a Warp kernel (`frame_kernels`).
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from neuido.physics.runtime.device import launch, real_of, torch_stream
 
 
 class Frame(NamedTuple):
-    """The principal frame of F. `sigma` is differentiable; `U` and `V` are constants (see `isotropic_map`)."""
+    """The principal frame F = U diag(sigma) V^T of F. Gradients flow through `sigma` alone; `isotropic_map` accounts for U and V."""
 
     U: Tensor
     """Left rotation, (..., 3, 3)."""
@@ -47,7 +47,7 @@ def _decompose(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _pair_sums(sigma: Tensor) -> Tensor:
-    """sigma_i + sigma_j, bounded below (only an inverted F can come near zero)."""
+    """Return sigma_i + sigma_j, (..., 3, 3), bounded below by `GAP`; only an inverted F comes near zero."""
     return (sigma.unsqueeze(-1) + sigma.unsqueeze(-2)).clamp(min=GAP)
 
 
@@ -79,20 +79,18 @@ class _SVD(torch.autograd.Function):
 
 
 def svd(F: Tensor, *, gap: float | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """F = U diag(sigma) V^T with rotations U and V, and a derivative at every F with sigma_2 + sigma_3 > 0.
+    """Decompose F = U diag(sigma) V^T into rotations U and V and singular values, with a derivative for sigma_2 + sigma_3 > 0.
 
-    Singular values closer than `gap` (relative to the largest; default: the square root of the machine epsilon) are returned pushed
-    apart to it, so that differences of a smooth function of sigma, divided by differences of sigma in the backward pass, tend to its
-    derivative. At repeated singular values the gradient of anything built from U, sigma and V that does not depend on the choice of the
-    singular vectors (polar parts, isotropic functions) is thus right to O(gap), and so is its value. Elsewhere both are exact.
-    Isotropic functions that need more digits go through `frame` and `isotropic_map`.
+    Singular values closer than `gap` are moved apart to that distance. A function of U, sigma and V that does not depend on the choice of
+    the singular vectors (a polar factor, an isotropic function) then has a value and a gradient with an error of order `gap` at
+    repeated singular values, and exact ones elsewhere. For more digits use `frame` and `isotropic_map`.
 
     Args:
         F: Matrices, (..., 3, 3).
-        gap: Smallest relative distance of two singular values.
+        gap: Smallest difference of two singular values relative to the largest [-]; by default the square root of the machine epsilon.
 
     Returns:
-        U (..., 3, 3), sigma (..., 3) descending with the sign of det F on the last, V (..., 3, 3).
+        U (..., 3, 3), sigma (..., 3) in descending order with the sign of det F on the last, V (..., 3, 3).
     """
     return _SVD.apply(F, torch.finfo(F.dtype).eps ** 0.5 if gap is None else gap)
 
@@ -112,15 +110,15 @@ class _Rotation(torch.autograd.Function):
 
 
 def polar(F: Tensor) -> tuple[Tensor, Tensor]:
-    """Polar decomposition F = R S: the rotation nearest to F (det R = +1 even where det F < 0) and the symmetric stretch.
+    """Decompose F = R S into the nearest rotation and a symmetric stretch.
 
-    The derivative has no singularity at repeated singular values, F = I included.
+    det R is +1 even if det F < 0. The derivative has no singularity at repeated singular values, F = I included.
 
     Args:
         F: Matrices, (..., 3, 3).
 
     Returns:
-        R (..., 3, 3), S (..., 3, 3).
+        The rotation R (..., 3, 3) and the stretch S (..., 3, 3).
     """
     R = _Rotation.apply(F)
     S = R.mT @ F
@@ -143,7 +141,11 @@ class _Values(torch.autograd.Function):
 
 
 def frame(F: Tensor) -> Frame:
-    """Return the principal frame of F, (..., 3, 3): `sigma` differentiable, the rotations constant."""
+    """Compute the principal frame F = U diag(sigma) V^T; gradients flow through `sigma` alone.
+
+    Args:
+        F: Matrices, (..., 3, 3).
+    """
     return Frame(*_Values.apply(F))
 
 
@@ -169,26 +171,35 @@ class _Spectral(torch.autograd.Function):
 
 
 def isotropic_map(F: Tensor, at: Frame, values: Tensor, slopes: Tensor) -> Tensor:
-    """U diag(z) V^T, with the exact derivative with respect to F: return maps.
+    """Compute U diag(z) V^T, such as the result of a return map, with the exact derivative with respect to F.
 
     Args:
         F: Matrices, (..., 3, 3).
-        at: `frame(F)`.
-        values: z (..., 3), computed differentiably from `at.sigma` and parameters.
-        slopes: Divided differences (z_j - z_i) / (sigma_j - sigma_i), (..., 3, 3), finite at repeated singular values; no diagonal needed.
+        at: The principal frame `frame(F)`.
+        values: z (..., 3), a differentiable function of `at.sigma` and parameters.
+        slopes: Divided differences (z_j - z_i) / (sigma_j - sigma_i), (..., 3, 3), finite at repeated singular values. The diagonal is not
+            used.
     """
     U, sigma, V = (part.detach() for part in at)
     return _Spectral.apply(F, values, U, sigma, V, slopes.detach(), False)
 
 
 def isotropic_stress(F: Tensor, at: Frame, values: Tensor, slopes: Tensor) -> Tensor:
-    """U diag(t) U^T, with the exact derivative with respect to F: stresses. Arguments as in `isotropic_map`."""
+    """Compute U diag(t) U^T, such as a stress, with the exact derivative with respect to F.
+
+    Args:
+        F: Matrices, (..., 3, 3).
+        at: The principal frame `frame(F)`.
+        values: t (..., 3), a differentiable function of `at.sigma` and parameters.
+        slopes: Divided differences (t_j - t_i) / (sigma_j - sigma_i), (..., 3, 3), finite at repeated singular values. The diagonal is not
+            used.
+    """
     U, sigma, V = (part.detach() for part in at)
     return _Spectral.apply(F, values, U, sigma, V, slopes.detach(), True)
 
 
 def log_difference(sigma: Tensor, floor: float) -> Tensor:
-    """Divided differences of ln(max(sigma, floor)): (..., 3) -> (..., 3, 3), finite at repeated values."""
+    """Return the divided differences of ln(max(sigma, floor)), (..., 3) -> (..., 3, 3), finite at repeated values."""
     a, b = sigma.unsqueeze(-1), sigma.unsqueeze(-2)
     ca, cb = a.clamp(min=floor), b.clamp(min=floor)
     x = (cb - ca) / ca
@@ -200,7 +211,7 @@ def log_difference(sigma: Tensor, floor: float) -> Tensor:
 
 
 def exp_difference(h: Tensor) -> Tensor:
-    """Divided differences of exp at h: (..., 3) -> (..., 3, 3), finite at repeated values."""
+    """Return the divided differences of exp at h, (..., 3) -> (..., 3, 3), finite at repeated values."""
     a, b = h.unsqueeze(-1), h.unsqueeze(-2)
     x = b - a
     return torch.exp(a) * torch.where(x == 0, torch.ones_like(x), torch.expm1(x) / torch.where(x == 0, torch.ones_like(x), x))

@@ -13,7 +13,7 @@ from neuido.physics.runtime.once import cached
 def build(real: type) -> SimpleNamespace:
     """Return the kernel `decompose` for `wp.float32` or `wp.float64`.
 
-    (F, U, sigma, V): the principal frame of F, sigma with the sign of det F on the last.
+    It takes F (n) and writes U (n), sigma (n) with the sign of det F on the last, and V (n).
     """
     start_warp()
     mat = wp.types.matrix((3, 3), real)

@@ -1,4 +1,4 @@
-"""Nearest points of many frames at once, by all pairs: for a GPU, where a tree would have to be built on the host for each frame."""
+"""Nearest points of many frames at once by comparison of all pairs, for a GPU; a tree would have to be built on the CPU for each frame."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ from neuido.physics.runtime.once import cached
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """Return the kernel for one scalar type.
+    """Return the kernel `nearest` for one scalar type.
 
     Args:
         real: `wp.float32` or `wp.float64`.
@@ -22,7 +22,10 @@ def build(real: type) -> SimpleNamespace:
 
     @wp.kernel(module=f"neuido.nearest.{real.__name__}", enable_backward=False)
     def nearest(a: wp.array(dtype=vec3), b: wp.array(dtype=vec3), many: int, others: int, out: wp.array(dtype=real)):
-        """One thread a point of `a`; all threads of a warp read the same point of `b`, so that memory is read once for all of them."""
+        """Write the squared distance of each point of `a` to the nearest point of `b` in the same frame.
+
+        All threads of a warp read the same point of `b`, so that memory is read once for all of them.
+        """
         i = wp.tid()
         first = (i // many) * others
         p = a[i]
@@ -35,14 +38,16 @@ def build(real: type) -> SimpleNamespace:
 
 
 def nearest_by_pairs(a: Tensor, b: Tensor) -> Tensor:
-    """Squared distance of each point to its nearest in the same frame, exact differences throughout [unit of a, squared].
+    """Compute the squared distance of each point to the nearest of other points in the same frame.
+
+    The distances come from differences of coordinates, and not from the less accurate |a|^2 - 2 a b + |b|^2.
 
     Args:
         a: Points of K frames, (K, P, 3).
-        b: Points of K frames, (K, Q, 3), Q >= 1, of the same type and on the same device.
+        b: Other points of the same frames, (K, Q, 3) with Q >= 1, of the same dtype and device.
 
     Returns:
-        (K, P).
+        Squared distances in the squared unit of `a`, (K, P).
     """
     frames, many = a.shape[:2]
     a, b = a.detach().contiguous(), b.detach().contiguous()

@@ -1,8 +1,8 @@
-"""Warp functions for 3x3 matrices: the principal frame of F, and strains that keep their digits near F = I.
+"""Warp functions for 3x3 matrices: the principal frame of F, and strains that are accurate near F = I.
 
-Warp's `svd3` has two faults here: its adjoint is wrong near F = I, and in float32 its singular values carry an error of 1e-6 (1 Pa for
-E = 1 MPa at rest). The frame below comes from a Jacobi iteration on the strain F F^T - I, formed from F - I, so that the stretches
-minus one keep their relative accuracy, and it is faster on the CPU.
+Warp's `svd3` is not used for two reasons: its adjoint is wrong near F = I, and in float32 its singular values have an error of 1e-6 (a
+stress of 1 Pa for E = 1 MPa at rest). Here the frame comes from a Jacobi iteration on the strain F F^T - I, computed from F - I. The
+stretches minus one then keep their relative accuracy, and on the CPU it is faster.
 """
 
 from typing import Any, NamedTuple
@@ -12,9 +12,9 @@ import warp as wp
 from neuido.physics.runtime.once import cached
 
 FLOOR = 1e-3
-"""Lower bound of a principal stretch (of J in neo-Hookean) in a logarithm; below it the logarithm is constant, its gradient zero."""
+"""Lower bound of a principal stretch, or of J in the neo-Hookean law, in a logarithm; below it the gradient is zero."""
 GAP = 1e-6
-"""Lower bound of sigma_i + sigma_j in a denominator; only an inverted F can come near it."""
+"""Lower bound of sigma_i + sigma_j in a denominator; only an inverted F comes near it."""
 
 
 class Functions(NamedTuple):
@@ -41,36 +41,38 @@ class Functions(NamedTuple):
     hencky: Any
     """sigma - 1 -> ln sigma, sigma bounded below by FLOOR"""
     inverse_stretch: Any
-    """Its derivative, 1 / sigma, or zero below FLOOR"""
+    """sigma - 1 -> 1 / sigma, the derivative of `hencky`; zero below FLOOR"""
     log_difference: Any
     """(x, y) -> (ln(1 + y) - ln(1 + x)) / (y - x) of the bounded logarithm"""
     bounded: Any
-    """max(x, FLOOR - 1), NaN kept"""
+    """max(x, FLOOR - 1), but NaN for NaN"""
     stretch: Any
     """(F F^T - I, det F - 1) -> V - I of the left stretch V, exactly symmetric; for det F > 0"""
-    slight: Any
-    """Largest norm of F F^T - I for `log_stretch`."""
+    series_limit: Any
+    """Largest norm of F F^T - I for which the series of `log_stretch` is accurate"""
     log_stretch: Any
-    """F F^T - I -> ln V, exactly symmetric, by a series for slight strains"""
-    exp_excess: Any
-    """symmetric X -> exp(X) - I by a series, |X| at most `slight`"""
+    """F F^T - I -> ln V, exactly symmetric, by a series for small strains"""
+    exp_minus_one: Any
+    """symmetric X -> exp(X) - I by a series, for |X| up to `series_limit`"""
 
 
 @cached
 def functions(real: type, *, builtin_svd: bool = False) -> Functions:
-    """Build the functions for `wp.float32` or `wp.float64`.
+    """Return the functions for `wp.float32` or `wp.float64`.
 
-    `builtin_svd` puts Warp's own `svd3` in place of the Jacobi iteration, whose data-dependent loop Warp cannot differentiate; for tests.
+    Args:
+        real: The scalar type.
+        builtin_svd: Decompose by Warp's `svd3` in place of the Jacobi iteration, whose loop Warp cannot differentiate; for tests.
     """
     mat = wp.types.matrix((3, 3), real)
     vec = wp.types.vector(3, real)
-    # Largest strain at which stretches are taken from the strain; beyond it they are lengths of the rows of U^T F.
+    # largest strain at which stretches are computed from the strain; above it they are the lengths of the rows of U^T F
     small_strain = wp.constant(real(0.5))
-    # Square of the relative size at which an off-diagonal strain counts as zero.
+    # square of the relative size at which an off-diagonal strain counts as zero
     converged = wp.constant(real(1e-14 if real is wp.float32 else 1e-33))
-    # Square of the relative size of a Newton step whose successor is below the rounding.
+    # square of the relative size of a Newton step after which the next one would be below the rounding error
     halved = wp.constant(real(1e-8 if real is wp.float32 else 1e-17))
-    slight = wp.constant(real(0.1 if real is wp.float32 else 2e-3))
+    series_limit = wp.constant(real(0.1 if real is wp.float32 else 2e-3))
     zero = wp.constant(real(0.0))
     half = wp.constant(real(0.5))
     one = wp.constant(real(1.0))
@@ -217,7 +219,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
             u1 = u2
             u2 = -u
 
-        # The rows of U^T F are sigma_i v_i; Gram-Schmidt from the largest makes V a rotation and leaves the sign of det F to sigma_3.
+        # the rows of U^T F are sigma_i v_i; Gram-Schmidt from the largest makes V a rotation, and sigma_3 gets the sign of det F
         FT = wp.transpose(F)
         w0 = FT * u0
         w1 = FT * u1
@@ -225,7 +227,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         v0 = wp.normalize(w0)
         p = w1 - wp.dot(w1, v0) * v0
         if wp.length_sq(p) <= converged * wp.length_sq(w0):
-            # F has rank one: any direction across v0 serves.
+            # F has rank one: any direction normal to v0 will do
             axis = vec(one, zero, zero)
             if wp.abs(v0[0]) > real(0.7):
                 axis = vec(zero, one, zero)
@@ -261,7 +263,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
 
     @wp.func
     def bounded(x: real):
-        """max(x, FLOOR - 1), but NaN stays NaN."""
+        """Return max(x, FLOOR - 1), but NaN for NaN."""
         result = x
         if x < floor - one:
             result = floor - one
@@ -269,13 +271,14 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
 
     @wp.func
     def hencky(excess: vec):
-        """Logarithms of the principal stretches, bounded below."""
+        """Return the logarithms of the principal stretches, bounded below by FLOOR."""
         return vec(log1p(bounded(excess[0])), log1p(bounded(excess[1])), log1p(bounded(excess[2])))
 
     @wp.func
     def stretch(E: mat, dJ: real):
-        # Newton on the trace p of V - I: with its second and third invariants q and r, tr E = 2 p + p^2 - 2 q, det V = 1 + p + q + r, and
-        # g(p) = 0 is the second invariant of E. From above, where it starts, Newton falls to the largest root; g' = 2 det(tr(V) I - V).
+        # Newton's method for p = tr(V - I). With the second and third invariants q and r of V - I: tr E = 2 p + p^2 - 2 q and
+        # det V = 1 + p + q + r; g(p) = 0 is the equation for the second invariant of E. Started from above, it converges to the largest
+        # root; g' = 2 det(tr(V) I - V).
         e1 = wp.trace(E)
         size = wp.ddot(E, E)
         e2 = half * (e1 * e1 - size)
@@ -295,7 +298,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         q = p + half * (p * p - e1)
         r = dJ - p - q
         D = (real(3.0) + p) * (real(3.0) + two * p + q) - one - dJ
-        # Cayley and Hamilton (Hoger and Carlson, Q. Appl. Math. 42, 1984), less I
+        # V - I by the Cayley-Hamilton theorem (Hoger and Carlson, Q. Appl. Math. 42, 1984)
         return (((two + p) * (two + p) - q) / D) * E - (one / D) * (E * E) + ((real(4.0) + p) * r / D) * wp.identity(n=3, dtype=real)
 
     @wp.func
@@ -306,7 +309,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         return half * (L + wp.transpose(L))
 
     @wp.func
-    def exp_excess(X: mat):
+    def exp_minus_one(X: mat):
         eye = wp.identity(n=3, dtype=real)
         out = eye + X / real(5.0)
         out = eye + X * out / real(4.0)
@@ -324,7 +327,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
 
     @wp.func
     def log_difference(x: real, y: real):
-        """(ln(1 + y) - ln(1 + x)) / (y - x) of the bounded logarithm."""
+        """Return (ln(1 + y) - ln(1 + x)) / (y - x) of the bounded logarithm."""
         low = floor - one
         cx = bounded(x)
         cy = bounded(y)
@@ -351,7 +354,7 @@ def functions(real: type, *, builtin_svd: bool = False) -> Functions:
         log_difference,
         bounded,
         stretch,
-        slight,
+        series_limit,
         log_stretch,
-        exp_excess,
+        exp_minus_one,
     )

@@ -1,6 +1,6 @@
-"""The backward pass of a rollout: hand-written adjoints of the kernels and of the laws, last substep first.
+"""The backward pass of a rollout: hand-written adjoints of the kernels and of the laws, from the last substep to the first.
 
-It makes again what the tape of the forward pass lacks.
+What the tape of the forward pass does not contain is computed again.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,19 @@ from neuido.physics.runtime.device import torch_stream
 def run_backward(
     plan: Plan, inputs: Sequence[Tensor], tape: Tape, gradients: Sequence[Tensor | None], wanted: Sequence[bool], steps: int | None = None
 ) -> list[Tensor | None]:
-    """Return the adjoint of every input that is wanted, from the gradients of the frames of x, v, C and F (None: zero)."""
+    """Compute the gradients of the inputs of a rollout.
+
+    Args:
+        plan: The rollout.
+        inputs: Inputs of the forward pass.
+        tape: Tape of the forward pass.
+        gradients: Gradient with respect to the frames of x, v, C, F and the history; None: zero.
+        wanted: Which inputs need a gradient.
+        steps: Number of substeps; by default those of the plan.
+
+    Returns:
+        The gradient of each input; None for tensors of laws that need none.
+    """
     setup, k = plan.setup, plan.setup.kernels
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
     a_fixed = [torch.zeros_like(t) for t in inputs[STATES:FIXED]]
@@ -83,7 +95,7 @@ def recompute(
     material: Material | None,
     scratch: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Stress, grid and nodal velocities of substep n, from the tape, or made again from the state before it."""
+    """Return stress, nodal momentum and nodal velocity of substep n, from the tape or recomputed from the state before it."""
     setup = plan.setup
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
     x, v, C, F, history = state
@@ -109,7 +121,10 @@ def update_history_adjoint(
     a_trial: Tensor,
     a_history: Tensor,
 ) -> None:
-    """Add to the adjoints of C and F after the substep (in `a_next`), of the trial gradient and of the history before."""
+    """Compute the adjoint of `rollout.update_history`.
+
+    Adds to the adjoints of C and F after the substep (in `a_next`), of the trial gradient and of the history before the substep.
+    """
     setup, k = plan.setup, plan.effects
     a_C, a_F, a_history_next = a_next[2:]
     if plan.layout.e_max:
@@ -123,12 +138,13 @@ def update_history_adjoint(
 
 
 def trial_gradient(plan: Plan, F: Tensor, C_next: Tensor, out: Tensor) -> Tensor:
-    """F_tr = (I + dt C) F, as grid_to_particles wrote it."""
+    """Compute the trial gradient F_tr = (I + dt C) F in `out`, as the forward pass did."""
     plan.launch(plan.setup.kernels.trial_gradient, len(F), [plan.setup.particles.scene, plan.setup.dt, F, C_next, out])
     return out
 
 
 def _add(now: Sequence[Tensor], gradients: Sequence[Tensor | None], frame: int) -> None:
+    """Add the gradients of one frame to the adjoints of the state."""
     for a, gradient in zip(now, gradients):
         if gradient is not None:
             a.add_(gradient[frame])

@@ -139,7 +139,13 @@ def _own(t: Tensor, kind: str, i: int, steps: int) -> Tensor:
 
 
 class SingleScenes:
-    """One plan for several scenes, split into one plan per scene; converts inputs and gradients between the two."""
+    """A rollout of several scenes, split into one rollout per scene.
+
+    Args:
+        plan: The rollout of all scenes.
+        cache: The cached rollouts of the simulator.
+        pool: Threads, one scene each.
+    """
 
     def __init__(self, plan: Plan, cache: RolloutCache, pool: ThreadPoolExecutor) -> None:
         self.whole, self.pool, self.lock = plan, pool, cache.lock

@@ -25,7 +25,12 @@ CAPACITY = 4
 
 
 class CachedRollout:
-    """A rollout of one shape, run eagerly, with its tape."""
+    """A rollout that runs eagerly and reuses its tape for inputs of the same shapes.
+
+    Args:
+        plan: The rollout.
+        keep_all: Whether the tape stores every substep, as a backward pass needs it, or the frames alone.
+    """
 
     def __init__(self, plan: Plan, keep_all: bool) -> None:
         self.tape = new_tape(plan, keep_all)
@@ -55,7 +60,13 @@ class CachedRollout:
 
 
 class CapturedRollout(CachedRollout):
-    """A rollout as CUDA graphs: one forward graph, and one backward graph per set of requested gradients."""
+    """A rollout that is captured as CUDA graphs: one forward graph, and one backward graph per set of requested gradients.
+
+    Args:
+        plan: The rollout.
+        inputs: Inputs of the first run; later runs copy theirs into the same memory.
+        keep_all: As for `CachedRollout`.
+    """
 
     def __init__(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> None:
         super().__init__(plan, keep_all)
@@ -88,10 +99,16 @@ class CapturedRollout(CachedRollout):
 
 
 def capture(launches: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
-    """Capture the launches as a CUDA graph, and return it with their result.
+    """Capture kernel launches as a CUDA graph.
 
     Garbage collection is disabled during the capture, since freeing another graph would break it. Unlike `torch.cuda.graph`, it does not
     collect beforehand either: that takes longer than capturing a hundred substeps.
+
+    Args:
+        launches: Function that launches the kernels.
+
+    Returns:
+        The graph, and the result of the function, which replays of the graph overwrite.
     """
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
     torch.cuda.synchronize()
@@ -112,7 +129,11 @@ def capture(launches: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
 
 
 class RolloutCache:
-    """The cached rollouts of a simulator; the least recently used is dropped first."""
+    """The cached rollouts of a simulator; the least recently used is dropped first.
+
+    Args:
+        graphs: Whether to capture rollouts as CUDA graphs.
+    """
 
     def __init__(self, graphs: bool) -> None:
         self.graphs = graphs

@@ -1,7 +1,7 @@
-"""Warp kernels of what happens on the grid (gravity, body forces, colliders, clamps) and of viscous stress, with adjoints.
+"""Warp kernels of the grid update (gravity, body forces, colliders, clamps) and of viscous stress, with hand-written adjoints.
 
-Collider loops carry a velocity from plane to plane, which Warp's own autodiff gets wrong without a word (dynamic loops);
-the hand-written adjoint recomputes the velocity before each plane instead.
+The loop over colliders carries a velocity from plane to plane. Warp's autodiff of such dynamic loops is silently wrong, so the adjoint here
+recomputes the velocity before each plane.
 """
 
 import functools
@@ -17,8 +17,8 @@ from neuido.physics.runtime.once import cached
 def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     """Return the kernels for one scalar type; arguments as in `transfers.build`.
 
-    Body forces come as a table (S, 6): linear drag [1/s], quadratic drag [1/m], pull [1/s^2], its centre x, y, z [m]. With five
-    columns more it holds Magnus' vector [1/s], stick and restitution [1/s] (`effects.Effects.force_table`).
+    `Effects.force_table` has the body forces of each scene: linear drag [1/s], quadratic drag [1/m], pull [1/s^2] and its centre x, y, z
+    [m], (S, 6), and optionally the Magnus vector, stick and restitution [1/s], (S, 11).
     """
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -39,7 +39,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         F: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33),
     ):
-        """tau += J (2 eta dev D + zeta tr(D) I), D = sym C: Kelvin-Voigt, columns eta (shear) and zeta (bulk) in Pa s."""
+        """Add the Kelvin-Voigt stress J (2 eta dev D + zeta tr(D) I) with D = sym C to tau; `viscosity` has eta and zeta [Pa s]."""
         p = wp.tid()
         s = wp.min(scene[p], viscosity.shape[0] - 1)
         D = real(0.5) * (C[p] + wp.transpose(C[p]))
@@ -81,19 +81,19 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         wp.atomic_add(a_viscosity, s, 1, J * t * tA)
 
     @func
-    def place(c: wp.vec4i, origin: vec3, h: real):
-        """Position of a node [m] from its three indices."""
+    def node_position(c: wp.vec4i, origin: vec3, h: real):
+        """Return the position of a node [m] from its three indices."""
         return origin + vec3(real(c[0]), real(c[1]), real(c[2])) * h
 
     @func
-    def turn(v: vec3, q: vec3):
-        """v turned by Cayley's rotation of q, half the angle's vector: a force across v that does no work."""
+    def rotate(v: vec3, q: vec3):
+        """Return v rotated by Cayley's rotation of the half-angle vector q, so that a force normal to v does no work."""
         t = wp.cross(q, v)
         return v + (real(2.0) / (real(1.0) + wp.dot(q, q))) * (t + wp.cross(q, t))
 
     @func
-    def turn_adjoint(v: vec3, q: vec3, a: vec3):
-        """Adjoint of q; that of v is `turn(a, -q)`."""
+    def rotate_adjoint(v: vec3, q: vec3, a: vec3):
+        """Return the adjoint of q for the adjoint a of the result; the adjoint of v is `rotate(a, -q)`."""
         s = real(2.0) / (real(1.0) + wp.dot(q, q))
         t = wp.cross(q, v)
         both = wp.dot(a, t + wp.cross(q, t))
@@ -101,15 +101,15 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
 
     @func
     def push(v0: vec3, x: vec3, dt: real, g: vec3, force: wp.array2d(dtype=real), row: int):
-        """Nodal velocity after gravity and the body forces; drag is implicit in its size, so any coefficient is stable."""
+        """Return the nodal velocity after gravity and body forces; drag is integrated implicitly, so any coefficient is stable."""
         centre = vec3(force[row, 3], force[row, 4], force[row, 5])
         u = v0 + dt * (g - force[row, 2] * (x - centre))
         if force.shape[1] > 6:
-            u = turn(u, real(0.5) * dt * vec3(force[row, 6], force[row, 7], force[row, 8]))
+            u = rotate(u, real(0.5) * dt * vec3(force[row, 6], force[row, 7], force[row, 8]))
         return u / (real(1.0) + dt * (force[row, 0] + force[row, 1] * wp.length(u)))
 
     @func
-    def clamped(x: vec3, s: int, lower: wp.array2d(dtype=vec3), upper: wp.array2d(dtype=vec3)):
+    def is_clamped(x: vec3, s: int, lower: wp.array2d(dtype=vec3), upper: wp.array2d(dtype=vec3)):
         inside = bool(False)
         for b in range(lower.shape[1]):
             l = lower[s, b]
@@ -130,7 +130,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         dt: real,
         force: wp.array2d(dtype=real),
     ):
-        """Return the velocity after the first `count` colliders, in their order."""
+        """Return the nodal velocity after the first `count` colliders."""
         out = v
         for c in range(count):
             n = normal_of(plane[s, c])
@@ -159,7 +159,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         velocity: wp.array(dtype=vec4),
         clear: bool,
     ):
-        """(momentum, mass) -> (velocity, 0) of each node; an empty node gets zero.
+        """Compute the velocity of each node from its momentum and mass; zero for an empty node.
 
         `clear` empties the nodes for the next scatter, and leaves what an empty one has: no particle gives it weight.
         """
@@ -171,8 +171,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                 if clear:
                     grid[node] = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
                 s = index[node][3]
-                x = place(index[node], origin[s], dx[s])
-                if not clamped(x, s, lower, upper):
+                x = node_position(index[node], origin[s], dx[s])
+                if not is_clamped(x, s, lower, upper):
                     v0 = vec3(g[0], g[1], g[2]) / g[3]
                     u = push(v0, x, dt[s], gravity[s], force, s)
                     out = collide(u, x, s, kind.shape[1], plane, kind, friction, dt[s], force)
@@ -208,8 +208,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
             out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
             if g[3] > real(0.0):
                 s = index[node][3]
-                x = place(index[node], origin[s], dx[s])
-                if not clamped(x, s, lower, upper):
+                x = node_position(index[node], origin[s], dx[s])
+                if not is_clamped(x, s, lower, upper):
                     v0 = vec3(g[0], g[1], g[2]) / g[3]
                     u = push(v0, x, dt[s], gravity[s], force, s)
                     av = a_velocity[node]
@@ -247,7 +247,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                     straight = u
                     if force.shape[1] > 6:
                         q = real(0.5) * dt[s] * vec3(force[s, 6], force[s, 7], force[s, 8])
-                        u = turn(u, q)
+                        u = rotate(u, q)
                     speed = wp.length(u)
                     D = real(1.0) + dt[s] * (force[s, 0] + force[s, 1] * speed)
                     aD = -wp.dot(a, u) / (D * D)
@@ -256,11 +256,11 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                         au = au + (aD * dt[s] * force[s, 1] / speed) * u
                     if force.shape[1] > 6:
                         if parameters:
-                            aq = real(0.5) * dt[s] * turn_adjoint(straight, q, au)
+                            aq = real(0.5) * dt[s] * rotate_adjoint(straight, q, au)
                             wp.atomic_add(a_force, s, 6, aq[0])
                             wp.atomic_add(a_force, s, 7, aq[1])
                             wp.atomic_add(a_force, s, 8, aq[2])
-                        au = turn(au, -q)
+                        au = rotate(au, -q)
                     if parameters:
                         wp.atomic_add(a_gravity, s, dt[s] * au)
                         wp.atomic_add(a_force, s, 0, dt[s] * aD)

@@ -32,32 +32,34 @@ class Solver(Protocol):
 
 
 class RolloutInputs(NamedTuple):
-    """Inputs for S scenes with P particles and K colliders, in the dtype and on the device of the solver."""
+    """Validated inputs of a rollout of S scenes with P particles and K colliders, in the dtype and on the device of the solver."""
 
     state: ParticleState
+    """Initial state."""
     effects: Effects
+    """Effects beyond the laws."""
     gravity: Tensor
-    """[m/s^2], (S, 3), without effects."""
+    """Acceleration of gravity [m/s^2], (S, 3), without effects."""
     force: Tensor
     """`Effects.force_table`."""
     friction: Tensor
-    """(S, K), that of the effects included."""
+    """Friction coefficients [-], (S, K), with the effect `friction`."""
     mass: Tensor
-    """[kg], (P,), added mass and relative density included."""
+    """Particle masses [kg], (P,), with the effects `added_mass` and `relative_density`."""
     viscosity: Tensor | None
     """`Effects.viscosity` [Pa s], (S, 2)."""
     tables: Tables | None
-    """None where no effect acts on the law."""
+    """Tables of the effects that act on the law; None without such effects."""
     stiffness: Tensor | None
-    """Factor of each particle's elastic stress, (P,)."""
+    """Factor of each particle's elastic stress [-], (P,)."""
     growth: Tensor | None
-    """`Effects.growth` over the solver's own steps, (T, S)."""
+    """`Effects.growth` over the steps of the solver [-], (T, S)."""
 
     def stiffening(self, solver: Solver) -> tuple[Tensor, Tensor] | None:
-        """Return what the effects add to each scene's P-wave modulus [Pa], and the factor on the sum, (S,) float64 each.
+        """Return what the effects add to the P-wave modulus of each scene [Pa], and a factor on the sum [-], (S,) float64 each.
 
-        Where stiffness differs between particles, the particle with the fastest wave decides. Its factor is referred to the smallest
-        density of the scene, since the step limit combines the modulus with that density.
+        If the stiffness differs between particles, the factor is that of the particle with the fastest wave, scaled to the smallest
+        density of the scene, with which the step limit combines the modulus.
         """
         if self.tables is None:
             return None
@@ -90,7 +92,7 @@ def prepare(
     friction: Tensor | None = None,
     mass: Tensor | None = None,
 ) -> RolloutInputs:
-    """Return the inputs of a rollout, differentiable in all arguments, which are those of `mpm.Simulator.rollout`.
+    """Validate and convert the inputs of a rollout, differentiable in all of them; arguments as for `mpm.Simulator.rollout`.
 
     Raises:
         UserError: A shape that does not fit, an effect outside its range or without the law that it needs.
@@ -134,13 +136,13 @@ def prepare(
 def waves(
     solver: Solver, elasticity: ElasticLaw, mass: Tensor | None = None, stiffening: tuple[Tensor, Tensor] | None = None
 ) -> list[tuple[float, float]]:
-    """Return the P-wave modulus at rest [Pa] and the least density [kg/m^3] of each scene, which bound its step.
+    """Return the P-wave modulus at rest [Pa] and the smallest density [kg/m^3] of each scene, which bound the stable step.
 
     Args:
-        solver: The scenes.
-        elasticity: The law.
-        mass: [kg], (P,); the solver's own where absent.
-        stiffening: Of `RolloutInputs.stiffening`.
+        solver: The simulator.
+        elasticity: Elastic law.
+        mass: Particle masses [kg], (P,); by default those of the solver.
+        stiffening: The result of `RolloutInputs.stiffening`.
 
     Raises:
         UserError: A modulus that is negative or not a number.

@@ -103,6 +103,7 @@ class Plan:
         return plan
 
     def engines(self, inputs: Sequence[Tensor]) -> tuple[Engine, Engine | None]:
+        """Create the engines of the elastic and the plastic law."""
         particles = self.setup.particles
         plastic = None if self.plasticity is None else self.plasticity.engine(inputs[self.split :], particles)
         return self.elasticity.engine(inputs[FIXED : self.split], particles), plastic
@@ -117,6 +118,7 @@ class Plan:
         return plan
 
     def launch(self, kernel: wp.Kernel, dim: int, inputs: list, block: int = 256) -> None:
+        """Launch a kernel on the device of the simulator."""
         launch(kernel, dim, inputs, self.setup.device, block=block)
 
     @property

@@ -1,6 +1,7 @@
-"""Source of the sums between particles and grid: over the particles of a warp on a GPU, over the four lanes of a register on the CPU.
+"""Native source of the sums between particles and grid, for float32.
 
-Bodies of Warp functions, for float32: `transfers.build` uses them in P2G, in G2P and in its adjoint.
+On a GPU the sums run over the particles of a warp, on the CPU over the four lanes of a vector register. `transfers.build` uses these bodies
+of Warp functions in P2G, in G2P and in the adjoint of G2P.
 """
 
 ARRANGE = """
@@ -20,7 +21,7 @@ ARRANGE = """
     return 0;
 #endif
 """
-"""Which particle of the warp a lane takes, as an offset, so that those with the same node are neighbours (bitonic sort)."""
+"""Sort the particles of a warp by node (bitonic sort); returns the offset to the particle that this lane takes."""
 
 RUN = """
 #if defined(__CUDA_ARCH__)
@@ -31,20 +32,23 @@ RUN = """
     const unsigned above = __ballot_sync(active, head) & ~((2u << lane) - 1u);
     const int last = above ? __ffs(above) - 2 : 31 - __clz(active);
     const int left = last - lane;
-    const int most = __reduce_max_sync(active, left);
-    return left | (most << 8) | (head ? 1 << 16 : 0);
+    const int longest = __reduce_max_sync(active, left);
+    return left | (longest << 8) | (head ? 1 << 16 : 0);
 #else
     return 1 << 16;
 #endif
 """
-"""Lanes left in this lane's run of particles with one and the same node, the longest such in the warp, and the first one's flag."""
+"""Describe the run of neighbouring lanes with the same node.
+
+Returns the number of lanes left in this lane's run, the largest such number in the warp, and a flag for the first lane of a run.
+"""
 
 _ADD = """
     const unsigned active = __activemask();
-    const int left = run & 255, most = (run >> 8) & 255;
+    const int left = run & 255, longest = (run >> 8) & 255;
     const auto add = [&](int at, float a, float b, float c, float d) {
         float v[4] = {a, b, c, d};
-        for (int e = 1; e <= most; e *= 2) {
+        for (int e = 1; e <= longest; e *= 2) {
             #pragma unroll
             for (int k = 0; k < 4; ++k) {
                 const float u = __shfl_down_sync(active, v[k], e);
@@ -60,7 +64,7 @@ _ADD = """
         }
     };
 """
-"""The sum over a run of neighbouring lanes, then one vector reduction by its first: particles are sorted by cell at the start."""
+"""Sum over a run of lanes with the same node, then add the sum to the node once, by the first lane of the run."""
 
 ADD4 = f"""
 #if defined(__CUDA_ARCH__)
@@ -70,7 +74,7 @@ ADD4 = f"""
     for (int c = 0; c < 4; ++c) grid.data[node].c[c] += value[c];
 #endif
 """
-"""Four numbers added to a node."""
+"""Add four numbers to a node."""
 
 SPREAD = f"""
 #if defined(__CUDA_ARCH__)
@@ -110,7 +114,7 @@ SPREAD = f"""
     }}
 #endif
 """
-"""Momentum and mass of a particle, added to its 27 nodes: momentum b at the first one, and ax, ay and az more at the next along an axis."""
+"""Add momentum and mass of a particle to its 27 nodes; the momentum at the first node is b, and grows by ax, ay, az per node."""
 
 GATHER = """
 #if defined(__CUDA_ARCH__)
@@ -149,4 +153,4 @@ GATHER = """
     }
     return out;
 """
-"""Sums of the nodal velocities over a particle's 27 nodes, and of them times the node's number along x, y and z, (4, 3)."""
+"""Return weighted sums over a particle's 27 nodes, (4, 3): of the velocities, and of these times the node's number along x, y and z."""

@@ -1,7 +1,7 @@
-"""The slow twin of `simulator.py`: the same substep in plain torch, differentiable by autograd. An oracle for tests and benchmarks.
+"""The same substep as in `simulator`, in plain torch and differentiable by autograd: a slow reference for tests and benchmarks.
 
-Written from the equations, not from the kernels: nothing is shared with them but the tables of colliders and clamps, and those of the
-effects' parameters. The material is `constitutive.Constitutive`.
+It is written from the equations and shares with the kernels only the tables of colliders, clamps and effects. Laws and effects are those of
+`constitutive.Constitutive`.
 """
 
 import torch
@@ -16,7 +16,7 @@ from neuido.types import ParticleState
 
 
 def _splines(cells: Tensor) -> tuple[Tensor, Tensor]:
-    """First node (P, 3) and weights (P, 3 nodes, 3 axes) of the quadratic B-spline."""
+    """Return the first node (P, 3) and the weights (P, 3 nodes, 3 axes) of the quadratic B-spline at positions in cells."""
     base = torch.floor(cells.detach() - 0.5)
     f = cells - base
     weights = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2], dim=1)
@@ -49,7 +49,7 @@ def substep(
     friction: Tensor | None = None,
     mass: Tensor | None = None,
 ) -> tuple[ParticleState, History]:
-    """One substep of all scenes.
+    """Simulate one substep of all scenes.
 
     Args:
         sim: The scenes.
@@ -132,7 +132,7 @@ def rollout(
     mass: Tensor | None = None,
     every: int = 1,
 ) -> ParticleState:
-    """Frames of `steps` substeps, shaped as `Simulator.rollout` shapes them."""
+    """Simulate `steps` substeps; arguments and shapes of the result are those of `Simulator.rollout`."""
     state = sim.state if state is None else state
     effects = Effects() if effects is None else effects
     mass = sim.mass if mass is None else mass

@@ -21,7 +21,7 @@ from neuido.physics.runtime.launches import LaunchRecordings
 
 
 class Tape(NamedTuple):
-    """What a forward pass writes, in K frames; one frame per substep if a backward pass follows."""
+    """The results of a forward pass in K frames; one frame per substep if a backward pass follows."""
 
     x: Tensor
     v: Tensor
@@ -47,11 +47,12 @@ class Tape(NamedTuple):
 
     @property
     def states(self) -> tuple[Tensor, ...]:
+        """Frames of x, v, C, F and the history."""
         return self[:STATES]
 
 
 def new_tape(plan: Plan, keep_all: bool) -> Tape:
-    """Allocate the memory of a forward pass; `keep_all`: for every substep, as a backward pass needs it."""
+    """Allocate the memory of a forward pass, with `keep_all` for every substep, as a backward pass needs it."""
     setup = plan.setup
     count = plan.steps if keep_all else plan.steps // plan.every
     history = setup.mass.new_empty(len(setup.mass), plan.layout.width)
@@ -152,6 +153,7 @@ def gather(
 def stress(
     plan: Plan, elastic: Engine, F: Tensor, C: Tensor, history: Tensor, viscosity: Tensor, material: Material | None, tau: Tensor
 ) -> None:
+    """Compute the Kirchhoff stress with effects and viscosity in `tau`."""
     setup = plan.setup
     elastic.forward(F, tau)
     if material is not None:
@@ -161,10 +163,12 @@ def stress(
 
 
 def stress_inputs(plan: Plan, material: Material) -> list:
+    """Return the first arguments of `add_effect_stress` and its adjoint."""
     return [plan.setup.particles.scene, *material[:4], plan.spectral, plan.layout.e_max_column]
 
 
 def flow_inputs(plan: Plan, material: Material) -> list:
+    """Return the first arguments of `flow` and its adjoint."""
     setup, layout = plan.setup, plan.layout
     table = [setup.particles.scene, setup.dt, plan.kinds, material.flow, material.stiffness, material.growth]
     return [*table, layout.alpha_column, layout.backstress_column]
@@ -207,7 +211,7 @@ def to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tens
 
 
 def add_to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> None:
-    """Add momentum and mass to the nodes."""
+    """Add momentum and mass of the particles to the nodes of `grid`."""
     setup = plan.setup
     arguments = [setup.particles.scene, setup.origin, setup.dx, setup.dt, setup.nodes, mass, setup.sorted_volume, x, v, C, tau, grid]
     plan.launch(setup.kernels.particles_to_grid, len(x), arguments, plan.block)
@@ -230,6 +234,7 @@ def update_nodes(
 
 
 def grid_inputs(plan: Plan, pull: Tensor, force: Tensor, friction: Tensor, reach: slice = slice(None)) -> list:
+    """Return the first arguments of `update_grid` and its adjoint."""
     setup = plan.setup
     table = setup.colliders
     return [

@@ -90,7 +90,7 @@ class Simulator:
         self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
         bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
         if len(bodies) != len(self.scenes) or not bodies:
-            raise UserError(f"{len(bodies)} bodies for {len(self.scenes)} scenes; give one body a scene")
+            raise UserError(f"{len(bodies)} bodies for {len(self.scenes)} scenes; give one body per scene")
         densities = [float(density)] * len(bodies) if isinstance(density, (int, float)) else [float(d) for d in density]
         if len(densities) != len(bodies) or not all(d > 0 for d in densities):
             raise UserError(f"density is {density}; give one positive number, or one for each of {len(bodies)} scenes")

@@ -1,4 +1,4 @@
-"""Scenes and bodies as the arrays that a rollout reads: what neither laws nor effects change."""
+"""The arrays of a simulator that depend on scenes and bodies alone, and not on laws or effects."""
 
 import math
 from collections.abc import Sequence
@@ -16,14 +16,19 @@ from neuido.types import Body, Particles, ParticleState, Scene
 
 
 def affine_velocity(x: Tensor, v: Tensor, neighbours: int = 32, chunk: int = 2048) -> Tensor:
-    """Return the velocity gradient that belongs to a velocity field on particles, (P, 3, 3) [1/s].
+    """Estimate the gradient of a velocity field from its values at particles; differentiable in v.
 
-    A rollout starts with it (C = 0 would lose 6-8 % of a spin in the first step). One affine fit serves where it is exact
-    to 1e-3 (all rigid and uniform motions), else a fit over the nearest neighbours of each particle. Differentiable in v.
+    A rollout starts with C equal to it, since C = 0 would lose 6-8 % of a spin in the first step. If one affine fit is accurate to 1e-3, as
+    for all rigid and uniform motions, it serves for all particles. Else the fit is over the nearest neighbours of each particle.
 
     Args:
         x: Positions [m], (P, 3).
         v: Velocities [m/s], (P, 3).
+        neighbours: Number of neighbours in a local fit.
+        chunk: Number of particles that are processed at a time.
+
+    Returns:
+        Velocity gradient [1/s], (P, 3, 3).
     """
     dx = x - x.mean(dim=0)
     dv = v - v.mean(dim=0)
@@ -103,7 +108,7 @@ class Setup:
         self.nodes = wp.vec3i(*nodes)
         self.grid_shape = (len(self.scenes), *nodes)
         self.node_count = math.prod(self.grid_shape)
-        self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes per thread: on the CPU a thread's call costs as much as a node
+        self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes per thread: on the CPU, calling a thread costs as much as a node
         scene, *axes = (torch.arange(n, dtype=torch.int32) for n in self.grid_shape)
         s, i, j, k = torch.meshgrid(scene, *axes, indexing="ij")
         self.node_index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(self.device)
@@ -211,4 +216,5 @@ class Setup:
 
 
 def short_vector(t: Tensor) -> list[float]:
+    """Return the numbers of a tensor with four digits, for messages."""
     return [float(f"{value:.4g}") for value in t.tolist()]

@@ -1,6 +1,6 @@
-"""Warp functions of a particle's 27 nodes: weights, indices, and the sums between particle and nodes.
+"""Warp functions for the 27 nodes around a particle: weights, indices, and the sums between particle and nodes.
 
-Weights, arms and slopes are products over the axes, so the nodes are summed axis by axis: about a third of the operations of the plain sum.
+Weights are products over the axes, so the nodes are summed axis by axis, with about a third of the operations of a plain sum.
 """
 
 import functools
@@ -12,12 +12,12 @@ from neuido.physics.mpm.reductions import ADD4, ARRANGE, GATHER, RUN, SPREAD
 
 
 def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
-    """Return the functions of one scalar type, for a Warp module.
+    """Return the functions for one scalar type and one Warp module.
 
     Args:
         real: `wp.float32` or `wp.float64`.
         module: Name of the Warp module whose kernels call them.
-        native: Sum by the C++ and CUDA source of `reductions` (float32 alone; Warp cannot differentiate it).
+        native: Whether to sum by the C++ and CUDA source of `reductions`; float32 only, and Warp cannot differentiate it.
     """
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -31,7 +31,7 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
 
     @func
     def first_moment(w: vec3):
-        """Weights times the node's number in the stencil, 0, 1 or 2."""
+        """Return the weights times the number of the node in the stencil, 0, 1 or 2."""
         return vec3(real(0.0), w[1], real(2.0) * w[2])
 
     if native:
@@ -117,7 +117,7 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
 
     @func
     def spline(f: real):
-        """Quadratic B-spline weights of the three nodes; f in [0.5, 1.5) is the distance to the first one in cells."""
+        """Return the quadratic B-spline weights of the three nodes; f in [0.5, 1.5) is the distance to the first node in cells."""
         a = real(1.5) - f
         b = f - real(1.0)
         c = f - real(0.5)
@@ -125,12 +125,12 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
 
     @func
     def spline_slope(f: real):
-        """Their derivative with respect to the position in cells."""
+        """Return the derivatives of the B-spline weights with respect to the position in cells."""
         return vec3(f - real(1.5), real(-2.0) * (f - real(1.0)), f - real(0.5))
 
     @func
     def first_node(cells: vec3, nodes: wp.vec3i):
-        """Return the lowest node of a particle's stencil, clamped into the grid (a lost particle is flagged elsewhere)."""
+        """Return the first node of the stencil of a particle, clamped into the grid; `grid_to_particles` reports lost particles."""
         return wp.vec3i(
             wp.clamp(int(wp.floor(cells[0] - real(0.5))), 0, nodes[0] - 3),
             wp.clamp(int(wp.floor(cells[1] - real(0.5))), 0, nodes[1] - 3),
@@ -138,16 +138,16 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
         )
 
     @func
-    def flat(s: int, node: wp.vec3i, nodes: wp.vec3i):
+    def flat_index(s: int, node: wp.vec3i, nodes: wp.vec3i):
         return ((s * nodes[0] + node[0]) * nodes[1] + node[1]) * nodes[2] + node[2]
 
     @func
     def stencil(x: vec3, s: int, origin: wp.array(dtype=vec3), dx: wp.array(dtype=real), nodes: wp.vec3i):
-        return flat(s, first_node((x - origin[s]) / dx[s], nodes), nodes)
+        return flat_index(s, first_node((x - origin[s]) / dx[s], nodes), nodes)
 
     @func
-    def within(cells: vec3, base: wp.vec3i):
-        """Distance to the first node of the stencil, in cells."""
+    def stencil_offset(cells: vec3, base: wp.vec3i):
+        """Return the distance to the first node of the stencil in cells."""
         return vec3(cells[0] - real(base[0]), cells[1] - real(base[1]), cells[2] - real(base[2]))
 
     @func
@@ -155,15 +155,15 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
         return vec3(A[0, c], A[1, c], A[2, c])
 
     @func
-    def widen(span: wp.array(dtype=real), at: real):
-        """Take a figure into the least and the greatest one, where there is room for them."""
+    def extend_span(span: wp.array(dtype=real), at: real):
+        """Extend the range in `span` to include a value, unless `span` is empty."""
         if span.shape[0] > 0:
             wp.atomic_min(span, 0, at)
             wp.atomic_max(span, 1, at)
 
     @func
-    def cell_of(y: vec3, origin: vec3, h: real, nodes: wp.vec3i):
-        """Whether the stencil of a particle at y lies in the padded grid."""
+    def in_grid(y: vec3, origin: vec3, h: real, nodes: wp.vec3i):
+        """Return whether the stencil of a particle at y lies in the padded grid."""
         c = (y - origin) / h
         return (
             c[0] >= real(0.5)
@@ -185,10 +185,10 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
         spline=spline,
         spline_slope=spline_slope,
         first_node=first_node,
-        flat=flat,
+        flat_index=flat_index,
         stencil=stencil,
-        within=within,
+        stencil_offset=stencil_offset,
         column=column,
-        widen=widen,
-        cell_of=cell_of,
+        extend_span=extend_span,
+        in_grid=in_grid,
     )

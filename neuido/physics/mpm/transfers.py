@@ -1,17 +1,16 @@
-"""Warp kernels of the transfers between particles and grid, and their hand-written adjoints, for float32 and float64.
+"""Warp kernels of the transfers between particles and grid (P2G, G2P), with hand-written adjoints, for float32 and float64.
 
-A substep (paper, appendix "Material Point Method"; the MLS form of Hu et al. 2018) moves P particles of S scenes at once.
-The grid is one array over all nodes of all scenes, [scene, x, y, z] with z fastest, and each scene's part is padded by PAD
-nodes on each side so that the quadratic stencil of a particle in the domain never leaves it. Nodes hold four numbers:
-(momentum, mass) or (velocity, 0).
+A substep (paper, appendix "Material Point Method"; MLS-MPM, Hu et al. 2018) moves P particles of S scenes at once. The grid is one array
+over the nodes of all scenes, [scene, x, y, z] with z fastest. Each scene has PAD more nodes on each side of its domain, so that the
+quadratic stencil of a particle in the domain lies in the array. A node has four numbers: (momentum, mass) or (velocity, 0).
 
     particles_to_grid   tau, C, v -> momentum and mass of the nodes          A = m C - dt V0 (4/dx^2) tau
-    (grid_kernels)      nodal velocity: gravity, body forces, colliders, clamps
+    update_grid         nodal velocity: gravity, body forces, colliders, clamps (in `grid`)
     grid_to_particles   v, C, x, and the trial F_tr = (I + dt C) F
 
-`*_adjoint` kernels take the adjoint of what the forward kernel wrote and add to the adjoint of what it read. The adjoint of
-the scatter is a gather and has no atomics; only the adjoint of the gather scatters. The 27 nodes are summed axis by axis,
-since weights, arms and slopes are products over the axes: about a third of the operations of the plain sum.
+A kernel `*_adjoint` reads the adjoints of the forward kernel's outputs and adds to the adjoints of its inputs. The adjoint of P2G gathers
+and needs no atomics; only the adjoint of G2P scatters. Weights are products over the axes, so the 27 nodes are summed axis by axis, with
+about a third of the operations of a plain sum.
 """
 
 import functools
@@ -19,7 +18,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.mpm import grid as grid_kernels
+from neuido.physics.mpm import grid as grid_functions
 from neuido.physics.mpm import stencil as stencil_functions
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.events import COLLAPSED
@@ -29,19 +28,19 @@ PAD = 2
 """Nodes added on each side of the domain."""
 
 LOST, FAST = 1, 2
-"""Codes in the `status` of a scene: a particle outside the padded grid; one that moves by more than a cell a substep, or is not finite."""
+"""Codes in the `status` of a scene: a particle left the padded grid; a particle moved by more than a cell per substep or is not finite."""
 
 
 @cached
 def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
-    """All kernels of a substep for one scalar type, compiled on first launch.
+    """Return all kernels of a substep for one scalar type, compiled at their first launch.
 
     Args:
         real: `wp.float32` or `wp.float64`.
-        enable_backward: Also generate Warp's own adjoints of the forward kernels (the oracle of the tests).
+        enable_backward: Let Warp generate adjoints of the forward kernels too, for tests.
 
     Returns:
-        A namespace of kernels, those of `grid_kernels` included.
+        A namespace of kernels, with those of `grid`.
     """
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
@@ -54,8 +53,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     own = stencil_functions.functions(real, name, native=real is wp.float32 and not enable_backward)
     velocity_of, first_moment, arrange, run_of = own.velocity_of, own.first_moment, own.arrange, own.run_of
     add4, spread, moments, spline = own.add4, own.spread, own.moments, own.spline
-    spline_slope, first_node, flat, stencil = own.spline_slope, own.first_node, own.flat, own.stencil
-    within, column, widen, cell_of = own.within, own.column, own.widen, own.cell_of
+    spline_slope, first_node, flat_index, stencil = own.spline_slope, own.first_node, own.flat_index, own.stencil
+    stencil_offset, column, extend_span, in_grid = own.stencil_offset, own.column, own.extend_span, own.in_grid
 
     @kernel
     def particles_to_grid(
@@ -72,7 +71,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         tau: wp.array(dtype=mat33),
         grid: wp.array(dtype=vec4),
     ):
-        """Nodes get (momentum [kg m/s], mass [kg]); `grid` must be zero before."""
+        """Add momentum [kg m/s] and mass [kg] of the particles to the nodes; `grid` must be zero before."""
         p = wp.tid()
         p += arrange(stencil(x[p], scene[p], origin, dx, nodes))
         s = scene[p]
@@ -80,7 +79,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         m = mass[p]
         cells = (x[p] - origin[s]) / h
         base = first_node(cells, nodes)
-        f = within(cells, base)
+        f = stencil_offset(cells, base)
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
@@ -89,7 +88,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         ay = column(hA, 1)
         az = column(hA, 2)
         bi = m * v[p] - hA * f
-        node = flat(s, base, nodes)
+        node = flat_index(s, base, nodes)
         spread(grid, node, nodes[1], nodes[2], wx, wy, wz, bi, ax, ay, az, m, run_of(node))
 
     @adjoint_kernel
@@ -119,7 +118,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         m = mass[p]
         cells = (x[p] - origin[s]) / h
         base = first_node(cells, nodes)
-        f = within(cells, base)
+        f = stencil_offset(cells, base)
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
@@ -135,7 +134,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         ay = column(hA, 1)
         az = column(hA, 2)
         bi = m * v[p] - hA * f
-        node = flat(s, base, nodes)
+        node = flat_index(s, base, nodes)
         zero = vec3(real(0.0), real(0.0), real(0.0))
         s0 = zero
         sx = zero
@@ -213,10 +212,11 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         lowest: wp.array(dtype=real),
         since: wp.array(dtype=wp.int32),
     ):
-        """Gather; the first particle of a scene that is lost, too fast or not finite leaves its code, index and step in `status`.
+        """Compute x, v, C and the trial F of the particles from the nodal velocities.
 
-        Where `span` has room for two figures, it is widened to the x of all particles. A particle whose trial det F is below
-        `COLLAPSED` leaves the smallest one in `lowest` and the first such step in `since`.
+        The first particle of a scene that is lost, too fast or not finite writes a code, its index and the step into `status`. If `span`
+        is not empty, it becomes the smallest and the largest x of the particles. A particle with a trial det F below `COLLAPSED` writes
+        the smallest det F into `lowest` and the first such step into `since`.
         """
         p = wp.tid()
         s = scene[p]
@@ -224,24 +224,24 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         zero = vec3(real(0.0), real(0.0), real(0.0))
         if held[p] == wp.uint8(1):
             x_next[p] = x[p]
-            widen(span, x[p][0])
+            extend_span(span, x[p][0])
             v_next[p] = zero
             C_next[p] = wp.outer(zero, zero)
             F_trial[p] = F[p]
             return
         cells = (x[p] - origin[s]) / h
         base = first_node(cells, nodes)
-        f = within(cells, base)
+        f = stencil_offset(cells, base)
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
-        node = flat(s, base, nodes)
+        node = flat_index(s, base, nodes)
         m = moments(velocity, node, nodes[1], nodes[2], wx, wy, wz)
         v = m[0]
         C = (real(4.0) / h) * wp.matrix_from_cols(m[1] - f[0] * v, m[2] - f[1] * v, m[3] - f[2] * v)
         y = x[p] + dt[s] * v
         x_next[p] = y
-        widen(span, y[0])
+        extend_span(span, y[0])
         v_next[p] = v
         C_next[p] = C
         trial = F[p] + dt[s] * (C * F[p])
@@ -254,7 +254,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         code = int(0)
         if not (wp.length(v) * dt[s] < h):
             code = wp.static(FAST)
-        if not cell_of(y, origin[s], h, nodes):
+        if not in_grid(y, origin[s], h, nodes):
             code = wp.max(code, wp.static(LOST))
         if code > 0:
             if wp.atomic_cas(status, 3 * s, 0, code) == 0:
@@ -282,7 +282,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         a_x: wp.array(dtype=vec3),
         a_F: wp.array(dtype=mat33),
     ):
-        """Add to a_velocity (zero before); write a_x and a_F."""
+        """Write a_x and a_F, and add to a_velocity, which must be zero before."""
         p = wp.tid()
         p += arrange(stencil(x[p], scene[p], origin, dx, nodes))
         s = scene[p]
@@ -292,7 +292,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
             free = real(0.0)
         cells = (x[p] - origin[s]) / h
         base = first_node(cells, nodes)
-        f = within(cells, base)
+        f = stencil_offset(cells, base)
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
@@ -306,7 +306,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         by = column(hB, 1)
         bz = column(hB, 2)
         qi = free * (a_v_next[p] + dt[s] * a_x_next[p]) - hB * f
-        node = flat(s, base, nodes)
+        node = flat_index(s, base, nodes)
         run = run_of(node)
         slope = vec3(real(0.0), real(0.0), real(0.0))
         for i in range(3):
@@ -343,7 +343,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         C_next: wp.array(dtype=mat33),
         F_trial: wp.array(dtype=mat33),
     ):
-        """Write the trial gradient again, as `grid_to_particles` wrote it."""
+        """Recompute the trial gradient as in `grid_to_particles`."""
         p = wp.tid()
         F_trial[p] = F[p] + dt[scene[p]] * (C_next[p] * F[p])
 
@@ -354,5 +354,5 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         particles_to_grid_adjoint=particles_to_grid_adjoint,
         grid_to_particles=grid_to_particles,
         grid_to_particles_adjoint=grid_to_particles_adjoint,
-        **vars(grid_kernels.build(real, enable_backward)),
+        **vars(grid_functions.build(real, enable_backward)),
     )

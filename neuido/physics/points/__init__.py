@@ -1,4 +1,4 @@
-"""Bodies without extent: the point mass and the material point.
+"""Models without spatial discretisation: the point mass and the material point.
 
 The names of `__all__` are imported when they are first used.
 """

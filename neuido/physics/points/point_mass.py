@@ -1,9 +1,9 @@
-"""The point mass: a body whose deformation does not matter, held until it is released, then moved by gravity and body-force effects.
+"""The point mass: a body whose deformation does not matter, held until its release, then moved by gravity and other forces.
 
 x'' = g / (1 + added_mass) + uniform_acceleration + time_force(t) - drag_linear v - drag_quadratic |v| v + magnus x v
       - position_force (x - position_centre),
-the accelerations of `physics.effects` for a centre of mass. Many parameter sets run as one batch; integrated by the classical
-Runge-Kutta scheme of fourth order, read between its steps by cubic Hermite interpolation.
+with the effects of `physics.effects` at the centre of mass. Many parameter sets run as one batch. The motion is integrated by the
+classical Runge-Kutta scheme of fourth order, with cubic Hermite interpolation between its steps.
 """
 
 import math
@@ -16,28 +16,28 @@ from neuido.types import brief_fields
 
 
 class Forces(NamedTuple):
-    """What acts on P point masses; each of shape () or (P,), vectors (3,) or (P, 3). None: absent."""
+    """The forces on P point masses; numbers () or (P,), vectors (3,) or (P, 3). None: absent."""
 
     gravity: np.ndarray | tuple[float, float, float] = (0.0, -9.81, 0.0)
-    """[m/s^2]"""
+    """Acceleration of gravity [m/s^2], vector."""
     uniform_acceleration: np.ndarray | None = None
-    """[m/s^2], vector."""
+    """A further acceleration [m/s^2], vector."""
     drag_linear: np.ndarray | float | None = None
-    """c of -c v [1/s]."""
+    """c of the acceleration -c v [1/s]."""
     drag_quadratic: np.ndarray | float | None = None
-    """k of -k |v| v [1/m]."""
+    """k of the acceleration -k |v| v [1/m]."""
     magnus: np.ndarray | None = None
-    """w of w x v [1/s], vector: the spin times a coefficient."""
+    """w of the acceleration w x v [1/s], vector: the spin times a coefficient."""
     position_force: np.ndarray | float | None = None
-    """k of -k (x - centre) [1/s^2]."""
+    """k of the acceleration -k (x - centre) [1/s^2]."""
     position_centre: np.ndarray | None = None
-    """That centre [m], vector; the origin where absent."""
+    """The centre of `position_force` [m], vector; None: the origin."""
     time_force: np.ndarray | None = None
     """Accelerations [m/s^2] at J evenly spaced times from 0, (J, 3) or (P, J, 3); linear in between, constant after the last."""
     time_force_interval: float = 0.1
-    """Time between those [s]."""
+    """Time between two values of `time_force` [s]."""
     added_mass: np.ndarray | float | None = None
-    """c of the inertia (1 + c) [-]; the weight is unchanged."""
+    """c of the factor 1 + c on the inertia at unchanged weight [-]."""
 
     def __repr__(self) -> str:
         return brief_fields(self)
@@ -52,18 +52,18 @@ def fly(
     *,
     step: float = 0.01,
 ) -> np.ndarray:
-    """Positions of P point masses at given times.
+    """Simulate the flight of P point masses from their release.
 
     Args:
-        times: [s], (n,) or (P, n).
-        position: Where each is held until it is released [m], (P, 3).
-        velocity: With which it then starts [m/s], (P, 3).
-        release: When [s], (P,); a release before the first time is in flight from the start.
-        forces: What acts from then on.
-        step: Time step [s].
+        times: Times of the result [s], (n,) or (P, n).
+        position: Position until the release [m], (P, 3).
+        velocity: Velocity at the release [m/s], (P, 3).
+        release: Time of the release [s], (P,); it may lie before the first of `times`.
+        forces: The forces from the release on.
+        step: Time step of the integration [s].
 
     Returns:
-        (P, n, 3) [m]; NaN for a point mass whose motion leaves all bounds.
+        Positions [m], (P, n, 3); NaN for a point mass whose motion is not finite.
 
     Raises:
         UserError: A step that is not positive, or forces whose number of rows is neither one nor P.
@@ -97,7 +97,7 @@ def fly(
 
 
 def _hermite(X: np.ndarray, V: np.ndarray, since: np.ndarray, h: float) -> np.ndarray:
-    """Positions (P, n, 3) at times (P, n) after the release from positions and velocities (K, P, 3) at every `h`."""
+    """Interpolate positions, (P, n, 3), at times `since` the release (P, n), from x and v (K, P, 3) at multiples of `h`."""
     at = np.minimum((since / h).astype(np.int64), len(X) - 2)
     u = (since / h - at)[..., None]
     row = np.arange(X.shape[1])[:, None]
@@ -106,7 +106,7 @@ def _hermite(X: np.ndarray, V: np.ndarray, since: np.ndarray, h: float) -> np.nd
 
 
 def _acceleration(forces: Forces, count: int, release: np.ndarray):
-    """Return the function (x (P, 3), v (P, 3), time since the release) -> acceleration (P, 3) [m/s^2]."""
+    """Return a function of x (P, 3), v (P, 3) and the time since the release that gives the acceleration [m/s^2], (P, 3)."""
 
     def scalar(name: str) -> np.ndarray | None:
         value = getattr(forces, name)
@@ -148,6 +148,7 @@ def _acceleration(forces: Forces, count: int, release: np.ndarray):
 
 
 def _rows(value, count: int, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Expand a parameter to one row for each point mass."""
     rows = np.asarray(value, dtype=np.float64)
     if rows.shape not in (shape, (1, *shape), (count, *shape)):
         raise UserError(f"{name} has the shape {rows.shape} for {count} point masses; give {shape} or {(count, *shape)}")

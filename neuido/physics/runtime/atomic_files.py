@@ -1,4 +1,4 @@
-"""Files that appear under their names only when they are whole."""
+"""Atomic writing of files."""
 
 import os
 import uuid
@@ -11,10 +11,15 @@ from neuido.errors import UserError
 
 @contextmanager
 def whole_file(path: str | os.PathLike) -> Iterator[Path]:
-    """Give a temporary path beside `path`, which takes its name when the block ends without an error.
+    """Open a context that yields a temporary path in the folder of `path`; at its end the temporary file is renamed to `path`.
+
+    After an error the temporary file is deleted, and an existing file at `path` is unchanged.
+
+    Args:
+        path: The file to write; missing folders are created.
 
     Raises:
-        UserError: The file cannot be written there.
+        UserError: The file cannot be written.
     """
     path = Path(path)
     hidden = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")

@@ -1,4 +1,4 @@
-"""Options that were renamed; the old name still works and warns."""
+"""Deprecated names of options."""
 
 import warnings
 from typing import TypeVar
@@ -7,13 +7,13 @@ T = TypeVar("T")
 
 
 def renamed_option(name: str, value: T, old_name: str, old_value: T | None) -> T:
-    """Return the value of an option that may be given by its old name, and warn if it is.
+    """Return the value of an option, and warn if it was given by its deprecated name.
 
     Args:
-        name: The option.
-        value: Its value.
-        old_name: Its deprecated name.
-        old_value: The value given by that name; None: not given.
+        name: Name of the option.
+        value: Value that was given by this name.
+        old_name: Deprecated name of the option.
+        old_value: Value that was given by the deprecated name; None: it was not used.
     """
     if old_value is None:
         return value

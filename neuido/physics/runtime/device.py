@@ -1,4 +1,4 @@
-"""Where torch and Warp meet: start-up, streams, and launches of Warp kernels on torch tensors."""
+"""Warp kernels on torch tensors: choice of the device, start of Warp, streams and launches."""
 
 import contextlib
 import ctypes
@@ -15,10 +15,10 @@ from neuido.physics.runtime.once import BUILDING, cached
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the device for `auto` (cuda where there is one), `cpu` or `cuda`.
+    """Return the torch device for the `device` option of a command: `auto` (CUDA if available), `cpu` or `cuda`.
 
     Raises:
-        UserError: Another name, or cuda where there is none.
+        UserError: Another name, or `cuda` without a CUDA device.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise UserError(f"device must be auto, cpu or cuda, got {name!r}")
@@ -28,10 +28,10 @@ def choose_device(name: str) -> torch.device:
 
 
 def as_device(device: str | torch.device) -> torch.device:
-    """Return the torch device, with its index, for `auto`, `cpu`, `cuda`, `cuda:1`, ... or a device.
+    """Return the torch device, with its index, for `auto` (CUDA if available), `cpu`, `cuda`, `cuda:1`, ..., or a `torch.device`.
 
     Raises:
-        UserError: Another name, or a CUDA device that is not there.
+        UserError: Another name, or a CUDA device that does not exist.
     """
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -50,7 +50,7 @@ def as_device(device: str | torch.device) -> torch.device:
 
 @cached
 def start_warp() -> None:
-    """Initialise Warp without its banner, and without its remark on a missing driver; safe to call again, and from several threads."""
+    """Initialise Warp once, without its banner and without its warning of a missing CUDA driver."""
     level = max(wp.config.log_level, wp.LOG_WARNING)
     wp.config.log_level = wp.LOG_ERROR
     with contextlib.nullcontext() if torch.cuda.is_available() else _silent_stderr():
@@ -60,27 +60,27 @@ def start_warp() -> None:
 
 @contextlib.contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Redirect standard error while Warp's C library prints its remark."""
-    kept, hole = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    """Discard what is written to standard error, by C code too."""
+    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(hole, 2)
+        os.dup2(null, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(hole)
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)
 
 
 def real_of(dtype: torch.dtype) -> type:
-    """Return the Warp scalar type of a torch float type."""
+    """Return the Warp scalar type for `torch.float32` or `torch.float64`."""
     return {torch.float32: wp.float32, torch.float64: wp.float64}[dtype]
 
 
 @contextlib.contextmanager
 def torch_stream(device: torch.device) -> Iterator[None]:
-    """Warp launches go to torch's current stream while this is open."""
+    """Open a context in which Warp launches go to torch's current stream."""
     if device.type == "cuda":
-        # no events between streams: everything is on torch's, and a capture forbids them
+        # no synchronisation between streams: all work is on torch's stream, and a graph capture forbids it
         with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False):
             yield
     else:
@@ -88,23 +88,39 @@ def torch_stream(device: torch.device) -> Iterator[None]:
 
 
 def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, *, block: int = 256) -> None:
-    """Launch a kernel with torch tensors in place of Warp arrays, typed by the kernel's own annotations.
+    """Launch a Warp kernel on torch tensors.
 
-    Inside `torch_stream` it goes to torch's current stream. The tensors keep their memory and must outlive the launch. None is
-    an absent array; `block` is the number of threads a block on a GPU.
+    Call it within `torch_stream`. The tensors must stay alive until the launch has run.
+
+    Args:
+        kernel: The kernel; its annotations give the array types.
+        dim: Number of threads.
+        arguments: Arguments of the kernel, with tensors for arrays and None for absent arrays.
+        device: Device of the tensors.
+        block: Threads per block on a GPU.
     """
     if device.type == "cpu":
         if dim:
-            _launch_again(kernel, dim, arguments, device)
+            _launch_cached(kernel, dim, arguments, device)
         return
     _load(kernel, device, block)
     wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), block_dim=block)
 
 
 def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, *, block: int = 256) -> Callable[[int], None]:
-    """Prepare a launch for many steps, of a kernel whose first argument is the step; `arguments` are the others.
+    """Prepare the repeated launch of a kernel whose first argument is the number of the step.
 
-    On a GPU they are packed once, which takes longer than a launch. They must outlive the last one.
+    On a GPU the arguments are packed once for all launches, since packing takes longer than a launch.
+
+    Args:
+        kernel: The kernel.
+        dim: Number of threads.
+        arguments: The arguments after the step; the tensors must stay alive until the last launch has run.
+        device: Device of the tensors.
+        block: Threads per block on a GPU.
+
+    Returns:
+        A function that launches the kernel for a step.
     """
     if device.type == "cpu":
         return lambda step: launch(kernel, dim, [step, *arguments], device)
@@ -121,7 +137,7 @@ def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.dev
 
 @cached
 def _load(kernel: wp.Kernel, device: torch.device, block: int) -> None:
-    """Load a kernel's code on a GPU, one thread at a time, since Warp's tables of modules are not for several."""
+    """Load the code of a kernel on a GPU; one thread at a time, since Warp's module tables are not thread-safe."""
     _contract(kernel)
     internals.load(kernel, device, block)
 
@@ -130,7 +146,7 @@ _contract = cached(internals.contract_products)
 
 
 def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:
-    """Return what Warp takes for the arguments of a kernel, whose module has its options from here on."""
+    """Convert the arguments of a kernel for Warp, and set the compiler options of its module."""
     _contract(kernel)
     return [
         _array(value, arg.type.dtype) if isinstance(value, Tensor) else value
@@ -139,34 +155,34 @@ def _inputs(kernel: wp.Kernel, arguments: Sequence) -> list:
 
 
 class _Command:
-    """A packed launch, and the arguments that its key knows by their address."""
+    """A packed launch, with references to the arguments that are identified by their address, so that no other object gets it."""
 
-    __slots__ = ("kept", "launch")
+    __slots__ = ("launch", "references")
 
     def __init__(self, kernel: wp.Kernel, dim: int, arguments: Sequence) -> None:
         self.launch = internals.PackedLaunch(kernel, dim, _inputs(kernel, arguments))
-        self.kept = [value for value in arguments if not isinstance(value, Tensor)]
+        self.references = [value for value in arguments if not isinstance(value, Tensor)]
 
 
 COMMAND_CAPACITY = 12_000
-"""Packed launches that are kept: those of a thousand substeps with their adjoints."""
+"""Largest number of packed launches in the cache: those of a thousand substeps with their adjoints."""
 _commands: dict[tuple, _Command] = {}
 
 
 def forget_launches() -> None:
-    """Drop all packed launches."""
+    """Empty the cache of packed launches."""
     with BUILDING:
         _commands.clear()
 
 
 def packed_launches() -> int:
-    """Return how many packed launches are kept."""
+    """Return the number of packed launches in the cache."""
     return len(_commands)
 
 
-def _launch_again(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
-    """Launch on the CPU, with the arguments packed where a launch of these tensors was before."""
-    if not internals.WARP_TRIED:
+def _launch_cached(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:
+    """Launch on the CPU; the packed arguments of an earlier launch on the same tensors are reused."""
+    if not internals.WARP_TESTED:
         with BUILDING:
             inputs = _inputs(kernel, arguments)
         launches.forbid_repetition()
@@ -183,7 +199,7 @@ def _launch_again(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torc
             key.append(id(value))
     command = _commands.get(tuple(key))
     if command is None:
-        with BUILDING:  # two threads that load one module at a time would leave one of them with the other's code, or with none
+        with BUILDING:  # two threads must not load a module at the same time: one would get the code of the other, or none
             if len(_commands) > COMMAND_CAPACITY:
                 _commands.clear()
             command = _commands[tuple(key)] = _Command(kernel, dim, arguments)
@@ -198,8 +214,8 @@ _arrays: dict[tuple, object] = {}
 
 
 def _array(t: Tensor, dtype: type) -> object:
-    """Return Warp's descriptor of a tensor. It is address, shape and strides, so one serves whatever lies there next: 4 us saved."""
-    if not internals.WARP_TRIED:
+    """Return Warp's descriptor of a tensor (address, shape, strides), from a cache if possible, which saves 4 us."""
+    if not internals.WARP_TESTED:
         return internals.describe_array(t, dtype)
     key = (t.data_ptr(), t.shape, t.stride(), dtype)
     found = _arrays.get(key)

@@ -1,4 +1,4 @@
-"""What a rollout returns: the frames of its particles, with their times, to unpack, to look at and to save."""
+"""The result of a rollout: frames of the particles with their times, which can be unpacked, printed and saved."""
 
 import functools
 import os
@@ -19,9 +19,7 @@ from neuido.types import Particles, ParticleState
 
 
 class Frames(ParticleState):
-    """K frames of P particles: a `ParticleState` with a leading K that knows its times.
-
-    It unpacks to x, v, C and F as a `ParticleState` does.
+    """K frames of P particles with their times; unpacks to x, v, C and F as a `ParticleState` does.
 
     Args:
         x: Position [m], (K, P, 3).
@@ -29,10 +27,10 @@ class Frames(ParticleState):
         C: Affine velocity [1/s], (K, P, 3, 3).
         F: Elastic deformation gradient [-], (K, P, 3, 3).
         dt: Time between two frames [s], a number or one for each scene, (S,).
-        particles: Scene of each particle; none: one scene.
-        history: What the effects remember, (K, P, width); width 0 where none does, None where the solver does not tell.
-        marks: What the kernels noted of det F in every step; None: `events` looks at the frames alone.
-        strain_limit: Largest logarithmic stretch that the law knows; None: any.
+        particles: The scene of each particle; None: one scene.
+        history: History of the effects, (K, P, width), with width 0 if no effect has one; None if the solver does not return it.
+        marks: What the kernels recorded about det F in every step; None: `events` uses the frames alone.
+        strain_limit: Largest logarithmic stretch for which the law is known; None: no limit.
 
     Attributes:
         dt: Time between two frames [s], (S,).
@@ -60,19 +58,19 @@ class Frames(ParticleState):
         marks: Marks | None = None,
         strain_limit: float | None = None,
     ) -> "Frames":
-        """Make frames; see the class."""
+        """Create frames; the class describes the arguments."""
         frames = super().__new__(cls, x, v, C, F)
         frames.dt = torch.as_tensor(dt, dtype=torch.float64).detach().cpu().reshape(-1)
         frames.particles, frames.history, frames.marks, frames.strain_limit = particles, history, marks, strain_limit
         return frames
 
     @classmethod
-    def _make(cls, iterable: Iterable[Any]) -> ParticleState:  # type: ignore[override]  # what `_replace` calls
+    def _make(cls, iterable: Iterable[Any]) -> ParticleState:  # type: ignore[override]  # called by `_replace`
         return ParticleState._make(iterable)
 
     @property
     def times(self) -> Tensor:
-        """Time of each frame [s], float64, (K,), or (S, K) where the scenes have different steps."""
+        """Time of each frame [s], (K,) float64, or (S, K) if the frame intervals of the scenes differ."""
         at = torch.arange(len(self.x), dtype=torch.float64)
         each = torch.unique(self.dt)
         return at * each if len(each) == 1 else self.dt[:, None] * at
@@ -105,20 +103,18 @@ class Frames(ParticleState):
         return f"Frames({frames} frames of {count} particles in {scenes} scene{plural}, the last at {end}, {kind}{word})"
 
     def save(self, path: str | os.PathLike) -> list[Path]:
-        """Write the frames in the format that the name ends with, each file all at once.
-
-        `.npz`: arrays x, v, C, F, times and scene (C and F where the motion has them). `.ply`: a point cloud a frame, `NAME_0000.ply`,
-        `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; files of a longer series of that name are removed. `.csv`: a row for
-        each frame and particle.
+        """Write the frames to a file; its extension selects the format. A file is complete or absent, never cut.
 
         Args:
-            path: Where; folders on the way are made.
+            path: The file; missing folders are created. `.npz`: arrays x, v, C, F, times and scene (C and F if the motion has them).
+                `.ply`: one point cloud per frame, `NAME_0000.ply`, `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; other
+                files of a series of that name are deleted. `.csv`: one row per frame and particle.
 
         Returns:
             The files that were written.
 
         Raises:
-            UserError: Another ending, or a place where nothing can be written.
+            UserError: Another extension, or a file that cannot be written.
         """
         path = Path(path)
         writers = {".npz": self._save_npz, ".ply": self._save_ply, ".csv": self._save_csv}

@@ -1,6 +1,6 @@
-"""Adapter for private parts of Warp and torch: packed launches, array descriptors, out-variants of activations.
+"""Adapter for private functions of Warp and torch: packed launches, array descriptors, activations that write into existing memory.
 
-They save time and change no result. With an untested version of either package a warning is given once and slower public calls are used.
+They save time and change no result. With an untested version of a package, this module warns once and uses slower public functions.
 """
 
 import ctypes
@@ -13,23 +13,23 @@ import warp as wp
 from torch import Tensor
 from torch.nn import functional
 
-TRIED = {"torch": ((2, 11), (2, 13)), "warp": ((1, 19), (1, 19))}
-"""First and last minor version of each package that the private parts were tested with."""
+TESTED = {"torch": ((2, 11), (2, 13)), "warp": ((1, 19), (1, 19))}
+"""First and last minor version of each package with which its private functions were tested."""
 
 
-def was_tried(package: str, version: str) -> bool:
-    """Return whether this version of a package is in `TRIED`, and warn in one line where it is not."""
+def is_tested(package: str, version: str) -> bool:
+    """Return whether a version of a package is in `TESTED`, and warn if it is not."""
     numbers = version.split("+")[0].split(".")[:2]
-    first, last = TRIED[package]
+    first, last = TESTED[package]
     if first <= tuple(int(n) if n.isdigit() else 0 for n in numbers) <= last:
         return True
     span = " to ".join(dict.fromkeys(".".join(map(str, v)) for v in (first, last)))
-    warnings.warn(f"{package} {version} was not tried (tried: {span}); neuido takes slower public calls in place of private ones",
+    warnings.warn(f"{package} {version} was not tested (tested: {span}); neuido uses slower public functions in place of private ones",
                   RuntimeWarning, stacklevel=2)  # fmt: skip
     return False
 
 
-TORCH_TRIED, WARP_TRIED = was_tried("torch", torch.__version__), was_tried("warp", wp.__version__)
+TORCH_TESTED, WARP_TESTED = is_tested("torch", torch.__version__), is_tested("warp", wp.__version__)
 
 
 # Warp.
@@ -47,7 +47,7 @@ def contract_products(kernel: wp.Kernel) -> None:
     part of the module's hash. Modules of other packages and modules with flags of their own are left unchanged.
     """
     module = kernel.module
-    if WARP_TRIED and kernel.func.__module__.startswith("neuido.") and module.options["cpu_compiler_flags"] is None:
+    if WARP_TESTED and kernel.func.__module__.startswith("neuido.") and module.options["cpu_compiler_flags"] is None:
         flags = wp.config.cpu_compiler_flags
         flags = "-march=native" if flags is None else flags
         wp.set_module_options({"cpu_compiler_flags": f"{flags} -ffp-contract=fast".strip()}, module=module)
@@ -55,16 +55,16 @@ def contract_products(kernel: wp.Kernel) -> None:
 
 def load(kernel: wp.Kernel, device: torch.device, block: int) -> None:
     """Load the code of a kernel ahead of its first launch, for `block` threads per block."""
-    if WARP_TRIED:
+    if WARP_TESTED:
         kernel.module.load(wp.device_from_torch(device), block)
 
 
 def describe_array(t: Tensor, dtype: type) -> Any:
     """Return Warp's descriptor of a tensor: address, shape and strides. It does not keep the tensor alive; the slower public call does."""
-    if not WARP_TRIED:
+    if not WARP_TESTED:
         return wp.from_torch(t.detach(), dtype=dtype, requires_grad=False)
     found = wp.from_torch(t.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-    found._ref = found._gradref = None  # Warp would hold the tensor's memory as long as the descriptor exists
+    found._ref = found._gradref = None  # else the descriptor would keep the tensor's memory alive
     return found
 
 
@@ -72,9 +72,9 @@ _layouts: dict[wp.Kernel, type[ctypes.Structure]] = {}
 
 
 class PackedLaunch:
-    """A CPU launch with packed arguments; Warp's own packing takes as long as the work of 500 particles.
+    """A launch on the CPU with packed arguments, since Warp's packing takes as long as the computation for 500 particles.
 
-    It does not hold its tensors. The caller must ensure that tensors at the same addresses are alive when it is launched again.
+    It does not keep its tensors alive. When it is launched again, there must be tensors at the same addresses.
 
     Args:
         kernel: The kernel.
@@ -98,12 +98,12 @@ class PackedLaunch:
 # torch.
 
 
-if TORCH_TRIED:
-    from torch.utils._python_dispatch import TorchDispatchMode as DispatchMode  # type: ignore[assignment]  # the stand-in below
+if TORCH_TESTED:
+    from torch.utils._python_dispatch import TorchDispatchMode as DispatchMode  # type: ignore[assignment]  # the replacement below
 else:
 
     class DispatchMode:
-        """Stand-in that intercepts no operation; `launches.LaunchRecordings` then repeats nothing."""
+        """Replacement that intercepts no operation; `launches.LaunchRecordings` then repeats nothing."""
 
         def __enter__(self) -> "DispatchMode":
             return self
@@ -114,7 +114,7 @@ else:
 
 def silu_into(x: Tensor, out: Tensor) -> None:
     """Write SiLU of x into `out`."""
-    if TORCH_TRIED:
+    if TORCH_TESTED:
         torch._C._nn.silu(x, out=out)
     else:
         out.copy_(functional.silu(x))
@@ -122,7 +122,7 @@ def silu_into(x: Tensor, out: Tensor) -> None:
 
 def silu_adjoint_into(grad: Tensor, x: Tensor, out: Tensor) -> None:
     """Write the adjoint of SiLU's input x into `out`, which may be `grad`."""
-    if TORCH_TRIED:
+    if TORCH_TESTED:
         torch.ops.aten.silu_backward.grad_input(grad, x, grad_input=out)
     else:
         s = torch.sigmoid(x)
@@ -131,7 +131,7 @@ def silu_adjoint_into(grad: Tensor, x: Tensor, out: Tensor) -> None:
 
 def gelu_into(x: Tensor, out: Tensor) -> None:
     """Write GELU of x into `out`."""
-    if TORCH_TRIED:
+    if TORCH_TESTED:
         torch._C._nn.gelu(x, out=out)
     else:
         out.copy_(functional.gelu(x))
@@ -139,7 +139,7 @@ def gelu_into(x: Tensor, out: Tensor) -> None:
 
 def gelu_adjoint_into(grad: Tensor, x: Tensor, out: Tensor) -> None:
     """Write the adjoint of GELU's input x into `out`, which may be `grad`."""
-    if TORCH_TRIED:
+    if TORCH_TESTED:
         torch.ops.aten.gelu_backward.grad_input(grad, x, approximate="none", grad_input=out)
     else:
         slope = 0.5 * (1 + torch.erf(x / 2**0.5)) + x * torch.exp(-0.5 * x * x) / (2 * torch.pi) ** 0.5

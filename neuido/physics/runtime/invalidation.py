@@ -1,4 +1,4 @@
-"""Rollouts of many scenes of which some may fail: the frames of those become NaN, and the others stay what they are."""
+"""Invalidation of the scenes that failed in a rollout of several scenes."""
 
 from collections.abc import Sequence
 
@@ -7,12 +7,12 @@ from torch import Tensor
 
 
 def invalidate(frames: Sequence[Tensor], failed: Tensor, scene: Tensor) -> None:
-    """Make all frames NaN of every scene in which a particle failed, in place.
+    """Set all frames of the scenes in which a particle failed to NaN, in place; other scenes are unchanged.
 
     Args:
-        frames: (K, P, ...) each.
-        failed: Which particles did, (P,) bool.
-        scene: Scene of each particle, (P,).
+        frames: Frames of each quantity, (K, P, ...).
+        failed: Which particles failed, (P,) bool.
+        scene: The scene of each particle, (P,).
     """
     scene = scene.long()
     broken = torch.zeros(int(scene.max()) + 1, dtype=torch.int32, device=scene.device).index_add_(0, scene, failed.int()) > 0

@@ -1,7 +1,7 @@
-"""Record and repeat kernel launches on the CPU, as a CUDA graph does on a GPU.
+"""Recording and repetition of kernel launches on the CPU, as a CUDA graph does on a GPU.
 
-Looking a launch up by its tensors takes as long as the work of some hundred particles. A sequence of launches is therefore recorded the
-first time it runs and repeated with the same memory afterwards, at the cost of one Python call each.
+The preparation of a launch takes as long as the computation for some hundred particles. A sequence of launches is therefore recorded when
+it first runs, and later repeated on the same memory at the cost of one Python call per launch.
 """
 
 import ctypes
@@ -82,14 +82,20 @@ class Recording(internals.DispatchMode):
 
 
 class LaunchRecordings:
-    """The recordings of one rollout, by a key that identifies the memory they use."""
+    """The recordings of one rollout; a key identifies the memory that each uses."""
 
     def __init__(self) -> None:
         self.recordings: dict[Hashable, Recording | None] = {}
 
     def run(self, key: Hashable, function: Callable[[], None], step: int = 0) -> None:
-        """Run a function of launches, or repeat its recording if it ran with this key before and did nothing but launch."""
-        if not internals.TORCH_TRIED:  # torch operations between the launches would go unnoticed
+        """Run a function that launches kernels, or repeat its recording.
+
+        Args:
+            key: Identifies the function and the memory that its launches use.
+            function: Called the first time, and each time if it runs anything but launches.
+            step: Number of the step, passed to the kernels that take one.
+        """
+        if not internals.TORCH_TESTED:  # torch operations between the launches would go unnoticed
             function()
             return
         if key not in self.recordings:

@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first used (PEP 562)."""
+"""Lazy import of the public names of a package (PEP 562)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
@@ -6,11 +6,11 @@ from typing import Any
 
 
 def lazy_names(package: str, modules: Mapping[str, Sequence[str]]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package.
+    """Return functions `__getattr__` and `__dir__` for a package whose names are imported at first use.
 
     Args:
-        package: Its name.
-        modules: Names by the module that they come from; a module without names is itself one.
+        package: Name of the package.
+        modules: The public names of each module; a module without names is itself public.
     """
     source = {name: module for module, names in modules.items() for name in names}
     own = {module.rpartition(".")[2]: module for module, names in modules.items() if not names}

@@ -1,4 +1,4 @@
-"""Threads for scenes on the CPU: Warp runs a kernel on one core there, and releases the GIL meanwhile."""
+"""One thread per scene on the CPU, where Warp runs a kernel on one core and releases the GIL meanwhile."""
 
 import os
 import threading
@@ -10,17 +10,17 @@ import torch
 
 _counting = threading.Lock()
 _inside: list[int] = []
-"""torch's number of threads before the first of the rollouts that run now, once for each."""
+"""The number of torch's threads before the first of the rollouts that are running, once for each rollout."""
 
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """torch's own threads would crowd those of the scenes, and cost more than they bring where matrices are small."""
+    """Open a context in which torch uses one thread, so that its threads do not compete with those of the scenes."""
     with _counting:
         if not _inside:
             _inside.append(torch.get_num_threads())
         else:
-            _inside.append(_inside[0])  # the number is the process's own: what another rollout lowered is not what it was before
+            _inside.append(_inside[0])  # the number belongs to the process, and another rollout may have lowered it already
         torch.set_num_threads(1)
     try:
         yield
@@ -31,5 +31,5 @@ def one_thread_each() -> Iterator[None]:
 
 
 def scene_pool() -> ThreadPoolExecutor:
-    """One worker for each core that this process may use."""
+    """Create a pool of threads for scenes, one for each core that this process may use."""
     return ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(), "scene")

@@ -1,6 +1,6 @@
-"""Masses joined by springs, differentiable (Zhong et al. 2024, Spring-Gaus): kernels with a hand adjoint, and the slow twin in torch.
+"""A differentiable mass-spring model (Spring-Gaus, Zhong et al. 2024).
 
-Unlike there a spring acts on both its ends, so that momentum is kept; there each mass has its own list of springs that pull at it alone.
+Here a spring acts on both of its ends, which conserves momentum. In Spring-Gaus each mass has a list of springs that pull at it alone.
 """
 
 import math
@@ -17,41 +17,41 @@ from neuido.physics.springs import spring_kernels
 from neuido.types import Scene, brief_fields
 
 SAFETY = 0.5
-"""Share of the largest stable step that a rollout takes at most."""
+"""Largest step of a rollout, relative to the largest stable step [-]."""
 
 BLOCK = 32
-"""Threads a block: masses are few, and more blocks fill more of a GPU."""
+"""Threads per block; small blocks, since the masses are few and more blocks use more of the GPU."""
 
 LANES = 32
-"""Threads that share the springs at a mass on a GPU."""
+"""Number of threads that share the springs of a mass on a GPU."""
 
 
 class Springs(NamedTuple):
     """N springs between A masses."""
 
     pairs: Tensor
-    """The two ends, the smaller index first, (N, 2) int64."""
+    """Masses at the two ends, the smaller index first, (N, 2) int64."""
     rest: Tensor
-    """Lengths at rest [m], (N,)."""
+    """Rest length [m], (N,)."""
     rank: Tensor
-    """Which neighbour one end is to the other, 0 the nearest; the lesser of the two, (N,) int64."""
+    """Rank of one end among the neighbours of the other, 0 for the nearest; the smaller of both directions, (N,) int64."""
 
     def __repr__(self) -> str:
         return brief_fields(self)
 
 
 def connect(x: Tensor, neighbours: int) -> Springs:
-    """Springs from each mass to its nearest neighbours, at rest as the masses stand.
+    """Connect each mass to its nearest neighbours by springs that are at rest at the given positions.
 
     Args:
         x: Positions [m], (A, 3).
-        neighbours: Neighbours k of each; a pair that both name is one spring.
+        neighbours: Number of neighbours of each mass; two masses that are neighbours of each other get one spring.
 
     Raises:
-        UserError: Fewer than two masses, or no neighbour asked for.
+        UserError: Fewer than two masses, or fewer than one neighbour.
     """
     if len(x) < 2 or neighbours < 1:
-        raise UserError(f"{len(x)} masses with {neighbours} neighbours each: springs need two masses and one neighbour at least")
+        raise UserError(f"{len(x)} masses with {neighbours} neighbours each; give at least two masses and one neighbour")
     points, k = x.detach().double(), min(neighbours, len(x) - 1)
     near = torch.cat([torch.cdist(part, points).topk(k + 1, largest=False).indices for part in points.split(2048)])
     own = torch.arange(len(x), device=x.device)[:, None].expand_as(near)
@@ -61,28 +61,28 @@ def connect(x: Tensor, neighbours: int) -> Springs:
     pairs, which = ends[other].sort(1).values.unique(dim=0, return_inverse=True)
     least = torch.full((len(pairs),), k, device=x.device).scatter_reduce(0, which, rank[other], "amin")
     length = (points[pairs[:, 1]] - points[pairs[:, 0]]).norm(dim=1)
-    apart = length > 1e-6 * length.mean()  # two masses in one place are joined by nothing
+    apart = length > 1e-6 * length.mean()  # no spring between two masses at one position
     return Springs(pairs[apart], length[apart], least[apart])
 
 
 class MassSpring:
-    """A body of masses and springs in a scene: its gravity, and its planes and walls as the ground.
+    """Simulate a body of masses and springs under the gravity and with the colliders of a scene.
 
     Args:
-        scene: Gravity, colliders and walls; friction is `grip` of the rollout in its place.
-        springs: Of `connect`.
-        mass: [kg], (A,).
-        power: p of the force (`spring_kernels`); Spring-Gaus: 0.5, Hooke: 0.
-        dtype: `torch.float32` for work, `torch.float64` for checks.
+        scene: Gravity, colliders and walls; their friction is replaced by `grip` of the rollout.
+        springs: The springs, from `connect`.
+        mass: Masses [kg], (A,).
+        power: Exponent p of the spring force (`spring_kernels`); Spring-Gaus: 0.5, Hooke: 0.
+        dtype: `torch.float32` for production, `torch.float64` for gradient checks.
 
     Raises:
-        UserError: A mass that is not positive, a power below zero.
+        UserError: A mass that is not positive, or a negative power.
     """
 
     def __init__(self, scene: Scene, springs: Springs, mass: Tensor, *, power: float = 0.5, dtype: torch.dtype = torch.float32):
         if not bool((mass > 0).all()) or power < 0:
             raise UserError(
-                f"mass-spring: the least mass is {float(mass.min()):g} kg and power {power}; needed above zero, and zero or more"
+                f"mass-spring: the least mass is {float(mass.min()):g} kg and power is {power}; give masses above 0, power >= 0"
             )
         self.device, self.power = mass.device, float(power)
         self.pairs, self.rest, self.mass = springs.pairs, springs.rest.to(dtype), mass.to(dtype).contiguous()
@@ -103,7 +103,18 @@ class MassSpring:
         return f"MassSpring({len(self.mass)} masses, {len(self.pairs)} springs, power {self.power:g}, {kind})"
 
     def substeps(self, stiffness: Tensor, damping: Tensor, dt: float) -> int:
-        """Return into how many steps dt [s] must be divided: `SAFETY` of what Gershgorin's bound on the frequencies and damping allow."""
+        """Return into how many stable steps a step must be divided.
+
+        The bound is `SAFETY` times the stable step for Gershgorin's bound of the frequencies and of the damping.
+
+        Args:
+            stiffness: k of each spring [N/m], (N,).
+            damping: c of each spring [N s/m], (N,).
+            dt: The step to divide [s].
+
+        Raises:
+            UserError: A stiffness or damping that is not finite.
+        """
         with torch.no_grad():
             both = torch.stack([stiffness, damping], 1).to(self.mass)
             sums = torch.zeros(len(self.mass), 2, dtype=both.dtype, device=self.device)
@@ -111,30 +122,30 @@ class MassSpring:
                 sums.index_add_(0, end, both)
             spring, loss = (2 * sums / self.mass[:, None]).amax(0).double().tolist()
         if not math.isfinite(spring + loss):
-            raise UserError("mass-spring: a stiffness or damping is not finite; lower the rates")
+            raise UserError("mass-spring: a stiffness or damping is not finite; lower the learning rate")
         limit = SAFETY * 2 / (spring**0.5 + loss + 1e-30)  # dt^2 w^2 + 2 dt c < 4 and a little less
         return max(1, math.ceil(dt / limit))
 
     def rollout(
         self, steps: int, dt: float, x: Tensor, v: Tensor, stiffness: Tensor, damping: Tensor, grip: Tensor, *, every: int = 1
     ) -> tuple[Tensor, Tensor]:
-        """Run `steps` steps; differentiable with respect to all tensors.
+        """Simulate `steps` steps; differentiable with respect to all tensors.
 
         Args:
-            steps: A multiple of `every`.
+            steps: Number of steps, a multiple of `every`.
             dt: Step [s].
-            x: Start [m], (A, 3).
-            v: Start [m/s], (A, 3).
+            x: Initial positions [m], (A, 3).
+            v: Initial velocities [m/s], (A, 3).
             stiffness: k of each spring [N/m], (N,).
             damping: c of each spring [N s/m], (N,).
-            grip: Share of the tangential velocity that a step in contact leaves [-], ().
-            every: Keep a frame every so many steps.
+            grip: Factor on the tangential velocity in each step of contact [-], ().
+            every: Steps between two frames.
 
         Returns:
-            Frames of x and v, (K, A, 3) each, K = steps / every + 1.
+            Frames of x [m] and v [m/s], (K, A, 3) each, K = steps / every + 1; frame 0 is the initial state.
 
         Raises:
-            UserError: The motion is not finite.
+            UserError: A motion that is not finite, or steps that are not a multiple of `every`.
         """
         if steps < 1 or every < 1 or steps % every:
             raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
@@ -145,14 +156,20 @@ class MassSpring:
         return xs[::every], vs[::every]
 
     def energy(self, x: Tensor, v: Tensor, stiffness: Tensor) -> Tensor:
-        """Kinetic, elastic (of Hooke's springs) and potential energy [J], of x and v (..., A, 3) -> (...)."""
+        """Return the sum of kinetic, elastic (Hooke's law) and potential energy [J], (...).
+
+        Args:
+            x: Positions [m], (..., A, 3).
+            v: Velocities [m/s], (..., A, 3).
+            stiffness: k of each spring [N/m], (N,).
+        """
         length = (x[..., self.pairs[:, 1], :] - x[..., self.pairs[:, 0], :]).norm(dim=-1)
         elastic = 0.5 * (stiffness * (length - self.rest).square()).sum(-1)
         height = (x * x.new_tensor(self.gravity)).sum(-1)
         return (self.mass * (0.5 * v.square().sum(-1) - height)).sum(-1) + elastic
 
     def reference_step(self, x: Tensor, v: Tensor, stiffness: Tensor, damping: Tensor, grip: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-        """One step in plain torch, the twin of the kernel; (A, 3) each."""
+        """Simulate one step in plain torch, for tests of the kernels; returns x and v, (A, 3) each."""
         i, j = self.pairs.T
         delta, speed = x[j] - x[i], v[j] - v[i]
         length = delta.norm(dim=1).clamp(min=spring_kernels.SHORTEST)
@@ -173,7 +190,7 @@ class MassSpring:
 
 
 class _Rollout(torch.autograd.Function):
-    """All x and v of a rollout, (steps + 1, A, 3) each."""
+    """Map the initial state and the parameters to x and v of every step, (steps + 1, A, 3) each."""
 
     @staticmethod
     def forward(ctx: Any, body: MassSpring, steps: int, dt: float, x: Tensor, v: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:

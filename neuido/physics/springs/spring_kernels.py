@@ -1,13 +1,13 @@
-"""Warp kernels of a mass-spring step and its adjoint.
+"""Warp kernels of a mass-spring step and of its adjoint.
 
-So many threads (`lanes`) share the springs at a mass, and another thread adds what they found, so that nothing is added atomically.
+Several threads (`lanes`) share the springs of a mass. Each writes its part of the force, and a second kernel adds the parts: no atomics.
 
 A spring between i and j with l = |x_j - x_i|, d = (x_j - x_i) / l and s = l / L - 1 pulls i by T d and j by -T d,
 
     T = k (l - L) (1 + |s|)^p + c (v_j - v_i) d        (Spring-Gaus, `compute_force`; p = 0: Hooke)
 
-The step is semi-implicit Euler: v* = v + dt (g + f / m), x* = x + dt v*; then contact: a mass inside a plane is put onto it, its velocity
-into the plane becomes zero, and the share `grip` of the tangential one is left (Spring-Gaus, `apply_bc`).
+The step is semi-implicit Euler: v* = v + dt (g + f / m), x* = x + dt v*. Then contact: a mass inside a plane is moved onto it, its velocity
+into the plane becomes zero, and its tangential velocity is multiplied by `grip` (Spring-Gaus, `apply_bc`).
 """
 
 import functools
@@ -20,16 +20,16 @@ from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
 SHORTEST = 1e-9
-"""Lower bound of a spring's length in a denominator [m]."""
+"""Lower bound of the length of a spring in a denominator [m]."""
 
 
 @cached
 def build(real: type) -> SimpleNamespace:
     """Return the kernels for `wp.float32` or `wp.float64`.
 
-    Springs come as lists: those of mass i stand at offsets[i]:offsets[i + 1] of `others` (the mass at the other end) and `springs` (which
-    spring it is); each spring stands in two lists. Thread t of `pull` and `pull_adjoint` takes every `lanes`-th spring of mass t / lanes.
-    `n` is the step; `frames` hold all of them.
+    The springs of mass i are the entries offsets[i]:offsets[i + 1] of `others` (mass at the other end) and `springs` (index of the
+    spring), so that each spring is listed twice. Thread t of `pull` and `pull_adjoint` takes every `lanes`-th spring of mass t / lanes.
+    `n` is the step, and x and v hold all steps.
     """
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
@@ -52,7 +52,7 @@ def build(real: type) -> SimpleNamespace:
 
     @func
     def touch(plane: vec4, kind: int, grip: real, x: vec3, v: vec3):
-        """Position and velocity after one plane."""
+        """Return position and velocity after contact with one plane."""
         n = normal_of(plane)
         depth = plane[3] - wp.dot(n, x)
         if kind != 0 and depth >= zero:
@@ -72,7 +72,7 @@ def build(real: type) -> SimpleNamespace:
         n: int, power: real, offsets: ints, others: ints, springs: ints, rest: reals, stiffness: reals, damping: reals, x: frames,
         v: frames, lanes: int, parts: vecs,
     ):  # fmt: skip
-        """Write a thread's part of the force on its mass."""
+        """Write the part of the force on a mass that one thread computes."""
         t = wp.tid()
         i = t // lanes
         force = vec3(zero, zero, zero)
@@ -110,7 +110,10 @@ def build(real: type) -> SimpleNamespace:
         n: int, dt: real, mass: reals, planes: planes_of, kinds: ints, grip: reals, x: frames, before: frames, g_x: vecs, g_v: vecs,
         g_force: vecs, g_grip: reals,
     ):  # fmt: skip
-        """Adjoints of the next x and v become those of these past the forces; writes that of the force, adds to a share of `grip`'s."""
+        """Propagate the adjoints of the next x and v back through contact and motion, in place.
+
+        Writes the adjoint of the force, and adds to the mass's part of the adjoint of `grip`.
+        """
         i = wp.tid()
         gx = g_x[i]
         gv = g_v[i]
@@ -147,7 +150,10 @@ def build(real: type) -> SimpleNamespace:
         n: int, power: real, offsets: ints, others: ints, springs: ints, rest: reals, stiffness: reals, damping: reals, x: frames,
         v: frames, g_force: vecs, lanes: int, parts_x: vecs, parts_v: vecs, g_stiffness: reals, g_damping: reals,
     ):  # fmt: skip
-        """Write a thread's part of the adjoints of x and v; from the end with the smaller index it adds to those of the springs."""
+        """Write the part of the adjoints of x and v that one thread computes.
+
+        The thread of the end with the smaller index adds to the adjoints of stiffness and damping.
+        """
         t = wp.tid()
         i = t // lanes
         gx = vec3(zero, zero, zero)
@@ -177,7 +183,7 @@ def build(real: type) -> SimpleNamespace:
 
     @kernel
     def gather(n: int, lanes: int, parts_x: vecs, parts_v: vecs, own_x: frames, own_v: frames, g_x: vecs, g_v: vecs):
-        """Add a mass's parts, and what reaches this frame itself, to the adjoints of x and v."""
+        """Add the parts of all threads of a mass, and the gradient of this frame, to the adjoints of x and v."""
         i = wp.tid()
         gx = g_x[i] + own_x[n, i]
         gv = g_v[i] + own_v[n, i]

@@ -199,7 +199,7 @@ def test_what_has_no_equilibrium_is_nan_alone():
         ("torsion", L, {}, "mode = 'torsion' is not known"),
         ("biaxial", L, {}, r"biaxial takes \(n, 2\)"),
         ("uniaxial", L - 1, {}, "stretches must be positive"),
-        ("uniaxial", L, {"time": torch.zeros(6)}, "time must rise"),
+        ("uniaxial", L, {"time": torch.zeros(6)}, "time must increase"),
         ("uniaxial", L, {"step": 0.0}, "step = 0.0 must be positive"),
     ],
 )

@@ -36,7 +36,7 @@ INPUTS = 16
 
 @cached
 def build(width: int) -> SimpleNamespace:
-    """Return the fused kernels for one hidden width."""
+    """Return the fused kernels for one hidden width, one of `WIDTHS`."""
     start_warp()
     tiles = width // 8
     kept = 8 * tiles + 4
@@ -202,7 +202,13 @@ def _fragments(W: Tensor) -> Tensor:
 
 
 class FusedEngine(Engine):
-    """The engine of an objective network with fused kernels; same interface and results as `Engine`."""
+    """The engine of an objective network with fused kernels; same interface and results as `Engine`.
+
+    Args:
+        law: The law.
+        tensors: Result of `law.tensors()`, in the dtype and on the device of the rollout.
+        particles: The scene of each particle.
+    """
 
     def __init__(self, law, tensors: Sequence[Tensor], particles: Particles):
         super().__init__(law, tensors, particles)

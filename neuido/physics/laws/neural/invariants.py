@@ -26,7 +26,13 @@ PLASTIC_SCALE = 1e-3
 
 
 class InvariantEngine(Engine):
-    """The engine of an invariant network, with its own buffers for the intermediate results and their adjoints."""
+    """The engine of an invariant network, with its own buffers for the intermediate results and their adjoints.
+
+    Args:
+        law: The law.
+        tensors: Result of `law.tensors()`, in the dtype and on the device of the rollout.
+        particles: The scene of each particle.
+    """
 
     def __init__(self, law: "_Invariant", tensors: Sequence[Tensor], particles: Particles):
         super().__init__(law, [t.detach() for t in tensors], particles)
@@ -165,9 +171,15 @@ class InvariantPlastic(_Invariant, PlasticLaw):
 
 
 def features(F: Tensor) -> Tensor:
-    """Compute the inputs of the network: sigma - 1, F^T F - I and det F - 1 of F (..., 3, 3), (..., 13).
+    """Compute the inputs of an invariant network: sigma - 1, F^T F - I and det F - 1.
 
     In the backward pass, equal singular values share the mean of their gradients.
+
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
+
+    Returns:
+        Features [-], (..., 13).
     """
     eye = torch.eye(3, dtype=F.dtype, device=F.device)
     sigma = linalg.frame(F).sigma

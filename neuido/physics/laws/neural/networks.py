@@ -46,7 +46,13 @@ STRAIN_SCALE = 1e-2
 
 
 def launch(kernel, like: Tensor, *arguments) -> None:
-    """Launch a kernel with one thread per row of `like`, on the device of `like` and torch's current stream."""
+    """Launch a kernel on torch's current stream.
+
+    Args:
+        kernel: The kernel.
+        like: A tensor on the device of the launch, with one row for each thread.
+        arguments: Arguments of the kernel.
+    """
     with torch_stream(like.device):
         device.launch(kernel, like.shape[0], arguments, like.device)
 
@@ -385,57 +391,12 @@ class ObjectivePlastic(_Objective, PlasticLaw):
 
 
 def raw_features(F: Tensor) -> Tensor:
-    """Compute the input 10 (F - I) of a raw network, (..., 9)."""
-    return RAW_GAIN * (F - torch.eye(3, dtype=F.dtype, device=F.device)).flatten(-2)
+    """Compute the input features 10 (F - I) of a raw network.
 
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
 
-# Stage I learns from given F: these functions differentiate with respect to the coefficients and not to F.
-
-
-class StressReadout(torch.autograd.Function):
-    """`isotropic_stress` by a Warp kernel, differentiable with respect to the coefficients c (B, 4) alone."""
-
-    @staticmethod
-    def forward(ctx, c: Tensor, F: Tensor, scale: float) -> Tensor:
-        out = torch.empty_like(F)
-        launch(kernels(F).stress, F, F, c.detach().contiguous(), scale, out)
-        ctx.save_for_backward(F)
-        ctx.scale = scale
-        return out
-
-    @staticmethod
-    def backward(ctx, grad: Tensor):
-        (F,) = ctx.saved_tensors
-        out = torch.empty(F.shape[0], network_kernels.STRESS_COEFFICIENTS, dtype=F.dtype, device=F.device)
-        launch(kernels(F).stress_coefficients_adjoint, F, F, ctx.scale, grad.contiguous(), out)
-        return out, None, None
-
-
-class CorrectionReadout(torch.autograd.Function):
-    """`return_map` by a Warp kernel, differentiable with respect to the coefficients c (B, 3) alone.
-
-    Where a clamp is active, the gradient is passed if descent moves the value back into the range; without that, a radius outside the
-    range would never learn. The gradient is zero if descent would move the value further out.
+    Returns:
+        Features [-], (..., 9).
     """
-
-    @staticmethod
-    def forward(ctx, c: Tensor, F: Tensor, scale: float) -> Tensor:
-        c, out = c.detach().contiguous(), torch.empty_like(F)
-        launch(kernels(F).correction, F, F, c, scale, out)
-        ctx.save_for_backward(F, c)
-        ctx.scale = scale
-        return out
-
-    @staticmethod
-    def backward(ctx, grad: Tensor):
-        F, c = ctx.saved_tensors
-        out = torch.empty_like(c)
-        launch(kernels(F).correction_coefficients_adjoint, F, F, c, ctx.scale, 1, grad.contiguous(), out)
-        return out, None, None
-
-
-def compute_strain_features(F: Tensor) -> Tensor:
-    """Compute `strain_features` of F (B, 3, 3) by a Warp kernel, (B, 9), without gradient."""
-    out = torch.empty(F.shape[0], network_kernels.FEATURES, dtype=F.dtype, device=F.device)
-    launch(kernels(F).features, F, F.detach().contiguous(), out)
-    return out
+    return RAW_GAIN * (F - torch.eye(3, dtype=F.dtype, device=F.device)).flatten(-2)

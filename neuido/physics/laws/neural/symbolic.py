@@ -32,7 +32,13 @@ FIRST = 6
 
 
 class SymbolicEngine(Engine):
-    """The engine of a symbolic law, with its own buffers."""
+    """The engine of a symbolic law, with its own buffers.
+
+    Args:
+        law: The law.
+        tensors: Result of `law.tensors()`, in the dtype and on the device of the rollout.
+        particles: The scene of each particle.
+    """
 
     def __init__(self, law: "_Symbolic", tensors: Sequence[Tensor], particles: Particles):
         super().__init__(law, [t.detach() for t in tensors], particles)
@@ -149,13 +155,27 @@ class SymbolicPlastic(_Symbolic, PlasticLaw):
 
 
 def polynomial(F: Tensor) -> Tensor:
-    """Evaluate the terms `TERMS` of F (..., 3, 3) in plain torch, (..., 7)."""
+    """Evaluate the terms of the polynomials in plain torch.
+
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
+
+    Returns:
+        Values of the terms in the order of `TERMS` [-], (..., 7).
+    """
     l, q, r = networks.strain_features(*networks.hencky_strain(F))[..., FIRST:].unbind(-1)
     return torch.stack([torch.ones_like(l), l, q, r, l * l, l * q, q * q], -1)
 
 
 def generators(F: Tensor) -> Tensor:
-    """Evaluate the generators `GENERATORS` of F (..., 3, 3) in plain torch, (..., 4, 3, 3)."""
+    """Evaluate the tensors that the polynomials multiply, in plain torch.
+
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
+
+    Returns:
+        The tensors in the order of `GENERATORS` [-], (..., 4, 3, 3).
+    """
     units = torch.eye(4, dtype=F.dtype, device=F.device)
     return torch.stack([networks.isotropic_stress(F, unit.expand(*F.shape[:-2], 4), 1.0) for unit in units], -3)
 

@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from neuido.errors import UserError
-from neuido.physics.laws.neural import network_kernels, networks
+from neuido.physics.laws.neural import network_kernels, networks, readouts
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 from neuido.types import Particles
 
@@ -216,11 +216,11 @@ def test_straight_through_gradient_enters_the_range_and_does_not_leave_it():
     F = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
     F[:, 0, 0], F[:, 1, 1] = 1.05, 0.95
     c = torch.tensor([[100.0, 0.0, 100.0], [-5.0, 0.0, 100.0]], dtype=F.dtype, requires_grad=True)  # radius too large; below zero
-    more = networks.CorrectionReadout.apply(c, F, networks.STRAIN_SCALE)  # f = 0 in the first row, 1 in the second
+    more = readouts.CorrectionReadout.apply(c, F, networks.STRAIN_SCALE)  # f = 0 in the first row, 1 in the second
     target = torch.stack([0.5 * (F[0] + torch.eye(3)), 0.5 * (F[1] + torch.eye(3))])
     (gradient,) = torch.autograd.grad((more - target).square().sum(), c)
     assert gradient[0, 0] > 0 and gradient[1, 0] < 0  # both radii are led back
-    (away,) = torch.autograd.grad(-(networks.CorrectionReadout.apply(c, F, networks.STRAIN_SCALE) - target).square().sum(), c)
+    (away,) = torch.autograd.grad(-(readouts.CorrectionReadout.apply(c, F, networks.STRAIN_SCALE) - target).square().sum(), c)
     assert away[0, 0] == 0 and away[1, 0] == 0
 
 

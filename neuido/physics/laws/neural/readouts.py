@@ -1,0 +1,63 @@
+"""Read-outs of objective networks for Stage I, which learns from given F: no gradient flows to F."""
+
+import torch
+from torch import Tensor
+
+from neuido.physics.laws.neural import network_kernels
+from neuido.physics.laws.neural.networks import kernels, launch
+
+
+class StressReadout(torch.autograd.Function):
+    """`isotropic_stress` by a Warp kernel, differentiable with respect to the coefficients c (B, 4) alone."""
+
+    @staticmethod
+    def forward(ctx, c: Tensor, F: Tensor, scale: float) -> Tensor:
+        out = torch.empty_like(F)
+        launch(kernels(F).stress, F, F, c.detach().contiguous(), scale, out)
+        ctx.save_for_backward(F)
+        ctx.scale = scale
+        return out
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        (F,) = ctx.saved_tensors
+        out = torch.empty(F.shape[0], network_kernels.STRESS_COEFFICIENTS, dtype=F.dtype, device=F.device)
+        launch(kernels(F).stress_coefficients_adjoint, F, F, ctx.scale, grad.contiguous(), out)
+        return out, None, None
+
+
+class CorrectionReadout(torch.autograd.Function):
+    """`return_map` by a Warp kernel, differentiable with respect to the coefficients c (B, 3) alone.
+
+    Where a clamp is active, the gradient is passed if descent moves the value back into the range; without that, a radius outside the
+    range would never learn. The gradient is zero if descent would move the value further out.
+    """
+
+    @staticmethod
+    def forward(ctx, c: Tensor, F: Tensor, scale: float) -> Tensor:
+        c, out = c.detach().contiguous(), torch.empty_like(F)
+        launch(kernels(F).correction, F, F, c, scale, out)
+        ctx.save_for_backward(F, c)
+        ctx.scale = scale
+        return out
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        F, c = ctx.saved_tensors
+        out = torch.empty_like(c)
+        launch(kernels(F).correction_coefficients_adjoint, F, F, c, ctx.scale, 1, grad.contiguous(), out)
+        return out, None, None
+
+
+def compute_strain_features(F: Tensor) -> Tensor:
+    """Compute the input features of an objective network by a Warp kernel, without gradient.
+
+    Args:
+        F: Deformation gradient [-], (B, 3, 3).
+
+    Returns:
+        The same as `strain_features` [-], (B, 9).
+    """
+    out = torch.empty(F.shape[0], network_kernels.FEATURES, dtype=F.dtype, device=F.device)
+    launch(kernels(F).features, F, F.detach().contiguous(), out)
+    return out
