@@ -4,13 +4,21 @@ The message of a `UserError` is one line: what is wrong, the value, and the opti
 """
 
 import argparse
+import difflib
 import errno
 import pickle
 import re
+from collections.abc import Iterable
 
 
 class UserError(ValueError):
     """Bad input. The command line prints the message as one line and exits with status 2."""
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """Return `, did you mean '…'?` for the known word closest to one that is not known, or nothing where none is close."""
+    close = difflib.get_close_matches(word, [str(each) for each in known], n=1, cutoff=0.6)
+    return f", did you mean '{close[0]}'?" if close else ""
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -50,7 +58,7 @@ def _line_of(error: BaseException) -> str | None:
         seen.append(cause)
         cause = cause.__cause__
     if isinstance(error, argparse.ArgumentError):
-        return _condense(str(error))
+        return condensed(error)
     if isinstance(error, OSError) and error.strerror is not None:
         own = [f"'{name}'" for name in (error.filename, error.filename2) if name is not None]
         what = f"{error.strerror}: {', '.join(own)}" if own else error.strerror
@@ -75,9 +83,9 @@ _NOISE = re.compile(  # lines of jsonargparse's messages without information for
 )
 
 
-def _condense(message: str) -> str:
-    """Condense jsonargparse's indented message to the key, the fault and the value."""
-    lines = [line.strip().removeprefix("- ") for line in message.splitlines()]
+def condensed(error: argparse.ArgumentError) -> str:
+    """Return jsonargparse's indented message as one line: the key, the fault and the value."""
+    lines = [line.strip().removeprefix("- ") for line in str(error).splitlines()]
     text = ": ".join(dict.fromkeys(line.rstrip(":") for line in lines if not _NOISE.match(line)))
     text = re.sub(r"Parser key \"([\w.]+)\"", r"--\1", text)
     text = re.sub(r"Problem with given class_path '(.+?)'", r"\1", text)

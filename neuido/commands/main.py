@@ -21,11 +21,11 @@ import neuido
 from neuido.commands import interruption
 from neuido.commands.cli.config_files import find_configs
 from neuido.commands.cli.functions import run_function
-from neuido.commands.cli.suggestions import refuse_abbreviations, suggest
+from neuido.commands.cli.suggestions import refuse_abbreviations
 from neuido.commands.cli.trainer import run_lightning
 from neuido.commands.cli.trainer_help import HEAVY, help_text, wants_help
 from neuido.commands.simulation.former_options import current_command
-from neuido.errors import UserError, one_line, shortened
+from neuido.errors import UserError, one_line, shortened, suggest
 
 LIGHT = {  # name: (module, function, one line for the list); the module must import torch only inside its functions
     "simulate": ("neuido.commands.simulation.simulate", "simulate", "Run a scene file and write its motion."),

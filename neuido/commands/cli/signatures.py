@@ -57,6 +57,8 @@ class Signature(NamedTuple):
     """Whether it takes options that its source does not name."""
     bases: tuple[str, ...]
     """The names of the classes that it is derived from, near ones first."""
+    former: tuple[str, ...] = ()
+    """Former names of options, which are still taken."""
 
 
 @functools.cache
@@ -84,7 +86,20 @@ def signature(path: str) -> Signature | None:
             if parent is not None:
                 options = {**{key: value for key, value in parent.options.items() if key not in options}, **options}
         takes_more = any(parent is None or parent.open for parent in parents) or (construct is not None and not _passes_on(construct))
-    return Signature(f"{module}.{node.name}", _first_line(node), options, takes_more, tuple(dict.fromkeys(names)))
+    return Signature(f"{module}.{node.name}", _first_line(node), options, takes_more, tuple(dict.fromkeys(names)), _former(node))
+
+
+def _former(node: ast.ClassDef) -> tuple[str, ...]:
+    """Return the names that `@renamed_options(old="new")` gives a class."""
+    calls = [each for each in node.decorator_list if isinstance(each, ast.Call) and ast.unparse(each.func) == "renamed_options"]
+    return tuple(keyword.arg for call in calls for keyword in call.keywords if keyword.arg)
+
+
+def names_of(module: str) -> list[str]:
+    """Return the names of classes, functions and imports at the top of a module; empty where its source is not found."""
+    tree = _source(module)
+    own = [node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)] if tree else []
+    return [*own, *_imports(module)]
 
 
 @functools.cache

@@ -1,13 +1,4 @@
-"""What a mistyped word on the command line may have meant."""
-
-import difflib
-from collections.abc import Iterable
-
-
-def suggest(word: str, known: Iterable[str]) -> str:
-    """Return `, did you mean '…'?` for the known word closest to one that is not known, or nothing where none is close."""
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return f", did you mean '{close[0]}'?" if close else ""
+"""Names on the command line must be whole."""
 
 
 def refuse_abbreviations() -> None:

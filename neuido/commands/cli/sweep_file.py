@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from neuido.data.files.yaml_files import located
 from neuido.errors import UserError
 
 KEYS = ("program", "command", "method", "metric", "parameters", "name", "description", "project", "entity", "run_cap", "early_terminate")
@@ -92,7 +93,7 @@ def read_sweep(path: str | os.PathLike) -> SweepFile:
     try:
         return _parse(content, path.stem)
     except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+        raise located(path, error) from error
 
 
 def _parse(content: Any, name: str) -> SweepFile:

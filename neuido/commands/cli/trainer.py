@@ -7,6 +7,7 @@ import functools
 import importlib
 import os
 import zipfile
+from argparse import ArgumentError
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,20 +15,36 @@ import neuido
 from neuido.commands import interruption
 from neuido.commands.cli.config_files import expanded
 from neuido.commands.cli.console import quiet_lightning
+from neuido.commands.cli.mistakes import check_configurations
 from neuido.commands.cli.plain_progress import needs_plain_lines, plain_progress
 from neuido.commands.cli.signatures import MODULES
 from neuido.commands.cli.trainer_help import HEAVY
+from neuido.commands.cli.wrong_values import explained, placed, type_in_configuration
 from neuido.data.files.renamed_options import rename_in_arguments, rename_in_configuration
 from neuido.data.files.sweep_run import own_folder, redirect
-from neuido.errors import UserError
+from neuido.errors import UserError, condensed
 
 if TYPE_CHECKING:
+    from lightning.pytorch import Trainer
     from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 
 def run_lightning(args: list[str]) -> "LightningCLI":
     """Run a command of the trainer; the model, the data module and the trainer are attributes of what it returns."""
+    args = list(args)
+    trust = "--trust" in args
+    args = [word for word in args if word != "--trust"]
+    check_configurations(args, trust=trust)
     quiet_lightning()
+    try:
+        return _run(args)
+    except ArgumentError as error:
+        raise UserError(explained(condensed(error), args, type_in_configuration(args))) from error
+    except UserError as error:
+        raise UserError(placed(str(error), args)) from error
+
+
+def _run(args: list[str]) -> "LightningCLI":
     return _cli_class()(args=rename_in_arguments(expanded(args), "model.method", MODULES), **_settings())
 
 
@@ -93,6 +110,14 @@ def _cli_class() -> type["LightningCLI"]:
                 numbers = _numbers_of(options["ckpt_path"], options.model.class_path)
                 model = {"class_path": options.model.class_path, "init_args": numbers}
                 self.config = self.parser.parse_object({self.config.subcommand: {"model": model}}, self.config)
+
+        def instantiate_trainer(self, **options: Any) -> "Trainer":
+            try:
+                return super().instantiate_trainer(**options)
+            except (ValueError, TypeError) as error:
+                if isinstance(error, UserError):
+                    raise
+                raise UserError(f"trainer: {' '.join(str(error).split())}") from error
 
         def before_instantiate_classes(self) -> None:
             # Lightning loads a remote checkpoint with pickle unless told otherwise; here that takes an explicit `--weights_only false`.

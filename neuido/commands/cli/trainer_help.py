@@ -10,9 +10,8 @@ from typing import Any
 
 from neuido.commands.cli.config_files import given_configs
 from neuido.commands.cli.signatures import TRAINER, Option, Signature, class_named, classes, signature, yaml_word
-from neuido.commands.cli.suggestions import suggest
 from neuido.data.files.yaml_files import merged, read_configuration
-from neuido.errors import UserError
+from neuido.errors import UserError, suggest
 
 WIDTH, COLUMN = 120, 34
 HEAVY = {

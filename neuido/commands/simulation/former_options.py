@@ -100,7 +100,7 @@ def _given(args: list[str]) -> set[str]:
 
 def _configurations(args: list[str]) -> list[tuple[int, str, dict[str, Any]]]:
     """Return place, prefix and content of each configuration on a command line; one that cannot be read is left to its parser."""
-    from neuido.data.files.parsing import read_yaml
+    from neuido.data.files.yaml_files import read_configuration
 
     found = []
     for i, (before, word) in enumerate(zip(["", *args], args, strict=False)):
@@ -108,7 +108,7 @@ def _configurations(args: list[str]) -> list[tuple[int, str, dict[str, Any]]]:
         if prefix and not word.startswith(prefix):
             continue
         try:
-            content = read_yaml(word.removeprefix(prefix))
+            content = read_configuration(word.removeprefix(prefix))
         except (UserError, OSError):
             continue
         if isinstance(content, dict):

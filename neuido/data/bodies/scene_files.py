@@ -4,6 +4,7 @@
 (`neuido-experiment/1`), with `scene.walls` added. A scene file also has `name`, `source`, `body` and `steps`.
 """
 
+import inspect
 import math
 import os
 from collections.abc import Mapping
@@ -16,7 +17,8 @@ import torch
 from neuido.data.bodies import shapes
 from neuido.data.files.parsing import check_limit, read_arrays, read_yaml
 from neuido.data.files.values import check_keys, mapping, number, path_inside, vector
-from neuido.errors import UserError
+from neuido.data.files.yaml_files import located
+from neuido.errors import UserError, suggest
 from neuido.physics.laws.classical import material
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
 
@@ -72,7 +74,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
     """
     path = Path(name) if str(name).endswith((".yaml", ".yml")) else scenes_folder() / f"{name}.yaml"
     if not path.is_file():
-        known = "" if path.parent != scenes_folder() else f"; known scenes: {', '.join(scene_names())}"
+        known = "" if path.parent != scenes_folder() else f"{suggest(str(name), scene_names())}; known scenes: {', '.join(scene_names())}"
         raise UserError(f"the scene file {path} is missing{known}")
     content = read_yaml(path)
     try:
@@ -95,7 +97,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         if outside.any():
             raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain: enlarge the domain or move the body")
     except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+        raise located(path, error) from error
     info = {"name": content["name"], "source": content.get("source", ""), "steps": steps, "on_inversion": on_inversion, **model}
     return SceneSetup(scene, body, info)
 
@@ -203,20 +205,38 @@ def body_from_dict(given: Any, root: str | os.PathLike | None) -> Body:
     makers = {"cube": shapes.cube, "box": shapes.box, "ball": shapes.ball, "cylinder": shapes.cylinder}
     if "shape" in given:
         options = {key: value for key, value in given.items() if key != "shape"}
-        maker = makers.get(given["shape"])
+        maker = makers.get(given["shape"]) if isinstance(given["shape"], str) else None
         if maker is None:
-            raise UserError(f"body.shape = {given['shape']!r} is unknown: choose from {', '.join(makers)}")
+            close = suggest(str(given["shape"]), makers) or ":"
+            raise UserError(f"body.shape = {given['shape']!r} is unknown{close} choose from {', '.join(makers)}")
         unknown = set(options) - set(maker.__kwdefaults__ or {}) - set(maker.__annotations__)
         if unknown:
-            raise UserError(
-                f"unknown key {sorted(unknown)[0]!r} in body; it takes shape, {', '.join(sorted(set(maker.__annotations__) - {'return'}))}"
-            )
-        try:
-            return maker(**options)
-        except TypeError as error:
-            raise UserError(f"body: {error}") from error
+            known = ("shape", *inspect.signature(maker).parameters)
+            wrong = sorted(unknown)[0]
+            raise UserError(f"unknown key {wrong!r} in body{suggest(str(wrong), known) or ';'} it takes {', '.join(known)}")
+        for key, parameter in inspect.signature(maker).parameters.items():
+            if key not in options and parameter.default is inspect.Parameter.empty:
+                raise UserError(f"body lacks the key {key!r}, which a {given['shape']} needs")
+            if key in options:
+                options[key] = _shape_option(options[key], f"body.{key}", parameter.annotation)
+        return maker(**options)
     check_keys(given, "body", ("particles",))
     return _particles(str(given["particles"]), data_root(root))
+
+
+def _shape_option(value: Any, where: str, kind: Any) -> Any:
+    """Return an option of a shape, checked against the type that its function declares."""
+    if kind is float:
+        return number(value, where)
+    if kind is int:
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise UserError(f"{where} must be a whole number, got {value!r}")
+        return value
+    if kind is str:
+        if not isinstance(value, str):
+            raise UserError(f"{where} must be text, got {value!r}")
+        return value
+    return vector(value, where)
 
 
 def _particles(relative: str, root: Path) -> Body:

@@ -145,6 +145,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
             loader.dispose()
     except UserError:
         raise
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
+        what = ", ".join(filter(None, (error.context, error.problem)))
+        raise UserError(f"{path}:{line}: it is not valid YAML: {what} (line {line}, column {column})") from error
     except Exception as error:  # YAMLError; ValueError of a date or a huge integer; RecursionError; TypeError of a key
         raise UserError(f"{path} is not valid YAML: {one_line(error)}") from error
     if not isinstance(content, dict):

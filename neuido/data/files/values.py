@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from neuido.errors import UserError
+from neuido.errors import UserError, suggest
 from neuido.types import Vector
 
 
@@ -52,7 +52,8 @@ def check_keys(value: Any, where: str, allowed: tuple[str, ...], optional: tuple
     value = mapping(value, where)
     for key in value:
         if key not in allowed:
-            raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(allowed)}")
+            close = suggest(str(key), allowed) or ";"
+            raise UserError(f"unknown key {key!r} in {where}{close} it takes {', '.join(allowed)}")
     for key in allowed:
         if key not in value and key not in optional:
             raise UserError(f"{where} lacks the key {key!r}")

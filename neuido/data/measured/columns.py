@@ -10,6 +10,7 @@ import numpy as np
 from neuido.data.files.delimited import is_number, read_delimited
 from neuido.data.files.parsing import read_yaml
 from neuido.data.files.values import check_keys, mapping, number, path_inside
+from neuido.data.files.yaml_files import located
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY, Effects
 
@@ -41,7 +42,7 @@ def errors_of(file: Path) -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        raise UserError(f"{file}: {error}") from error
+        raise located(file, error) from error
     except OverflowError as error:
         raise UserError(f"{file}: a number is too large: {error}") from error
 

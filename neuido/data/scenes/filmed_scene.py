@@ -33,6 +33,7 @@ from neuido.data.bodies import scene_files as scenes
 from neuido.data.files.parsing import read_arrays, read_yaml
 from neuido.data.files.storage import write_text
 from neuido.data.files.values import check_keys, mapping, number, vector
+from neuido.data.files.yaml_files import located
 from neuido.data.measured.experiment import read_experiment, scene_to_dict
 from neuido.data.scenes.multiview import UP, SceneViews
 from neuido.data.scenes.readers import read
@@ -227,7 +228,7 @@ def read_setting(path: Path, *, recording: str | None = None) -> SceneSetting:
         scale = number(given["scale"], "placing.scale", above=0.0)
         placing = Placement(scale, vector(given["shift"], "placing.shift"), given["up"])
     except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+        raise located(path, error) from error
     return SceneSetting(str(content["name"]), scene, model["density"], model, placing)
 
 
@@ -256,7 +257,7 @@ def read_motion(folder: Path) -> Motion | None:
             raise UserError(f"format is {content['format']!r}, not {MOTION!r}")
         vectors = {key: vector(value, key) for key, value in content.items() if key != "format"}
     except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+        raise located(path, error) from error
     return Motion(**vectors)
 
 

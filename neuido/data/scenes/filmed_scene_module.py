@@ -15,7 +15,7 @@ from neuido.data.bodies.scene_files import VARIABLE, data_root
 from neuido.data.sampling import ResumableLoader
 from neuido.data.scenes.filmed_scene import VisualScene, load_visual_scene
 from neuido.data.scenes.known_body import load_known_body
-from neuido.errors import UserError
+from neuido.errors import UserError, suggest
 from neuido.types import MultiViewBatch
 
 KEYS = {
@@ -219,7 +219,7 @@ class VisualDataModule(LightningDataModule):
         known = ("path", "body", *KEYS[body])
         for key in options:
             if key not in known:
-                raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(known)}")
+                raise UserError(f"unknown key {key!r} in {where}{suggest(str(key), known) or ';'} it takes {', '.join(known)}")
         path = self._find(Path(options.pop("path")).expanduser())
         if body == "reconstruction" and "reconstruction" not in options and self.reconstructions is not None:
             options["reconstruction"] = Path(self.reconstructions) / path.resolve().name

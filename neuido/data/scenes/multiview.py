@@ -18,7 +18,7 @@ from neuido.data.files.values import number
 from neuido.data.formats.layout import SAME_SHAPE, MultiView, read_matrix
 from neuido.data.scenes.masks import mask_channel, mask_from_empty, mask_on_plain_background, rim_colour
 from neuido.data.scenes.readers import read
-from neuido.errors import UserError
+from neuido.errors import UserError, suggest
 from neuido.types import Cameras, MultiViewBatch, Vector
 
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
@@ -334,7 +334,7 @@ class MultiViewDataModule(LightningDataModule):
         known = ("path", "format", "recording", "frame_interval", "views", "held_out_views", "scale", "shift", "up")
         for key in options:
             if key not in known:
-                raise UserError(f"unknown key {key!r} in {where}; it takes {', '.join(known)}")
+                raise UserError(f"unknown key {key!r} in {where}{suggest(str(key), known) or ';'} it takes {', '.join(known)}")
         reading = {key: options.pop(key) for key in known[:4] if key in options}
         try:
             return SceneViews(read(reading.pop("path"), reading.pop("format", "auto"), **reading), **self.options, **options)

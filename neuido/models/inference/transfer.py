@@ -24,6 +24,7 @@ from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.files.parsing import read_yaml
 from neuido.data.files.score_tables import folder_of
 from neuido.data.files.values import check_keys, vector
+from neuido.data.files.yaml_files import located
 from neuido.errors import UserError
 from neuido.models.inference.outputs import contact_sheet, write_plys, write_video
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
@@ -81,7 +82,7 @@ def read_conditions(path: str | os.PathLike) -> Condition:
             raise UserError(f"bodies must be a list of at least one body, got {given!r}")
         bodies = tuple(_body(entry, f"bodies[{i}]") for i, entry in enumerate(given))
     except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+        raise located(path, error) from error
     return Condition(str(content["name"]), bodies, frames)
 
 

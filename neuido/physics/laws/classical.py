@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuido.errors import UserError
+from neuido.errors import UserError, suggest
 from neuido.physics.laws import classical_kernels
 from neuido.physics.laws.base import AutogradElastic, AutogradLaw, AutogradPlastic, ElasticLaw, Law, Parameter, PlasticLaw
 from neuido.physics.laws.parametric import ParametricLaw, checked_parameters, lame
@@ -294,7 +294,7 @@ _PLASTIC = {"identity": (Identity, ()), "von_mises": (VonMises, ("yield_stress",
 def _named(section: str, given: Mapping[str, Any], laws: dict, common: tuple[str, ...]) -> tuple[type, dict[str, Any]]:
     name = given.get("law")
     if not isinstance(name, str) or name not in laws:
-        raise UserError(f"{section}.law = {name!r} is not known; choose one of {', '.join(laws)}")
+        raise UserError(f"{section}.law = {name!r} is not known{suggest(str(name), laws) or ';'} choose one of {', '.join(laws)}")
     law, own = laws[name]
     accepted = (*common, *own)
     for key in given:
