@@ -95,12 +95,16 @@ def diagnose(
         problems = problems_of(kind, place, model, chosen, law=law, data=data)
     names = effects if effects is None or isinstance(effects, str) else ",".join(effects)
     problems = [restricted(solved_by(p, solver), names) for p in problems]
+    for problem in problems:
+        if problem.margin({}, problem.solvers[0]) < 0.0:  # refused before anything is written
+            raise UserError(problem.refusal(problem.solvers[0]))
     temporary = tempfile.TemporaryDirectory(prefix="neuido-diagnosis-") if out is None else None
     target = Path(temporary.name if temporary else out or "").expanduser()
     given = {"model": _content(model), "law": _content(law)}
     options = {"effects": names, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": store.code_digest(), "data": data}
     options |= given | {"solver": solver}
     plan = "read-data" if folder is None else store.plan_of(place, options, out=target)
+    made, untouched = not target.is_dir(), not target.is_dir() or not any(target.iterdir())
     target.mkdir(parents=True, exist_ok=True)
     resumes = resume and folder is not None
     outdated = store.outdated(target, plan) if resumes else []
@@ -117,7 +121,13 @@ def diagnose(
             log.name = problem.name if len(problems) > 1 else ""
             log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
             seconds = 60.0 * minutes or math.inf
-            found.append((infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds), time.monotonic() - started))
+            try:
+                own = infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds)
+            except UserError:
+                if untouched:
+                    _forget(target, made)
+                raise
+            found.append((own, time.monotonic() - started))
         log.name = ""
         answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
         if not any(own.left_out or own.deadline.cut for own, _ in found):  # otherwise a run with more minutes continues from what is kept
@@ -126,6 +136,16 @@ def diagnose(
             log.work(own.work)
         log("written")
     return Diagnosis.read(target, keep=temporary)
+
+
+def _forget(target: Path, made: bool) -> None:
+    """Remove what a diagnosis that is refused has written; `made`: the folder too, where it holds nothing else."""
+    from neuido.discrepancy import store
+
+    store.clear(target)
+    (target / "log.csv").unlink(missing_ok=True)
+    if made and not any(target.iterdir()):
+        target.rmdir()
 
 
 def _content(given: str | os.PathLike | Mapping[str, Any] | None) -> str | None:

@@ -277,6 +277,8 @@ def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
     outside = ((arrays["x0"] < lower) | (arrays["x0"] > upper)).any(axis=1)
     if outside.any():
         raise UserError(f"{path}: {outside.sum()} particles of x0 lie outside scene.domain")
+    if not np.ptp(arrays["x0"], axis=0).any():
+        raise UserError(f"{path}: x0 has {len(arrays['x0'])} particles in one place, which are no body: give more, or a track of a point")
     if not (arrays["volume"] > 0).all():
         raise UserError(f"{path}: volume must be positive, got {arrays['volume'].min():g} m^3")
     if arrays["volume"].sum(dtype=np.float64) > np.prod(upper - lower):

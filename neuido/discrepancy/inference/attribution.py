@@ -199,6 +199,10 @@ def diagnose(
     tried: list[Inference] = []
     starts: list[Stand] = []
     for n in problem.solvers:
+        if problem.margin({}, n) < 0.0:
+            if starts:
+                continue
+            raise UserError(problem.refusal(n))
         inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo, deadline=deadline)
         if starts and (tried[-1].is_settled(starts[-1].errors) or deadline.skips(problem.setting_name(n))):
             continue

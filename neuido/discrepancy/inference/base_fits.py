@@ -8,7 +8,7 @@ import numpy as np
 
 from neuido.discrepancy.inference.floors import Floor, Stand
 from neuido.discrepancy.inference.laboratory import ROUGH, Laboratory
-from neuido.discrepancy.inference.least_squares import Fit
+from neuido.discrepancy.inference.least_squares import Fit, NotFinite
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 from neuido.errors import UserError
 
@@ -107,7 +107,9 @@ class BaseFits(Laboratory):
             fit = self.base(begins, self.noise(), iterations=6, tolerance=ROUGH)
         if fit.setting != self.own and not self.runs(fit.point):
             fit = self.base(begins, self.noise(), iterations=6, tolerance=ROUGH)
-        if near is not None and not self.runs(fit.point):
+        if not self.runs(fit.point):
+            if near is None:
+                raise NotFinite("the declared model has no finite prediction")
             return None
         if self.problem.settings == 1:
             floor = self.floor(fit.point)

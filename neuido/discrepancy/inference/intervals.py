@@ -72,8 +72,9 @@ def _first_order(laboratory: BaseFits, parameters: Sequence[Parameter], fit: Fit
     whiten, recordings = floor.whitener(laboratory.parts), laboratory.fitted_recordings
     slopes = laboratory.slopes(parameters, fit.point, recordings, step=0.1)
     J = np.concatenate([whiten(slopes[n], n) for n in recordings])
-    gain = np.linalg.pinv(J)
-    gain[~J.any(axis=0)] = np.inf
+    known = np.isfinite(J).all(axis=0)  # beside a point where the model just runs it may not: then nothing is known of the parameter
+    gain = np.linalg.pinv(np.where(known, J, 0.0))
+    gain[~(known & J.any(axis=0))] = np.inf
     left = np.concatenate([whiten(laboratory.residual(fit.point, n), n) for n in recordings])
     return np.sum(gain**2, axis=1) * float(np.mean(left**2))
 

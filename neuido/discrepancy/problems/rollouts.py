@@ -86,15 +86,16 @@ class BodyRollouts(Problem):
     def refusal(self, setting: int) -> str:
         margin, line = self.margin({}, setting), self._strict(setting)
         if -math.inf < margin < 0.0:
-            dt, moduli = 0.9 * math.exp(margin), 0.8 * math.exp(2.0 * margin)
-            line += f"; it would run with discretisation.dt times {dt:.2g}, or with its moduli over its density times {moduli:.2g}"
+            line += f"; it would run with discretisation.dt times {0.9 * math.exp(margin):.2g}"
+            if "stiffness" in line:
+                line += f", or with its moduli over its density times {0.8 * math.exp(2.0 * margin):.2g}"
         return f"the declared model cannot run: {line}"
 
     def _strict(self, setting: int) -> str:
         """Why the declared model's motion is not finite, in the words of its simulator."""
         for n in range(len(self.measured)):
             simulator = self._made([n], setting, 1, "cpu")
-            _, steps, every = substeps(self.measured[n], simulator.scenes[0].dt)
+            every, steps, _ = substeps(self.measured[n], simulator.scenes[0].dt)
             full = [self._full({})]
             try:
                 simulator.rollout(steps, *self.laws(full), effects=self._effects(simulator, full, [n], ()), every=every)

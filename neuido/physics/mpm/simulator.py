@@ -145,7 +145,12 @@ class Simulator:
         """
         given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
         limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
-        return min(min(limit) / scene.dt for limit, scene in zip(limits, self.scenes))
+        crossing = [scene.dx / max(self._speed(s), 1e-30) for s, scene in enumerate(self.scenes)]
+        return min(min(*limit, own) / scene.dt for limit, own, scene in zip(limits, crossing, self.scenes))
+
+    def _speed(self, s: int) -> float:
+        """Return the largest initial speed of the body of scene s [m/s]."""
+        return float(self.state.v[self.particles.offsets[s] : self.particles.offsets[s + 1]].norm(dim=1).max())
 
     def check_step(
         self,
@@ -178,7 +183,6 @@ class Simulator:
         for s, limit in enumerate(self.step_limits(elasticity, viscosity, mass, stiffer)):
             why = ""
             scene = self.scenes[s]
-            own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
             if scene.dt > limit.of_waves:
                 wave = COURANT_LIMIT * scene.dx / limit.of_waves
                 why = (f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_waves:.3g} s of a wave of {wave:.4g} m/s on "
@@ -188,7 +192,7 @@ class Simulator:
                 eta = float(viscosity[s, 0].detach())
                 why = (f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_viscosity:.3g} s of a shear viscosity of "
                        f"{eta:.3g} and a bulk viscosity of {bulk:.3g} Pa s; lower `dt` or the viscosity")  # fmt: skip
-            elif (speed := float(self.state.v[own].norm(dim=1).max())) * scene.dt >= scene.dx:
+            elif (speed := self._speed(s)) * scene.dt >= scene.dx:
                 why = (f"the body of scene {s} starts with {speed:.4g} m/s and crosses a cell of {scene.dx:.4g} m in a step of "
                        f"{scene.dt:g} s; lower `dt`")  # fmt: skip
             out.append(why)
