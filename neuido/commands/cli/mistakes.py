@@ -72,7 +72,7 @@ def check_configurations(args: list[str], *, trust: bool = False) -> None:
 
 
 def _top(command: str) -> list[str]:
-    return [name.removeprefix("--") for name in (*COMMON, *BY_COMMAND[command]) if name not in ("--config", "--print_config")]
+    return [name.removeprefix("--") for name in (*COMMON, *BY_COMMAND[command]) if name not in ("--config", "--print_config", "--trust")]
 
 
 def _check_file(file: _File, command: str) -> None:
@@ -155,6 +155,8 @@ def check_trust(path: Path, content: Any, keys: Keys = ()) -> None:
     """
     if isinstance(content, list):
         for i, part in enumerate(content):
+            if isinstance(part, str) and _is_import(str(keys[-1]) if keys else "", part):
+                _check_name(path, str(keys[-1]), part, (*keys, i))
             check_trust(path, part, (*keys, i))
     if not isinstance(content, Mapping):
         return
@@ -235,7 +237,7 @@ def _short(name: Any) -> str:
 def _check_words(args: list[str], content: Mapping[str, Any], *, trust: bool) -> None:
     """Check the names of the options of a command line, and of the classes that they give."""
     known = ["c", "config", "print_config", "h", "help", "model", "data", "trainer", *_top(args[0])]
-    for name, value in _given_options(args):
+    for name, value in given_options(args):
         first, *rest = name.removesuffix("+").split(".")
         if name.endswith(".help"):
             continue
@@ -255,7 +257,7 @@ def _check_words(args: list[str], content: Mapping[str, Any], *, trust: bool) ->
             _check_word(name, rest, first, content.get(first), value or "")
 
 
-def _given_options(args: list[str]) -> Iterator[tuple[str, str | None]]:
+def given_options(args: list[str]) -> Iterator[tuple[str, str | None]]:
     """Yield the name and the value of each option of a command line.
 
     Raises:

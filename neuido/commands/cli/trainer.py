@@ -6,13 +6,15 @@ YAML gives `class_path` and `init_args` of the model and the data module.
 import functools
 import importlib
 import os
-import zipfile
 from argparse import ArgumentError
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import neuido
 from neuido.commands import interruption
+from neuido.commands.cli.checkpoint_options import check_checkpoint, does_not_fit, numbers_of, stated_options, tell_differences
 from neuido.commands.cli.config_files import expanded
 from neuido.commands.cli.console import quiet_lightning
 from neuido.commands.cli.mistakes import check_configurations
@@ -45,7 +47,13 @@ def run_lightning(args: list[str]) -> "LightningCLI":
 
 
 def _run(args: list[str]) -> "LightningCLI":
-    return _cli_class()(args=rename_in_arguments(expanded(args), "model.method", MODULES), **_settings())
+    words = rename_in_arguments(expanded(args), "model.method", MODULES)
+    try:
+        return _cli_class()(args=words, stated=stated_options(args), **_settings())
+    except RuntimeError as error:
+        if str(error).startswith("Error(s) in loading state_dict"):
+            raise does_not_fit(error, args) from error
+        raise
 
 
 def trainer_parser() -> "LightningArgumentParser":
@@ -97,18 +105,21 @@ def _cli_class() -> type["LightningCLI"]:
                 super().setup(trainer, pl_module, stage)
 
     class NeuidoCLI(LightningCLI):
-        def __init__(self, **settings: Any):
+        def __init__(self, stated: Mapping[str, str] = MappingProxyType({}), **settings: Any):
+            self.stated = stated
             super().__init__(save_config_callback=BesideTheLog, **settings)
 
         def add_arguments_to_parser(self, parser: "LightningArgumentParser") -> None:
             parser.link_arguments("data.trajectory_count", "model.init_args.trajectory_count", apply_on="instantiate")
 
         def _parse_ckpt_path(self) -> None:  # Lightning reads the hyperparameters of the checkpoint here
-            _check_checkpoint(self.config[self.config.subcommand].get("ckpt_path"))
+            check_checkpoint(self.config[self.config.subcommand].get("ckpt_path"))
             options = self.config[self.config.subcommand]
             if options.get("ckpt_path") and Path(options["ckpt_path"]).is_file():
-                numbers = _numbers_of(options["ckpt_path"], options.model.class_path)
-                model = {"class_path": options.model.class_path, "init_args": numbers}
+                numbers = numbers_of(options["ckpt_path"], options.model.class_path)
+                tell_differences(options["ckpt_path"], numbers, options.model.init_args, self.stated)
+                taken = {name: value for name, value in numbers.items() if name not in self.stated}
+                model = {"class_path": options.model.class_path, "init_args": taken}
                 self.config = self.parser.parse_object({self.config.subcommand: {"model": model}}, self.config)
 
         def instantiate_trainer(self, **options: Any) -> "Trainer":
@@ -145,30 +156,3 @@ def _load_former_names() -> None:
 
     load = get_loader("yaml")
     set_loader("yaml", lambda text: rename_in_configuration(load(text)), (yaml.YAMLError,))
-
-
-def _numbers_of(checkpoint: str, class_path: str) -> dict[str, Any]:
-    """Return the hyperparameters of a checkpoint that are numbers. What could be a path, a module or a class comes from the user alone.
-
-    Raises:
-        UserError: The checkpoint is of another class.
-    """
-    import torch
-
-    found = torch.load(checkpoint, weights_only=True, map_location="cpu")
-    found = found.get("hyper_parameters") if isinstance(found, dict) else None
-    if not isinstance(found, dict):
-        return {}
-    name = found.get("_class_path", class_path)
-    if str(name).rpartition(".")[2] != class_path.rpartition(".")[2]:
-        raise UserError(f"ckpt_path = {checkpoint} is a checkpoint of {str(name)[:80]!r}, and the model is {class_path}")
-    return {key: value for key, value in found.items() if isinstance(value, int | float)}
-
-
-def _check_checkpoint(given: str | None) -> None:
-    if given is None or given in ("best", "last", "hpc") or given.startswith("registry") or "://" in given:
-        return
-    if not Path(given).exists():
-        raise UserError(f"ckpt_path = {given}: there is no such file")
-    if Path(given).is_file() and not zipfile.is_zipfile(given):
-        raise UserError(f"ckpt_path = {given} is not a checkpoint, or is cut short")

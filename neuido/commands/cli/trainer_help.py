@@ -27,6 +27,7 @@ COMMON = {  # of every command: option -> (what it takes, what it does)
     "--seed_everything": ("INT or true", "seed of all random numbers; true: another one each time (default: 0)"),
     "--ckpt_path": ("FILE", "checkpoint to go on from, or to test"),
     "--weights_only": ("true or false", "false: read the checkpoint with pickle, which may run what it holds (default: true)"),
+    "--trust": ("", "let configuration files name classes outside neuido, lightning, torch.optim and torchmetrics"),
 }
 BY_COMMAND = {  # beside these: what Lightning gives one command
     "fit": {},
