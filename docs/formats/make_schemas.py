@@ -96,6 +96,7 @@ def schemas() -> dict[str, Schema]:
     """Return the schema of each format by its file name."""
     from neuido.data.measured import material_test, track
     from neuido.data.measured.columns import ROLES
+    from neuido.discrepancy.report import diagnosis_format
     from neuido.physics.effects import LIBRARY
 
     names = [entry.name for entry in LIBRARY]
@@ -196,7 +197,8 @@ def schemas() -> dict[str, Schema]:
             },
             {"source": {"type": "string"}, "on_inversion": one_of(["report", "error"])},
         ),
-        "neuido-diagnosis-1": _diagnosis(names),
+        "neuido-diagnosis-1": _older_diagnosis(names),
+        "neuido-diagnosis-2": diagnosis_format.schema(),
     }
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {f"{name}.schema.json": {"$schema": dialect, "title": name, **schema} for name, schema in formats.items()}
@@ -208,7 +210,7 @@ def _choices(keys: tuple[str, ...], others: dict[str, str]) -> list[list[str]]:
     return [list(keys)] if renamed == list(keys) else [list(keys), renamed]
 
 
-def _diagnosis(names: list[str]) -> Schema:
+def _older_diagnosis(names: list[str]) -> Schema:
     figure: Schema = {"anyOf": [NUMBER, {"type": "null"}, {"type": "array"}]}
     quantity: Schema = {
         "type": "object",

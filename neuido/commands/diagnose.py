@@ -20,8 +20,8 @@ def diagnose(
 ) -> None:
     """Find the physical effect that a declared model lacks, from measured motion; add it and report the error before and after.
 
-    The answer is an effect, a class of effects that the data cannot tell apart, none, unknown, or insufficient. The same command given
-    again continues an interrupted run.
+    The answer, in plain words, is an effect, a class of effects that the data cannot tell apart, none, unknown, insufficient, or unfinished
+    where the time was up. The same command given again continues an interrupted run.
 
     Args:
         folder: Measured data: a folder with experiment.yaml, test.yaml or track.yaml.
@@ -61,5 +61,5 @@ def diagnose(
         resume=resume,
         progress=progress,
     )
-    print(found.line)
+    print(found.summary())
     print(f"results in {found.folder}: open report.html, go on with model_after.yaml")

@@ -38,13 +38,15 @@ def report(
     videos: bool = True,
     limit: float = 30.0,
 ) -> None:
-    """Write one self-contained page of several runs: scores side by side, curves over time, logged curves, videos.
+    """Write one self-contained page of several runs: scores side by side, curves over time, logged curves, videos; or of diagnoses.
 
     Best figures are bold. Beside the Chamfer distance stands its resampling floor: what a perfect law with other particles would score. A
     figure that a run does not have is left empty (LPIPS needs weights, `--model.lpips_backbone`).
 
+    Results of `neuido diagnose`, of this version or an older one, give the page of a diagnosis, several of them with a table of all first.
+
     Args:
-        runs: Folders of runs, of results, or of sweeps (whose runs then count one by one); `label=folder` gives a name.
+        runs: Folders of runs, of results, or of sweeps (whose runs then count one by one), or of diagnoses; `label=folder` gives a name.
         out: The page to write.
         title: Its title.
         paper: CSV of figures to quote beside, with columns `run`, `scene` and measures, or others; they are never bold.
@@ -58,6 +60,13 @@ def report(
 
     if not runs:
         raise UserError("runs is empty: name at least one folder")
+    diagnosed = _diagnoses(runs)
+    if diagnosed is not None:
+        target = Path(out)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_text(target, diagnosed)
+        print(f"report: {target}")
+        return
     entries = open_runs(runs)
     quoted = read_rows(paper) if paper else []
     parts = [f"<h1>{escaped(title)}</h1>", *_scores(entries, [row for row in quoted if "scene" in row])]
@@ -71,6 +80,36 @@ def report(
     target.parent.mkdir(parents=True, exist_ok=True)
     write_text(target, page(title, "\n".join(parts)))
     print(f"{len(entries)} runs, {len(scenes_of(entries))} scenes\nresults in {target}")
+
+
+def _diagnoses(runs: Sequence[str]) -> str | None:
+    """Return the page of diagnoses where the folders hold some; None where none of them does.
+
+    Raises:
+        UserError: Only some of them do.
+    """
+    named = []
+    for run in runs:
+        label, _, folder = run.rpartition("=")
+        named.append((label or Path(folder).name, Path(folder)))
+    there = [(folder / "diagnosis.json").is_file() for _, folder in named]
+    if not any(there):
+        return None
+    if not all(there):
+        raise UserError(f"runs: {named[there.index(False)][1]} holds no diagnosis.json, others do: name one kind of results at a time")
+    from neuido.discrepancy import Diagnosis
+
+    found = [(label, Diagnosis.read(folder)) for label, folder in named]
+    if len(found) == 1:
+        return found[0][1].page()
+    from neuido.discrepancy.report.page import page
+
+    parts = [
+        (own.to_dict() | {"body": label if len(d.bodies) == 1 else f"{label}: {body}"}, own.motion())
+        for label, d in found
+        for body, own in d.bodies.items()
+    ]
+    return page([content for content, _ in parts], [motion for _, motion in parts], name=f"{len(found)} diagnoses")
 
 
 class Line(NamedTuple):

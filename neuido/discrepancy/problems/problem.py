@@ -66,7 +66,7 @@ class Candidate:
     """An effect that the model may lack."""
 
     name: str
-    """Of the vocabulary of `neuido-diagnosis/1`."""
+    """Of the vocabulary of `neuido-diagnosis/2`."""
     parameters: tuple[Parameter, ...]
     starts: tuple[Mapping[str, float], ...]
     """Values of its parameters that the screening probes and that full fits start from."""

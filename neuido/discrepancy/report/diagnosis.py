@@ -1,4 +1,4 @@
-"""What a diagnosis found, read from the folder of its results (`neuido-diagnosis/1`)."""
+"""What a diagnosis found, read from the folder of its results (`neuido-diagnosis/2`, or the older `/1`)."""
 
 import json
 import math
@@ -11,16 +11,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from neuido.discrepancy.report import diagnosis_format
+from neuido.discrepancy.report.reader_units import Units, axis_of
+from neuido.discrepancy.report.wording import LEADING, MORE, Words, words_of
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
 
-FORMAT = "neuido-diagnosis/1"
-LEADING = ("yield_stress", "damping_ratio", "coefficient", "ratio")
-"""Derived figures that say more about an effect than the fitted ones."""
-MORE = 3.0
-"""Times its floor above which what named effects leave is more than they explain."""
 MORE_LEFT = ", and something more that no effect here explains"
 BEFORE, AFTER, INK = "#c0392b", "#1f77b4", "#333333"
 MOST_PANELS = 4
@@ -112,13 +111,7 @@ class Diagnosis:
         path = Path(folder).expanduser() / "diagnosis.json"
         if not path.is_file():
             raise UserError(f"{folder} holds no diagnosis.json: give the folder that `neuido diagnose --out` wrote")
-        try:
-            content = json.loads(path.read_text())
-        except ValueError as error:
-            raise UserError(f"{path} is no valid JSON: {error}") from error
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise UserError(f"{path}: format must be {FORMAT}; run `neuido diagnose` again")
-        return cls(path.parent, content, keep)
+        return cls(path.parent, diagnosis_format.read(path), keep)
 
     @property
     def name(self) -> str:
@@ -213,60 +206,69 @@ class Diagnosis:
         out += f"; {scored} error {error.before:.3g} -> {error.after:.3g} {error.unit} (floor {error.floor:.2g})"
         return out + (f"; no time for {', '.join(self.left_out)}: give more minutes" if self.left_out else "")
 
-    def summary(self) -> str:
-        """Return the answer in plain words: what is missing, how large it is, and what the error was and is."""
+    @property
+    def words(self) -> Words:
+        """The answer in plain words: finding, error, how sure, what is not excluded, what to measure next. Of one body alone."""
         if "bodies" in self._content:
-            return "\n\n".join(own.summary() for own in self.bodies.values())
-        error, lines = self.error, [f"{self.name}: {self._sentence()}"]
-        equations = _equations()
-        for e in self.effects:
-            figure = _figure(e.parameters[e.parameter])
-            lines.append(
-                f"{e.name} ({equations.get(e.name, 'an effect')}): {e.parameter} = {figure}; p = {e.p_value:.3g}. Where: {e.where}."
-            )
-        scored = "recordings that no fit has seen" if error.held_out else "the fitted recordings"
-        lines += [f"In the lead so far: {name}." for name in self.leads]
-        change = f"falls from {error.before:.3g} to {error.after:.3g}" if self.effects else f"is {error.after:.3g}"
-        lines.append(f"The error of {scored} {change} {error.unit}; noise and discretisation leave {error.floor:.3g} {error.unit}.")
-        if self.left_out:
-            lines.append(f"There was no time for {', '.join(self.left_out)}: give more minutes.")
-        return "\n".join(lines)
+            raise UserError(f"{self.name} has several bodies: take the words of one of `bodies`")
+        return words_of(self._content, Units.of([self._content]))
 
-    def _sentence(self) -> str:
-        names = " and ".join(" or ".join((e.name, *e.alternatives)) for e in self.effects)
-        more = MORE_LEFT if self.leaves_more else ""
-        sentence = {
-            "effect": f"the declared model lacks {names}{more}.",
-            "class": f"the declared model lacks an effect, {names}{more}; these data cannot tell the alternatives apart.",
-            "none": "nothing is missing. What remains is noise and the error of the discretisation.",
-            "unknown": "something is missing that no effect of the library explains.",
-            "insufficient": "these data do not say whether something is missing.",
-            "unfinished": "the time was up before every effect was tried: nothing is named yet.",
-        }[self.answer]
-        return " ".join([*(f"{why}." for why in self.why), sentence])
+    def summary(self) -> str:
+        """Return the answer in plain words, as the command prints it and the page opens with it; of several bodies a paragraph each."""
+        if "bodies" in self._content:
+            return "\n\n".join(f"{body}: {own.summary()}" for body, own in self.bodies.items())
+        return "\n".join(self.words.paragraphs)
+
+    @property
+    def kind(self) -> str:
+        """What was measured: `experiment`, `material test` or `track`."""
+        return self._content["kind"]
+
+    def page(self) -> str:
+        """Return the page of the diagnosis, made anew from diagnosis.json and the predicted motion."""
+        from neuido.discrepancy.report import page
+
+        parts = [own._content for own in self.bodies.values()]
+        return page.page(parts, [own.motion() for own in self.bodies.values()], kind=self.kind, name=self.name)
+
+    def motion(self) -> "dict[str, dict[str, np.ndarray]]":
+        """Return the arrays of each recording that is stored: what was measured, what is predicted before and after, over what."""
+        import numpy as np
+
+        out = {}
+        for name in self._content["recordings"] or self._content["error"]["after"]["by_recording"]:
+            path = self._motion(name)
+            if path is not None:
+                try:
+                    with np.load(path, allow_pickle=False) as archive:
+                        out[name] = dict(archive)
+                except (ValueError, OSError) as error:
+                    raise UserError(f"{path} cannot be read: {error}") from error
+        return out
 
     def plot(self) -> "Figure":
         """Return a matplotlib figure: the error over time before and after, or the data with both predictions, a panel a recording."""
-        import numpy as np
         from matplotlib.figure import Figure
 
-        names = [name for own in self.bodies.values() for name in own._content["error"]["after"]["by_recording"]]
-        paths = [path for name in names if (path := self._motion(name)) is not None][:MOST_PANELS]
-        figure = Figure(figsize=(3.6 * max(len(paths), 1), 2.8), layout="constrained")
-        for i, path in enumerate(paths):
-            ax = figure.add_subplot(1, len(paths), i + 1)
-            with np.load(path, allow_pickle=False) as archive:
-                arrays = dict(archive)
-            (_curves if "positions" in arrays else _data)(ax, arrays, self.error)
-            ax.set_title(path.stem, fontsize=9)
-        if paths:
+        shown = [(name, own, arrays) for own in self.bodies.values() for name, arrays in own.motion().items() if "before" in arrays]
+        shown = shown[:MOST_PANELS]
+        figure = Figure(figsize=(3.6 * max(len(shown), 1), 2.8), layout="constrained")
+        units = Units.of([own._content for own in self.bodies.values()])
+        for i, (name, own, arrays) in enumerate(shown):
+            ax = figure.add_subplot(1, len(shown), i + 1)
+            if "positions" in arrays:
+                _curves(ax, arrays, own.error, units)
+            else:
+                _data(ax, arrays, own._content, name, units)
+            ax.set_title(name, fontsize=9)
+        if shown:
             figure.axes[0].legend(fontsize=7, frameon=False)
-        figure.suptitle(textwrap.fill(self.line.splitlines()[0], 52 * max(len(paths), 1)), fontsize=9)
+        figure.suptitle(textwrap.fill(self.line.splitlines()[0], 52 * max(len(shown), 1)), fontsize=9)
         return figure
 
     def _motion(self, name: str) -> Path | None:
         path = self.folder / "predicted" / f"{name}.npz"
-        return path if path.is_file() else None
+        return path if path.name == f"{name}.npz" and path.is_file() else None  # a name is no path
 
     def report(self, path: str | os.PathLike | None = None) -> Path:
         """Copy the report, one self-contained HTML page, to a path; return where it is.
@@ -301,31 +303,29 @@ def _figure(q: Quantity) -> str:
     return f"{q.value:.3g}{'' if q.unit == '1' else f' {q.unit}'} (90 %: {low} to {high})"
 
 
-def _equations() -> dict[str, str]:
-    from neuido.physics.effects.library import LIBRARY
-
-    return {entry.name: entry.equation for entry in LIBRARY}
-
-
-def _curves(ax: Any, arrays: Mapping[str, Any], error: ErrorChange) -> None:
+def _curves(ax: Any, arrays: Mapping[str, Any], error: ErrorChange, units: Units) -> None:
     """Draw the root mean square distance of the points over time."""
     import numpy as np
 
+    factor, unit = units.scaled("m")
     for when, colour in (("before", BEFORE), ("after", AFTER)):
         square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
         seen = np.isfinite(square).any(axis=1)
-        ax.plot(arrays["t"][seen], 1e3 * np.sqrt(np.nanmean(square[seen], axis=1)), color=colour, label=when, lw=1.2)
-    ax.axhline(1e3 * error.floor, color=INK, ls=":", lw=1, label="floor")
-    ax.set(xlabel="t [s]", ylabel="RMS distance [mm]")
+        ax.plot(arrays["t"][seen], factor * np.sqrt(np.nanmean(square[seen], axis=1)), color=colour, label=when, lw=1.2)
+    ax.axhline(factor * error.floor, color=INK, ls=":", lw=1, label="floor")
+    ax.set(xlabel="time [s]", ylabel=f"RMS distance [{unit}]")
     ax.set_ylim(bottom=0.0)
 
 
-def _data(ax: Any, arrays: Mapping[str, Any], error: ErrorChange) -> None:
-    """Draw the data and the predictions; a channel after the other."""
+def _data(ax: Any, arrays: Mapping[str, Any], content: Mapping[str, Any], name: str, units: Units) -> None:
+    """Draw the data and the predictions over their physical axis; a channel after the other."""
+    told = content["recordings"].get(name, {})
+    factor, unit = units.scaled(content["error"]["unit"])
+    x, label = axis_of(arrays, told, units)
     for i, group in enumerate(dict.fromkeys(arrays["groups"].tolist())):
         own = arrays["groups"] == group
         labels = ("measured", "before", "after") if i == 0 else (None, None, None)
-        ax.plot(arrays["times"][own], arrays["measured"][own], ".", color=INK, ms=3, label=labels[0])
-        ax.plot(arrays["times"][own], arrays["before"][own], color=BEFORE, lw=1, label=labels[1])
-        ax.plot(arrays["times"][own], arrays["after"][own], color=AFTER, lw=1.2, label=labels[2])
-    ax.set(xlabel="t [s], or row", ylabel=f"measured [{error.unit}]")
+        ax.plot(x[own], factor * arrays["measured"][own], ".", color=INK, ms=3, label=labels[0])
+        ax.plot(x[own], factor * arrays["before"][own], color=BEFORE, lw=1, label=labels[1])
+        ax.plot(x[own], factor * arrays["after"][own], color=AFTER, lw=1.2, label=labels[2])
+    ax.set(xlabel=label, ylabel=f"{told.get('quantity', 'measured')} [{unit}]")

@@ -7,7 +7,7 @@ known of them. Half the squared distance is the expectation of the logarithm of 
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -278,11 +278,3 @@ def _materials(problem: Problem) -> Iterator[tuple[str, Problem, Any]]:
         span = f"shear {e.max():.2g}" if mode == "simple_shear" else f"stretch {math.exp(e.max()):.3g}"
         name = f"{mode.replace('_', ' ')} to {span}{' and back' if back else ''}{', ten times as fast' if pace < 1 else ''}"
         yield name, _Loads(problem, mode, path, time), lambda rows: np.full(rows.shape[1], noise)
-
-
-def summary(proposal: Mapping[str, Any] | None) -> str:
-    """One sentence for the report."""
-    if proposal is None:
-        return "Nothing is left to tell apart."
-    a, b = proposal["tells_apart"]
-    return f"{proposal['change'].capitalize()}: it tells {a} from {b} with expected odds of e^{proposal['expected_log_odds']:.1f}."

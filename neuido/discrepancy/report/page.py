@@ -1,258 +1,371 @@
-"""The report of a diagnosis: one self-contained HTML page. Without matplotlib it has the tables and the player of the motion alone."""
+"""The page of a diagnosis: one self-contained HTML file, made from diagnosis.json and the predicted motion, with nothing to load."""
 
+import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuido.data.files.html_page import escaped, table
-from neuido.data.files.html_page import page as html_page
-from neuido.discrepancy.inference.attribution import Diagnosis
-from neuido.discrepancy.inference.judging import ALPHA
-from neuido.discrepancy.report import figures, next_experiment
-from neuido.discrepancy.report.ceiling import Ceiling
-from neuido.discrepancy.report.diagnosis import MORE
-from neuido.discrepancy.report.residual import Series
+from neuido.discrepancy.report import motion_player, plots, silhouette_pictures
+from neuido.discrepancy.report.reader_units import WRITTEN, Units, rounded
+from neuido.discrepancy.report.wording import FIGURES, Words, leading, listed, title, worded, words_of
 
-STYLE = """h2{font-size:1.15em}
-.answer{font-size:1.2em;padding:.6em 1em;background:#f3f6f9;border-left:4px solid #1f77b4}
-canvas{border:1px solid #ddd;background:#fff;touch-action:none;max-width:100%}
-.player{margin-bottom:1.2em}.player label{margin-right:.8em}.b{color:#c0392b}.a{color:#1f77b4}"""
-WEAK = "The missing force by the weak residual, which differentiates no measured position; grey: what noise alone makes of it."
-NOTHING = "<p>The residual is noise alone: no effect was fitted.</p>"
-SENTENCES = {
-    "effect": "The declared model lacks {names}.",
-    "class": "The declared model lacks an effect; these recordings cannot tell {names} apart.",
-    "none": "Nothing is missing: what remains is what noise, nuisances and the discretisation bring.",
-    "unknown": "Something is missing that none of the known effects explains.",
-    "insufficient": "These recordings do not say whether something is missing.",
-    "unfinished": "The time was up before every effect was tried: nothing is named yet.",
+LIMIT = 6_000_000
+"""Most bytes of a page."""
+CURVE_POINTS = 24_000
+"""Points of all curves of a page; with many recordings each has fewer."""
+PARTS = Path(__file__).parent / "page_parts"
+ANSWERS = {
+    "effect": "an effect is missing",
+    "class": "one of several effects is missing",
+    "none": "nothing is missing",
+    "unknown": "something unknown is missing",
+    "insufficient": "the data do not say",
+    "unfinished": "the search was cut off",
 }
-MORE_LEFT = (
-    "The declared model lacks {names}, and something more that no effect here explains: what is left is {over:.0f} times what noise and "
-    "discretisation would leave."
-)
-STANDS = " What remains stands at {noise:.1f} times the noise: an effect that does less would not be seen (see Not excluded)."
-SIZES = "Sizes up to which an effect would not have been named here, to first order; empty: any size that it may have."
+VERDICTS = {"named": "named", "class": "not told from it", "lead": "in the lead", "rejected": "rejected", "weighed": ""}
 HELD_OUT = {
     "validation": "validation: held out of the fits, not of the choice of effects",
     "test": "test: not looked at before the answer was there",
 }
 """What each error of held-out recordings is of."""
+Motion = Mapping[str, Mapping[str, np.ndarray]]
 
 
-STANDS_ABOVE = 1.5
-"""Times the noise above which the answer `none` says where the residual stands."""
+class Table(NamedTuple):
+    """A table with its heading."""
+
+    heading: str
+    head: tuple[str, ...]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+    more: Sequence[str] = ()
+    """Paragraphs after it."""
 
 
-@dataclass(eq=False)
-class Details:
-    """What is computed from a diagnosis for its report."""
+class Section(NamedTuple):
+    """What the page says of one body, or of the only one."""
 
-    content: dict[str, Any]
-    """Of diagnosis.json."""
-    motion: dict[str, dict[str, np.ndarray]]
-    """Arrays of each recording: measured, before, after, and what they are over."""
-    stages: dict[str, list[Series]] = field(default_factory=dict)
-    """Of each recording of a body."""
-    ceilings: dict[str, Ceiling] = field(default_factory=dict)
-    """`before` and `after`."""
-    silhouettes: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Of each recording of a filmed body: masks, those drawn before and after, and their scores."""
+    name: str
+    answer: str
+    words: Words
+    effects: Table
+    tables: Sequence[Table]
+    notes: Sequence[str]
+    parts: Sequence[Mapping[str, Any]]
+    """Headings with the numbers of the plots under them."""
+    pictures: Sequence[tuple[str, str]]
+    """Captions and data URLs of silhouettes."""
 
 
-def page(details: Sequence[Details], diagnoses: Sequence[Diagnosis], *, kind: str) -> str:
-    """The whole page.
+def page(contents: Sequence[Mapping[str, Any]], motions: Sequence[Motion], *, kind: str = "", name: str = "") -> str:
+    """Return the whole page.
 
     Args:
-        details: What `answer.describe` made of each diagnosis.
-        diagnoses: The diagnoses.
+        contents: Part of diagnosis.json of each body, one mostly, in the form of `neuido-diagnosis/2`.
+        motions: Arrays of the recordings of each, as in `predicted`.
         kind: `experiment`, `material test` or `track`.
+        name: Of what was measured; of the first part where absent.
     """
-    name = diagnoses[0].problem.name if len(diagnoses) == 1 else diagnoses[0].problem.name.rpartition(": ")[0]
-    parts = [f"<h1>Diagnosis of the {escaped(kind)} {escaped(name)}</h1>"]
-    for made, d in zip(details, diagnoses, strict=True):
-        if len(diagnoses) > 1:
-            parts.append(f"<h1>{escaped(made.content.get('body', d.problem.name))}</h1>")
-        parts += _one(made, d)
-    seconds = sum(made.content["seconds"] for made in details)
-    device, version = details[0].content["device"], details[0].content["version"]
-    simulations = sum(d.evaluations for d in diagnoses)
-    parts.append(f'<p class="note">neuido {escaped(version)}, {seconds:.0f} s on {escaped(device)}, {simulations} simulations.</p>')
-    return html_page(name, "\n".join(part for part in parts if part), style=STYLE)
+    share = 1.0
+    while True:
+        made = _page(contents, motions, kind, name or contents[0]["experiment"], share)
+        if len(made.encode()) <= LIMIT or share < 0.05:
+            return made
+        share *= 0.6
 
 
-def _one(made: Details, d: Diagnosis) -> list[str]:
-    c = made.content
-    names = " and ".join(" or ".join(e["class"]) for e in c["effects"])
-    bodies = {name: arrays for name, arrays in made.motion.items() if "positions" in arrays}
-    out = [f'<p class="answer">{escaped(_answer(c, names))}</p>', _effects(c), _leads(c), _errors(c)]
-    if c["left_out"]:
-        out.append(
-            f'<p class="note">{escaped("The time was up before: " + "; ".join(c["left_out"]) + ". More minutes go on from here.")}</p>'
+def _page(contents: Sequence[Mapping[str, Any]], motions: Sequence[Motion], kind: str, name: str, share: float) -> str:
+    units = Units.of(contents, reach=motion_player.reach(motions))
+    figures: list[dict[str, Any]] = []
+    count = max(sum(len(m) for m in motions), 1)
+    rows = max(int(share * min(plots.MOST_ROWS, CURVE_POINTS // count)), 40)
+    room = share * motion_player.ROOM / len(contents)
+    sections = [_section(c, m, units, figures, rows, room) for c, m in zip(contents, motions, strict=True)]
+    summary = None
+    if len(contents) > 1:
+        summary = Table("All bodies", ("body", "answer", "size", "error before", "error after", "noise"), _summary(contents, units))
+    return (
+        environment()
+        .get_template("page.html.j2")
+        .render(
+            name=name,
+            kind=kind,
+            sections=sections,
+            summary=summary,
+            several=len(sections) > 1,
+            payload=json_in_html(figures),
+            plotly=plotly_script() if figures else "",
+            style=_part("page.css"),
+            script=_part("page.js"),
+            footer=_footer(contents),
         )
-    for place, settings in c["settings_not_run"].items():
-        lost = f"{place}: {', '.join(settings)} does not run there, and takes no part in the discretisation error."
-        out.append(f'<p class="note">{escaped(lost)}</p>')
-    for place, reason in c.get("not_predicted", {}).items():
-        out.append(f'<p class="note">{escaped(f"{place} is not shown: {reason}.")}</p>')
+    )
+
+
+@cache
+def environment() -> Any:
+    """Return the templates; what is put into them is escaped."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    return Environment(loader=FileSystemLoader(PARTS), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+
+
+@cache
+def _part(name: str) -> Any:
+    from markupsafe import Markup
+
+    return Markup((PARTS / name).read_text(encoding="utf-8"))
+
+
+@cache
+def plotly_script() -> Any:
+    """Return Plotly's JavaScript, from the package of that name."""
+    from markupsafe import Markup
+
+    text = files("plotly").joinpath("package_data/plotly.min.js").read_text(encoding="utf-8")
+    return Markup(text.replace("</script", "<\\/script").replace("<!--", "<\\!--"))
+
+
+def json_in_html(value: Any) -> Any:
+    """Return JSON for a script element: nothing in it ends the element or begins a comment."""
+    from markupsafe import Markup
+
+    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
+    return Markup(text.translate({ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}))
+
+
+def _section(c: Mapping[str, Any], motion: Motion, units: Units, figures: list[dict[str, Any]], rows: int, room: float) -> Section:
+    parts: list[dict[str, Any]] = []
+
+    def add(heading: str, made: Sequence[Mapping[str, Any]], *, form: str = "plot", note: str = "") -> None:
+        if made:
+            first = len(figures)
+            figures.extend({"form": form} | dict(one) for one in made)
+            parts.append({"heading": heading, "form": form, "numbers": range(first, len(figures)), "note": note})
+
+    bodies = {name: arrays for name, arrays in motion.items() if "positions" in arrays}
+    others = {name: arrays for name, arrays in motion.items() if "groups" in arrays and "positions" not in arrays}
+    pictures: list[tuple[str, str]] = []
     if bodies:
-        out += [
-            "<h2>Motion before and after</h2>",
-            figures.player(bodies),
-            figures.error_curves(bodies, c["error"]["noise_floor"], c["error"]["discretisation_floor"]),
-        ]
-        out += [
-            "<h2>Where on the body</h2>",
-            figures.residual_maps(bodies),
-            "<h2>Which stage</h2>",
-            _stages(made),
-            figures.stage_curves(made.stages),
-        ]
-        out.append(f'<p class="note">{WEAK}</p>')
-        for place, p in c["places"].items():
-            at = ", ".join(_said(v, 3) for v in p["from_centre"])
-            where = f"{place}: the missing force is largest at ({at}) m from the centre, {_said(p['over_median'], 3)} times the median."
-            out.append(f"<p>{escaped(where)}</p>")
-    elif made.silhouettes:
-        out += figures.section(made.silhouettes)
-    elif made.motion:
-        out += ["<h2>Data before and after</h2>", figures.data_curves(made.motion, d.problem.unit)]
-    out += _ranking(d)
-    out += _sizes(c)
-    if c["rejected"]:
-        out += ["<h2>Rejected</h2>", table(("effect", "reason"), [(r["name"], r["reason"]) for r in c["rejected"]])]
-    out += ["<h2>Fitted figures</h2>", _figures(c)]
-    share = made.ceilings["after"]
-    fit, held = (100 * min(max(value, 0.0), 1.0) for value in (share.fit, share.held_out))
-    there = "" if math.isnan(share.held_out) else f", and {held:.0f} % of it on what was held out"
-    if not math.isnan(share.fit):
-        most = f"{fit:.0f} % of what remains beside noise where it was fitted{there}"
-        out.append(f"<p>A small network explains {most}: the ceiling of any effect.</p>")
-    out += ["<h2>Next experiment</h2>", f"<p>{escaped(next_experiment.summary(c['next_experiment']))}</p>"]
-    if c["next_experiment"]:
-        out.append(
-            table(("other changes", "expected log odds"), [(o["change"], o["expected_log_odds"]) for o in c["next_experiment"]["others"]])
+        add("Motion before and after", [motion_player.player(bodies, c, units, room=room)], form="player")
+        add("Error over time", [plots.error_over_time(name, arrays, c, units, rows) for name, arrays in bodies.items()])
+        add("Where on the body", [motion_player.residual_map(bodies, units)], form="map", note=_places(c, units))
+        add("Which stage", plots.stage_plots(c), note=WEAK)
+    elif any("masks" in arrays for arrays in motion.values()):
+        pictures = silhouette_pictures.pictures(motion, c)
+    else:
+        add("Data before and after", [p for name, arrays in others.items() for p in plots.data_plots(name, arrays, c, units, rows)])
+    steps = list(dict.fromkeys(m["step"] for m in c["models"]))
+    for step in steps:
+        own = [m for m in c["models"] if m["step"] == step]
+        chance = next((row["error_ratio95"] for row in c["chance"] if row["step"] == step), None)
+        made = plots.ranking(own, chance)
+        if made:
+            add("Rivals" if len(steps) == 1 else f"Rivals, step {step}", [made])
+    return Section(
+        name=c.get("body", c["experiment"]),
+        answer=ANSWERS[c["answer"]],
+        words=words_of(c, units),
+        effects=_effects(c, units),
+        tables=[
+            t
+            for t in (_errors(c, units), _silhouettes(c), *_models(c, units), _power(c, units), _rejected(c), _figures(c, units))
+            if t.rows
+        ],
+        notes=_notes(c),
+        parts=parts,
+        pictures=pictures,
+    )
+
+
+WEAK = "What is missing, by the weak residual, which differentiates no measured position; grey: what noise alone makes of it."
+SIZES = "The largest size that each other effect could have without having been named here, to first order."
+
+
+def _places(c: Mapping[str, Any], units: Units) -> str:
+    said = []
+    for name, p in c["places"].items():
+        factor, unit = units.scaled("m")
+        at = ", ".join(rounded(factor * v, 2) for v in p["from_centre"])
+        said.append(
+            f"{name}: the missing force is largest {at} {unit} (x, y, z) from the centre, {rounded(p['over_median'], 2)} times its median."
         )
-    return out
+    return " ".join(said)
 
 
-def _answer(c: dict[str, Any], names: str) -> str:
-    """The answer in a few sentences, what is wrong with the recordings first."""
-    out = SENTENCES[c["answer"]].format(names=names or "it")
-    over, noise = c["error"]["left_over_floor"], c["error"]["left_over_noise"]
-    if c["effects"] and over is not None and over > MORE:
-        out = MORE_LEFT.format(names=names, over=over)
-    if c["answer"] == "none" and noise is not None and noise > STANDS_ABOVE:
-        out += STANDS.format(noise=noise)
-    if c["why"]:
-        why = "; ".join(c["why"])
-        out = f"{why[0].upper()}{why[1:]}. {out}"
-    if c["would_help"]:
-        out += f" What would help: {'; '.join(c['would_help'])}."
-    return out
+def _quantity(value: Any, unit: str, units: Units) -> str:
+    """A figure of a table without its unit; a vector in brackets."""
+    factor = units.scaled(unit)[0]
+    if isinstance(value, list):
+        return f"({', '.join(_quantity(v, unit, units) for v in value)})"
+    return "" if value is None else rounded(factor * value) if math.isfinite(value) else "infinite"
 
 
-def _leads(c: dict[str, Any]) -> str:
-    """What leads in a search that was cut off, and what it has not tried."""
-    out = ""
-    for lead in c["leads"]:
-        figures = ", ".join(f"{key} = {_said(p['value'], 3)} {p['unit']}" for key, p in lead["parameters"].items())
-        told = f"In the lead so far: {lead['name']} ({figures}), which lowers the error {lead['error_ratio']:.2f}-fold. It is no answer."
-        out += f"<p>{escaped(told)}</p>"
-    return out + (f"<p>{escaped('Not tried: ' + ', '.join(c['untried']) + '.')}</p>" if c["untried"] else "")
-
-
-def _sizes(c: dict[str, Any]) -> list[str]:
-    """How large each effect may be without having been seen."""
-    rows = [(h["name"], h["parameter"], "" if h["up_to"] is None else _said(h["up_to"], 3), h["unit"]) for h in c["not_excluded"]]
-    heads = ("effect", "parameter", "up to", "unit")
-    return ["<h2>Not excluded</h2>", f"<p>{SIZES}</p>", table(heads, rows)] if rows else []
-
-
-def _effects(c: dict[str, Any]) -> str:
+def _effects(c: Mapping[str, Any], units: Units) -> Table:
     rows = []
     for e in c["effects"]:
         for key, p in e["parameters"].items():
-            if isinstance(p["value"], list):
-                value = ", ".join(f"{v:.4g}" for v in p["value"])
-                rows.append((e["name"], key, value, p["unit"], "", f"{e['p_value']:.3g}", e["where"]))
-            else:
-                low, high = p["interval90"]
-                rows.append((e["name"], key, p["value"], p["unit"], f"{_said(low)} to {_said(high)}", f"{e['p_value']:.3g}", e["where"]))
-    return table(("effect", "parameter", "value", "unit", "90 % interval", "p (linear model)", "where"), rows) if rows else ""
+            value, interval = _quantity(p["value"], p["unit"], units), ""
+            if not isinstance(p["value"], list):
+                value, interval = units.figures(p["value"], p["interval90"], p["unit"])
+            chance = "" if e.get("p_value") is None else f"{e['p_value']:.2g}"
+            rows.append((title(e["name"]), e["name"], key, value, interval, units.label(p["unit"]), chance, e["where"]))
+    head = ("effect", "identifier", "figure", "value", "90 % interval", "unit", "p", "where it shows")
+    return Table("What is missing", head, rows)
 
 
-def _errors(c: dict[str, Any]) -> str:
+def _errors(c: Mapping[str, Any], units: Units) -> Table:
     e = c["error"]
-    rows = [(name, before, e["after"]["by_recording"][name]) for name, before in e["before"]["by_recording"].items()]
-    for name, label in (("fit", "all that is fitted"), *HELD_OUT.items()):
-        if e["before"].get(name) is not None:
-            rows.append((label, e["before"][name], e["after"][name]))
-    rows = [(label, before, after, None if None in (before, after) else before / max(after, 1e-300)) for label, before, after in rows]
-    known = ", ".join(dict.fromkeys(e.get("noise_from", {}).values())) or "not told whence"
-    floors = f"Floors: noise {e['noise_floor']:.3g} {e['unit']} ({known}), discretisation {e['discretisation_floor']:.3g} {e['unit']}."
-    out = f"<h2>Error [{escaped(e['unit'])}]</h2>" + table(("recording", "before", "after", "ratio"), rows) + f"<p>{escaped(floors)}</p>"
-    return out + _settings(e)
-
-
-def _settings(e: dict[str, Any]) -> str:
-    """What other settings take part in the predictions, and what one simulation leaves without them."""
-    if "one_setting" not in e:
-        return ""
-    held = "The predictions hold the differences of other settings, in the amounts that the fitted recordings ask for."
-    rows = [(name, e["amounts"]["before"][name], amount) for name, amount in e["amounts"]["after"].items()]
-    scored = "held_out" if e["one_setting"]["after"]["held_out"] is not None else "fit"
-    before, after = (e["one_setting"][when][scored] for when in ("before", "after"))
-    alone = f"One simulation without them leaves {_said(before, 3)} {e['unit']} before and {_said(after, 3)} {e['unit']} after."
-    if height := e.get("contact_height"):
-        places = " and ".join(f"{1e3 * height[when]:.3g} mm {when}" for when in ("before", "after"))
-        alone += f" The colliders of that grid are higher than they are declared by {places}: a grid's floor is a layer of its nodes."
-    return f"<p>{held}</p>" + table(("other setting", "amount before", "amount after"), rows) + f"<p>{escaped(alone)}</p>"
-
-
-def _said(value: float | None, digits: int = 4) -> str:
-    """A figure; none is one that is not finite, where a recording cannot be predicted."""
-    return "infinite" if value is None else f"{value:.{digits}g}"
-
-
-def _stages(made: Details) -> str:
+    factor, unit = units.scaled(e["unit"])
+    found = [(plots.heading(name, c), b, e["after"]["by_recording"].get(name)) for name, b in e["before"]["by_recording"].items()]
+    found += [
+        (text, e["before"][key], e["after"][key])
+        for key, text in (("fit", "all that is fitted"), *HELD_OUT.items())
+        if e["before"].get(key) is not None
+    ]
     rows = []
-    for recording, series in made.stages.items():
-        for s in series:
-            rows.append((recording, s.name, s.unit, s.size(s.before), s.size(s.after), s.size(s.noise), math.sqrt(s.excess(s.before))))
-    return table(("recording", "stage", "unit", "missing before", "missing after", "noise", "before, in noise"), rows)
+    for name, before, after in found:
+        ratio = "" if None in (before, after) else rounded(before / max(after, 1e-300))
+        rows.append((name, *("" if v is None else rounded(factor * v) for v in (before, after)), ratio))
+    origin = listed(sorted(set(e.get("noise_from", {}).values()))) or "origin not told"
+    noise = "not known" if e["noise_floor"] is None else units.said(e["noise_floor"], e["unit"])
+    grid = e["discretisation_floor"] or 0.0
+    more = [f"Floors: noise {noise} ({origin})" + (f", discretisation {units.said(grid, e['unit'])}." if grid > 0 else ".")]
+    if "one_setting" in e:
+        more += _settings(e, units)
+    return Table("Errors", ("recording", f"before [{unit}]", f"after [{unit}]", "before / after"), rows, more=more)
 
 
-def _ranking(d: Diagnosis) -> list[str]:
+def _silhouettes(c: Mapping[str, Any]) -> Table:
+    rows = [
+        (name, role.replace("_", " "), when, *(rounded(scores[when][role][key]) for key in ("iou", "outline_px", "outline_mm", "psnr")))
+        for name, scores in c.get("silhouettes", {}).items()
+        for role in scores["before"]
+        for when in ("before", "after")
+    ]
+    return Table("Silhouettes", ("recording", "frames", "", "overlap (IoU)", "outline [px]", "outline [mm]", "PSNR [dB]"), rows)
+
+
+def _settings(e: Mapping[str, Any], units: Units) -> list[str]:
+    """What other settings take part in the predictions, and what one simulation leaves without them."""
+    amounts = [
+        f"{name}: {rounded(e['amounts']['before'][name], 2)} before, {rounded(v, 2)} after" for name, v in e["amounts"]["after"].items()
+    ]
     out = []
-    for i, r in enumerate(d.rounds):
-        kept = {id(t) for t in r.members} if r.chosen is not None else set()
-        trials = sorted(r.trials, key=lambda t: (id(t) not in kept, t.score))
-        threshold = r.by_chance(ALPHA)
-        out.append(f"<h2>Ranking{f', step {i + 1}' if len(d.rounds) > 1 else ''}</h2>")
-        out.append(figures.ranking([(t.candidate.key, t.gain, id(t) in kept) for t in trials], threshold))
+    if amounts:
+        held = "The predictions hold the differences of other settings, in the amounts that the fitted recordings ask for: "
+        out.append(f"{held}{'; '.join(amounts)}.")
+    scored = "held_out" if e["one_setting"]["after"]["held_out"] is not None else "fit"
+    before, after = (units.said(e["one_setting"][when][scored], e["unit"]) for when in ("before", "after"))
+    alone = f"One simulation without them leaves {before} before and {after} after."
+    if height := e.get("contact_height"):
+        places = " and ".join(f"{units.said(height[when], 'm')} {when}" for when in ("before", "after"))
+        alone += f" The colliders of that grid are higher than they are declared by {places}: a grid's floor is a layer of its nodes."
+    return [*out, alone]
+
+
+def _models(c: Mapping[str, Any], units: Units) -> list[Table]:
+    """The effects that were tried in each step, the best first, with what they were fitted to."""
+    steps: dict[int, list[Mapping[str, Any]]] = {}
+    for m in c["models"]:
+        steps.setdefault(m["step"], []).append(m)
+    out = []
+    for step, models in steps.items():
         rows = []
-        for t in trials:
-            values = ", ".join(
-                f"{p.name.partition('.')[2]} = {t.fit.point.get(p.name, p.value):.3g} {p.unit}" for p in t.candidate.parameters[:6]
+        for m in models:
+            said = [
+                f"{key} = {_quantity(p['value'], p['unit'], units)}{_behind(units.label(p['unit']))}"
+                for key, p in list(m["parameters"].items())[:6]
+            ]
+            ratio = "" if not m.get("error_ratio") else rounded(m["error_ratio"])
+            cosine = "" if m.get("cosine") is None else f"{m['cosine']:.2f}"
+            evidence = "" if m.get("log_evidence") is None else rounded(m["log_evidence"])
+            rows.append(
+                (plots.label_of(m), m["name"], ", ".join(said), ratio, evidence, cosine, worded(m["reason"]) or VERDICTS[m["verdict"]])
             )
-            verdict = t.reason or ("chosen" if t is r.chosen else "not told from it" if id(t) in kept else "")
-            cosine = r.cosines.get(t.candidate.key)
-            rows.append((t.candidate.key, values, f"{math.exp(t.gain):.2f}", "" if cosine is None else f"{cosine:.2f}", verdict))
-        out.append(table(("effect", "parameters", "error ratio", "cosine to the best", "verdict"), rows))
-        chance = f"chance brings {math.exp(threshold):.2f} at 95 %, from {len(r.null)} draws"
-        told = f"p = {r.p_value:.3g}, of the largest gain over all candidates in a linear model of the fits; {chance}."
-        out.append(f'<p class="note">{told}</p>' if trials else NOTHING)
+        told = next((row for row in c["chance"] if row["step"] == step), None)
+        note = ""
+        if told and told["p_value"] is not None:
+            note = f"p = {told['p_value']:.2g}: {told['of']}."
+        head = ["effect", "identifier", "fitted", "error ratio", "evidence", "cosine to the best", "verdict"]
+        shown = [i for i in range(len(head)) if i not in (4, 5) or any(row[i] for row in rows)]
+        heading = "Effects that were tried" if len(steps) == 1 else f"Effects that were tried, step {step}"
+        out.append(Table(heading, tuple(head[i] for i in shown), [[row[i] for i in shown] for row in rows], note))
     return out
 
 
-def _figures(c: dict[str, Any]) -> str:
+def _behind(unit: str) -> str:
+    return "" if unit == WRITTEN["1"] else f" {unit}"
+
+
+def _power(c: Mapping[str, Any], units: Units) -> Table:
     rows = []
-    for name in c["declared"]:
-        b, a = c["declared"][name], c["after"][name]
-        spans = (" to ".join(_said(v) for v in own["interval90"]) for own in (b, a))
-        rows.append((name, b["unit"], b["value"], next(spans), a["value"], next(spans)))
-    return table(("figure", "unit", "before", "90 % interval", "after", "90 % interval"), rows) if rows else "<p>None was free.</p>"
+    for row in c["power"]:
+        size = "any size" if row["up_to"] is None else rounded(units.scaled(row["unit"])[0] * row["up_to"])
+        rows.append((title(row["name"]), row["name"], row["parameter"], size, units.label(row["unit"])))
+    return Table("Not excluded", ("effect", "identifier", "figure", "up to", "unit"), rows, SIZES)
+
+
+def _rejected(c: Mapping[str, Any]) -> Table:
+    tried = {m["name"] for m in c["models"]}
+    rows = [(title(r["name"]), r["name"], worded(r["reason"])) for r in c["rejected"] if r["name"] not in tried]
+    return Table("Not fitted in full" if tried else "Rejected", ("effect", "identifier", "reason"), rows)
+
+
+def _figures(c: Mapping[str, Any], units: Units) -> Table:
+    rows = []
+    for name, b in c["declared"].items():
+        cells = [cell for own in (b, c["after"].get(name, b)) for cell in units.figures(own["value"], own["interval90"], own["unit"])]
+        rows.append((FIGURES.get(name, name.replace("_", " ")), name, units.label(b["unit"]), *cells))
+    return Table("The model's own figures", ("figure", "identifier", "unit", "before", "90 % interval", "after", "90 % interval"), rows)
+
+
+def _notes(c: Mapping[str, Any]) -> list[str]:
+    out = [
+        f"{place}: {listed(settings)} does not run there, and takes no part in the discretisation error."
+        for place, settings in c["settings_not_run"].items()
+    ]
+    out += [f"{place} is not shown: {reason}." for place, reason in c.get("not_predicted", {}).items()]
+    share = c["ceiling"].get("after", {})
+    fit, held = (None if share.get(key) is None else 100 * min(max(share[key], 0.0), 1.0) for key in ("fit", "held_out"))
+    if fit is not None:
+        there = "" if held is None else f", and {held:.0f} % of it on what was held out"
+        out.append(
+            f"A small network explains {fit:.0f} % of what remains beside noise where it was fitted{there}: the ceiling of any effect."
+        )
+    if c.get("next_experiment") and c["next_experiment"]["others"]:
+        said = [f"{o['change']} (expected log odds {rounded(o['expected_log_odds'], 2)})" for o in c["next_experiment"]["others"]]
+        out.append(f"Other changes that tell them apart: {'; '.join(said)}.")
+    return out
+
+
+def _summary(contents: Sequence[Mapping[str, Any]], units: Units) -> list[tuple[str, ...]]:
+    rows = []
+    for c in contents:
+        said, e = [], c["error"]
+        for effect in c["effects"]:
+            keys = leading(effect["parameters"])
+            value = ", ".join(_summary_figure(key, effect["parameters"][key], units) for key in keys)
+            said.append(f"{listed([title(name) for name in effect['class']], 'or')}{f': {value}' if value else ''}")
+        scored = "held_out" if e["after"].get("held_out") is not None else "fit"
+        before, after = (units.said(e[when][scored], e["unit"]) for when in ("before", "after"))
+        noise = "" if e["noise_floor"] is None else units.said(e["noise_floor"], e["unit"])
+        rows.append((c.get("body", c["experiment"]), ANSWERS[c["answer"]], "; ".join(said), before, after, noise))
+    return rows
+
+
+def _summary_figure(key: str, p: Mapping[str, Any], units: Units) -> str:
+    value, interval = units.figures(p["value"], p["interval90"], p["unit"])
+    return f"{key.replace('_', ' ')} = {value}{_behind(units.label(p['unit']))}{f' ({interval})' if interval else ''}"
+
+
+def _footer(contents: Sequence[Mapping[str, Any]]) -> str:
+    seconds = sum(c["seconds"] for c in contents)
+    runs = [c["work"]["simulations"] for c in contents]
+    ran = f", {sum(runs)} simulations" if all(runs) else ""
+    return f"neuido {contents[0]['version']}, {seconds:.0f} s on {contents[0]['device']}{ran}."

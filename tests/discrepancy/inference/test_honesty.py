@@ -21,7 +21,7 @@ from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.noise import correlation, surface
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.problems.tracks import TrackProblem, track_problems
-from neuido.discrepancy.report import answer
+from neuido.discrepancy.report import answer, answer_content
 from neuido.errors import UserError
 from tests.discrepancy import made
 
@@ -92,8 +92,8 @@ def test_a_recording_is_sealed_until_the_answer_is_there(tmp_path):
     object.__setattr__(problem, "recordings", (*problem.recordings[:2], replace(last, y=last.y + 5.0 * T)))
     other = diagnose(problem, draws=39)
     assert other.after == found.after and answer.trace(other) == answer.trace(found)
-    assert answer.errors(other, "after")["test"] > 1.0
-    single = answer.errors(diagnose(Line({"young": 1.5}), draws=39), "after")
+    assert answer_content.errors(other, "after")["test"] > 1.0
+    single = answer_content.errors(diagnose(Line({"young": 1.5}), draws=39), "after")
     assert single["test"] is None and single["validation"] == single["held_out"]
 
 
@@ -102,7 +102,7 @@ def test_what_could_hide_is_told(tmp_path):
     found = diagnose(Line({"young": 1.5, "drag_linear.k": 0.02}), draws=39)
     assert found.answer == "none" and found.hidden == []  # it is noise: nothing was looked for
     told = content(diagnose(Line({"young": 1.5}, beside=0.02), draws=39), tmp_path)
-    (size,) = told["not_excluded"]
+    (size,) = told["power"]
     assert (size["name"], size["parameter"], size["unit"]) == ("drag_linear", "k", "1/s")
     assert diagnose(Line({"young": 1.5, "drag_linear.k": 3.0 * size["up_to"]}, beside=0.02), draws=39).effects
     assert not diagnose(Line({"young": 1.5, "drag_linear.k": 0.3 * size["up_to"]}, beside=0.02), draws=39).effects

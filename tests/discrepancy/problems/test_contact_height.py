@@ -9,7 +9,7 @@ import torch
 from neuido.discrepancy.inference.attribution import Inference, diagnose
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.problems.settings import CONTACT_HEIGHT, SETTINGS
-from neuido.discrepancy.report import answer
+from neuido.discrepancy.report import answer_content
 from neuido.discrepancy.workflow import restricted, solved_by
 from neuido.types import Box
 from tests.discrepancy import made
@@ -100,7 +100,7 @@ def test_a_floor_that_is_elsewhere_is_no_effect(effect, experiment):
         assert found.after["viscosity_shear.eta"] == pytest.approx(90.0, rel=0.1)
     else:
         assert start.fit.point[CONTACT_HEIGHT] == pytest.approx(height, rel=0.2)
-    told = answer._settings(found)["contact_height"]
+    told = answer_content._settings(found)["contact_height"]
     assert told == {"before": found.before.get(CONTACT_HEIGHT, 0.0), "after": found.after[CONTACT_HEIGHT], "unit": "m"}
     assert CONTACT_HEIGHT not in str(problem.model_after(found.after, [effect]))
 

@@ -10,7 +10,7 @@ import yaml
 from neuido.discrepancy import store
 from neuido.discrepancy.inference.attribution import diagnose
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
-from neuido.discrepancy.report import answer
+from neuido.discrepancy.report import answer, answer_content, diagnosis_format
 
 T = np.linspace(0.0, 1.0, 40)
 
@@ -72,7 +72,7 @@ def test_content_is_the_contract(written):
         "version",
     }
     assert keys <= set(content)
-    assert content["format"] == "neuido-diagnosis/1"
+    assert content["format"] == "neuido-diagnosis/2"
     (effect,) = content["effects"]
     assert {"name", "class", "parameters", "p_value", "where"} <= set(effect)
     assert effect["name"] == effect["class"][0] == "drag_linear"
@@ -90,6 +90,20 @@ def test_content_is_the_contract(written):
     assert content["after"]["young"]["value"] == pytest.approx(1.5, rel=0.02)
     assert [r["name"] for r in content["rejected"]] == ["gravity"]
     assert all(r["reason"] for r in content["rejected"])
+
+
+def test_content_follows_the_schema_and_tells_what_was_weighed(written):
+    content = diagnosis_format.read(written / "diagnosis.json")
+    assert content["kind"] == "experiment" and content["words"][0].startswith("The model lacks linear air drag: k = ")
+    assert content["effects"][0]["title"] == "linear air drag" and content["effects"][0]["step"] == 1
+    first, *others = content["models"]
+    assert (first["name"], first["verdict"]) == ("drag_linear", "named")
+    assert all(m["verdict"] in ("rejected", "weighed") and m["error_ratio"] < first["error_ratio"] for m in others)
+    assert {m["name"] for m in content["models"]} <= {"drag_linear", "gravity"}
+    assert content["chance"][0]["p_value"] == content["effects"][0]["p_value"] and content["chance"][0]["error_ratio95"] >= 1
+    assert content["work"]["simulations"] == sum(own["simulations"] for own in content["work"]["by_step"].values()) > 0
+    assert {name: r["role"] for name, r in content["recordings"].items()} == {"r0": "fit", "r1": "fit", "r2": "held_out"}
+    assert "The model lacks linear air drag" in (written / "report.html").read_text()
 
 
 def test_model_and_trace(found, written):
@@ -116,7 +130,7 @@ def test_null_has_reasons_and_no_effects(tmp_path):
 
 def test_figures_that_people_use(found):
     own = {"inverse": {"value": 2e-4, "unit": "1/Pa", "interval90": [1.6e-4, 2.5e-4]}}
-    made = answer._derived(found, "yield", own)
+    made = answer_content._derived(found, "yield", own)
     assert made["inverse"] == own["inverse"]
     assert made["yield_stress"]["value"] == pytest.approx(5000.0)
     assert made["yield_stress"]["interval90"] == pytest.approx([4000.0, 6250.0])
@@ -125,14 +139,16 @@ def test_figures_that_people_use(found):
         for k, v in {"cx": 0.1, "cy": 0.0, "cz": -0.1, "radius": 0.08}.items()
     }
     ball["log_ratio"] = {"value": math.log(10), "unit": "1", "interval90": [math.log(8), math.log(12)]}
-    made = answer._derived(found, "stiffness_gradient", ball)
+    made = answer_content._derived(found, "stiffness_gradient", ball)
     assert made["ratio"]["value"] == pytest.approx(10.0)
     assert made["ratio"]["interval90"] == pytest.approx([8.0, 12.0])
     assert made["centre"]["value"] == [0.1, 0.0, -0.1]
 
 
 def test_figures_that_are_not_finite_become_null(tmp_path):
-    answer.write_json(tmp_path / "a.json", answer._plain({"a": np.float32(np.nan), "b": [np.int64(3), math.inf], "c": np.bool_(True)}))
+    answer.write_json(
+        tmp_path / "a.json", answer_content.plain({"a": np.float32(np.nan), "b": [np.int64(3), math.inf], "c": np.bool_(True)})
+    )
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": None, "b": [3, None], "c": True}
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
 

@@ -1,6 +1,8 @@
 """Diagnosis from Python: the command's answer, on a folder and on data that are read already, and what can be asked of it."""
 
 import json
+import shutil
+from pathlib import Path
 
 import matplotlib as mpl
 import pytest
@@ -9,6 +11,7 @@ import yaml
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.discrepancy.report.diagnosis import Diagnosis
+from neuido.discrepancy.report.wording import title
 from neuido.discrepancy.workflow import diagnose
 from neuido.errors import UserError
 from tests import command
@@ -40,8 +43,9 @@ def test_answer_is_that_of_the_command(folder, found, tmp_path, capsys):
     options = ["--effects", DRAGS, "--draws", "39", "--device", "cpu", "--progress", "false"]
     status, out, _ = command.run(capsys, "diagnose", folder, "--out", tmp_path / "by-command", *options)
     assert status == 0
-    assert out.splitlines()[0] == found.line
-    assert str(tmp_path / "by-command") in out.splitlines()[1]
+    *words, place, _ = [*out.splitlines(), ""]
+    assert "\n".join(words) == found.summary() and words[0].startswith("The model lacks quadratic air drag")
+    assert str(tmp_path / "by-command") in place
     assert without_time(found.folder) == without_time(tmp_path / "by-command")
 
 
@@ -63,10 +67,12 @@ def test_effects_and_error_are_those_of_the_file(found):
 
 def test_words_name_effect_figure_and_errors(found):
     (effect,) = found.effects
-    words = found.summary()
     for part in (effect.name, f"{effect.value:.3g}", f"{found.error.before:.3g}", f"{found.error.after:.3g}", found.error.unit):
-        assert part in words
         assert part in repr(found)
+    words = found.summary()
+    assert words == "\n".join(found.words.paragraphs) == "\n".join(found.to_dict()["words"])
+    for part in (title(effect.name), f"{effect.parameter} = {effect.value:.1g}"[:7], f"{1e3 * found.error.after:.3g} mm after"):
+        assert part in words
 
 
 def test_plot_has_a_panel_for_each_recording(found):
@@ -81,6 +87,51 @@ def test_report_is_copied(found, tmp_path):
     path = found.report(tmp_path / "new" / "page.html")
     assert path.read_text() == found.report().read_text()
     assert found.report(tmp_path) == tmp_path / "report.html"
+
+
+OLDER = Path(__file__).parent / "diagnosis-1"
+
+
+def test_an_older_file_is_read_and_drawn(tmp_path, capsys):
+    found = Diagnosis.read(OLDER)
+    assert (found.kind, found.answer, found.effects[0].value) == ("experiment", "effect", pytest.approx(3.0013, abs=1e-3))
+    assert found.summary().startswith("The model lacks linear air drag: k = 3.00 per second (90 %: 2.98–3.02).")
+    assert set(found.motion()) == {"throw", "toss"} and len(found.plot().axes) == 2
+    status, out, _ = command.run(capsys, "report", str(OLDER), "--out", tmp_path / "page.html")
+    assert status == 0 and str(tmp_path / "page.html") in out
+    assert (tmp_path / "page.html").read_text() == found.page()
+    status, _, _ = command.run(capsys, "report", f"a={OLDER}", f"<b>={OLDER}", "--out", tmp_path / "both.html")
+    both = (tmp_path / "both.html").read_text()
+    assert status == 0 and both.index("All bodies") < both.index("<h2>a: an effect is missing") < both.index("<h2>&lt;b&gt;: an effect")
+
+
+@pytest.mark.parametrize(
+    ("changed", "word"),
+    [
+        ({"answer": "perhaps"}, "perhaps"),
+        ({"effects": [{"name": "drag_linear", "parameters": {}}]}, "class"),
+        ({"format": "neuido-diagnosis/2"}, "kind"),
+        ({"error": {}}, "before"),
+        ({"experiment": "../x", "error": {"before": 1}}, "not as"),
+    ],
+)
+def test_a_file_that_is_not_as_its_format_says_is_refused_in_one_line(tmp_path, changed, word):
+    content = json.loads((OLDER / "diagnosis.json").read_text()) | changed
+    (tmp_path / "diagnosis.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match=word) as refused:
+        Diagnosis.read(tmp_path)
+    assert "\n" not in str(refused.value) and "diagnosis.json" in str(refused.value)
+
+
+def test_names_of_a_file_are_no_paths(tmp_path):
+    content = json.loads((OLDER / "diagnosis.json").read_text())
+    for when in ("before", "after"):
+        content["error"][when]["by_recording"] = {"../throw": 1.0}
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "diagnosis.json").write_text(json.dumps(content))
+    (tmp_path / "sub" / "predicted").mkdir()
+    shutil.copy(OLDER / "predicted" / "throw.npz", tmp_path / "sub" / "throw.npz")
+    assert Diagnosis.read(tmp_path / "sub").motion() == {}
 
 
 def test_read_again(found):
@@ -111,7 +162,7 @@ def test_model_after_closes_the_loop(folder, found):
     assert (again.answer, again.effects) == ("none", ())
     content = yaml.safe_load(found.model_after.read_text())
     assert diagnose(folder, model=content, effects=DRAGS, draws=39).line == again.line
-    assert "nothing is missing" in again.summary()
+    assert again.summary().startswith("Nothing is missing")
 
 
 @pytest.mark.slow

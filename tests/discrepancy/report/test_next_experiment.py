@@ -67,13 +67,11 @@ def test_spin_tells_a_pull_to_a_place_from_a_lift(body):
     assert found["expected_log_odds"] > 0
     assert all(o["expected_log_odds"] <= found["expected_log_odds"] for o in found["others"])
     assert found["change"] in [name for name, _ in next_experiment.changes(body.measured[0], 1000.0)]
-    assert next_experiment.summary(found).endswith(".")
 
 
 def test_nothing_to_tell_apart(body):
     d = diagnosis(body, {"drag_linear": {"drag_linear.k": 1.5}})
     assert next_experiment.propose(d) is None
-    assert "Nothing" in next_experiment.summary(None)
 
 
 def test_rivals_that_a_longer_step_does_not_bear_are_told_apart_with_the_suggested_one(body):

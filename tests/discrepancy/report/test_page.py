@@ -1,197 +1,205 @@
-"""The page of a diagnosis: whole, self-contained, escaped, and useful without matplotlib."""
+"""The page of a diagnosis: whole, self-contained, escaped, small, and useful without JavaScript."""
 
-import base64
 import json
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
-from shutil import which
 
 import numpy as np
 import pytest
 
-from neuido.discrepancy.inference.attribution import diagnose
-from neuido.discrepancy.report import answer, figures
-from neuido.discrepancy.report import page as report
-from neuido.discrepancy.report.residual import Series
-from tests.discrepancy.report.test_answer import Curve
+from neuido.discrepancy.report import motion_player, page, plots
+from neuido.discrepancy.report.reader_units import Units
+from tests.discrepancy.report.report_content import HOSTILE, content, motion, stress_curve
 
-RNG = np.random.default_rng(0)
+VOID = ("meta", "input", "br", "img", "link", "hr")
 
 
-def motion(frames: int = 9, points: int = 600) -> dict:
-    x = RNG.uniform(0, 1, (frames, points, 3))
-    seen = x.copy()
-    seen[4, 0] = np.nan
-    return {
-        "take <1>": {"positions": np.array(1), "t": np.linspace(0, 0.08, frames), "measured": seen, "before": x + 0.1, "after": x + 0.01}
-    }
-
-
-class Checker(HTMLParser):
-    """Collects what a page would load from elsewhere, and whether its elements close."""
+class Reader(HTMLParser):
+    """Collects what a page would load from elsewhere, whether its elements close, and its text outside scripts."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.outside, self.open = [], []
+        self.outside, self.open, self.text, self.scripts = [], [], "", 0
 
     def handle_starttag(self, tag, attributes):
         for key, value in attributes:
+            assert not key.startswith("on"), (tag, key)
             if key in ("src", "href", "data") and value and not value.startswith(("#", "data:")):
                 self.outside.append((tag, value))
-        if tag not in ("meta", "input", "br", "use", "path"):
+        self.scripts += tag == "script"
+        if tag not in VOID:
             self.open.append(tag)
 
-    def handle_startendtag(self, tag, attributes):
-        self.handle_starttag(tag, attributes)
-        if tag not in ("meta", "input", "br", "use", "path"):
-            self.open.pop()
-
     def handle_endtag(self, tag):
-        if tag in ("path", "use"):
-            return
-        assert self.open
         assert self.open.pop() == tag
 
-
-@pytest.fixture(scope="module")
-def found():
-    return diagnose(Curve({"young": 1.5, "drag_linear.k": 0.8}), draws=39)
-
-
-def test_page_is_whole_and_needs_nothing_else(found):
-    details = answer.describe(found, device="cpu")
-    page = report.page([details], [found], kind="experiment")
-    checker = Checker()
-    checker.feed(page)
-    assert checker.outside == []
-    assert checker.open == []
-    for word in ("drag_linear", "gravity", "90 % interval", "linear model", "Next experiment", "<svg", "Floors"):
-        assert word in page
+    def handle_data(self, data):
+        if "script" not in self.open and "style" not in self.open:
+            self.text += " " + data
 
 
-def test_names_are_escaped(found):
-    details = answer.describe(found, device="cpu")
-    details.content["effects"][0]["where"] = "<script>alert(1)</script>"
-    assert "<script>alert" not in report.page([details], [found], kind="experiment")
+def read(text: str) -> Reader:
+    reader = Reader()
+    reader.feed(text)
+    assert reader.open == [] and reader.outside == []
+    return reader
 
 
-@pytest.mark.slow
-def test_page_without_matplotlib_has_its_tables(tmp_path):
-    code = f"""
-import sys
-sys.modules["matplotlib"] = None
-from neuido.discrepancy.report import answer
-from neuido.discrepancy.report import page as report
-from neuido.discrepancy.inference.attribution import diagnose
-from tests.discrepancy.report.test_answer import Curve
-d = diagnose(Curve({{"young": 1.5, "drag_linear.k": 0.8}}), draws=19)
-page = report.page([answer.describe(d, device="cpu")], [d], kind="experiment")
-assert "<svg" not in page and "<table" in page and "drag_linear" in page
-open({str(tmp_path / "page.html")!r}, "w").write(page)
-"""
-    answer_ = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert answer_.returncode == 0, answer_.stderr
-    assert (tmp_path / "page.html").stat().st_size > 1000
+def figures(text: str) -> list:
+    return json.loads(re.search(r'<script type="application/json" id="figures">(.*?)</script>', text, re.S).group(1))
 
 
-def test_player_holds_the_motion():
-    page = figures.player(motion())
-    assert page.count("</script>") == 1  # a name with markup closes nothing
-    data = json.loads(re.search(r"const data = (\{.*?\}), colours", page).group(1))
-    own = data["take <1>"]
-    assert (own["n"], own["k"]) == (figures.MOST_POINTS, 9)
-    values = [np.frombuffer(base64.b64decode(s), "<i2").reshape(9, own["n"], 3).astype(float) for s in own["sets"]]
-    x = motion()["take <1>"]
-    assert (values[0] == -32768).any()
-    shift = values[1] - values[2]  # both are the same motion, 0.09 apart
-    low, high = 0.0, float(np.nanmax(x["before"]))
-    assert np.median(shift) * (high - low) / 2 / 32000 == pytest.approx(0.09, rel=0.05)
-
-
-def test_player_begins_where_the_motions_lie_furthest_apart():
-    moved = motion()
-    moved["take <1>"]["before"][6, :40] += 2.0
-    moved["take <1>"]["before"][4, 0] += 9.0  # not seen there
-    assert '"first": 6' in figures.player(moved)
-
-
-def test_player_runs(tmp_path):
-    node = which("node")
-    if node is None:
-        pytest.skip("node is not installed")
-    script = re.search(r"<script>(.*)</script>", figures.player(motion()), re.S).group(1)
-    stub = """
-let drawn = 0; const pen = {clearRect() {}, fillRect() { drawn++; }};
-const element = {getContext: () => pen, width: 10, height: 10, add(o) { this.value = o; }, value: 0, max: 0};
-const box = {querySelector: () => element, querySelectorAll: () => [{checked: true}, {checked: true}, {checked: true}]};
-globalThis.document = {currentScript: {previousElementSibling: box}}; globalThis.Option = function (n) { return n; };
-const pick = {add(o) { this.value = o; }, value: ""}; const slider = {value: 0};
-box.querySelector = q => q === "select" ? pick : q === "canvas" ? element : q.includes("range") ? slider : {};
-"""
-    # `new Option(name)` yields an object of the constructor's return only for objects: names are kept as they are
-    stub = stub.replace("function (n) { return n; }", "class extends String {}").replace("this.value = o;", "this.value = String(o);")
-    (tmp_path / "p.js").write_text(stub + script + "\nif (drawn < 1100) throw new Error('drew ' + drawn);")
-    answer_ = subprocess.run([node, str(tmp_path / "p.js")], capture_output=True, text=True)
-    assert answer_.returncode == 0, answer_.stderr
-
-
-def test_figures_are_drawn():
-    m = motion()
-    series = [Series(n, "m", np.arange(3.0), np.ones(3), np.ones(3), 0.1 * np.ones(3), 3) for n in ("flight", "power")]
-    for page in (
-        figures.error_curves(m, 1e-3, 1e-3),
-        figures.residual_maps(m),
-        figures.stage_curves({"take <1>": series}),
-        figures.ranking([("a", 1.0, True), ("b", 0.1, False)], 0.3),
+def test_the_page_opens_with_the_answer_and_needs_nothing_else():
+    text = page.page([content()], [motion()], kind="experiment", name="thrown block")
+    reader = read(text)
+    assert reader.scripts == 3 and len(text.encode()) < page.LIMIT
+    said = re.sub(r"\s+", " ", reader.text)
+    first = said.index("The model lacks linear air drag: k = 3.00 per second (90 %: 2.98–3.02).")
+    assert first < said.index("How sure") < said.index("What could not be excluded") < said.index("Motion before and after")
+    for word in (
+        "drag_linear",
+        "quadratic air drag",
+        "leaves 6 times the error of linear air drag",
+        "validation",
+        "throw (fit)",
+        "Young's modulus",
     ):
-        assert page.startswith("<svg")
-        assert "</svg>" in page
-    assert figures.stage_curves({}) == ""
-    assert figures.ranking([], 0.0) == ""
+        assert word in said, word
+    assert [f["form"] for f in figures(text)] == ["player", "plot", "plot", "map", "plot", "plot"]
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "ticks"),
-    [
-        (0.4, 4.5, [0.5, 1, 2]),
-        (0.9, 1.24, [0.9, 0.95, 1, 1.05, 1.1, 1.15, 1.2]),
-        (0.09, 210, [0.1, 0.5, 2, 10, 50, 200]),
-        (1.1, 2.45, [1.2, 1.4, 1.6, 1.8, 2.0, 2.2, 2.4]),
-    ],
-)
-def test_ticks_are_round_and_few(low, high, ticks):
-    np.testing.assert_allclose(figures.log_ticks(low, high), ticks)
-    for width in np.geomspace(1.01, 1e9, 200):
-        own = figures.log_ticks(1e-3, 1e-3 * width)
-        assert 2 <= len(own) <= figures.MOST_TICKS and np.all(np.diff(own) > 0)
+def test_every_plot_has_labels_a_title_and_a_legend():
+    c, arrays = stress_curve()
+    made = [f for f in figures(page.page([content()], [motion()])) if f["form"] == "plot"]
+    made += figures(page.page([c], [arrays]))
+    assert len(made) == 6
+    for one in made:
+        layout = one["layout"]
+        assert layout["title"]["text"] and layout["xaxis"]["title"]["text"] and layout["yaxis"]["title"]["text"] and layout["showlegend"]
+        assert all(trace["name"] for trace in one["data"])
+
+
+def test_a_material_test_is_drawn_over_its_stretch_in_one_unit():
+    c, arrays = stress_curve()
+    text = page.page([c], [arrays], kind="material test")
+    stress, left = figures(text)
+    assert (stress["layout"]["xaxis"]["title"]["text"], stress["layout"]["yaxis"]["title"]["text"]) == ("stretch", "nominal stress [kPa]")
+    assert stress["data"][0]["x"] == pytest.approx(np.linspace(1, 6, 12), rel=1e-4)
+    assert stress["data"][0]["y"][0] == pytest.approx(400.0)
+    assert left["layout"]["yaxis"]["title"]["text"] == "measured − predicted [kPa]"
+    said = read(text).text
+    assert "[kPa]" in said and "MPa" not in said and " Pa" not in said
+
+
+def test_points_without_a_path_are_no_line():
+    c, arrays = stress_curve()
+    own = arrays["uniaxial"]
+    order = np.random.default_rng(0).permutation(12)
+    shuffled = {key: value[order] for key, value in own.items()}
+    made = plots.data_plots("uniaxial", shuffled, c, Units.of([c]))
+    assert {trace["mode"] for trace in made[0]["data"]} == {"markers"}
+    assert {trace["mode"] for trace in plots.data_plots("uniaxial", own, c, Units.of([c]))[0]["data"]} == {"markers", "lines"}
+
+
+def test_several_bodies_have_a_table_first():
+    none = content(answer="none", effects=[], body="stone", models=[])
+    text = page.page([content(body="feather"), none], [motion(), motion()], kind="track", name="two bodies")
+    said = re.sub(r"\s+", " ", read(text).text)
+    assert said.index("All bodies") < said.index("feather") < said.index("an effect is missing") < said.index("The model lacks")
+    assert "linear air drag: k = 3.00 1/s (2.98–3.02)" in said and "39.8 mm" in said
+    assert text.count("<details") == 2 and text.count("<details open>") == 1
+
+
+def test_names_do_nothing():
+    c, arrays = stress_curve(HOSTILE)
+    effect = {
+        "name": HOSTILE,
+        "class": [HOSTILE],
+        "where": HOSTILE,
+        "parameters": {HOSTILE: {"value": 1.0, "unit": "1", "interval90": [0.9, 1.1]}},
+    }
+    c["effects"] = [c["effects"][0] | effect]
+    c["error"]["noise_from"] = {}
+    c |= {"body": HOSTILE, "why": [HOSTILE], "device": HOSTILE, "left_out": [HOSTILE], "settings_not_run": {HOSTILE: [HOSTILE]}}
+    c["models"] = [{"step": 1, "name": HOSTILE, "error_ratio": 2.0, "verdict": "named", "reason": HOSTILE, "parameters": {}}]
+    c["recordings"][HOSTILE]["axis"] = {"label": HOSTILE, "unit": "1"}
+    text = page.page([c], [arrays], kind=HOSTILE, name=HOSTILE)
+    reader = read(text)
+    assert reader.scripts == 3  # the figures, Plotly, the page's own
+    outside = text.replace(str(page.plotly_script()), "")
+    assert "<img" not in outside and "window.hit = 1</" not in outside
+    for one in figures(text):
+        for trace in one["data"]:
+            assert "<" not in trace["name"]
+        for label in (one["layout"]["title"], one["layout"]["xaxis"]["title"], one["layout"]["yaxis"]["title"]):
+            assert "<" not in label["text"]
 
 
 def test_a_recording_that_cannot_be_predicted_has_no_figure():
-    """Infinite errors are null in diagnosis.json; the report says so and is written all the same."""
-    errors = {"fit": 0.002, "held_out": None, "by_recording": {"first": 0.002, "second": None}}
-    alone = {"fit": 0.003, "held_out": None}
-    content = {
-        "error": {"unit": "m", "noise_floor": 1e-3, "discretisation_floor": 2e-3, "before": errors, "after": errors,
-                  "amounts": {"before": {}, "after": {}}, "one_setting": {"before": alone, "after": alone}},
-        "effects": [{"name": "yield", "p_value": 0.01, "where": "",
-                     "parameters": {"inverse": {"value": 1.0, "unit": "1/Pa", "interval90": [0.5, None]}}}],
-        "declared": {"young": {"value": 1e5, "unit": "Pa", "interval90": [None, None]}},
-        "after": {"young": {"value": 1e5, "unit": "Pa", "interval90": [9e4, 1.1e5]}},
-    }  # fmt: skip
-    text = report._errors(content) + report._effects(content) + report._figures(content)
-    assert "<td>second</td><td></td><td></td><td></td>" in text
-    assert "0.5 to infinite" in text and "infinite to infinite" in text and "9e+04 to 1.1e+05" in text
+    c = content()
+    for when in ("before", "after"):
+        c["error"][when]["by_recording"]["throw"] = None
+    c["effects"][0]["parameters"]["k"]["interval90"] = [2.5, None]
+    said = read(page.page([c], [{}])).text
+    assert "2.50 to infinite" in said and "nan" not in said.lower().replace("dynamic", "")
 
 
-def test_other_settings_are_named():
-    e = {
-        "unit": "m",
-        "amounts": {"before": {"half <1>": 0.1}, "after": {"half <1>": -0.75}},
-        "one_setting": {"before": {"fit": 0.3, "held_out": 0.4}, "after": {"fit": 0.03, "held_out": 0.0625}},
-    }
-    text = report._settings(e)
-    assert "half &lt;1&gt;" in text and "-0.75" in text
-    assert "leaves 0.4 m before and 0.0625 m after" in text
-    assert report._settings({"unit": "m"}) == ""
+def test_a_page_without_plots_holds_no_plotting_library():
+    text = page.page([content(models=[], stages={})], [{}])
+    assert len(text) < 60_000 and read(text).scripts == 1
+
+
+def test_many_recordings_still_fit_the_page():
+    rng = np.random.default_rng(0)
+    own = {"positions": np.array(1), "t": np.linspace(0, 1, 300)}
+    arrays = own | {key: rng.uniform(0, 1, (300, 500, 3)) for key in ("measured", "before", "after")}
+    many = {f"take {i}": arrays for i in range(12)}
+    c = content(recordings={})
+    for when in ("before", "after"):
+        c["error"][when]["by_recording"] = dict.fromkeys(many, 0.1)
+    assert len(page.page([c], [many]).encode()) <= page.LIMIT
+
+
+def test_player_holds_the_motion():
+    c, m = content(), motion()
+    made = motion_player.player(m, c, Units(lengths=[7e-4, 0.7]))
+    assert made["unit"] == "mm"
+    own = made["recordings"][0]
+    import base64
+
+    sets = [np.frombuffer(base64.b64decode(s), "<i2").reshape(own["frames"], own["points"], 3) for s in own["sets"]]
+    for key, packed in zip(motion_player.SETS, sets, strict=True):
+        np.testing.assert_allclose(np.array(own["middle"]) + own["scale"] * packed, 1e3 * m["throw"][key], atol=0.1)
+    assert own["down"] == [0.0, -1.0, 0.0] and own["name"] == "throw (fit)"
+
+
+def test_player_draws_a_floor_that_is_near_and_hides_what_was_not_seen():
+    c, m = content(), motion()
+    m["throw"]["measured"][1, 0] = np.nan
+    own = motion_player.player(m, c, Units())["recordings"][0]
+    import base64
+
+    packed = np.frombuffer(base64.b64decode(own["sets"][0]), "<i2").reshape(own["frames"], own["points"], 3)
+    assert (packed[1, 0] == motion_player.HIDDEN).all() and (packed[0] != motion_player.HIDDEN).all()
+    c["recordings"]["throw"]["colliders"][0]["point"] = [0.0, float(m["throw"]["measured"][0, :, 1].min()) - 0.05, 0.0]
+    (plane,) = motion_player.player(m, c, Units())["recordings"][0]["planes"]
+    assert len(plane["corners"]) == 4 and len({corner[1] for corner in plane["corners"]}) == 1
+    c["recordings"]["throw"]["colliders"][0]["point"] = [0.0, -50.0, 0.0]
+    assert motion_player.player(m, c, Units())["recordings"][0]["planes"] == []
+
+
+def test_player_begins_where_the_motions_lie_furthest_apart():
+    x = np.zeros((9, 40, 3))
+    moved = x.copy()
+    moved[6] += 2.0
+    assert motion_player.most_telling(x, moved) == 6
+    x[6] = np.nan
+    moved[4] += 1.0
+    assert motion_player.most_telling(x, moved) == 4
+
+
+def test_a_ranking_shows_the_named_effect_apart_from_its_rivals():
+    made = plots.ranking(content()["models"], 1.1)
+    assert [trace["name"] for trace in made["data"]] == ["named, or not told from it", "other effects", "95 % of what chance brings"]
+    assert made["data"][0]["x"] == [27.0] and made["layout"]["xaxis"]["type"] == "log"
+    assert plots.ranking([], None) is None

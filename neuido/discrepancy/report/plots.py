@@ -1,0 +1,204 @@
+"""The plots of a diagnosis' page as Plotly's traces and layouts; colours are names such as "@before", which the page fills in."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from neuido.discrepancy.report.reader_units import Units, axis_of, rounded
+from neuido.discrepancy.report.wording import title
+
+Arrays = Mapping[str, np.ndarray]
+Plot = dict[str, Any]
+MOST_ROWS = 400
+"""Points of a curve; more are thinned out evenly."""
+MOST_BARS = 16
+LOG_FROM = 10.0
+"""Times the noise above which errors are drawn by their logarithms, so that the floor shows."""
+
+
+def safe(name: Any) -> str:
+    """Return a name as Plotly shows it: its labels know some HTML, of which a name may contain nothing."""
+    return str(name).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def numbers(values: Iterable[float], digits: int = 5) -> list[float | None]:
+    """Return figures for JSON; what is not finite leaves a gap."""
+    return [
+        float(f"{v:.{digits}g}") if math.isfinite(v) else None
+        for v in np.array([math.nan if v is None else v for v in values], dtype=float)
+    ]
+
+
+def line(name: str, x: Iterable[float], y: Iterable[float], role: str, *, width: float = 2, dash: str = "solid", **more: Any) -> Plot:
+    """Return a curve."""
+    shape = {"color": f"@{role}", "width": width, "dash": dash}
+    return {"type": "scatter", "mode": "lines", "name": safe(name), "x": numbers(x), "y": numbers(y), "line": shape, **more}
+
+
+def dots(name: str, x: Iterable[float], y: Iterable[float], role: str, *, symbol: str = "circle", size: int = 5, **more: Any) -> Plot:
+    """Return points."""
+    marker = {"color": f"@{role}", "size": size, "symbol": symbol}
+    return {"type": "scatter", "mode": "markers", "name": safe(name), "x": numbers(x), "y": numbers(y), "marker": marker, **more}
+
+
+def plot(heading: str, x: str, y: str, traces: Sequence[Plot], **layout: Any) -> Plot:
+    """Return a plot with a title, two labelled axes and a legend."""
+    axes = {name: {"title": {"text": safe(label)}} | layout.pop(name, {}) for name, label in (("xaxis", x), ("yaxis", y))}
+    return {"data": list(traces), "layout": {"title": {"text": safe(heading)}, "showlegend": True} | axes | layout}
+
+
+def thinned(count: int, most: int) -> np.ndarray:
+    """Return the rows of a long curve that are drawn."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def error_over_time(name: str, arrays: Arrays, c: Mapping[str, Any], units: Units, most: int = MOST_ROWS) -> Plot:
+    """Return the root mean square distance of a recording's points over time, before and after, with the floors."""
+    factor, unit = units.scaled("m")
+    times, traces = arrays["t"], []
+    for when in ("before", "after"):
+        square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
+        seen = np.isfinite(square).any(axis=1)
+        curve = factor * np.sqrt(np.nanmean(square[seen], axis=1))
+        rows = thinned(len(curve), most)
+        traces.append(line(when, times[seen][rows], curve[rows], when))
+    ends = [float(times[0]), float(times[-1])]
+    noise, grid = (c["error"].get(key) or 0.0 for key in ("noise_floor", "discretisation_floor"))
+    traces.append(line("noise", ends, [factor * noise] * 2, "muted", width=1, dash="dot"))
+    if grid > 0:
+        traces.append(line("noise and discretisation", ends, [factor * math.hypot(noise, grid)] * 2, "muted", width=1, dash="dash"))
+    top = max((v for trace in traces[:2] for v in trace["y"] if v), default=0.0)
+    wide = noise > 0 and top > LOG_FROM * factor * noise
+    scale = {"type": "log"} if wide else {"rangemode": "tozero"}
+    label = f"RMS distance [{unit}]"
+    return plot(heading(name, c), "time [s]", label, traces, yaxis=scale)
+
+
+def heading(name: str, c: Mapping[str, Any]) -> str:
+    """Return the name of a recording with its part in the diagnosis."""
+    role = c["recordings"].get(name, {}).get("role")
+    return f"{name} ({role.replace('_', ' ')})" if role else name
+
+
+def data_plots(name: str, arrays: Arrays, c: Mapping[str, Any], units: Units, most: int = MOST_ROWS) -> list[Plot]:
+    """Return what was measured and predicted in a track or a material test, and what is left, over a physical axis."""
+    told = c["recordings"].get(name, {})
+    factor, unit = units.scaled(c["error"]["unit"])
+    quantity = told.get("quantity", "measured")
+    axis, label = axis_of(arrays, told, units)
+    groups = list(dict.fromkeys(arrays["groups"].tolist()))
+    channels = told.get("channels") or ([""] if len(groups) == 1 else [f"channel {g}" for g in groups])
+    curves: list[Plot] = []
+    left: list[Plot] = []
+    for i, (group, channel) in enumerate(zip(groups, channels)):
+        own = np.flatnonzero(arrays["groups"] == group)
+        own = own[thinned(len(own), most)]
+        x, after = axis[own], f", {channel}" if channel else ""
+        look = ("solid", "dash", "dot")[i % 3]
+        scattered = _is_scattered(x)
+        curves.append(
+            dots(f"measured{after}", x, factor * arrays["measured"][own], "measured", symbol=("circle", "square", "diamond")[i % 3])
+        )
+        for when in ("before", "after"):
+            made = factor * arrays[when][own]
+            residual = factor * (arrays["measured"][own] - arrays[when][own])
+            if scattered:
+                symbol = ("circle-open", "square-open", "diamond-open")[i % 3]
+                curves.append(dots(f"{when}{after}", x, made, when, symbol=symbol))
+                left.append(dots(f"{when}{after}", x, residual, when, symbol=symbol))
+            else:
+                curves.append(line(f"{when}{after}", x, made, when, dash=look))
+                left.append(line(f"{when}{after}", x, residual, when, dash=look, width=1.5))
+    noise = c["error"].get("noise_floor") or 0.0
+    if noise > 0:
+        ends = [float(np.nanmin(axis)), float(np.nanmax(axis))]
+        left += [
+            line("± noise", ends, [sign * factor * noise] * 2, "muted", width=1, dash="dot", showlegend=sign > 0, legendgroup="noise")
+            for sign in (1, -1)
+        ]
+    top = heading(name, c)
+    return [plot(top, label, f"{quantity} [{unit}]", curves), plot(f"{top}: what is left", label, f"measured − predicted [{unit}]", left)]
+
+
+def _is_scattered(x: np.ndarray) -> bool:
+    """Whether neighbours in a list lie far from each other, so that no line through them says anything."""
+    if len(x) < 3 or not np.ptp(x) > 0:
+        return False
+    return float(np.median(np.abs(np.diff(x)))) > 0.2 * float(np.ptp(x))
+
+
+def stage_plots(c: Mapping[str, Any]) -> list[Plot]:
+    """Return what is missing in each stage of each recording over time, before and after, with what noise alone makes of it."""
+    out = []
+    for recording, rows in c["stages"].items():
+        for s in rows:
+            if len(s["times"]) < 2:
+                continue
+            unit = s["unit"].replace("^2", "²")
+            traces = [
+                line("noise", s["times"], s["noise"], "muted", width=0, fill="tozeroy", fillcolor="@shade"),
+                *(line(when, s["times"], s[when], when, mode="lines+markers") for when in ("before", "after")),
+            ]
+            label = f"{STAGE_QUANTITIES.get(s['stage'], 'missing')} [{unit}]"
+            out.append(plot(f"{recording}: {s['stage']}", "time [s]", label, traces, yaxis={"rangemode": "tozero"}))
+    return out
+
+
+STAGE_QUANTITIES = {
+    "flight": "missing acceleration",
+    "contact": "missing impulse",
+    "rotation": "missing angular acceleration",
+    "internal modes": "missing acceleration of strain",
+    "power": "missing power",
+    "rest": "missing distance",
+}
+
+
+def ranking(models: Sequence[Mapping[str, Any]], chance: float | None) -> Plot | None:
+    """Return by how much each model divides the error, the named ones in the colour of `after`."""
+    rows = [m for m in models if m.get("error_ratio")][:MOST_BARS]
+    if not rows:
+        return None
+    kept, other = ([m for m in rows if (m["verdict"] in ("named", "class")) == named] for named in (True, False))
+    labels = [safe(label_of(m)) for m in rows]
+    data = []
+    for name, own, role in (("named, or not told from it", kept, "after"), ("other effects", other, "faint")):
+        if own:
+            y = [safe(label_of(m)) for m in own]
+            text = [rounded(m["error_ratio"]) for m in own]
+            data.append(
+                {
+                    "type": "bar",
+                    "orientation": "h",
+                    "name": name,
+                    "y": y,
+                    "x": numbers(m["error_ratio"] for m in own),
+                    "text": text,
+                    "marker": {"color": f"@{role}"},
+                    "hovertemplate": "%{y}: %{x:.3g}<extra></extra>",
+                }
+            )
+    if chance:
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": "95 % of what chance brings",
+                "x": numbers([chance] * len(labels)),
+                "y": labels,
+                "line": {"color": "@before", "dash": "dash", "width": 1},
+            }
+        )
+    label = "error without the effect over error with it"
+    axes = {
+        "xaxis": {"type": "log"},
+        "yaxis": {"categoryorder": "array", "categoryarray": labels[::-1]},
+    }
+    return plot("Effects that were tried", label, "effect", data, **axes, height=150 + 26 * len(labels), bargap=0.25, barmode="overlay")
+
+
+def label_of(m: Mapping[str, Any]) -> str:
+    """Return an effect that was tried in words, with its form where there are several."""
+    return f"{title(m['name'])}, {m['form']}" if m.get("form") else title(m["name"])

@@ -1,0 +1,237 @@
+"""The answer of a diagnosis in plain words: what the command prints, and what its page opens with."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from neuido.discrepancy.report.reader_units import Units, rounded
+
+LEADING = ("yield_stress", "damping_ratio", "coefficient", "ratio")
+"""Derived figures that say more about an effect than the fitted ones."""
+MORE = 3.0
+"""Times its floor above which what named effects leave is more than they explain."""
+STANDS_ABOVE = 1.5
+"""Times the noise above which the answer `none` says where the residual stands."""
+MOST_SAID = 4
+"""Figures or effects that a sentence lists; a table has all of them."""
+TELLING = 1.05
+"""Times the error of the named effect at which a rival is worth a sentence."""
+NUMBERS = ("no", "one", "two", "three")
+Content = Mapping[str, Any]
+
+
+class Words(NamedTuple):
+    """The answer, a paragraph each; empty where there is nothing to say."""
+
+    finding: str
+    """What is missing, and how large it is."""
+    error: str
+    """The error before and after, beside the noise."""
+    sure: str
+    """How sure the answer is, and against which rivals."""
+    not_excluded: str
+    """Which other effects could still be there, and how large."""
+    next: str
+    """What to measure next."""
+    notes: str
+    """What was left out."""
+
+    @property
+    def paragraphs(self) -> tuple[str, ...]:
+        """Those that say something."""
+        return tuple(part for part in self if part)
+
+
+def words_of(c: Content, units: Units | None = None) -> Words:
+    """Return the words of one part of diagnosis.json."""
+    units = units or Units.of([c])
+    notes = f"There was no time for {listed(c['left_out'])}: the same command with more minutes goes on." if c["left_out"] else ""
+    return Words(_finding(c, units), _error(c, units), _sure(c), _not_excluded(c, units), _next(c), notes)
+
+
+def titles() -> dict[str, str]:
+    """Return the words for each effect of the library."""
+    from neuido.physics.effects.library import LIBRARY
+
+    return {entry.name: entry.title for entry in LIBRARY}
+
+
+def title(name: str) -> str:
+    """Return the words for an effect; for one that is not of the library its name."""
+    return titles().get(name, name.replace("_", " "))
+
+
+FIGURES = {
+    "young": "Young's modulus",
+    "poisson": "Poisson's ratio",
+    "density": "density",
+    "yield_stress": "yield stress",
+    "friction_angle": "friction angle",
+    "gravity": "gravity",
+    "stiffness": "factor on the law's stress",
+}
+"""Words for the figures of a declared model."""
+
+
+def worded(text: str) -> str:
+    """Return a text in which the identifiers of effects are replaced by words."""
+    import re
+
+    words = titles()
+    return re.sub(r"[a-z]+(?:_[a-z]+)*", lambda found: words.get(found[0], found[0]) if "_" in found[0] else found[0], text)
+
+
+def listed(parts: Sequence[str], last: str = "and") -> str:
+    """Return "a, b and c"."""
+    parts = list(parts)
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} {last} {parts[-1]}" if parts else ""
+
+
+def leading(parameters: Mapping[str, Any]) -> list[str]:
+    """Return the names of the figures that say how large an effect is, one mostly; the parts of a vector all."""
+    derived = [key for key in LEADING if key in parameters]
+    if derived:
+        return derived[:1]
+    keys = [key for key, p in parameters.items() if not isinstance(p["value"], list)]
+    first = parameters[keys[0]]["unit"] if keys else ""
+    return [key for key in keys if parameters[key]["unit"] == first][:MOST_SAID]
+
+
+def size_of(parameters: Mapping[str, Any], units: Units) -> str:
+    """Return the leading figures of an effect with their 90 % intervals: "k = 3.00 per second (90 %: 2.98–3.02)"."""
+    from neuido.discrepancy.report.reader_units import SPOKEN
+
+    out = []
+    for key in leading(parameters):
+        p = parameters[key]
+        value, interval = units.figures(p["value"], p.get("interval90", (None, None)), p["unit"])
+        unit = SPOKEN.get(p["unit"], units.label(p["unit"]))
+        told = f" (90 %: {interval})" if interval and "interval90" in p else ""
+        out.append(f"{key.replace('_', ' ')} = {value}{f' {unit}' if unit else ''}{told}")
+    return ", ".join(out)
+
+
+def _class_of(e: Content) -> str:
+    """Return the words for an effect, or for all that cannot be told from it."""
+    return listed([title(name) for name in e["class"]], "or")
+
+
+def _finding(c: Content, units: Units) -> str:
+    answer, effects = c["answer"], c["effects"]
+    why = "; ".join(c["why"])
+    out = [f"{why[0].upper()}{why[1:]}."] if why else []
+    if answer in ("effect", "class"):
+        out.append(_missing(effects, units, name=c.get("name", "model")))
+        over = c["error"].get("left_over_floor")
+        if over is not None and over > MORE:
+            out.append(
+                "Something more is missing that no effect of the library explains: what is left is "
+                f"{over:.0f} times what noise and discretisation leave."
+            )
+    elif answer == "none":
+        out.append("Nothing is missing that these data could show.")
+        over = c["error"].get("left_over_noise")
+        if over is not None and over > STANDS_ABOVE:
+            out.append(f"What remains stands at {over:.1f} times the noise, so an effect that does less would not be seen.")
+    elif answer == "unknown":
+        out.append("Something is missing that none of the known effects explains.")
+    elif answer == "insufficient":
+        out.append("These data do not say whether something is missing.")
+    else:
+        out.append("The search was cut off before every effect was tried: nothing is named yet.")
+        for lead in c["leads"]:
+            ratio = f", which divides the error by {rounded(lead['error_ratio'])}" if lead.get("error_ratio") else ""
+            size = size_of(lead["parameters"], units)
+            out.append(f"In the lead so far, and no answer: {title(lead['name'])}{f' ({size})' if size else ''}{ratio}.")
+        if c["untried"]:
+            out.append(f"Not tried: {listed([title(name) for name in c['untried']])}.")
+    return " ".join(out)
+
+
+def _missing(effects: Sequence[Content], units: Units, *, name: str) -> str:
+    """Return what is missing in one sentence, or two where the data cannot tell effects apart."""
+    if len(effects) == 1:
+        (e,) = effects
+        size = size_of(e["parameters"], units)
+        if len(e["class"]) == 1:
+            return f"The model lacks {title(e['name'])}: {size}." if size else f"The model lacks {title(e['name'])}."
+        as_first = f" As {title(e['name'])}: {size}." if size else ""
+        return f"The model lacks {_class_of(e)}; these data cannot tell them apart.{as_first}"
+    said = [f"{_class_of(e)}{f', {size}' if (size := size_of(e['parameters'], units)) else ''}" for e in effects]
+    apart = " The data cannot tell apart what is joined by “or”." if any(len(e["class"]) > 1 for e in effects) else ""
+    return (
+        f"The model lacks {NUMBERS[len(effects)] if len(effects) < len(NUMBERS) else len(effects)} effects: {'; and '.join(said)}.{apart}"
+    )
+
+
+def _error(c: Content, units: Units) -> str:
+    e = c["error"]
+    key = "held_out" if e["after"].get("held_out") is not None else "fit"
+    before, after = (units.said(e[when].get(key), e["unit"]) for when in ("before", "after"))
+    named = "Held-out error" if key == "held_out" else "Error of the fit"
+    change = f"{before} before, {after} after" if c["effects"] else after
+    origin = sorted(set(e.get("noise_from", {}).values()))
+    noise = f"noise {units.said(e['noise_floor'], e['unit'])}" if e.get("noise_floor") is not None else "noise not known"
+    noise += f" ({listed(origin)})" if origin and origin != ["stated"] else ""
+    grid = e.get("discretisation_floor") or 0.0
+    return f"{named} {change}; {noise}" + (f", discretisation {units.said(grid, e['unit'])}." if grid > 0 else ".")
+
+
+def _sure(c: Content) -> str:
+    out, named = [], {name for e in c["effects"] for name in e["class"]}
+    for e in c["effects"]:
+        sentence = ""
+        if e.get("p_value") is not None:
+            sentence = f"Chance brings such a gain with p = {e['p_value']:.2g} by a linear model of the fits"
+        tried = [m for m in c["models"] if m["step"] == e["step"] and m.get("error_ratio")]
+        rivals = [m for m in tried if m["name"] not in named]
+        own = next((m for m in tried if m["name"] == e["name"]), None)
+        if own and rivals:
+            best = max(rivals, key=lambda m: m["error_ratio"])
+            times = own["error_ratio"] / best["error_ratio"]
+            if times >= TELLING:
+                rival = f"the nearest rival, {title(best['name'])}, leaves {rounded(times, 2)} times the error"
+                sentence = f"{sentence}; {rival}" if sentence else f"{rival[0].upper()}{rival[1:]}"
+        if sentence:
+            out.append(
+                f"{title(e['name']).capitalize()}: {sentence[0].lower()}{sentence[1:]}." if len(c["effects"]) > 1 else f"{sentence}."
+            )
+    return " ".join(out)
+
+
+def _not_excluded(c: Content, units: Units) -> str:
+    largest: dict[str, Content] = {}
+    for row in c["power"]:
+        before = largest.get(row["name"])
+        if before is None or (before["up_to"] is not None and (row["up_to"] is None or _share(row) > _share(before))):
+            largest[row["name"]] = row
+    sized = sorted((row for row in largest.values() if row["up_to"] is not None), key=_share, reverse=True)
+    free = [row["name"] for row in largest.values() if row["up_to"] is None]
+    out = []
+    if sized:
+        said = [
+            f"{title(r['name'])} ({r['parameter'].replace('_', ' ')} up to {units.said(r['up_to'], r['unit'])})" for r in sized[:MOST_SAID]
+        ]
+        more = f" and {len(sized) - MOST_SAID} others, listed in the report" if len(sized) > MOST_SAID else ""
+        out.append(f"Not excluded: {listed(said) if not more else ', '.join(said)}{more}.")
+    if free:
+        shown = listed([title(name) for name in free[:MOST_SAID]]) if len(free) <= MOST_SAID else ""
+        shown = shown or f"{', '.join(title(name) for name in free[:MOST_SAID])} and {len(free) - MOST_SAID} others"
+        out.append(f"These data set no limit to {shown}.")
+    return " ".join(out)
+
+
+def _share(row: Content) -> float:
+    """How much of its range an effect may fill unseen."""
+    if row["up_to"] is None:
+        return math.inf
+    return row["up_to"] / row["largest"] if row.get("largest") else 0.0
+
+
+def _next(c: Content) -> str:
+    proposal = c.get("next_experiment")
+    if proposal:
+        a, b = (title(name) for name in proposal["tells_apart"])
+        odds = rounded(math.exp(min(proposal["expected_log_odds"], 600.0)), 2)
+        return f"Measure next: {proposal['change']}. It tells {a} from {b}, with expected odds of {odds} to 1."
+    return f"What would help: {listed(c['would_help'], 'or')}." if c["would_help"] else ""
