@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from neuido.data.measured.material_test import read_material_tests as read_material_tests
     from neuido.data.measured.track import read_tracks as read_tracks
     from neuido.data.scenes.readers import read as read_recording
+    from neuido.discrepancy.own_effects import OwnEffect as OwnEffect
     from neuido.discrepancy.report.diagnosis import Diagnosis as Diagnosis
     from neuido.discrepancy.workflow import diagnose as diagnose
     from neuido.errors import UserError as UserError
@@ -51,6 +52,7 @@ _PLACES = {  # name: its module, and after a colon its name there; a module alon
     "FiniteElements": "physics.fem.finite_elements:FiniteElements",
     "Frames": "physics.runtime.frames:Frames",
     "Operator": "models.operator.dynamics_operator:IntrinsicDynamicsOperator",
+    "OwnEffect": "discrepancy.own_effects:OwnEffect",
     "Simulator": "physics.mpm.simulator:Simulator",
     "UserError": "errors:UserError",
     "diagnose": "discrepancy.workflow:diagnose",
@@ -80,6 +82,7 @@ __all__ = [
     "Frames",
     "Gaussians",
     "Operator",
+    "OwnEffect",
     "ParticleState",
     "Plane",
     "Scene",

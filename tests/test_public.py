@@ -17,9 +17,9 @@ import neuido
 ROOT = Path(__file__).parents[1]
 PUBLIC = {
     "neuido": """
-        AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Operator ParticleState Plane Scene Simulator
-        UserError Walls __version__ configs_root diagnose effects export import_file laws load_scene rasterize read_experiment read_law
-        read_material_tests read_recording read_tracks render shapes
+        AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Operator OwnEffect ParticleState Plane Scene
+        Simulator UserError Walls __version__ configs_root diagnose effects export import_file laws load_scene rasterize read_experiment
+        read_law read_material_tests read_recording read_tracks render shapes
     """,
     "neuido.data": """
         Experiment FilmDataModule MaterialTest MaterialTests MultiView MultiViewDataModule Recording SceneSetup Track Tracks
@@ -40,7 +40,7 @@ PUBLIC = {
         ObjectiveElastic ObjectivePlastic PlasticLaw RawElastic RawPlastic Sigma SymbolicElastic SymbolicPlastic VonMises by_body
         material stack
     """,
-    "neuido.discrepancy": "DiagnosedEffects Diagnosis Effect ErrorChange Quantity diagnose",
+    "neuido.discrepancy": "DiagnosedEffects Diagnosis Effect ErrorChange OwnEffect Quantity diagnose",
 }
 NAMES = [(room, name) for room, text in PUBLIC.items() for name in text.split()]
 ROOMS = ("neuido", "neuido.physics", "neuido.data", "neuido.models", "neuido.discrepancy")

@@ -129,6 +129,20 @@ steps: 200
 setup = load_scene("my-scene.yaml")
 print(setup.scene, len(setup.body.x))
 """,
+    "OwnEffect": """
+import numpy as np
+
+from neuido import OwnEffect, diagnose
+
+t = np.linspace(0, 0.6, 40)  # a ball dropped in a lift that begins to rise
+drop = {"t": t, "y": 2.0 - 0.5 * 9.81 * t**2 - 0.4 * t**3 + 1e-3 * np.random.default_rng(0).standard_normal(40), "noise": 1e-3}
+lift = OwnEffect(
+    "rising_lift", "jerk", "m/s^3", start=1.0, low=-20.0, high=20.0,
+    acts_as=lambda j: {"time_force.interval": 0.2, **{f"time_force.y{k}": -j * 0.2 * k for k in range(5)}},
+)
+found = diagnose({"drop": drop}, model={"gravity": [0.0, -9.81, 0.0]}, candidates=[lift], effects=["drag_linear"], draws=39)
+print(found.summary())
+""",
     "Operator": """
 from neuido import Operator
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from neuido.discrepancy.applied_model import DiagnosedEffects as DiagnosedEffects
+    from neuido.discrepancy.own_effects import OwnEffect as OwnEffect
     from neuido.discrepancy.report.diagnosis import Diagnosis as Diagnosis
     from neuido.discrepancy.report.diagnosis import Effect as Effect
     from neuido.discrepancy.report.diagnosis import ErrorChange as ErrorChange
@@ -16,10 +17,11 @@ _PUBLIC = {
     "Diagnosis": ("report.diagnosis", "Diagnosis"),
     "Effect": ("report.diagnosis", "Effect"),
     "ErrorChange": ("report.diagnosis", "ErrorChange"),
+    "OwnEffect": ("own_effects", "OwnEffect"),
     "Quantity": ("report.diagnosis", "Quantity"),
     "diagnose": ("workflow", "diagnose"),
 }
-__all__ = ["DiagnosedEffects", "Diagnosis", "Effect", "ErrorChange", "Quantity", "diagnose"]
+__all__ = ["DiagnosedEffects", "Diagnosis", "Effect", "ErrorChange", "OwnEffect", "Quantity", "diagnose"]
 
 
 def __getattr__(name: str) -> Any:

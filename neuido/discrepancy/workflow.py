@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuido.data.files.writing import check_writable
-from neuido.data.progress import Progress
+from neuido.data.progress import Progress, duration
 from neuido.discrepancy.report.diagnosis import Diagnosis
 from neuido.errors import UserError
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from neuido.data.measured.experiment import Experiment
     from neuido.data.measured.material_test import MaterialTests
     from neuido.data.measured.track import Tracks
+    from neuido.discrepancy.own_effects import OwnEffect
     from neuido.discrepancy.problems.body import BodyProblem
     from neuido.discrepancy.problems.problem import Problem
     from neuido.discrepancy.store import Work
@@ -31,13 +32,15 @@ KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.y
 
 
 def diagnose(
-    source: "str | os.PathLike | Experiment | MaterialTests | Tracks",
+    source: "str | os.PathLike | Experiment | MaterialTests | Tracks | Mapping[str, Mapping[str, Any]]",
     *,
     out: str | os.PathLike | None = None,
     model: str | os.PathLike | Mapping[str, Any] | None = None,
     law: str | os.PathLike | None = None,
     data: str = "auto",
     effects: str | Sequence[str] | None = None,
+    candidates: "Sequence[OwnEffect]" = (),
+    scene: Mapping[str, Any] | None = None,
     solver: str = "both",
     draws: int = 199,
     seed: int = 0,
@@ -51,12 +54,15 @@ def diagnose(
 
     Args:
         source: Measured data: a folder with experiment.yaml, test.yaml or track.yaml, or what `read_experiment`, `read_material_tests` or
-            `read_tracks` returned.
+            `read_tracks` returned, or arrays: of each recording its columns (`arrays.write_arrays` says which), with `model`.
         out: Folder for the results. None: a temporary folder, removed with the diagnosis.
-        model: Model in place of the folder's own: a file, for example an earlier model_after.yaml, or its content. Folders only.
+        model: Model in place of the folder's own: a file, for example an earlier model_after.yaml, or its content; that of arrays. Not of
+            data that are read already.
         law: Neural law of `neuido predict` in place of the elasticity and plasticity of an experiment; a factor on its stress is fitted.
         data: Of an experiment: points (tracked ones), video (silhouettes), or auto: points where every recording has them.
         effects: Names of the effects to consider, as a list or with commas. None: all that the data could show.
+        candidates: Effects of one's own to consider beside them.
+        scene: Of bodies that are given as arrays: the keys of `scene` and `discretisation` of the format together.
         solver: What may predict the motion of a body: material_points, finite_elements, or both, so that the data choose.
         draws: Draws of the parametric bootstrap, at least 19; p-values come in steps of 1 / (draws + 1).
         seed: Seed of the draws.
@@ -79,6 +85,14 @@ def diagnose(
         raise UserError(f"most = {most} must be 1, 2 or 3")
     if not minutes >= 0:
         raise UserError(f"minutes = {minutes} must not be negative; 0 sets no limit")
+    arrays = isinstance(source, Mapping)
+    given_place = tempfile.TemporaryDirectory(prefix="neuido-arrays-") if arrays else None
+    if given_place is not None:
+        from neuido.discrepancy.arrays import write_arrays
+
+        source, model = write_arrays(source, model, Path(given_place.name) / "arrays", scene=scene), None
+    elif scene is not None:
+        raise UserError("scene is for bodies that are given as arrays: a folder has its own")
     folder = os.fspath(source) if isinstance(source, str | os.PathLike) else None
     kind, place = ("", Path()) if folder is None else kind_of(folder)
     if out is not None:
@@ -86,6 +100,7 @@ def diagnose(
 
     from neuido.discrepancy import store
     from neuido.discrepancy.inference.attribution import diagnose as infer
+    from neuido.discrepancy.own_effects import with_own_effects
     from neuido.discrepancy.report import answer
 
     chosen = choose_device(device)
@@ -94,7 +109,7 @@ def diagnose(
     else:
         problems = problems_of(kind, place, model, chosen, law=law, data=data)
     names = effects if effects is None or isinstance(effects, str) else ",".join(effects)
-    problems = [restricted(solved_by(p, solver), names) for p in problems]
+    problems = [with_own_effects(restricted(solved_by(p, solver), names), candidates) for p in problems]
     for problem in problems:
         if problem.margin({}, problem.solvers[0]) < 0.0:  # refused before anything is written
             raise UserError(problem.refusal(problem.solvers[0]))
@@ -106,7 +121,7 @@ def diagnose(
     plan = "read-data" if folder is None else store.plan_of(place, options, out=target)
     made, untouched = not target.is_dir(), not target.is_dir() or not any(target.iterdir())
     target.mkdir(parents=True, exist_ok=True)
-    resumes = resume and folder is not None
+    resumes = resume and folder is not None and not arrays and not candidates  # what a function does has no name to keep it by
     outdated = store.outdated(target, plan) if resumes else []
     work = store.workplace(target, plan, resume=resumes)
     if not any(work.iterdir()):  # a run that continues keeps its log
@@ -118,9 +133,9 @@ def diagnose(
         for i, problem in enumerate(problems):
             started = time.monotonic()
             cached = store.CachedProblem(problem, work / str(i), tick=log.tick)
-            log.name = problem.name if len(problems) > 1 else ""
-            log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
             seconds = 60.0 * minutes or math.inf
+            log.begin(problem.name if len(problems) > 1 else "", seconds)
+            log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
             try:
                 own = infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds)
             except UserError:
@@ -128,13 +143,15 @@ def diagnose(
                     _forget(target, made)
                 raise
             found.append((own, time.monotonic() - started))
-        log.name = ""
+        log.begin("", math.inf)
         answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
         if not any(own.left_out or own.deadline.cut for own, _ in found):  # otherwise a run with more minutes continues from what is kept
             store.clear(target)
         for own, _ in found:
             log.work(own.work)
         log("written")
+    if given_place is not None:
+        given_place.cleanup()
     return Diagnosis.read(target, keep=temporary)
 
 
@@ -327,6 +344,27 @@ def choose_device(device: str) -> str:
     return ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
 
 
+class Budgeted(Progress):
+    """Progress that says what leads, and how much of a body's time is left."""
+
+    leads = ""
+    until = math.inf
+    """When the time is up, in `time.monotonic`."""
+
+    def line(self, now: float) -> str:
+        parts = [super().line(now)]
+        parts += [self.leads] if self.leads else []
+        if math.isfinite(self.until):
+            parts.append(f"{duration(max(self.until - now, 0.0))} of the time left" if now < self.until else "the time is up: concluding")
+        return "; ".join(parts)
+
+    def say(self, stage: str) -> None:
+        self.stage = stage
+        if self._bar is not None:
+            left = duration(max(self.until - time.monotonic(), 0.0)) if math.isfinite(self.until) else ""
+            self._bar.set_postfix_str("; ".join(filter(None, (stage, self.leads, left and f"{left} left"))))
+
+
 class Log:
     """Show progress on stderr, and write each stage as a row of log.csv.
 
@@ -338,7 +376,7 @@ class Log:
 
     def __init__(self, path: Path, *, shown: bool, begun: float) -> None:
         self.begun, self.count, self.stage, self.name = begun, 0, "", ""
-        self.progress = Progress("diagnosis", unit="simulations", shown=shown)
+        self.progress = Budgeted("diagnosis", unit="simulations", shown=shown)
         fresh = not path.is_file() or not path.stat().st_size
         self.file = path.open("a", newline="")
         self.rows = csv.writer(self.file)
@@ -353,21 +391,39 @@ class Log:
         self.file.close()
         self.progress.close()
 
+    def begin(self, name: str, seconds: float) -> None:
+        """Begin a body with a name, empty where there is one alone, and a time limit [s]."""
+        self.name, self.progress.leads, self.progress.until = name, "", time.monotonic() + seconds
+
     def tick(self, count: int) -> None:
         """Count further simulations."""
         self.count += count
         self.progress.update(count)
 
+    def lead(self, key: str, left: float, before: float, unit: str) -> None:
+        """Show which candidate leads, and what it leaves of the error."""
+        from neuido.discrepancy.report.reader_units import Units
+        from neuido.discrepancy.report.wording import title
+
+        name, _, form = key.partition(":")
+        units = Units([left, before], [left, before])
+        shown = f"{title(name)}{f', {form}' if form else ''}"
+        self.progress.leads = f"in the lead: {shown}, which leaves {units.said(left, unit)} of {units.said(before, unit)}"
+        self._row(self.progress.leads)
+
     def __call__(self, stage: str) -> None:
         if not stage.endswith(" simulations") and stage != self.stage:  # counts are shown anyway
             self.stage = stage
-            self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, stage, self.count])
-            self.file.flush()
+            self._row(stage)
             self.progress.say(f"{self.name}{': ' if self.name else ''}{self.stage}")
+
+    def _row(self, stage: str) -> None:
+        self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, stage, self.count])
+        self.file.flush()
 
     def work(self, steps: "Mapping[str, Work]") -> None:
         """Write what each step of a diagnosis ran, the most expensive first."""
         for step, w in sorted(steps.items(), key=lambda item: -item[1].effort):
             line = f"{step}: {w.simulations} simulations, {w.reused} reused, {w.effort:.3g} particle-substeps or data, {w.seconds:.1f} s"
-            self.rows.writerow([f"{time.monotonic() - self.begun:.1f}", self.name, line, self.count])
+            self._row(line)
             self.progress.note(line)

@@ -284,6 +284,12 @@ class Laboratory:
         ratios = [point[p.name] / p.value for p in self.problem.declared if p.log]
         return max((max(r, 1.0 / r) for r in ratios), default=1.0)
 
+    def tell_lead(self, key: str, squares: np.ndarray, before: np.ndarray) -> None:
+        """Tell which candidate leads and what it leaves, where progress shows that."""
+        lead = getattr(self.tell, "lead", None)
+        if lead is not None:
+            lead(key, self.typical(squares), self.typical(before), self.problem.unit)
+
     def typical(self, squares: np.ndarray) -> float:
         """The geometric mean over the parts of root mean squares, in the unit of the data."""
         return self.scale * math.exp(0.5 * score(squares))

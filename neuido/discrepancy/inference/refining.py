@@ -175,6 +175,8 @@ class Refining(Contests):
             return {}
         ends = (f"{c.key} ({self.typical(square):.3g})" for (c, _), square in zip(top, squares, strict=True))
         self.tell(f"refining {', '.join(ends)} of {self.typical(before):.3g} {self.problem.unit}")
+        first = min(range(len(top)), key=lambda i: score(squares[i]))
+        self.tell_lead(top[first][0].key, squares[first], before)
         leading = ranked[0][1].point
         out: dict[str, tuple[Candidate, Fit]] = {}
         least: dict[str, float] = {}

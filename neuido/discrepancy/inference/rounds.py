@@ -128,6 +128,9 @@ class Inference(Prospects):
         def judged(step: Round) -> Round:
             result = self.judge(step, best, model, every=every)
             self.tell(self.verdict(result))
+            if result.trials:
+                lead = result.chosen or result.trials[0]
+                self.tell_lead(lead.candidate.key, lead.errors, result.errors)
             return result
 
         result = judged(empty)
