@@ -1,8 +1,8 @@
 """Blind test of diagnoses: experiments with or without an undeclared effect, diagnosed without their keys and then scored against them.
 
     python benchmarks/blind.py --out runs/blind [--cases 60] [--curves 0] [--workers N] [--gpus 1] [--device cpu]
-                               [--minutes 0] [--ablation single-recording no-discretisation] [--only make|diagnose|score]
-                               [--folders FOLDER ...]
+                               [--minutes 0] [--ablation single-recording no-discretisation] [--statistics]
+                               [--only make|diagnose|score|replay] [--folders FOLDER ...]
 
 A third of the cases are nulls, half of them with wrong nuisance parameters. The others are spread evenly over the effects of the library;
 some have two effects, and some an effect outside the library. Three solvers generate the cases in turn. Existing results are kept, so the
@@ -10,6 +10,8 @@ command resumes where it was stopped. Only the scoring opens the keys, after the
 
 The ablations `plain-bic`, `no-unknown` and `take-smallest-error` are computed from the full run and are always scored; `single-recording`
 and `no-discretisation` need runs of their own. `--folders` scores the given folders instead, each with a truth.yaml or a key in ../keys.
+`--statistics` keeps the fits of each case in its answer's folder; then `--only replay` decides every case again from them, within seconds
+and without a simulation, and reports apart whether the search fitted the true effects and whether the decision named them (replay.csv).
 A GPU runs one case at a time unless `--workers` is given; with NVIDIA's MPS and twenty workers the throughput is about three times higher.
 """
 
@@ -105,7 +107,7 @@ def free_memory(device: str) -> None:
         torch.cuda.empty_cache()
 
 
-def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: float = 0.0) -> str:
+def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: float = 0.0, statistics: bool = False) -> str:
     """Diagnose a folder into `out` within a time limit [min] (0: none); return an empty string, or the reason of the failure."""
     from neuido.discrepancy import workflow
     from neuido.discrepancy.inference import attribution
@@ -127,7 +129,7 @@ def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: flo
             given = folder
             if ablation == "single-recording":
                 given = str(_with_one_recording(Path(folder), target.parent / ".inputs" / target.name))
-            workflow.diagnose(given, out=out, device=device, minutes=minutes, progress=False)
+            workflow.diagnose(given, out=out, device=device, minutes=minutes, statistics=statistics, progress=False)
     except Exception as error:  # the case is scored as failed; go on with the others
         target.mkdir(parents=True, exist_ok=True)
         (target / "failed.txt").write_text(f"{type(error).__name__}: {error}\n")
@@ -235,6 +237,27 @@ def score_all(folders: list[Path], out: Path, ablations: list[str]) -> str:
     return blind_scores.table(columns)
 
 
+def replay_all(folders: list[Path], out: Path) -> str:
+    """Decide all cases again from their kept fits, write replay.csv, and return the table of search recall and decision accuracy."""
+    from neuido.discrepancy.inference.decision import decide
+    from neuido.discrepancy.inference.statistics import read_fits
+
+    rows = []
+    for folder in folders:
+        place = out / "answers" / "none" / folder.name
+        for i, diagnosis in enumerate(answers(place) or []):
+            if (place / "fits" / f"{i}.npz").is_file():
+                case, _ = read_fits(place / "fits" / f"{i}.npz")
+                rows.append({"case": folder.name} | blind_scores.replayed(key_of(folder), diagnosis, case, decide(case)))
+    hidden = out / ".replay.csv.tmp"
+    hidden.unlink(missing_ok=True)
+    for row in rows:
+        record(hidden, row)
+    if rows:
+        os.replace(hidden, out / "replay.csv")
+    return blind_scores.table({"replayed": blind_scores.recall(rows)}) if rows else "no case has kept fits: diagnose with --statistics"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/blind"))
@@ -246,7 +269,8 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--minutes", type=float, default=0.0, help="time limit of a diagnosis [min]; 0: none")
     parser.add_argument("--ablation", nargs="*", choices=RERUN, default=[])
-    parser.add_argument("--only", choices=("make", "diagnose", "score"))
+    parser.add_argument("--only", choices=("make", "diagnose", "score", "replay"))
+    parser.add_argument("--statistics", action="store_true", help="keep what each decision rests on in ANSWER/fits, for --only replay")
     parser.add_argument("--folders", nargs="+", type=Path, help="diagnose and score these folders instead of generated ones")
     parser.add_argument("--particles", type=int, default=0, help="particles of a body; 0: 1500 to 3000")
     parser.add_argument("--seconds", type=float, default=0.0, help="duration of the recordings of a body [s]; 0: 0.4 to 0.6")
@@ -265,7 +289,7 @@ def main() -> None:
         folders = [folder for folder in folders if folder.is_dir()]
     if options.only in (None, "diagnose"):
         places = [(f, options.out / "answers" / how / f.name, how) for how in ("none", *options.ablation) for f in folders]
-        asked = [(str(folder), str(place), how, options.device, options.minutes) for folder, place, how in places]
+        asked = [(str(folder), str(place), how, options.device, options.minutes, options.statistics) for folder, place, how in places]
         waiting = [task for task in asked if not (Path(task[1]) / "diagnosis.json").is_file()]
         for n, (task, failed) in enumerate(in_parallel(diagnose_one, waiting, workers, options.gpus), 1):
             place = Path(task[1])
@@ -275,6 +299,10 @@ def main() -> None:
                    "named": " ".join(e["name"] for d in found for e in d["effects"]), "sha256": digest, "failed": failed}  # fmt: skip
             record(options.out / "results.csv", row)
             print(f"{n} of {len(waiting)}: {row['case']} ({task[2]}): {row['answer']} {row['named']} {failed}", flush=True)
+    if options.only == "replay":
+        text = replay_all(folders, options.out)
+        write_text(options.out / "replay.md", text + "\n")
+        print(text)
     if options.only in (None, "score"):
         text = score_all(folders, options.out, options.ablation)
         write_text(options.out / "table.md", text + "\n")

@@ -79,6 +79,98 @@ def score(key: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any
     }
 
 
+NEAR = 0.25
+"""Relative distance from the true sizes up to which a fit of the true effects counts as near its optimum; noise alone is another sign."""
+AT_NOISE = 1.1
+"""Times the noise that a fit of the true effects may leave in each part to count as near its optimum."""
+
+
+def replayed(key: Mapping[str, Any], diagnosis: Mapping[str, Any], case: Any, decision: Any) -> dict[str, Any]:
+    """Return what a replayed case says of the search and of the decision.
+
+    `tried`: all true effects were fitted together. `reached`: one of these fits ended near its optimum. `named`: each true effect is in the
+    class of a different named effect. `same`: the replay gives the answer, the effects and the classes of the diagnosis.
+
+    Args:
+        key: The truth.
+        diagnosis: The content of diagnosis.json.
+        case: A `CaseRecord`.
+        decision: What `decide` says of it.
+    """
+    true = key.get("undeclared") or []
+    known = [one for one in true if not one.get("outside_library")]
+    outside = len(known) < len(true)
+    fits = [end for r in case.judged for fit in r.fits for end in (fit, fit.finished) if end is not None]
+    own = [fit for fit in fits if known and _is_of(fit.effects, known)]
+    noise = [case.recordings[n][3] for n, *_ in case.parts]
+    reached = [fit for fit in own if _is_near(fit, known) or all(e < (AT_NOISE * s) ** 2 for e, s in zip(fit.errors, noise, strict=True))]
+    effects = [{"name": name.partition(":")[0], "class": list(c), "parameters": {}}
+               for name, c in zip(decision.effects, decision.classes, strict=True)]  # fmt: skip
+    now = score(key, {**diagnosis, "answer": decision.answer, "effects": effects})
+    live = [e["name"] for e in diagnosis.get("effects") or []] if diagnosis["answer"] in NAMED else []
+    classes = [set(e.get("class", ())) | {e["name"]} for e in diagnosis.get("effects") or []] if diagnosis["answer"] in NAMED else []
+    same = diagnosis["answer"] == decision.answer and live == [e["name"] for e in effects] and classes == [set(c) for c in decision.classes]
+    return {
+        "group": group_of(key),
+        "kind": now["kind"],
+        "solver": key.get("solver", ""),
+        "tried": bool(own),
+        "reached": bool(reached),
+        "named": now["in_class"],
+        "outside": outside,
+        "answer": decision.answer,
+        "effects": now["named"],
+        "same": same,
+        "effort": sum(w["effort"] for w in case.work.values()),
+    }
+
+
+def _is_of(effects: Sequence[str], known: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a fit has the true effects and no others."""
+    names = [{name.partition(":")[0]} for name in effects]
+    wanted = [set(one["diagnosis_names"]) for one in known]
+    return len(names) == len(wanted) and len(_pairs(wanted, names)) == len(wanted)
+
+
+def _is_near(fit: Any, known: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether the sizes of a fit are near the true ones, those of every effect that has sizes to compare."""
+    compared = 0
+    for one in known:
+        names = {name.partition(":")[0] for name in fit.effects} & set(one["diagnosis_names"])
+        own = {p.partition(".")[2]: value for p, value in fit.point.items() if p.partition(".")[0] in names}
+        asked = _sizes(one, own)
+        if asked:
+            compared += 1
+            off = math.hypot(*(own[name] - value for name, value in asked.items()))
+            if off > NEAR * math.hypot(*asked.values()):
+                return False
+    return compared == len(known)
+
+
+def recall(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return search recall and decision accuracy of replayed cases as text."""
+
+    def share(count: int, of: int) -> str:
+        return f"{count} of {of} ({100 * count / of:.0f} %)" if of else "none made"
+
+    out = {}
+    for name, groups in {"one effect": ("one",), "two effects": ("two",)}.items():
+        own = [r for r in rows if r["group"] in groups]
+        reached = [r for r in own if r["reached"]]
+        out[f"{name}: true effects fitted"] = share(sum(r["tried"] for r in own), len(own))
+        out[f"{name}: fitted near the optimum (search recall)"] = share(len(reached), len(own))
+        out[f"{name}: of these named (decision accuracy)"] = share(sum(r["named"] for r in reached), len(reached))
+    nulls = [r for r in rows if r["group"] in ("null", "nuisance")]
+    out["nulls on which an effect is named"] = share(sum(r["answer"] in NAMED for r in nulls), len(nulls))
+    out["outside the library: unknown or insufficient"] = share(
+        sum(r["answer"] in ("unknown", "insufficient") for r in rows if r["outside"]), sum(r["outside"] for r in rows)
+    )
+    out["replay equal to the diagnosis"] = share(sum(r["same"] for r in rows), len(rows))
+    efforts = [r["effort"] for r in rows]
+    out["particle-substeps a case, median"] = f"{float(np.median(efforts)):.3g}" if efforts else "none"
+    return out
+
+
 def group_of(key: Mapping[str, Any]) -> str:
     """Return the group of a case: null, nuisance (a null with wrong nuisance parameters), one, two or outside."""
     true = key.get("undeclared") or []

@@ -6,6 +6,7 @@ import math
 import sys
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -66,6 +67,42 @@ def test_one_effect():
     assert member["in_class"] and not member["exact"] and math.isnan(member["parameter_error"]) and member["intervals"] == 0
     wrong = scores.score(truth("drag_linear"), answer(effect("viscosity_shear")))
     assert not wrong["in_class"] and wrong["found"] == 0
+
+
+def stored(*fits, noise=0.01):
+    """A case of one part with fits, each the keys of its effects, its point, and the mean square that it leaves."""
+    made = [SimpleNamespace(effects=effects, point=point, errors=(error,), finished=None) for effects, point, error in fits]
+    parts, recordings = ((0, True, 10, "take1"),), (("take1", "fit", 10, noise, "stated"),)
+    work = {"fits": {"effort": 3.0, "simulations": 2, "reused": 0, "seconds": 1.0}}
+    return SimpleNamespace(judged=(SimpleNamespace(fits=made),), parts=parts, recordings=recordings, work=work)
+
+
+def decision(answer, *named):
+    return SimpleNamespace(answer=answer, effects=named, classes=tuple((name,) for name in named))
+
+
+def test_search_and_decision_are_reported_apart():
+    key, far = truth("drag_linear"), (("viscosity_shear",), {"viscosity_shear.k": 1.0}, 0.09)
+    live = answer(effect("viscosity_shear"))
+    cases = {
+        "reached, not named": ((("drag_linear",), {"drag_linear.k": 1.1}, 0.04), True, True),
+        "tried, astray": ((("drag_linear",), {"drag_linear.k": 3.0}, 0.04), True, False),
+        "at the noise, whatever its size": ((("drag_linear",), {"drag_linear.k": 3.0}, 1.1e-4), True, True),
+        "never tried": ((("drag_linear", "yield"), {"drag_linear.k": 1.0}, 1e-4), False, False),
+    }
+    rows = []
+    for fit, tried, reached in cases.values():
+        row = scores.replayed(key, live, stored(far, fit), decision("effect", "viscosity_shear"))
+        assert (row["tried"], row["reached"], row["named"], row["same"]) == (tried, reached, False, True)
+        rows.append(row)
+    right = scores.replayed(key, live, stored(far, cases["reached, not named"][0]), decision("effect", "drag_linear"))
+    assert right["named"] and not right["same"]
+    table = scores.recall([*rows, right])
+    assert table["one effect: fitted near the optimum (search recall)"].startswith("3 of 5")
+    assert table["one effect: of these named (decision accuracy)"].startswith("1 of 3")
+    assert table["replay equal to the diagnosis"].startswith("4 of 5") and table["two effects: true effects fitted"] == "none made"
+    null = scores.replayed(truth(), answer(kind="none"), stored(far), decision("none"))
+    assert not null["tried"] and scores.recall([null])["nulls on which an effect is named"].startswith("0 of 1")
 
 
 def test_one_effect_too_many_or_too_few():

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuido.data.files.writing import check_writable
+from neuido.data.files.writing import check_writable, make_real_folder
 from neuido.data.progress import Progress, duration
 from neuido.discrepancy.report.diagnosis import Diagnosis
 from neuido.errors import UserError
@@ -48,6 +48,7 @@ def diagnose(
     minutes: float = 15.0,
     device: str = "auto",
     resume: bool = True,
+    statistics: bool = False,
     progress: bool = False,
 ) -> Diagnosis:
     """Find the physical effect that a declared model lacks, from measured motion, and add it.
@@ -70,6 +71,7 @@ def diagnose(
         minutes: Time limit of the search for each body [min]; 0: none. A search that ends early names what it left out.
         device: auto, cpu, cuda or cuda:N.
         resume: Continue from the predictions that an interrupted run left in `out`/.work. Folders only.
+        statistics: Keep in `out`/fits what the decision rests on, to be decided again without simulations; this takes some more of them.
         progress: Show progress on stderr.
 
     Returns:
@@ -100,6 +102,7 @@ def diagnose(
 
     from neuido.discrepancy import store
     from neuido.discrepancy.inference.attribution import diagnose as infer
+    from neuido.discrepancy.inference.statistics import write_fits
     from neuido.discrepancy.own_effects import with_own_effects
     from neuido.discrepancy.report import answer
 
@@ -137,12 +140,14 @@ def diagnose(
             log.begin(problem.name if len(problems) > 1 else "", seconds)
             log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
             try:
-                own = infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds)
+                own = infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds, statistics=statistics)
             except UserError:
                 if untouched:
                     _forget(target, made)
                 raise
             found.append((own, time.monotonic() - started))
+            if statistics:
+                write_fits(make_real_folder(target / "fits", "the folder of fits") / f"{i}.npz", own.case, own.statistics)
         log.begin("", math.inf)
         answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
         if not any(own.left_out or own.deadline.cut for own, _ in found):  # otherwise a run with more minutes continues from what is kept

@@ -7,13 +7,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from neuido.discrepancy.inference.choosing import first_rounds, told_exactly
+from neuido.discrepancy.inference.decision import case_of, decided
 from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, score, split, times_over
 from neuido.discrepancy.inference.intervals import Hidden, blind_to_settings, findings, hidden, intervals, unable
-from neuido.discrepancy.inference.judging import ALPHA, CLASS_RATIO, STANDS_OUT, WITHIN
+from neuido.discrepancy.inference.journal import CaseRecord, Journal
+from neuido.discrepancy.inference.judging import ALPHA, CLASS_RATIO, WITHIN
 from neuido.discrepancy.inference.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.inference.least_squares import Fit, NotFinite
 from neuido.discrepancy.inference.pairs import by_growing, neighbours, simpler, two_effects
 from neuido.discrepancy.inference.rounds import UNEXPLAINED, Inference
+from neuido.discrepancy.inference.statistics import statistics_of
 from neuido.discrepancy.problems.problem import Point, Problem
 from neuido.discrepancy.store import Deadline, Memo, Work
 from neuido.errors import UserError
@@ -154,6 +157,10 @@ class Diagnosis:
     """The other settings that did not run, by recording."""
     noise_from: dict[str, str] = field(default_factory=dict)
     """`stated`, `estimated` or `assumed`, by recording."""
+    case: CaseRecord | None = None
+    """What the decision rests on."""
+    statistics: Mapping[str, np.ndarray] | None = None
+    """Statistics of the best fits, where they were asked for."""
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -179,6 +186,7 @@ def diagnose(
     most: int = MOST,
     tell: Tell | None = None,
     seconds: float = math.inf,
+    statistics: bool = False,
 ) -> Diagnosis:
     """Fit the declared model, look for effects that it lacks, and say what was found.
 
@@ -190,11 +198,12 @@ def diagnose(
         most: Effects that may be added.
         tell: Called with a line of progress.
         seconds: After which it comes to its end; see `Deadline`.
+        statistics: Keep what a likelihood needs of the best fits, which takes further simulations.
 
     Raises:
         UserError: No method can predict the declared model; the line of its simulator.
     """
-    memo = Memo(problem)
+    memo, journal = Memo(problem), Journal()
     deadline = Deadline(seconds, pace=lambda: memo.pace)
     tried: list[Inference] = []
     starts: list[Stand] = []
@@ -203,7 +212,8 @@ def diagnose(
             if starts:
                 continue
             raise UserError(problem.refusal(n))
-        inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, tell=tell, memo=memo, deadline=deadline)
+        shared = {"tell": tell, "memo": memo, "deadline": deadline, "journal": journal}
+        inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, **shared)
         if starts and (tried[-1].is_settled(starts[-1].errors) or deadline.skips(problem.setting_name(n))):
             continue
         if len(starts) == 1 and told_exactly(tried[0], starts[0]):
@@ -217,6 +227,7 @@ def diagnose(
         if start is not None:
             tried.append(inference)
             starts.append(start)
+            journal.bases.append(journal.fit(n, {}, None, start, inference.parts))
     chosen, firsts = first_rounds(tried, starts)
     inference, rounds = tried[chosen], firsts[chosen]
     start = rounds[0].plain or starts[chosen]
@@ -265,7 +276,10 @@ def diagnose(
         fit, found = drop(inference, at.fit, floor, found)
         fit, found = narrow(inference, fit, floor, found, rounds)
         at = inference.finished(Stand(fit, floor, inference.mean_squares([fit.point], floor)[0]))
-    return conclude(inference, start, at, found, rounds)
+    made = conclude(inference, start, at, found, rounds)
+    if statistics:
+        made.statistics = statistics_of(tried, [s.floor for s in starts], journal)
+    return made
 
 
 def conclude(inference: Inference, before: Stand, after: Stand, found: list[Trial], rounds: list[Round]) -> Diagnosis:
@@ -276,7 +290,13 @@ def conclude(inference: Inference, before: Stand, after: Stand, found: list[Tria
     steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
     leads = leading(rounds) if cut else []
     over = inference.over(after) if found and not cut else first.over
-    answer, why = decided(inference, before, after, found, steps, cut=cut)
+    wrong = [] if cut else findings(inference, after)
+    missing = bool(found) or first.unsure or inference.is_unexplained(first)
+    if missing and not cut and not wrong:
+        inference.floor(after.fit.point, like=after.floor)  # which settings run there
+    facts = {"cut": cut, "wrong": wrong, "blind": missing and blind_to_settings(inference), "found": [t.candidate.key for t in found]}
+    answer, why = decided(inference, before.errors, found, steps, cut=cut, wrong=wrong, blind=facts["blind"])
+    case = case_of(inference, before, after, rounds, answer, why, facts)
     if found and answer not in ("effect", "class"):  # nothing is named, and nothing added
         after, found, over = before, [], first.over
         steps = [replace(first, chosen=None, members=[])]
@@ -318,34 +338,8 @@ def conclude(inference: Inference, before: Stand, after: Stand, found: list[Tria
         hidden=looked,
         unable=unable(inference),
         noise_from={r.name: inference.noise_from(n) for n, r in enumerate(problem.recordings)},
+        case=case,
     )
-
-
-def decided(
-    inference: Inference, before: Stand, after: Stand, found: Sequence[Trial], steps: Sequence[Round], *, cut: bool
-) -> tuple[str, list[str]]:
-    """The answer, and why the recordings say too little or what is wrong with them; `cut`: the search ended for lack of time."""
-    first = steps[0]
-    if cut:
-        return "unfinished", []
-    wrong = findings(inference, after)
-    if wrong:
-        return "insufficient", wrong
-    missing = bool(found) or first.unsure or inference.is_unexplained(first)
-    inference.floor(after.fit.point, like=after.floor)  # which settings run there
-    if missing and blind_to_settings(inference):
-        return "insufficient", ["no other setting of the simulation runs there, so that its own error is not known"]
-    if found:
-        several = any(len({t.candidate.name for t in r.members}) > 1 for r in steps if r.chosen is not None)
-        return "class" if several else "effect", []
-    if missing:
-        return "unknown", []
-    if not enough(inference):
-        return "insufficient", ["there are few data for the figures that are free"]
-    noisy = times_over(before.errors, inference.noise_squares)
-    if noisy > STANDS_OUT:
-        return "insufficient", [f"what is left is {noisy:.0f} times the noise, and the discretisation alone may make as much"]
-    return "none", []
 
 
 def leading(rounds: Sequence[Round]) -> list[Trial]:
@@ -370,11 +364,6 @@ def tested(
                 left = there.settle(residual[part.recording], part, own)
                 out[when][part.name] = inference.scale * math.sqrt(float(np.mean(left**2)))
     return floors, errors, single
-
-
-def enough(inference: Inference) -> bool:
-    """Whether there are many more data than parameters in every part."""
-    return all(int(p.rows.sum()) > 3 * len(inference.problem.declared) + 10 for p in inference.parts)
 
 
 def _by_recording(inference: Inference, squares: np.ndarray) -> dict[str, float]:

@@ -229,6 +229,17 @@ class BaseFits(Laboratory):
                 out[place][n] = np.stack([row - here for row, p in zip(rows, places, strict=True) if p == place], axis=1)
         return out
 
+    def around(self, parameters: Sequence[Parameter], point: Point, step: float) -> tuple[list[Point], list[list[float]]]:
+        """The points on both sides of one, a step in each coordinate, and how far they are from it, within the ranges."""
+        asked: list[Point] = []
+        spans = []
+        for p in parameters:
+            q = p.coordinate(point.get(p.name, p.value))
+            ends = [p.physical(q + step), p.physical(q - step)]
+            asked += [dict(point) | {p.name: end} for end in ends]
+            spans.append([p.coordinate(ends[0]) - q, q - p.coordinate(ends[1])])
+        return asked, spans
+
     def slopes(self, parameters: Sequence[Parameter], point: Point, recordings: Sequence[int], step: float = 0.3) -> dict[int, np.ndarray]:
         """Derivatives of the data by coordinates of parameters, one typical step each; central where the range allows.
 
@@ -238,12 +249,7 @@ class BaseFits(Laboratory):
             UserError: The model runs at the point, but not even a small step away from it on either side.
         """
         out = {}
-        asked, spans = [], []
-        for p in parameters:
-            q = p.coordinate(point.get(p.name, p.value))
-            ends = [p.physical(q + step), p.physical(q - step)]
-            asked += [dict(point) | {p.name: end} for end in ends]
-            spans.append([p.coordinate(ends[0]) - q, q - p.coordinate(ends[1])])
+        asked, spans = self.around(parameters, point, step)
         with self.memo.during("slopes"):
             predicted = self.memo.predict_several([([point, *asked], n, self.setting) for n in recordings])
         for n, (here, *rows) in zip(recordings, predicted, strict=True):

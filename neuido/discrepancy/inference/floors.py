@@ -251,6 +251,8 @@ class Round:
     """Whether an effect gained enough, had there been time for the other method."""
     plain: Stand | None = None
     """The model without a further effect, where it does better than at the base that was looked from."""
+    record: int | None = None
+    """Its number in the journal."""
 
     @property
     def over(self) -> float:

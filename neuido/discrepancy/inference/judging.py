@@ -8,7 +8,8 @@ import numpy as np
 
 from neuido.discrepancy.inference import evidence
 from neuido.discrepancy.inference.contests import MANY, SMALL, better
-from neuido.discrepancy.inference.floors import Floor, Round, Trial, times_over, unphysical
+from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial, times_over, unphysical
+from neuido.discrepancy.inference.journal import place
 from neuido.discrepancy.inference.laboratory import LEAST_GAIN
 from neuido.discrepancy.inference.least_squares import Fit, Race
 from neuido.discrepancy.inference.refining import SOME_GAIN, Refining
@@ -240,7 +241,10 @@ class Judging(Refining):
         """A round with the trials that fits make, and what is chosen of them; `every` as for `measured`."""
         errors = empty.errors
         trials = []
-        for (c, fit), stand in zip(best.values(), self.measured(best, empty.floor, every=every), strict=True):
+        stands = self.measured(best, empty.floor, every=every)
+        finished: dict[str, Stand] = {}
+        exact_null = np.empty(0)
+        for (c, fit), stand in zip(best.values(), stands, strict=True):
             trial = Trial(c, stand, self.gain(errors, stand.errors))
             trial.reason = unphysical(c, fit.point) if np.isfinite(stand.errors).all() else "not every recording runs where its fit ends"
             trials.append(trial)
@@ -250,7 +254,9 @@ class Judging(Refining):
         p = float((1 + np.sum(empty.null >= top.gain)) / (1 + len(empty.null))) if top else 1.0
         unfitted = {key: why for key, why in empty.unfitted.items() if key not in best}
         result = replace(empty, trials=trials, p_value=p, cosines={}, unfitted=unfitted)
+        judged = [(c, stand) for (c, _), stand in zip(best.values(), stands, strict=True)]
         if top is None:
+            result.record = self.journal.judged(self.own, result, judged, self.parts, finished, exact_null)
             return result
         for t in trials:
             if t.candidate.key in model.keys and top.candidate.key in model.keys:
@@ -258,11 +264,11 @@ class Judging(Refining):
         named = p <= ALPHA and self.above_noise(errors, top) > self.least_gain(result, top)
         near = not named and top.gain > LEAST_GAIN_EXACT and self.is_noise(top.errors)
         if near and not self.is_exact(top):  # fits end where a step gains little, which may be short of the noise
-            top.stand = self.finished(top.stand)
+            top.stand = finished[top.candidate.key] = self.finished(top.stand)
             top.gain = self.gain(errors, top.errors)
         if near and self.is_exact(top):  # only chance is to be beaten
-            null = model.null(errors, self.draws, exact=True)
-            result.p_value = float((1 + np.sum(null >= top.gain)) / (1 + len(null)))
+            exact_null = model.null(errors, self.draws, exact=True)
+            result.p_value = float((1 + np.sum(exact_null >= top.gain)) / (1 + len(exact_null)))
             named = result.p_value <= ALPHA
         if named and self.is_like_a_grid(top, errors):
             named, top.reason = False, "leaves about what another grid does to the recordings that were held out"
@@ -272,6 +278,7 @@ class Judging(Refining):
         for t in trials:
             if not t.reason and t not in result.members:
                 t.reason = self._why(t, top, result)
+        result.record = self.journal.judged(self.own, result, judged, self.parts, finished, exact_null)
         return result
 
     def is_exact(self, t: Trial) -> bool:
@@ -279,9 +286,15 @@ class Judging(Refining):
         stated = all(self.problem.recordings[p.recording].noise for p in self.parts)
         if self.problem.settings == 1 or not stated or not self.is_noise(t.errors):
             return False
-        alone = self.mean_squares([t.fit.point], t.stand.floor, plain=True)[0]
+        alone = self.alone(t.stand)
         sure = EXACT + 3.0 * np.sqrt([2.0 / int(p.rows.sum()) for p in self.parts])
         return bool(np.all(alone < sure * self.noise_squares))
+
+    def alone(self, stand: Stand) -> np.ndarray:
+        """What one simulation leaves where a fit ended, mean squares of the parts."""
+        squares = self.mean_squares([stand.fit.point], stand.floor, plain=True)[0]
+        self.journal.alone[place(self.own, stand)] = tuple(squares.tolist())
+        return squares
 
     def is_like_a_grid(self, t: Trial, before: np.ndarray) -> bool:
         """Whether what is held out was off by about as much as grids differ by, `LIKE_A_GRID`, and still is with the effect.

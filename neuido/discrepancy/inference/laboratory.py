@@ -12,6 +12,7 @@ import numpy as np
 from neuido.discrepancy.inference import evidence
 from neuido.discrepancy.inference.evidence import NOISE_ALONE
 from neuido.discrepancy.inference.floors import Floor, Part, over_time, score, sealed, split
+from neuido.discrepancy.inference.journal import Journal
 from neuido.discrepancy.inference.least_squares import Fit, Request, levenberg_marquardt, residuals, run
 from neuido.discrepancy.problems import noise as noises
 from neuido.discrepancy.problems.problem import Parameter, Point, Problem, Recording
@@ -40,6 +41,7 @@ class Laboratory:
         tell: Called with a line of progress.
         memo: Predictions that are shared with those of other settings.
         deadline: When fits end where they are.
+        journal: What was judged, shared too.
     """
 
     def __init__(
@@ -50,7 +52,9 @@ class Laboratory:
         tell: Tell | None = None,
         memo: Memo | None = None,
         deadline: Deadline | None = None,
+        journal: Journal | None = None,
     ) -> None:
+        self.journal = journal if journal is not None else Journal()
         self.problem, self.own, self.setting, self.deadline = problem, setting, setting, deadline or Deadline()
         self.tell = tell or (lambda line: None)
         self.memo = memo or Memo(problem)

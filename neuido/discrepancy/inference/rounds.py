@@ -16,6 +16,7 @@ import numpy as np
 from neuido.discrepancy.inference import evidence
 from neuido.discrepancy.inference.contests import MANY, Contest, better
 from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, score, times_over
+from neuido.discrepancy.inference.journal import Journal
 from neuido.discrepancy.inference.judging import LED_AWAY, WITHIN
 from neuido.discrepancy.inference.laboratory import Tell
 from neuido.discrepancy.inference.least_squares import Fit
@@ -70,6 +71,7 @@ class Inference(Prospects):
         tell: Called with a line of progress.
         memo: Predictions that are shared with the inferences of other settings.
         deadline: When the search ends.
+        journal: What was judged, shared with the inferences of other settings.
     """
 
     def __init__(
@@ -83,8 +85,9 @@ class Inference(Prospects):
         tell: Tell | None = None,
         memo: Memo | None = None,
         deadline: Deadline | None = None,
+        journal: Journal | None = None,
     ) -> None:
-        super().__init__(problem, setting=setting, tell=tell, memo=memo, deadline=deadline)
+        super().__init__(problem, setting=setting, tell=tell, memo=memo, deadline=deadline, journal=journal)
         self.keep, self.draws, self.seed = keep, draws, seed
         self.seen: Look | None = None
         """The last look for a first effect."""
@@ -150,6 +153,8 @@ class Inference(Prospects):
             result = judged(empty)
         plain = self.without_effect(result, base, floor)
         if plain is not None:
+            if not found:
+                self.journal.bases.append(self.journal.fit(self.own, {}, None, plain, self.parts))
             result = judged(replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain))
         if not found:
             self.asked = result

@@ -16,7 +16,8 @@ from neuido.discrepancy.inference.laboratory import LEAST_GAIN
 from neuido.discrepancy.inference.least_squares import Fit, Race, levenberg_marquardt, run
 from neuido.discrepancy.inference.rounds import Inference, Look, Promising
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
-from neuido.discrepancy.report.answer import rejected, trace
+from neuido.discrepancy.report.answer import trace
+from neuido.discrepancy.report.answer_content import rejected
 from neuido.discrepancy.store import Deadline
 
 T = np.linspace(0.0, 1.0, 120)

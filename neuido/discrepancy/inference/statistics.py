@@ -1,0 +1,192 @@
+"""Statistics of fits that a likelihood needs, small enough to keep: the data enter through their projections on a few directions.
+
+For a part with residual r, and directions S (smooth patterns), N (nuisances), D (the other settings' differences) and J (slopes), a
+Gaussian density of r whose covariance is made of these directions depends on the triangular factor of [S N D J r] alone. It is kept in
+single precision, the part of S and N once for all fits of a method.
+"""
+
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from neuido.data.files.writing import atomic_write
+from neuido.discrepancy.inference.base_fits import BaseFits
+from neuido.discrepancy.inference.floors import Floor, score
+from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, Journal, from_json, to_json
+from neuido.errors import UserError
+
+MOST = 24
+"""Fits that statistics are kept of: the declared model by each method, and the best of each set of effects by each method."""
+STEP = 0.1
+"""Difference step of the slopes, in typical steps of a parameter."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartStatistics:
+    """A part of the data in an orthonormal basis of the directions and the residual; what is outside holds no residual."""
+
+    rows: int
+    noise: float
+    smooth: np.ndarray
+    """(k, s); the mean square over all rows of their sum is one."""
+    nuisances: np.ndarray
+    """(k, n), of one prior standard deviation each."""
+    settings: np.ndarray
+    """(k, d), differences of the other settings."""
+    slopes: np.ndarray
+    """(k, p) by the coordinates of the free parameters."""
+    residual: np.ndarray
+    """(k,), predicted minus measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitStatistics:
+    """A fit with the statistics of all parts."""
+
+    record: FitRecord
+    parts: tuple[PartStatistics, ...]
+
+
+def best_fits(journal: Journal, most: int = MOST) -> list[FitRecord]:
+    """Return the declared model's fits, and the best fit of each set of effects by each method, at most so many."""
+    best: dict[tuple, FitRecord] = {}
+    for r in journal.rounds:
+        for fit in r.fits:
+            last = fit.finished or fit
+            if np.isfinite(last.errors).all():
+                key = last.method, tuple(sorted(last.effects))
+                if key not in best or score(np.array(last.errors)) < score(np.array(best[key].errors)):
+                    best[key] = last
+    ranked = sorted(best.values(), key=lambda fit: score(np.array(fit.errors)))
+    return [*journal.bases, *ranked[: max(most - len(journal.bases), 0)]]
+
+
+def statistics_of(laboratories: Sequence[BaseFits], floors: Sequence[Floor], journal: Journal) -> dict[str, np.ndarray]:
+    """Return the arrays to keep.
+
+    Args:
+        laboratories: The methods.
+        floors: The floor of each where its declared model ended: its nuisances serve for all fits.
+        journal: What was fitted.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    listed, chosen = [], best_fits(journal)
+    for laboratory, floor in zip(laboratories, floors, strict=True):
+        own = [fit for fit in chosen if fit.method == laboratory.own]
+        with laboratory.under(laboratory.own):
+            laboratory.foresee([fit.point for fit in own])
+            _foresee_slopes(laboratory, own)
+            common = _common(laboratory, floor)
+            for i, (part, (_, factor, sizes)) in enumerate(zip(laboratory.parts, common, strict=True)):
+                arrays[f"common-{laboratory.own}-{i}"] = factor.astype(np.float32)
+                arrays[f"sizes-{laboratory.own}-{i}"] = np.array([*sizes, int(part.rows.sum())])
+            for fit in own:
+                columns = _columns(laboratory, fit, floor)
+                if columns is None:
+                    continue
+                k = len(listed)
+                listed.append(json.dumps(_plain(fit)))
+                for i, (part, (basis, *_)) in enumerate(zip(laboratory.parts, common, strict=True)):
+                    own_columns = columns[part.recording][part.rows]
+                    inside = basis.T @ own_columns
+                    arrays[f"inside-{k}-{i}"] = inside.astype(np.float32)
+                    arrays[f"outside-{k}-{i}"] = np.linalg.qr(own_columns - basis @ inside, mode="r").astype(np.float32)
+    noise = [laboratories[0].noise_of(p.recording) for p in laboratories[0].parts] if laboratories else []
+    return arrays | {"fits": np.array(listed), "noise": np.array(noise), "fitted": np.array(laboratories[0].fitted if laboratories else [])}
+
+
+def read(arrays: Mapping[str, np.ndarray]) -> list[FitStatistics]:
+    """Return the fits of kept arrays."""
+    out = []
+    for k, text in enumerate(arrays["fits"]):
+        content = json.loads(str(text))
+        tuples = {key: tuple(content[key]) for key in ("effects", "names", "errors", "spread")}
+        record = FitRecord(**{**content, **tuples})
+        parts = []
+        for i, noise in enumerate(arrays["noise"]):
+            common = arrays[f"common-{record.method}-{i}"].astype(float)
+            smooth, nuisances, rows = (int(v) for v in arrays[f"sizes-{record.method}-{i}"])
+            inside, outside = (arrays[f"{name}-{k}-{i}"].astype(float) for name in ("inside", "outside"))
+            below = np.concatenate([common, np.zeros((len(outside), common.shape[1]))])
+            own = np.concatenate([inside, outside])
+            free = len(record.names)
+            settings = own.shape[1] - free - 1
+            parts.append(
+                PartStatistics(
+                    rows,
+                    float(noise),
+                    below[:, :smooth],
+                    below[:, smooth : smooth + nuisances],
+                    own[:, :settings],
+                    own[:, settings:-1],
+                    own[:, -1],
+                )
+            )
+        out.append(FitStatistics(record, tuple(parts)))
+    return out
+
+
+def write_fits(path: Path, case: CaseRecord, arrays: Mapping[str, np.ndarray] | None) -> None:
+    """Write a case, and the statistics of its fits where there are some, as one compressed file."""
+    text = np.frombuffer(to_json(case).encode(), np.uint8)
+    with atomic_write(path) as hidden, hidden.open("wb") as stream:
+        np.savez_compressed(stream, case=text, **(arrays or {}))
+
+
+def read_fits(path: Path) -> tuple[CaseRecord, list[FitStatistics]]:
+    """Return the case and the statistics of a file of `write_fits`.
+
+    Raises:
+        UserError: The file is none.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            case = from_json(arrays["case"].tobytes().decode())
+            return case, read(arrays) if "fits" in arrays else []
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path} holds no stored fits: {error}") from error
+
+
+def _plain(fit: FitRecord) -> dict:
+    own = {**fit.__dict__, "finished": None, "alone": None}
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in own.items()}
+
+
+def _common(laboratory: BaseFits, floor: Floor) -> list[tuple[np.ndarray, np.ndarray, tuple[int, int]]]:
+    """Return basis, factor and numbers of the smooth patterns and nuisances of each part."""
+    out = []
+    for part in laboratory.parts:
+        smooth = laboratory.problem.directions(part.recording)[part.rows]
+        nuisances = floor.nuisances.get(part.recording, np.empty((len(part.rows), 0)))[part.rows]
+        basis, factor = np.linalg.qr(np.concatenate([smooth, nuisances], axis=1))
+        out.append((basis, factor, (smooth.shape[1], nuisances.shape[1])))
+    return out
+
+
+def _columns(laboratory: BaseFits, fit: FitRecord, floor: Floor) -> dict[int, np.ndarray] | None:
+    """Return [D J r] of each recording where a fit ended; none where it or a slope does not run."""
+    parameters = [laboratory.problem.parameter(name) for name in fit.names]
+    recordings = laboratory.scored_recordings
+    there = laboratory.floor(fit.point, like=floor)
+    try:
+        slopes = laboratory.slopes(parameters, fit.point, recordings, step=STEP)
+    except UserError:
+        return None
+    out = {}
+    for n in recordings:
+        residual = laboratory.residual(fit.point, n)
+        out[n] = np.concatenate([there.differences[n], slopes[n], residual[:, None]], axis=1)
+    return out if all(np.isfinite(c).all() for c in out.values()) else None
+
+
+def _foresee_slopes(laboratory: BaseFits, fits: Sequence[FitRecord]) -> None:
+    """Run what the slopes of all fits will ask for, side by side."""
+    points = []
+    for fit in fits:
+        points += laboratory.around([laboratory.problem.parameter(name) for name in fit.names], fit.point, STEP)[0]
+    with laboratory.memo.during("slopes"):
+        laboratory.predicted(points, laboratory.scored_recordings)
