@@ -135,7 +135,7 @@ def lines_of(name: str, entries: Sequence[Entry], quoted: Sequence[dict[str, Any
             rival = column.removeprefix(name).removeprefix("_")
             out.append(Line(f"{entry.label}, {rival}" if rival else entry.label, values))
     if out and name == "cd":
-        floors = {s: row["floor"] for s in scenes_of(entries) for e in entries if "floor" in (row := e.of(s))}
+        floors = {s: row["floor"] for s in scenes_of(entries) for e in entries if "floor" in (row := e.row_of(s))}
         out.append(Line(FLOOR, floors, counts=False))
     labels = dict.fromkeys(str(row.get("run", "")) for row in quoted if name in row) if out else ()
     for label in labels:
@@ -167,7 +167,7 @@ def score_table(name: str, lines: Sequence[Line], scenes: Sequence[str], unseen:
 
 def _scores(entries: list[Entry], quoted: list[dict[str, Any]]) -> list[str]:
     scenes = scenes_of(entries)
-    unseen = [s for s in scenes if any(e.of(s).get("unseen") == 1 for e in entries)]
+    unseen = [s for s in scenes if any(e.row_of(s).get("unseen") == 1 for e in entries)]
     parts = []
     for name, (title, higher) in MEASURES.items():
         lines = lines_of(name, entries, quoted)
@@ -217,7 +217,7 @@ def _spread(entries: list[Entry]) -> list[str]:
         return []
     rows = []
     for scene in scenes_of(seeds):
-        values = [row["cd"] for e in seeds if isinstance((row := e.of(scene)).get("cd"), float)]
+        values = [row["cd"] for e in seeds if isinstance((row := e.row_of(scene)).get("cd"), float)]
         if len(values) > 1:
             middle, deviation = statistics.fmean(values), statistics.stdev(values)
             rows.append(

@@ -130,7 +130,7 @@ def _execute(words: list[str], environment: Mapping[str, str], log: Path, lock: 
         except OSError as error:
             raise UserError(f"the command {words[0]!r} of the sweep cannot be run: {error.strerror}") from error
         try:
-            lock.hand_to(process.pid)
+            lock.share_with_child(process.pid)
             return process.wait()
         except BaseException:
             process.terminate()

@@ -1,8 +1,8 @@
-"""Clips of `neuido film` as data: windows of flow for the VAE, whole clips for the projector's warm-up.
+"""Clips of `neuido film` as training data: windows of optical flow for the VAE, whole clips for the warm-up of the projector.
 
-The folder holds `plan.json` (what is to be made), a `clip-<number>.npz` for each clip and, when all are there, `index.json`. A clip has
-flow (V, T - 1, S, S, 2) float16 [m/s], cell (V,) [m], frame_interval [s], and n samples of its law: trial,
-corrected (n, 3, 3) and stress (n, 3, 3) [Pa], float32.
+The folder has `plan.json` (the clips to generate), one `clip-<number>.npz` per clip and, when all are complete, `index.json`. A clip has
+flow (V, T - 1, S, S, 2) float16 [m/s], cell (V,) [m], frame_interval [s], and n samples of its law: trial (n, 3, 3), corrected (n, 3, 3)
+and stress (n, 3, 3) [Pa], float32.
 """
 
 import zipfile
@@ -23,50 +23,50 @@ FORMAT = "neuido-films/1"
 
 
 class Clip(NamedTuple):
-    """One filmed motion and its law."""
+    """One filmed motion from V views, and n samples of its material law."""
 
     flow: Tensor
-    """(V, T - 1, S, S, 2) [m/s]."""
+    """Optical flow in physical units [m/s], (V, T - 1, S, S, 2)."""
     cell: Tensor
-    """Side of one of the S x S cells at the body [m], (V,)."""
+    """Size of one of the S x S cells at the distance of the body [m], (V,)."""
     frame_interval: float
-    """[s]"""
+    """Time between frames [s]."""
     trial: Tensor
-    """(n, 3, 3)"""
+    """Trial deformation gradients, (n, 3, 3)."""
     corrected: Tensor
-    """(n, 3, 3)"""
+    """Deformation gradients after the plastic correction, (n, 3, 3)."""
     stress: Tensor
     """Kirchhoff stress [Pa], (n, 3, 3)."""
 
 
 class FlowBatch(NamedTuple):
-    """Windows of flow."""
+    """Batch of optical-flow windows."""
 
     flow: Tensor
-    """(B, t, S, S, 2) [m/s]."""
+    """Optical flow [m/s], (B, t, S, S, 2)."""
 
 
 def is_complete(path: Path) -> bool:
-    """Whether a clip is there in full."""
+    """Whether the file of a clip exists and is complete."""
     return path.is_file() and zipfile.is_zipfile(path)
 
 
 def read_clip(path: Path) -> Clip:
-    """Read a clip.
+    """Read a clip file.
 
     Raises:
-        UserError: A file that is missing, cut short or no clip.
+        UserError: The file is missing, truncated or not a clip.
     """
     arrays = read_arrays(path, Clip._fields, what="clip of `neuido film`")
     parts = {name: torch.from_numpy(arrays[name]) for name in Clip._fields if name != "frame_interval"}
     if arrays["frame_interval"].size != 1:
-        raise UserError(f"{path} is no clip of `neuido film`: frame_interval must be one number")
+        raise UserError(f"{path} is not a valid clip of `neuido film`: frame_interval must be one number")
     interval = float(arrays["frame_interval"])
     return Clip(**parts, frame_interval=interval)
 
 
 class FlowWindows(Dataset):
-    """Random windows of the clips' flow; a function of seed and number alone."""
+    """Random windows of the optical flow of clips; a window is a function of the seed and its index only."""
 
     def __init__(self, paths: list[Path], frames: int, per_clip: int, seed: int) -> None:
         self.paths, self.frames, self.per_clip, self.seed = paths, frames, per_clip, seed
@@ -80,21 +80,21 @@ class FlowWindows(Dataset):
         v = int(random.integers(len(clip.flow)))
         start = int(random.integers(max(1, clip.flow.shape[1] - self.frames + 1)))
         flow = clip.flow[v, start : start + self.frames].float()
-        if random.random() < 0.5:  # a mirrored motion has the same law
+        if random.random() < 0.5:  # the mirrored motion has the same law
             flow = flow.flip(2) * flow.new_tensor([-1.0, 1.0])
         return flow
 
 
 class FilmDataModule(LightningDataModule):
-    """Clips of `neuido film`.
+    """Lightning data module of the clips of `neuido film`.
 
     Args:
-        root: Its folder.
-        batch_size: Windows or clips of a batch.
-        frames: Flows of a window, a multiple of 4 (the VAE sees one frame more); 0: whole clips by number, for the warm-up.
-        windows: Windows of each clip in an epoch.
-        held_out: Share of the clips that validation takes, the last ones.
-        num_workers: Worker processes that read.
+        root: Folder of the clips.
+        batch_size: Windows or clips per batch.
+        frames: Flow frames of a window, a multiple of 4; the VAE sees one video frame more. 0: batches of clip numbers, for the warm-up.
+        windows: Windows of each clip per epoch.
+        held_out: Fraction of the clips for validation; the last clips are used.
+        num_workers: Number of worker processes that read.
         seed: Seed of the order and of the windows.
     """
 
@@ -111,7 +111,7 @@ class FilmDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         if batch_size < 1 or windows < 1 or frames < 0 or frames % 4:
-            raise UserError(f"batch_size = {batch_size}, windows = {windows} must be at least 1, frames = {frames} a multiple of 4")
+            raise UserError(f"batch_size = {batch_size} and windows = {windows} must be at least 1, and frames = {frames} a multiple of 4")
         if not 0 < held_out < 1:
             raise UserError(f"held_out must be a fraction between 0 and 1, got {held_out}")
         self.root, self.batch_size, self.frames, self.windows = Path(root), batch_size, frames, windows
@@ -126,30 +126,30 @@ class FilmDataModule(LightningDataModule):
         """
         path = self.root / "index.json"
         if not path.is_file():
-            raise UserError(f"data.root = {self.root} holds no finished clips: make them with `neuido film --out {self.root}`")
+            raise UserError(f"data.root = {self.root} has no finished clips: generate them with `neuido film --out {self.root}`")
         content = read_json(path)
         if not isinstance(content, dict):
-            raise UserError(f"{path} must be a mapping of keys to values")
+            raise UserError(f"{path} must contain a mapping of keys to values")
         if content.get("format") != FORMAT:
-            raise UserError(f"{path} has format {content.get('format')!r}, not {FORMAT!r}")
+            raise UserError(f"{path} has the format {content.get('format')!r}, not {FORMAT!r}")
         return content
 
     @property
     def clips(self) -> list[dict[str, Any]]:
-        """name, family and parameters of each clip."""
+        """Name, family and parameters of each clip."""
         return self.index["clips"]
 
     @property
     def training_count(self) -> int:
-        """Clips before those that are held out."""
+        """Number of training clips; the clips after them are held out."""
         count = len(self.clips)
         kept = count - max(1, round(self.held_out * count))
         if kept < 1:
-            raise UserError(f"data.root = {self.root} has {count} clips: too few to hold any out")
+            raise UserError(f"data.root = {self.root} has {count} clips, too few to hold one out: generate more")
         return kept
 
     def read(self, number: int) -> Clip:
-        """Return a clip by its number."""
+        """Read the clip with this number."""
         return read_clip(self.root / f"{self.clips[number]['name']}.npz")
 
     def train_dataloader(self) -> DataLoader:

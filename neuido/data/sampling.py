@@ -1,8 +1,8 @@
-"""The order of the training samples, and the loaders that follow it.
+"""Order of the training samples, and loaders that resume in the middle of an epoch.
 
-A batch holds the same number n of samples of each of M trajectories, sorted by trajectory. One permutation of the N training samples
-of a trajectory serves all trajectories of an epoch, each from an offset of its own, so an epoch's order costs one randperm(N)
-and no memory for each trajectory. It is a function of (seed, epoch, step) alone.
+A batch holds n samples of each of M trajectories, sorted by trajectory. In an epoch, all trajectories use the same permutation of their N
+training samples, each from a different offset. An epoch therefore costs one randperm(N) and no memory per trajectory. The order is a
+function of seed, epoch and step only.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -20,21 +20,23 @@ T = TypeVar("T")
 
 
 class Step(NamedTuple):
-    """A training batch that is still to be gathered."""
+    """Number of a training batch whose samples are gathered later, on the device."""
 
     epoch: int
     step: int
 
 
 class SampleOrder:
-    """Which rows of each trajectory a training step takes: a function of (seed, epoch, step).
+    """Random order of samples: the rows of each trajectory that a training step uses.
+
+    The order is a function of seed, epoch and step only.
 
     Args:
-        rows: Rows that may be taken from each trajectory, (N,) int64.
-        trajectory_count: M.
+        rows: Rows of a trajectory that training may use, (N,) int64.
+        trajectory_count: Number of trajectories M.
         samples: Samples of each trajectory in a batch, n.
-        seed: Seed.
-        drop_last: Leave out the last batch of an epoch if it would be smaller than the others.
+        seed: Seed of the order.
+        drop_last: Omit the last batch of an epoch if it is smaller than the others.
     """
 
     def __init__(self, rows: Tensor, trajectory_count: int, samples: int, *, seed: int, drop_last: bool = False) -> None:
@@ -48,7 +50,7 @@ class SampleOrder:
         return full + (1 if rest and not self.drop_last else 0)
 
     def __call__(self, epoch: int, step: int, device: torch.device) -> Tensor:
-        """Return rows of each trajectory, (M, n) int64; the last step of an epoch may have fewer."""
+        """Return the rows of each trajectory for a step, (M, n) int64 on `device`; the last step of an epoch may have fewer columns."""
         if self._epoch != (epoch, device):
             seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0] >> np.uint64(1))
             generator = torch.Generator().manual_seed(seed)
@@ -60,13 +62,13 @@ class SampleOrder:
 
 
 class ResumableLoader(Generic[T]):
-    """A training loader whose epochs go on where a resumed run stopped.
+    """Training loader that a resumed run continues in the middle of an epoch.
 
-    Lightning calls `sampler.set_epoch` before the first batch of an epoch and stores `state_dict` in its checkpoints. The state
-    counts the batches that were handed out, so workers that read ahead do not disturb it.
+    Lightning calls `sampler.set_epoch` before the first batch of an epoch and stores `state_dict` in its checkpoints. The state counts the
+    batches that training has received, so workers that read ahead do not change it.
 
     Args:
-        identity: What must be the same when a run is resumed.
+        identity: Values that must be equal when a run is resumed, such as the seed.
     """
 
     def __init__(self, identity: dict[str, int]) -> None:
@@ -76,19 +78,19 @@ class ResumableLoader(Generic[T]):
         self._resume: tuple[int, int] | None = None
 
     def batches(self, epoch: int, start: int) -> Iterable[T]:
-        """Return the batches of an epoch from number `start` on."""
+        """Return the batches of an epoch from batch `start` on; subclasses implement it."""
         raise NotImplementedError
 
     @property
     def sampler(self) -> "ResumableLoader":
-        """Where Lightning looks for `set_epoch`."""
+        """This loader: Lightning calls `set_epoch` of a loader's sampler."""
         return self
 
     def set_epoch(self, epoch: int) -> None:
         self.epoch = epoch
 
     def __iter__(self) -> Iterator[T]:
-        # A generator: Lightning makes the iterator before it sets the epoch, and nothing here runs before the first batch.
+        # This is a generator, so nothing runs before the first batch: Lightning creates the iterator before it sets the epoch.
         epoch, start = self.epoch, 0
         if self._resume is not None and self._resume[0] == epoch:
             start = self._resume[1]
@@ -102,20 +104,20 @@ class ResumableLoader(Generic[T]):
         return {"epoch": self.epoch, "step": self._next, **self.identity}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        changed = [f"{key} {state.get(key)} then, {value} now" for key, value in self.identity.items() if state.get(key) != value]
+        changed = [f"{key} was {state.get(key)} and is {value}" for key, value in self.identity.items() if state.get(key) != value]
         if changed:
-            raise UserError(f"the checkpoint was written with other data options ({'; '.join(changed)}): restore them to resume")
+            raise UserError(f"the checkpoint was written with other data options ({'; '.join(changed)}): use the former options to resume")
         self._resume = (state["epoch"], state["step"])
 
 
 class TrainingSteps(ResumableLoader[Step | TrajectoryBatch]):
-    """The steps of an epoch.
+    """Resumable loader of the training batches of an epoch, shared by several processes.
 
     Args:
         order: The order of the samples.
-        gather: Makes the batch of a step in a worker process; none: hand out `Step`s, gathered where the data lie.
-        workers: Worker processes; used with `gather`.
-        rank: This process among those that share the steps.
+        gather: Reads the batch of (epoch, step) from the files. None: yield `Step`s, whose samples are gathered on the device.
+        workers: Number of worker processes that call `gather`.
+        rank: Index of this process.
         ranks: Number of processes.
     """
 
@@ -131,10 +133,12 @@ class TrainingSteps(ResumableLoader[Step | TrajectoryBatch]):
 
     def batches(self, epoch: int, start: int) -> Iterable[Step | TrajectoryBatch]:
         steps = [Step(epoch, k * self.ranks + self.rank) for k in range(start, len(self))]
-        return steps if self.gather is None else DataLoader(_Gathered(self.gather, steps), batch_size=None, num_workers=self.workers)
+        return steps if self.gather is None else DataLoader(_GatheredSteps(self.gather, steps), batch_size=None, num_workers=self.workers)
 
 
-class _Gathered(Dataset):
+class _GatheredSteps(Dataset):
+    """Batches of given steps, each read by `gather` when it is accessed."""
+
     def __init__(self, gather: Callable[[int, int], TrajectoryBatch], steps: list[Step]) -> None:
         self.gather, self.steps = gather, steps
 
@@ -146,7 +150,7 @@ class _Gathered(Dataset):
 
 
 class FixedBatches:
-    """A fixed sequence of batches as a loader."""
+    """Loader of a fixed list of batches."""
 
     def __init__(self, batches: list[TrajectoryBatch]) -> None:
         self.batches = batches

@@ -119,7 +119,7 @@ def test_before_and_after_a_fit_are_rows_of_their_own(tmp_path):
     write_rows(tmp_path / "none" / "scores.csv", [{"scene": "Ball", "stage": "before", "cd": 7.0}])  # a method that learns nothing
     write_rows(tmp_path / "fit" / "Ball" / "before" / "particles.csv", [{"frame": 1, "cd": 4.0, "floor": 1.0}])
     entries = open_runs([str(tmp_path / "fit"), str(tmp_path / "none")])
-    assert [(e.label, e.of("Ball")["cd"]) for e in entries] == [("fit, before", 4), ("fit, after", 2), ("fit, test", 2.5), ("none", 7)]
+    assert [(e.label, e.row_of("Ball")["cd"]) for e in entries] == [("fit, before", 4), ("fit, after", 2), ("fit, test", 2.5), ("none", 7)]
     assert [len(e.by_frame("Ball")) for e in entries] == [1, 0, 0, 0]
     assert [e.last for e in entries] == [False, False, True, True]
 

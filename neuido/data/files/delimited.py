@@ -1,4 +1,4 @@
-"""Tables as text of any dialect: encoding, separator, decimal comma, comments, lines before the titles. The files are not trusted."""
+"""Reader of text tables of any dialect: encoding, separator, decimal sign, comments. The files are not trusted."""
 
 import csv
 import re
@@ -9,36 +9,36 @@ from neuido.data.files.parsing import check_limit, one_line
 from neuido.errors import UserError
 
 DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","))
-"""Separator and decimal sign, the likeliest first; a blank stands for any white space."""
+"""Separators and decimal signs, the most likely first; a blank means any white space."""
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _COMMA = re.compile(r"[+-]?(\d+|\d*,\d+)([eE][+-]?\d+)?")
 _GROUPED = {".": re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d+)?"), ",": re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d+)?")}
 _SAMPLE = 400
-"""Lines from which the dialect is told."""
+"""Number of lines from which the dialect is detected."""
 
 
 class Delimited(NamedTuple):
-    """The cells of a table, its numbers with a decimal point."""
+    """Cells of a text table; its numbers have a decimal point."""
 
     rows: list[list[str]]
-    """Those that are not empty, without comments."""
+    """Rows that are neither empty nor comments."""
     lines: list[int]
-    """The line of the file that each row is, from 1."""
+    """Line number of each row in the file, from 1."""
     encoding: str
     separator: str
     decimal: str
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell holds one finite number with a decimal point."""
+    """Whether a cell is one finite number with a decimal point."""
     return NUMBER.fullmatch(cell.strip()) is not None
 
 
 def read_delimited(path: Path) -> Delimited:
-    """Read a table of text, whatever its encoding, separator and decimal sign.
+    """Read a text table; detect its encoding, separator and decimal sign.
 
     Raises:
-        UserError: The file is missing, too large, or no text.
+        UserError: The file is missing, too large or not text.
     """
     text, encoding = _decoded(path)
     numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
@@ -48,7 +48,7 @@ def read_delimited(path: Path) -> Delimited:
         try:
             cells = _split(line, separator)
         except csv.Error as error:
-            raise UserError(f"{path} is no CSV file: line {i}: {one_line(error)}") from error
+            raise UserError(f"{path}, line {i} is not valid CSV: {one_line(error)}") from error
         cells = [_with_point(cell, decimal) for cell in cells]
         if any(cells):
             rows.append(cells)
@@ -58,28 +58,29 @@ def read_delimited(path: Path) -> Delimited:
 
 def _decoded(path: Path) -> tuple[str, str]:
     if not path.is_file():
-        raise UserError(f"{path} is missing" if not path.exists() else f"{path} is no file")
+        raise UserError(f"{path} is missing" if not path.exists() else f"{path} is not a file")
     try:
         size = path.stat().st_size
         check_limit(size, "NEUIDO_MAX_TEXT_BYTES", f"{path} has {size} bytes")
         data = path.read_bytes()
     except OSError as error:
-        raise UserError(f"{path} is no CSV file: {one_line(error)}") from error
+        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         encodings = ["utf-16"]
     else:
         encodings = ["utf-8-sig", "cp1252"]
     if b"\0" in data and encodings[0] != "utf-16":
-        raise UserError(f"{path} is no CSV file: it holds zero bytes; a sheet of Excel is read by `neuido import`")
+        raise UserError(f"{path} is not a CSV file: it contains zero bytes; convert an Excel sheet with `neuido import`")
     for encoding in encodings:
         try:
             return data.decode(encoding), encoding
         except UnicodeDecodeError:
             continue
-    raise UserError(f"{path} is no CSV file: its text is in none of the encodings {', '.join(encodings)}; save it as UTF-8")
+    raise UserError(f"{path} is not a CSV file: its encoding is none of {', '.join(encodings)}; save it as UTF-8")
 
 
 def _dialect(lines: list[str]) -> tuple[str, str]:
+    """Detect separator and decimal sign: those that make most cells numbers."""
     best, chosen = 0.0, DIALECTS[0]
     for separator, decimal in DIALECTS:
         score = 0.0
@@ -94,9 +95,11 @@ def _dialect(lines: list[str]) -> tuple[str, str]:
             best, chosen = score, (separator, decimal)
     if best > 0:
         return chosen
-    counts = {separator: sum(line.count(separator) for line in lines) for separator in ("\t", ";", ",")}  # no number: by the titles
-    most = max(counts, key=counts.__getitem__)
-    return (most if counts[most] > counts[","] else ","), "."
+    counts = {
+        separator: sum(line.count(separator) for line in lines) for separator in ("\t", ";", ",")
+    }  # without numbers the titles decide
+    commonest = max(counts, key=counts.__getitem__)
+    return (commonest if counts[commonest] > counts[","] else ","), "."
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -111,7 +114,7 @@ def _in_dialect(cell: str, decimal: str) -> bool:
 
 
 def _with_point(cell: str, decimal: str) -> str:
-    """Return a number with a decimal point and no groups of thousands; other text as it is."""
+    """Rewrite a number with a decimal point and without thousands separators; return other text unchanged."""
     if not _in_dialect(cell, decimal):
         return cell
     if _GROUPED[decimal].fullmatch(cell):

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: text, tables, inline figures, pictures and videos. Without matplotlib there are no figures."""
+"""Self-contained HTML pages with tables, inline figures, pictures and videos. Figures need matplotlib."""
 
 import base64
 import html
@@ -18,30 +18,30 @@ figure{display:inline-block;margin:.3em;vertical-align:top}figcaption{font-size:
 
 
 class Best(NamedTuple):
-    """A cell of a table in bold."""
+    """Value of a table cell that is shown in bold."""
 
     value: Any
 
 
 def page(title: str, body: str, *, style: str = "") -> str:
-    """Return a whole HTML page.
+    """Return a complete HTML page.
 
     Args:
-        title: Of the window.
-        body: HTML.
-        style: CSS after `STYLE`.
+        title: Title of the window.
+        body: HTML of the body.
+        style: CSS that is added to `STYLE`.
     """
     head = f'<meta charset="utf-8"><title>{escaped(title)}</title><style>{STYLE}{style}</style>'
     return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
 
 
 def escaped(value: Any) -> str:
-    """Return a value as HTML text."""
+    """Convert a value to text with HTML characters escaped."""
     return html.escape(str(value))
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, digits: int = 4) -> str:
-    """Return a table as HTML: numbers at the right with `digits` digits, NaN and None empty, a `Best` in bold."""
+    """Format a table as HTML: numbers right-aligned with `digits` significant digits, NaN and None empty, `Best` in bold."""
     if not rows:
         return "<p>None.</p>"
 
@@ -60,21 +60,23 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, digits: int = 4
 
 
 def picture(path: Path) -> str:
-    """Return the HTML of a PNG file."""
+    """Embed a PNG file in HTML."""
     return png(path.read_bytes(), path.stem)
 
 
 def png(data: bytes, name: str) -> str:
-    """Return a picture from the bytes of a PNG file."""
+    """Embed the bytes of a PNG file in HTML; `name` is the alternative text."""
     return f'<p><img alt="{escaped(name)}" src="data:image/png;base64,{base64.b64encode(data).decode()}"></p>'
 
 
 def video(path: Path, caption: str, *, width: int = 520) -> str | None:
-    """Return the HTML of a video file, as WebM because browsers do not play OpenCV's MPEG-4; none where it cannot be read.
+    """Embed a video file in HTML; return None if OpenCV cannot read it.
+
+    The video is converted to WebM, because browsers do not play the MPEG-4 files that OpenCV writes.
 
     Args:
-        path: The file.
-        caption: Below it.
+        path: The video file.
+        caption: Text below the video.
         width: Largest width [px].
     """
     data = webm(path, width)
@@ -85,7 +87,7 @@ def video(path: Path, caption: str, *, width: int = 520) -> str | None:
 
 
 def webm(path: Path, width: int) -> bytes | None:
-    """Return a video as WebM with VP9, at most `width` pixels wide; none where OpenCV cannot read or write it."""
+    """Convert a video file to WebM (VP9), at most `width` pixels wide; return None if OpenCV cannot read or write it."""
     import cv2
 
     source = cv2.VideoCapture(str(path))
@@ -97,7 +99,7 @@ def webm(path: Path, width: int) -> bytes | None:
     handle, name = tempfile.mkstemp(suffix=".webm")
     os.close(handle)
     try:
-        with _quiet():
+        with _silenced_stderr():
             sink = cv2.VideoWriter(name, cv2.VideoWriter_fourcc(*"VP90"), source.get(cv2.CAP_PROP_FPS) or 20.0, smaller)
             if not sink.isOpened():
                 return None
@@ -110,8 +112,8 @@ def webm(path: Path, width: int) -> bytes | None:
         Path(name).unlink()
 
 
-class _quiet:
-    """Without what FFmpeg writes to stderr about a tag that WebM has no use for."""
+class _silenced_stderr:
+    """Context that discards stderr, where FFmpeg warns about a codec tag that WebM does not use."""
 
     def __enter__(self) -> None:
         import sys
@@ -127,7 +129,7 @@ class _quiet:
 
 
 def figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any] | None:
-    """Return a figure without a window and its axes (rows, columns), or None where matplotlib is not installed."""
+    """Create a matplotlib figure without a window and its axes (rows, columns); return None if matplotlib is not installed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -139,7 +141,7 @@ def figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any
 
 
 def svg(made: Any) -> str:
-    """Return a figure as an inline element."""
+    """Convert a matplotlib figure to an inline SVG element."""
     import matplotlib
 
     stream = io.StringIO()
@@ -149,7 +151,7 @@ def svg(made: Any) -> str:
 
 
 def style_axes(ax: Any) -> None:
-    """Make the ticks small, and leave out the frame above and at the right."""
+    """Style the axes of a report figure: small tick labels, no upper and right frame line."""
     ax.tick_params(which="both", labelsize=7)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)

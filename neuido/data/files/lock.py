@@ -1,4 +1,4 @@
-"""A lock between processes that says who holds it."""
+"""File lock between processes that records its owner."""
 
 import json
 import math
@@ -16,18 +16,19 @@ from neuido.errors import UserError
 
 
 class LockHeld(UserError):
-    """Another process holds the lock."""
+    """The lock is held by another process."""
 
 
 class OwnedLock:
-    """An exclusive lock on a file, on every platform, with the pid and host of its owner beside it in `<file>.owner`.
+    """Exclusive file lock that stores the pid and host of its owner in `<file>.owner`.
 
-    The owner may name a process that it started (`hand_to`). While that process lives, the lock counts as held even where its owner died.
+    The owner can share the lock with a child process (`share_with_child`). The lock then stays held while the child lives, even if the
+    owner is killed.
 
     Args:
-        path: The lock file; it stays where it is.
-        purpose: What the lock guards, for the error: "the run runs/a".
-        wait: Seconds to wait for another owner; negative: without end.
+        path: The lock file. It is never removed.
+        purpose: What the lock guards, for error messages; for example "the run runs/a".
+        wait: Longest time to wait for the lock [s]; negative: wait forever.
     """
 
     def __init__(self, path: str | os.PathLike, purpose: str, *, wait: float = 0.0) -> None:
@@ -36,11 +37,11 @@ class OwnedLock:
         self._lock = FileLock(str(self.path))
 
     def __enter__(self) -> "OwnedLock":
-        """Take the lock.
+        """Acquire the lock.
 
         Raises:
-            Held: Another process has it; one line with its pid and host.
-            UserError: The file cannot be made.
+            LockHeld: Another process holds the lock; the message has its pid and host.
+            UserError: The lock file cannot be created.
         """
         end = math.inf if self.wait < 0 else time.monotonic() + self.wait
         while True:
@@ -49,7 +50,7 @@ class OwnedLock:
             except Timeout as error:
                 raise LockHeld(self._message(self._record())) from error
             except OSError as error:
-                raise UserError(f"the lock {self.path} cannot be made: {(error.strerror or str(error)).lower()}") from error
+                raise UserError(f"the lock file {self.path} cannot be created: {(error.strerror or str(error)).lower()}") from error
             record = self._record()
             if record.get("host") != socket.gethostname() or not _lives(record.get("child"), record.get("child_started")):
                 self._note({})
@@ -59,12 +60,12 @@ class OwnedLock:
                 raise LockHeld(self._message(record))
             time.sleep(0.1)
 
-    def hand_to(self, child: int) -> None:
-        """Let a process that was started under this lock hold it on, should this process be killed."""
+    def share_with_child(self, child: int) -> None:
+        """Keep the lock held while a child process lives, even if this process is killed."""
         self._note({"child": child, "child_started": _started(child)})
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Give the lock back."""
+        """Release the lock."""
         self.owner.unlink(missing_ok=True)
         self._lock.release()
 
@@ -82,11 +83,11 @@ class OwnedLock:
 
     def _message(self, record: dict[str, Any]) -> str:
         who = f"process {record.get('child', record['pid'])} on {record.get('host')}" if "pid" in record else "another process"
-        return f"{self.purpose} is held by {who} (lock {self.path}): wait for it or end it"
+        return f"{self.purpose} is held by {who} (lock file {self.path}): wait until it ends, or stop it"
 
 
 def _started(pid: int) -> str | None:
-    """Return when a process started, in a form that only equality is asked of; none where the platform does not say."""
+    """Return the start time of a process in ticks, to tell it from a later one with the same pid; None if the platform has no /proc."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
     except (OSError, IndexError):
@@ -94,7 +95,7 @@ def _started(pid: int) -> str | None:
 
 
 def _lives(pid: Any, started: Any) -> bool:
-    """Whether a process is alive and the one that was noted, not a later one with its number."""
+    """Whether the recorded process is alive, and not a later one with the same pid."""
     if not isinstance(pid, int) or pid < 1 or not process_lives(pid, unknown=False):
         return False
     if started is None:

@@ -1,4 +1,4 @@
-"""The command that makes a file of weights which is not there."""
+"""Find the command that creates a missing file of weights."""
 
 import os
 from pathlib import Path
@@ -9,12 +9,17 @@ from neuido import configs_root
 
 
 def weights_hint(path: str | os.PathLike, option: str = "init_from") -> str:
-    """Return the words that end an error about missing weights: the command that makes the file, or where others come from.
+    """Return the remedy for a missing file of weights, as the end of an error message.
 
-    A configuration makes a file when its `save_to` names it.
+    It is the `neuido fit` command of the configuration whose `save_to` is this file. Without such a configuration it says where weights
+    come from.
+
+    Args:
+        path: The missing file.
+        option: The option that gave the path; `law` asks for a file of a law.
     """
     if option == "law":
-        return "`neuido predict` writes a law.safetensors for each scene"
+        return "`neuido predict` writes law.safetensors for each scene"
     root = configs_root()
     for config in sorted(root.rglob("*.yaml"), key=lambda file: (len(file.parts), file.name)):
         content = yaml.safe_load(config.read_text())
@@ -23,5 +28,5 @@ def weights_hint(path: str | os.PathLike, option: str = "init_from") -> str:
         target = content["model"].get("init_args", {}).get("save_to")
         if target is not None and Path(target) == Path(path):
             name = config.relative_to(root).as_posix()
-            return f"`neuido fit --config configs/{name}` makes them; 'pretrained' takes those that come with neuido"
-    return "give a file that a `save_to` wrote, or 'pretrained' for those that come with neuido"
+            return f"create them with `neuido fit --config configs/{name}`, or give 'pretrained' for the weights that come with neuido"
+    return "give a file that a training wrote (`save_to`), or 'pretrained' for the weights that come with neuido"

@@ -1,7 +1,7 @@
 """Readers of untrusted files: JSON, YAML, CSV, NumPy archives and images.
 
-Each reader turns every failure of its parser into one line that names the file, and checks a size before it allocates memory.
-`LIMITS` has the sizes; an environment variable of the same name raises one of them.
+Each reader converts every failure of its parser into a `UserError` that names the file, and checks sizes before it allocates memory.
+`LIMITS` has the largest sizes; an environment variable of the same name changes one.
 """
 
 import contextlib
@@ -28,15 +28,15 @@ LIMITS = {
     "NEUIDO_MAX_PARTICLES": 20_000_000,
     "NEUIDO_MAX_COLLIDERS": 256,
 }
-"""The largest bytes of a text file, nodes of a YAML file, elements of an array, pixels of an image, particles of a body or a PLY file,
-colliders of a scene."""
+"""Largest number of bytes of a text file, nodes of a YAML file, elements of an array, pixels of an image, particles of a body or a PLY
+file, and colliders of a scene."""
 
 
 def limit(name: str) -> int:
-    """Return a limit of `LIMITS`, or the environment variable of this name.
+    """Return a limit of `LIMITS`, or the environment variable of the same name if it is set.
 
     Raises:
-        UserError: The variable holds no positive whole number.
+        UserError: The variable is not a positive whole number.
     """
     given = os.environ.get(name, "").strip()
     if not given:
@@ -47,56 +47,56 @@ def limit(name: str) -> int:
 
 
 def check_limit(count: int, name: str, what: str) -> None:
-    """Refuse a size above a limit.
+    """Check that a size does not exceed a limit of `LIMITS`.
 
     Args:
         count: The size.
-        name: A key of `LIMITS`.
-        what: What has that size, the beginning of the error.
+        name: Key of `LIMITS`.
+        what: Beginning of the error message, such as "a.yaml has 12 bytes".
 
     Raises:
-        UserError: The size is too large; the message names the variable that raises the limit.
+        UserError: The size exceeds the limit; the message names the environment variable that raises it.
     """
     if count > limit(name):
-        raise UserError(f"{what}, more than {limit(name)}: set the environment variable {name} to read it all the same")
+        raise UserError(f"{what}, more than the limit of {limit(name)}: raise it with the environment variable {name}")
 
 
 @contextlib.contextmanager
 def parser_errors(path: str | os.PathLike, what: str) -> Iterator[None]:
-    """Turn any exception of a parser into a `UserError` of one line: the file, what it should be, and why it is not."""
+    """Convert any exception of a parser into a one-line `UserError`: "<path> is not a valid <what>: <reason>"."""
     try:
         yield
     except UserError:
         raise
-    except Exception as error:  # parsers raise what their authors did not think of: zlib.error, TokenError, RecursionError, ...
+    except Exception as error:  # parsers raise undocumented exceptions: zlib.error, TokenError, RecursionError, ...
         raise UserError(f"{path} is not a valid {what}: {one_line(error)}") from error
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of an exception as one short line; its type where it has no message."""
+    """Return the message of an exception as one line of at most 300 characters, or its type if it has no message."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
     text = " ".join(str(error).split())
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     if isinstance(error, MemoryError):
-        return "it needs more memory than there is"
+        return "it needs more memory than available"
     return text[:300] if text else type(error).__name__
 
 
 def read_text(path: str | os.PathLike, failure: str = "is not text in UTF-8") -> str:
-    """Return the content of a UTF-8 file, with or without a byte order mark.
+    """Read a UTF-8 text file, with or without a byte order mark.
 
     Args:
         path: The file.
-        failure: What the error says of a file that is not text.
+        failure: Error message for a file that is not text, after the path.
 
     Raises:
         UserError: The file is missing, too large, or not UTF-8.
     """
     path = Path(path)
     if not path.is_file():
-        raise UserError(f"{path} is missing" if not path.exists() else f"{path} is no file")
+        raise UserError(f"{path} is missing" if not path.exists() else f"{path} is not a file")
     try:
         check_limit(path.stat().st_size, "NEUIDO_MAX_TEXT_BYTES", f"{path} has {path.stat().st_size} bytes")
         return path.read_text(encoding="utf-8-sig")
@@ -105,7 +105,7 @@ def read_text(path: str | os.PathLike, failure: str = "is not text in UTF-8") ->
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
+    """Read a JSON file.
 
     Raises:
         UserError: The file is missing or is not JSON.
@@ -118,7 +118,7 @@ def read_json(path: Path) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 1e5 as a number; PyYAML follows YAML 1.1, where it is text."""
+    """SafeLoader that reads 1e5 as a number, as in YAML 1.2; in YAML 1.1, which PyYAML follows, it is text."""
 
 
 _Loader.add_implicit_resolver(
@@ -129,7 +129,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping in a YAML file; 1e5 and 1.0e5 are numbers, as YAML 1.2 has them.
+    """Read a YAML file that contains a mapping; 1e5 and 1.0e5 are numbers, as in YAML 1.2.
 
     Raises:
         UserError: The file is missing, not valid YAML, not a mapping, or its aliases expand to too many values.
@@ -153,17 +153,17 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except Exception as error:  # YAMLError; ValueError of a date or a huge integer; RecursionError; TypeError of a key
         raise UserError(f"{path} is not valid YAML: {one_line(error)}") from error
     if not isinstance(content, dict):
-        raise UserError(f"{path} holds no mapping of keys to values")
+        raise UserError(f"{path} must contain a mapping of keys to values")
     return content
 
 
 def _expanded(node: yaml.Node | None, sizes: dict[int, int]) -> int:
-    """Count the values below a node, those behind aliases each time that they are named."""
+    """Count the values below a node; the values of an alias count once for each use."""
     if node is None or isinstance(node, yaml.ScalarNode):
         return 1
     if id(node) in sizes:
         if sizes[id(node)] == 0:
-            raise ValueError(f"an alias refers to what holds it, line {node.start_mark.line + 1}")
+            raise ValueError(f"line {node.start_mark.line + 1}: an alias refers to a node that contains it")
         return sizes[id(node)]
     sizes[id(node)] = 0
     children = (part for pair in node.value for part in pair) if isinstance(node, yaml.MappingNode) else iter(node.value)
@@ -172,29 +172,29 @@ def _expanded(node: yaml.Node | None, sizes: dict[int, int]) -> int:
 
 
 def read_table(path: Path) -> list[list[str]]:
-    """Return the rows of a CSV file that are not empty, the header first.
+    """Read the rows of a CSV file, header first; skip empty rows.
 
     Raises:
-        UserError: The file is missing, or no CSV.
+        UserError: The file is missing or not valid CSV.
     """
-    text = read_text(path, "is no CSV file")
+    text = read_text(path, "is not a valid CSV file")
     try:
         return [row for row in csv.reader(text.splitlines(keepends=True), strict=True) if row]
     except (csv.Error, ValueError) as error:
-        raise UserError(f"{path} is no CSV file: {one_line(error)}") from error
+        raise UserError(f"{path} is not a valid CSV file: {one_line(error)}") from error
 
 
 def read_arrays(
     path: str | os.PathLike, needed: Iterable[str], optional: Iterable[str] = (), *, what: str = "", others: bool = True
 ) -> dict[str, np.ndarray]:
-    """Return arrays of a NumPy archive (.npz); pickled objects are refused.
+    """Read arrays of a NumPy archive (.npz); pickled objects are refused.
 
     Args:
         path: The file.
-        needed: Names of arrays that must be there.
-        optional: Names of arrays that may be there.
-        what: What the file should be, for the error; by default an archive of the needed arrays.
-        others: Whether arrays of other names are ignored; else they are refused.
+        needed: Names of the required arrays.
+        optional: Names of arrays that may be absent.
+        what: What the file should be, for error messages; by default "archive of <needed>".
+        others: True: ignore arrays of other names. False: refuse them.
 
     Raises:
         UserError: The file is missing, damaged or too large, or lacks an array.
@@ -218,18 +218,22 @@ def _read_array(archive: zipfile.ZipFile, member: str, path: Path, what: str) ->
     with archive.open(member) as stream:
         version = np.lib.format.read_magic(stream)
         if version not in ((1, 0), (2, 0)):
-            raise UserError(f"{path}: {member} has the .npy version {version}, which is not read")
+            raise UserError(f"{path}: {member} has the unsupported .npy version {version}")
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = header(stream)
     if dtype.kind not in "biufU":
-        raise UserError(f"{path} is not a valid {what}: {member} holds values of the kind {dtype}, no plain numbers")
+        raise UserError(f"{path} is not a valid {what}: {member} contains {dtype} and not numbers")
     check_limit(math.prod(shape), "NEUIDO_MAX_ARRAY_ELEMENTS", f"{path}: {member} has {math.prod(shape)} elements")
     with archive.open(member) as stream:
         return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def _size_in_header(path: Path) -> tuple[int, int] | None:
-    """Return width and height [px] from an image's header, none where Pillow does not know the format; refuse what is too large."""
+    """Read width and height [px] from the header of an image; return None if Pillow does not know the format.
+
+    Raises:
+        UserError: The file is missing, or the image exceeds `NEUIDO_MAX_IMAGE_PIXELS`.
+    """
     from PIL import Image
 
     if not path.is_file():
@@ -240,7 +244,9 @@ def _size_in_header(path: Path) -> tuple[int, int] | None:
             size = image.size
     except Image.DecompressionBombError as error:
         if limit(name) <= 2 * (Image.MAX_IMAGE_PIXELS or 0):
-            raise UserError(f"{path} has more than {limit(name)} pixels: set the environment variable {name} to read it") from error
+            raise UserError(
+                f"{path} has more than the limit of {limit(name)} pixels: raise it with the environment variable {name}"
+            ) from error
         return None
     except Exception:  # a damaged header; OpenCV decides
         return None
@@ -249,19 +255,19 @@ def _size_in_header(path: Path) -> tuple[int, int] | None:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return width and height [px] of an image file, from its header where that is possible.
+    """Return width and height [px] of an image file; read only its header if possible.
 
     Raises:
-        UserError: The file is missing, no image, or too large.
+        UserError: The file is missing, not an image, or too large.
     """
     return _size_in_header(path) or read_image(path).shape[1::-1]  # type: ignore[return-value]
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Return an image (H, W) or (H, W, C) of 8 or 16 bits as stored: BGR or BGRA, without EXIF rotation.
+    """Read an image (H, W) or (H, W, C) of 8 or 16 bits as stored: BGR or BGRA, without EXIF rotation.
 
     Raises:
-        UserError: The file is missing, no image that OpenCV can read, of another depth, or too large.
+        UserError: The file is missing, not readable by OpenCV, of another bit depth, or too large.
     """
     import cv2
 
@@ -269,7 +275,7 @@ def read_image(path: Path) -> np.ndarray:
     try:
         raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise UserError(f"{path} is no image that OpenCV can read: {one_line(error)}") from error
+        raise UserError(f"{path} is not an image that OpenCV can read: {one_line(error)}") from error
     if raw is None or raw.dtype not in (np.uint8, np.uint16):
-        raise UserError(f"{path} is missing or no image of 8 or 16 bits that OpenCV can read")
+        raise UserError(f"{path} is not an image of 8 or 16 bits that OpenCV can read")
     return raw

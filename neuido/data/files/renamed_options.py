@@ -1,4 +1,4 @@
-"""Renamed options: constructors, configuration files and command lines still take an old name, with a warning that gives the new one."""
+"""Renamed options: constructors, configuration files and command lines accept an old name and warn with the new one."""
 
 import functools
 import re
@@ -11,16 +11,16 @@ from neuido.errors import UserError
 C = TypeVar("C", bound=type)
 
 RENAMED: dict[str, dict[str, str]] = {}
-"""Import path of a class -> old name of an option -> new name."""
+"""New name of an option, by import path of its class and old name."""
 
 
 def renamed_options(**names: str) -> Callable[[C], C]:
-    """Let the constructor of a class take options under their old names too: `@renamed_options(old="new")`.
+    """Let the constructor of a class accept options under their old names too: `@renamed_options(old="new")`.
 
-    The signature of the class, and with it the help of the command line, shows the new names alone.
+    The signature of the class, and so the help of the command line, shows the new names only.
 
     Args:
-        names: Old name of each option -> new name.
+        names: New name of each option, by old name.
     """
 
     def decorate(owner: C) -> C:
@@ -38,11 +38,11 @@ def renamed_options(**names: str) -> Callable[[C], C]:
 
 
 def rename(options: Mapping[str, Any], names: Mapping[str, str], where: str) -> dict[str, Any]:
-    """Return options under their new names, and warn about each old one.
+    """Rename options given under old names, with a warning for each.
 
     Args:
         options: Values by name.
-        names: Old name of each option -> new name.
+        names: New name of each option, by old name.
         where: Prefix of an option in messages, such as the name of its class.
 
     Raises:
@@ -52,7 +52,7 @@ def rename(options: Mapping[str, Any], names: Mapping[str, str], where: str) -> 
     for old in names.keys() & options.keys():
         new = names[old]
         if new in options:
-            raise UserError(f"{where}.{old} is the former name of {where}.{new}: give one of them")
+            raise UserError(f"{where}.{old} is the former name of {where}.{new}, and both are given: remove {where}.{old}")
         warnings.warn(f"{where}.{old} is now called {where}.{new}", FutureWarning, stacklevel=3)
         found[new] = found.pop(old)
     return found

@@ -1,4 +1,4 @@
-"""What runs have left on disk, for tables and figures: scores, scores by time step, logged curves, videos."""
+"""Read the results of runs for tables and figures: scores, scores by time step, logged curves and videos."""
 
 import csv
 import math
@@ -13,60 +13,60 @@ from neuido.errors import UserError
 
 
 class Entry(NamedTuple):
-    """One line of the tables: a run, or one of the score tables of a run."""
+    """One line of the tables of a report: a run, or one score table of a run."""
 
     label: str
     root: Path
-    """The folder that was given: logs are somewhere below it."""
+    """Folder of the run; logs lie below it."""
     scores: Path | None
-    """The folder of scores.csv; none where there is none."""
+    """Folder of scores.csv; None if the run has no scores."""
     rows: list[dict[str, Any]]
-    """scores.csv, a row a scene."""
+    """Rows of scores.csv, one per scene."""
     parameters: dict[str, Any]
-    """Of a run of a sweep."""
+    """Parameters of the run, if it belongs to a sweep."""
     stage: str = ""
-    """`before` or `after` fitting, or a later `test`, where the scores say so."""
+    """`before` or `after` fitting, or a later `test`; empty if the scores have no stage."""
     last: bool = True
-    """Whether it is the last stage of its run."""
+    """Whether `stage` is the last stage of the run."""
 
-    def of(self, scene: str) -> dict[str, Any]:
-        """Return the row of a scene; empty where there is none."""
+    def row_of(self, scene: str) -> dict[str, Any]:
+        """Return the row of a scene; empty if there is none."""
         return next((row for row in self.rows if str(row.get("scene")) == scene), {})
 
     def folder(self, scene: str) -> Path | None:
-        """Return the folder of a scene's results."""
+        """Return the folder with the results of a scene; None if the run has no scores."""
         return None if self.scores is None else folder_of(self.scores, scene)
 
     def by_frame(self, scene: str) -> list[dict[str, Any]]:
-        """Return the rows of a scene's particles.csv, one for each time step."""
+        """Read particles.csv of a scene, one row per time step; empty if there is none."""
         path = (self.folder(scene) or Path()) / self.stage / "particles.csv"
         return read_rows(path) if self.scores is not None and path.is_file() else []
 
     def videos(self, scene: str) -> list[Path]:
-        """Return the videos of a scene: of what came out of a run."""
+        """List the videos of a scene; only the last stage of a run has videos."""
         folder = self.folder(scene)
         return sorted(folder.glob("*.mp4")) if folder and folder.is_dir() and self.last else []
 
 
 def open_runs(given: Sequence[str]) -> list[Entry]:
-    """Return the entries of some runs, in order.
+    """Open the results of runs; return their entries in the given order.
 
     Args:
-        given: Folders, each of a run, of results, or of a sweep, whose finished runs then count one by one; `label=folder` gives it a name.
+        given: Folders of runs, results or sweeps; each finished run of a sweep is an entry. `label=folder` names an entry.
 
     Raises:
-        UserError: A folder that is missing, or that holds neither scores nor logs.
+        UserError: A folder is missing, or has neither scores nor logs.
     """
     entries: list[Entry] = []
     for one in given:
         label, _, path = one.rpartition("=") if "=" in one and not Path(one).exists() else ("", "", one)
         folder = Path(path).expanduser()
         if not folder.is_dir():
-            raise UserError(f"runs: there is no folder {folder}")
+            raise UserError(f"runs: the folder {folder} is missing")
         sweep = sorted(each for each in folder.iterdir() if read_status(each).get("status") == "done")
         found = [entry for each in sweep or [folder] for entry in _entries(each, label, read_status(each).get("parameters", {}))]
         if not found:
-            raise UserError(f"runs: {folder} holds neither scores.csv, test.csv nor metrics.csv: run `neuido fit` or `neuido test` first")
+            raise UserError(f"runs: {folder} has neither scores.csv, test.csv nor metrics.csv: run `neuido fit` or `neuido test` first")
         entries += found
     return _distinct(entries)
 
@@ -88,7 +88,7 @@ def _entries(folder: Path, label: str, parameters: dict[str, Any]) -> list[Entry
 
 
 def tables(folder: Path) -> dict[Path, list[dict[str, Any]]]:
-    """Return the scores below a folder by where they are: rows of scores.csv, and of test.csv, in which a finished fit was scored again."""
+    """Read scores.csv and test.csv below a folder; return the rows by folder. test.csv has the scores of a later `neuido test`."""
     paths = sorted({*folder.rglob("scores.csv"), *folder.rglob("test.csv")}, key=lambda path: (path.parent, path.name))
     return {place: [row for path in paths if path.parent == place for row in read_rows(path)] for place in {p.parent: 0 for p in paths}}
 
@@ -99,7 +99,7 @@ def _name(folder: Path) -> str:
 
 
 def _distinct(entries: list[Entry]) -> list[Entry]:
-    """Add the parent folder to labels that come twice."""
+    """Prefix repeated labels with the name of the parent folder."""
     labels = [entry.label for entry in entries]
     return [
         entry._replace(label=f"{entry.root.resolve().parent.name}/{entry.label}") if labels.count(entry.label) > 1 else entry
@@ -108,17 +108,17 @@ def _distinct(entries: list[Entry]) -> list[Entry]:
 
 
 def logs(root: Path) -> list[Path]:
-    """Return the metrics.csv files below a folder, the newest last: version_10 after version_9, whatever the clock says."""
+    """List the metrics.csv files below a folder by version number, the newest last: version_10 after version_9."""
     return sorted(root.rglob("metrics.csv"), key=_numbered)
 
 
 def _numbered(path: Path) -> list[tuple[str, int]]:
-    """Return a path as a key to sort by, its numbers as numbers."""
+    """Return a sort key that compares numbers in a path as numbers."""
     return [(text, int(number or 0)) for text, number in re.findall(r"([^0-9]*)([0-9]*)", path.as_posix())]
 
 
 def logged_curves(root: Path) -> dict[str, list[tuple[float, float]]]:
-    """Return (step, value) of each logged column; of a column in several files the newest counts."""
+    """Read (step, value) of each logged column from the metrics.csv files below a folder; for a repeated column, the newest file counts."""
     out: dict[str, list[tuple[float, float]]] = {}
     for path in logs(root):
         own: dict[str, list[tuple[float, float]]] = {}
@@ -132,10 +132,10 @@ def logged_curves(root: Path) -> dict[str, list[tuple[float, float]]]:
 
 
 def scenes_of(entries: Sequence[Entry]) -> list[str]:
-    """Return the names of all scenes, in the order in which they come."""
+    """List the names of all scenes, in order of appearance."""
     return list(dict.fromkeys(str(row["scene"]) for entry in entries for row in entry.rows if "scene" in row))
 
 
 def mean(values: Sequence[Any]) -> float:
-    """Return the mean of numbers; NaN where one is missing."""
+    """Return the mean of numbers; NaN if there is none or one is not a finite float."""
     return sum(values) / len(values) if values and all(isinstance(v, float) and math.isfinite(v) for v in values) else math.nan

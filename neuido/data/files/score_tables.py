@@ -1,4 +1,4 @@
-"""Results on disk: tables as CSV files, and the folder of each scene. No torch at import."""
+"""CSV tables of scores, and the folder of each scene's results. Importing this module does not load torch."""
 
 import csv
 import io
@@ -11,7 +11,7 @@ from neuido.errors import UserError
 
 
 def write_rows(path: str | os.PathLike, rows: Sequence[dict[str, Any]]) -> None:
-    """Write rows as CSV, all at once; a value that a row lacks is empty."""
+    """Write rows as a CSV file, atomically; a key that a row lacks gives an empty cell."""
     from neuido.data.files.storage import write_text
 
     path = Path(path)
@@ -25,10 +25,10 @@ def write_rows(path: str | os.PathLike, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def read_rows(path: str | os.PathLike) -> list[dict[str, Any]]:
-    """Read a CSV file: numbers as floats, other words as they are; an empty cell is left out.
+    """Read a CSV file as one dictionary per row; numbers become floats, and empty cells are omitted.
 
     Raises:
-        UserError: A file that is missing or no text.
+        UserError: The file is missing or not text.
     """
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
@@ -38,7 +38,7 @@ def read_rows(path: str | os.PathLike) -> list[dict[str, Any]]:
 
 
 def number(text: str) -> float | str:
-    """Return a cell as a float where it is a number, else as text."""
+    """Convert a cell to a float if it is a number; return it unchanged otherwise."""
     try:
         return float(text)
     except (TypeError, ValueError):
@@ -46,6 +46,6 @@ def number(text: str) -> float | str:
 
 
 def folder_of(out: str | os.PathLike, name: str) -> Path:
-    """Return the folder of a scene's results, under a name that stays inside `out`."""
+    """Return the folder of a scene's results; unsafe characters of the name are replaced, so the folder lies inside `out`."""
     clean = "".join(c if c.isalnum() or c in "-_." else "-" for c in name).lstrip(".") or "scene"
     return Path(out) / clean

@@ -1,4 +1,4 @@
-"""The folder of one run of a sweep: which one this process writes to, and the status of a run."""
+"""Folder and status of one run of a sweep."""
 
 import json
 from collections.abc import Mapping
@@ -7,11 +7,11 @@ from typing import Any
 
 FORMAT = "neuido-run/1"
 FOLDER = "NEUIDO_RUN"
-"""Environment variable with the folder of a run, which receives all its files."""
+"""Environment variable with the folder that receives all files of a run."""
 
 
 def read_status(folder: Path) -> dict[str, Any]:
-    """Return the content of a run's `run.json`; empty without one."""
+    """Read `run.json` of a run; return an empty dictionary if it is missing or malformed."""
     try:
         content = json.loads((folder / "run.json").read_text())
     except (OSError, ValueError):
@@ -20,14 +20,14 @@ def read_status(folder: Path) -> dict[str, Any]:
 
 
 def write_status(folder: Path, state: Mapping[str, Any]) -> None:
-    """Write the status of a run to its `run.json`."""
+    """Write the status of a run to `run.json` in its folder."""
     from neuido.data.files.storage import write_text
 
     write_text(folder / "run.json", json.dumps(state, indent=1) + "\n")
 
 
 def own_folder(environment: Mapping[str, str]) -> Path | None:
-    """Return the folder of this process if it is a run of a sweep, started by `neuido sweep` or by wandb's agent; else None."""
+    """Return the run folder of this process if `neuido sweep` or wandb's agent started it as a run of a sweep; None otherwise."""
     if environment.get(FOLDER):
         return Path(environment[FOLDER])
     if environment.get("WANDB_SWEEP_ID") and environment.get("WANDB_RUN_ID"):
@@ -36,7 +36,7 @@ def own_folder(environment: Mapping[str, str]) -> Path | None:
 
 
 def redirect(options: Any, folder: Path) -> None:
-    """Redirect the output of a trainer's configuration to the folder of a run: logs, checkpoints, `save_to` and `out` of the model.
+    """Redirect all output of a `neuido fit` configuration to the folder of a run: logs, checkpoints, and `save_to` and `out` of the model.
 
     Args:
         options: The parsed configuration of a subcommand, changed in place.

@@ -1,4 +1,4 @@
-"""Files and folders that appear under their names when they are whole, and never otherwise; links that are never followed."""
+"""Atomic writing: files and folders get their final name only when complete. Links are never followed."""
 
 import contextlib
 import os
@@ -13,14 +13,15 @@ from neuido.errors import UserError
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False) -> Iterator[Path]:
-    """Give the name of a temporary file beside a file; when the block ends it takes the file's place, for good and all at once.
+    """Write a file atomically: yield a temporary path, and rename it to `path` when the block ends.
 
-    Several processes may write one file: each has a temporary name of its own. Where the block fails, as on a full disk, the temporary
-    file goes and what was there before stays. A link is replaced, not followed.
+    The data are synchronised to disk before the renaming. If the block raises, as on a full disk, the temporary file is removed and an
+    earlier file stays unchanged. Several processes may write the same file, because each has its own temporary path. A link is replaced,
+    not followed.
 
     Args:
-        path: The file; its folder is made.
-        keep_suffix: Whether the temporary name ends as the file's does, for writers that go by it.
+        path: The file; its folder is created if it does not exist.
+        keep_suffix: Whether the temporary path has the suffix of `path`, for writers that depend on it.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,10 +38,12 @@ def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False) -> Itera
 
 @contextlib.contextmanager
 def new_folder(path: str | os.PathLike) -> Iterator[Path]:
-    """Give an empty temporary folder beside a folder; when the block ends it appears under that name. Where the block fails it goes.
+    """Create a folder atomically: yield an empty temporary folder, and rename it to `path` when the block ends.
+
+    If the block raises, the temporary folder is removed.
 
     Raises:
-        UserError: A folder with content, or a file, has the name by then.
+        UserError: By then `path` exists, and is a file or a folder with content.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,7 +58,7 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
             os.replace(hidden, path)
         except OSError as error:
             if path.exists():
-                raise UserError(f"{path} was made by another process meanwhile, and is left as it is") from error
+                raise UserError(f"{path} was created by another process meanwhile and is not replaced: give another folder") from error
             raise
     except BaseException:
         remove(hidden)
@@ -64,7 +67,10 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def temporary_path(path: Path, suffix: str = "") -> Path:
-    """Return a name beside a file that no other process uses; what dead processes of this machine left beside it goes first."""
+    """Return a temporary path beside a file that no other process uses.
+
+    Temporary files of this file that dead processes of this machine left are removed.
+    """
     host = "".join(c for c in socket.gethostname() if c.isalnum())[:20]
     old_name = path.with_name(f".{path.name}.tmp")  # of earlier versions
     if old_name.is_file():
@@ -77,7 +83,7 @@ def temporary_path(path: Path, suffix: str = "") -> Path:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, a folder with all that it holds, or a link, whose target stays."""
+    """Remove a file, a folder with its content, or a link without its target."""
     if path.is_symlink() or path.is_file():
         path.unlink(missing_ok=True)
     elif path.is_dir():
@@ -85,13 +91,17 @@ def remove(path: Path) -> None:
 
 
 def make_real_folder(path: Path, what: str) -> Path:
-    """Make a folder, or take the one that is there.
+    """Create a folder if it does not exist; refuse a link, which could lead anywhere.
+
+    Args:
+        path: The folder.
+        what: What it is called in error messages.
 
     Raises:
-        UserError: It is a link, which could lead anywhere, or a file.
+        UserError: `path` is a link or a file.
     """
     if path.is_symlink():
-        raise UserError(f"{what} {path} is a link, and links are not followed here: remove it, or give another out")
+        raise UserError(f"{what} {path} is a link, which is not followed here: remove it, or give another out")
     try:
         path.mkdir(parents=True, exist_ok=True)
     except FileExistsError as error:
@@ -100,10 +110,14 @@ def make_real_folder(path: Path, what: str) -> Path:
 
 
 def check_writable(folder: Path, option: str = "out") -> None:
-    """Refuse a folder that cannot be made or written, before long work begins; nothing is made.
+    """Check before long work that a folder can be created and written; create nothing.
+
+    Args:
+        folder: The folder.
+        option: The option that gave it, for error messages.
 
     Raises:
-        UserError: It is a file, lies below one, or may not be written.
+        UserError: The folder is a file, lies below a file, or is not writable.
     """
     there = folder
     while not there.exists() and there != there.parent:
@@ -119,14 +133,14 @@ def check_writable(folder: Path, option: str = "out") -> None:
 
 
 def _literal(text: str) -> str:
-    """Return a text as a pattern of `glob` that matches it alone."""
+    """Escape a text for `glob`, so that the pattern matches this text only."""
     return "".join(f"[{c}]" if c in "*?[" else c for c in text)
 
 
 def process_lives(pid: int, *, unknown: bool) -> bool:
-    """Return whether a process of this host is alive; `unknown` where that cannot be asked, as on Windows."""
+    """Return whether a process of this machine is alive; return `unknown` if the platform cannot tell, as on Windows."""
     if os.name != "posix":
-        return unknown  # a signal of 0 would end it there
+        return unknown  # there, os.kill with signal 0 would end the process
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -1,4 +1,4 @@
-"""A folder of measured data that appears once the reader of its format takes it."""
+"""Write a folder of measured data only if its reader accepts it."""
 
 import os
 import tempfile
@@ -10,15 +10,15 @@ from neuido.errors import UserError
 
 
 def write_checked(out: str | os.PathLike | None, fill: Callable[[Path], None], read: Callable[[Path], object]) -> None:
-    """Fill a new folder, read it, and give it its name; with no `out` only try that.
+    """Write a new folder, read it back, and give it its final name only if the reader accepts it.
 
     Args:
-        out: The folder to make.
-        fill: What writes its files.
-        read: The reader of its format.
+        out: The folder to create. None: check the content in a temporary folder and keep nothing.
+        fill: Writes the files into the folder that it is given.
+        read: Reads the folder; raises UserError if the content is not valid.
 
     Raises:
-        UserError: What the reader finds, without the name of the temporary folder; a folder that is there already.
+        UserError: The reader refuses the content, or `out` exists. The message does not contain the path of the temporary folder.
     """
 
     def attempt(folder: Path) -> None:

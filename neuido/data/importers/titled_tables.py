@@ -1,4 +1,4 @@
-"""Tables of measured figures, from text of any dialect or a sheet of Excel: titles, units, numbers, and what stood before them."""
+"""Reader of measured tables, from a text file of any dialect or an Excel sheet: titles, units, numbers and preamble."""
 
 import re
 from pathlib import Path
@@ -17,20 +17,21 @@ class Table(NamedTuple):
 
     titles: list[str]
     units: list[str]
-    """Of each column, empty where not given."""
+    """Unit of each column; empty if the table does not state it."""
     data: np.ndarray
-    """(n, C) float64, NaN where a cell holds no number."""
+    """(n, C) float64; NaN if a cell contains no number."""
     preamble: list[list[str]]
+    """Rows above the titles."""
     notes: list[str]
-    """What was found on the way, for the summary."""
+    """How the file was read, for the summary."""
 
 
 def read_cells(path: Path) -> tuple[list[list[str]], list[str]]:
-    """Return the rows of a file of text or of the first sheet of an Excel file, and notes for the summary."""
+    """Read the rows of a text file or of the first sheet of an Excel file; return them and notes for the summary."""
     if path.suffix.lower() in (".xlsx", ".xls", ".xlsm"):
         pandas = import_extra("pandas", f"{path.name}")
         import_extra("openpyxl", f"{path.name}")
-        with parser_errors(path, "sheet of Excel"):
+        with parser_errors(path, "Excel sheet"):
             sheet = pandas.read_excel(path, header=None, dtype=object)
         rows = [["" if pandas.isna(cell) else str(cell).strip() for cell in row] for row in sheet.to_numpy()]
         return [row for row in rows if any(row)], ["first sheet"]
@@ -41,15 +42,15 @@ def read_cells(path: Path) -> tuple[list[list[str]], list[str]]:
 
 
 def read_titled(path: Path) -> Table:
-    """Read a table whose titles stand right above its numbers, with a row of units or without.
+    """Read a table whose titles stand directly above its numbers, with or without a row of units between them.
 
     Raises:
-        UserError: There is no block of numbers.
+        UserError: The file has no block of at least three rows of numbers.
     """
     rows, notes = read_cells(path)
     first = next((i for i in range(len(rows)) if all(_numeric(row) for row in rows[i : i + 3]) and len(rows) - i > 2), None)
     if first is None:
-        raise UserError(f"{path} holds no three rows of numbers in a block: is it a table of measured figures?")
+        raise UserError(f"{path} has no block of three rows of numbers: is it a table of measured values?")
     width = max(len(row) for row in rows[first:])
     above = rows[first - 1] if first else [f"column {i + 1}" for i in range(width)]
     units = [""] * width
@@ -77,5 +78,6 @@ def read_titled(path: Path) -> Table:
 
 
 def _numeric(row: list[str]) -> bool:
+    """Whether more than half of the filled cells of a row are numbers."""
     filled = [cell for cell in row if cell]
     return len(filled) > 1 and sum(is_number(cell) for cell in filled) > 0.5 * len(filled)

@@ -1,10 +1,10 @@
-"""What a column means, by its title in English or German."""
+"""Recognise the quantity of a column from its title, in English or German."""
 
 import re
 
 from neuido.errors import UserError
 
-MEANINGS = {  # quantity: pattern of its title; the first that fits counts
+MEANINGS = {  # quantity: pattern of its title; the first match counts
     "true_stress": r"true stress|cauchy|wahre spannung",
     "log_strain": r"true strain|log\w* strain|hencky|wahre dehnung",
     "stretch_1": r"(stretch|lambda|λ|l)[ _]?1",
@@ -28,21 +28,21 @@ MEANINGS = {  # quantity: pattern of its title; the first that fits counts
 
 
 def find_columns(titles: list[str], given: dict[str, str] | None = None) -> dict[str, int]:
-    """Return quantity -> index of its column.
+    """Find the column of each quantity; return the column indices by quantity.
 
     Args:
-        titles: Of the columns.
-        given: quantity -> title, in place of what the titles say.
+        titles: Titles of the columns.
+        given: Title of the column of a quantity; it takes precedence over recognition.
 
     Raises:
-        UserError: A given title or quantity is not there.
+        UserError: A quantity of `given` is unknown, or no column has its title.
     """
     found: dict[str, int] = {}
     for quantity, title in (given or {}).items():
         if quantity not in MEANINGS:
-            raise UserError(f"--columns has {quantity!r}, which is no quantity; one of {', '.join(MEANINGS)}")
+            raise UserError(f"--columns has the unknown quantity {quantity!r}: choose from {', '.join(MEANINGS)}")
         if title not in titles:
-            raise UserError(f"--columns: no column is titled {title!r}; there are {', '.join(filter(None, titles))}")
+            raise UserError(f"--columns.{quantity}: no column has the title {title!r}; the titles are {', '.join(filter(None, titles))}")
         found[quantity] = titles.index(title)
     for i, title in enumerate(titles):
         bare = re.sub(r"\s*[\(\[].*?[\)\]]|[_ ](in )?(%|k?N|[kMG]?Pa|m?m|m?s)$", "", title).strip().lower()

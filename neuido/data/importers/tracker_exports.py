@@ -1,4 +1,4 @@
-"""Exports of trackers and motion capture as positions of named points: OptiTrack, Vicon, TRC, DeepLabCut, C3D, and plain tables."""
+"""Reader of tracker and motion-capture exports: OptiTrack, Vicon, TRC, DeepLabCut, C3D and plain tables."""
 
 import re
 from pathlib import Path
@@ -14,28 +14,33 @@ from neuido.data.importers.units import conversion_factor, import_extra
 from neuido.errors import UserError
 
 MIN_LIKELIHOOD = 0.6
-"""Points of DeepLabCut below this likelihood count as not seen."""
+"""Smallest likelihood at which a point of DeepLabCut counts as seen."""
 
 
 class Motion(NamedTuple):
-    """Positions of named points, T frames."""
+    """Positions of named points in T frames."""
 
     t: np.ndarray
-    """Times [s], (T,), or frame numbers where `frames`."""
+    """Times [s] (T,), or frame numbers if `frames` is true."""
     points: dict[str, np.ndarray]
-    """(T, A) each, NaN where not seen."""
+    """Positions (T, A) of each point by name; NaN if not seen."""
     unit: str
-    """Of the positions; empty where the file gives none."""
+    """Unit of the positions; empty if the file states none."""
     frames: bool
-    """Whether `t` counts frames."""
+    """Whether `t` holds frame numbers."""
     notes: list[str]
+    """How the file was read, for the summary."""
 
 
 def read_motion(path: Path, columns: dict[str, str]) -> Motion:
-    """Read a tracker's export, whose layout is told from its content.
+    """Read a tracker export; detect its layout from its content.
+
+    Args:
+        path: The file.
+        columns: Title of the column of a quantity, for plain tables whose titles are not recognised.
 
     Raises:
-        UserError: No layout that is known.
+        UserError: The layout is unknown, or the file is malformed.
     """
     if path.suffix.lower() == ".c3d":
         return _c3d(path)
@@ -74,7 +79,7 @@ def _optitrack(path: Path, rows: list[list[str]]) -> Motion:
     titles, kinds = rows[first - 1], rows[first - 2]
     names = next((row for row in rows[1:first] if len(row) > 1 and "name" in (row[0].lower(), row[1].lower())), None)
     if names is None:
-        raise UserError(f"{path}: the row of names is missing; export with headers")
+        raise UserError(f"{path}: the row of marker names is missing: export the file with headers")
     points: dict[str, np.ndarray] = {}
     for j in range(2, min(len(titles), len(kinds), len(names)) - 2):
         if kinds[j].lower() == "position" and [t.upper() for t in titles[j : j + 3]] == ["X", "Y", "Z"]:
@@ -92,7 +97,7 @@ def _trc(path: Path, rows: list[list[str]]) -> Motion:
 
 def _vicon(path: Path, rows: list[list[str]]) -> Motion:
     if len(rows) < 6 or not is_number(rows[1][0]) or not float(rows[1][0]) > 0:
-        raise UserError(f"{path}: the rate of a Vicon export is missing in its second row")
+        raise UserError(f"{path}: a Vicon export has the frame rate in its second row; it is missing")
     first, data = _numbers_from(path, rows, 4)
     units, names = rows[first - 1], rows[2]
     points = {name.rpartition(":")[2]: data[:, j : j + 3] for j, name in enumerate(names) if name and j + 3 <= data.shape[1]}
@@ -108,7 +113,11 @@ def _deeplabcut(path: Path, rows: list[list[str]]) -> Motion:
         if [kind.lower() for kind in kinds[j : j + 3]] == ["x", "y", "likelihood"]:
             points[parts[j]] = np.where(data[:, j + 2 : j + 3] < MIN_LIKELIHOOD, np.nan, data[:, j : j + 2])
     return Motion(
-        data[:, 0], points, "pixel", True, [f"DeepLabCut, {len(points)} body parts, likelihood below {MIN_LIKELIHOOD} as not seen"]
+        data[:, 0],
+        points,
+        "pixel",
+        True,
+        [f"DeepLabCut, {len(points)} body parts, points of likelihood below {MIN_LIKELIHOOD} count as not seen"],
     )
 
 
@@ -130,10 +139,12 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
     clock = next((name for name in ("time", "frame") if name in found), None)
     if not axes or clock is None:
         titles = ", ".join(filter(None, table.titles))
-        raise UserError(f"{path.name} has no time or no position: name them, --columns.time TITLE --columns.x TITLE ({titles})")
+        raise UserError(
+            f"{path.name} has no time or no position: name their columns with --columns.time TITLE --columns.x TITLE (titles: {titles})"
+        )
     units = {table.units[found[axis]] for axis in axes}
     if len(units) > 1:
-        raise UserError(f"{path.name}: the axes have several units, {', '.join(sorted(units))}")
+        raise UserError(f"{path.name}: the axes have different units ({', '.join(sorted(units))}): export them in one unit")
     t = table.data[:, found[clock]]
     if clock == "time" and table.units[found["time"]]:
         t = t * conversion_factor(table.units[found["time"]], "s", f"{path.name}, time")

@@ -1,4 +1,4 @@
-"""Units of columns and options, by pint."""
+"""Unit conversion of columns and options, with pint."""
 
 import re
 from functools import cache
@@ -14,10 +14,14 @@ _SPELLED = {
 
 
 def import_extra(module: str, what: str) -> Any:
-    """Import a library of the extra `import`.
+    """Import a library of the optional extra `import`.
+
+    Args:
+        module: Name of the library.
+        what: What needs it, for the error message.
 
     Raises:
-        UserError: It is not installed.
+        UserError: The library is not installed.
     """
     import importlib
 
@@ -33,29 +37,34 @@ def _registry() -> Any:
 
 
 def conversion_factor(unit: str, to: str, where: str) -> float:
-    """Return what a figure in a unit is multiplied by to be in another.
+    """Return the factor that converts values in `unit` to the unit `to`.
+
+    Args:
+        unit: Unit as written in a file or an option, such as `MPa`; empty for a ratio.
+        to: Target unit; empty for a ratio.
+        where: Prefix of the error message.
 
     Raises:
-        UserError: No unit, or one of another kind.
+        UserError: `unit` is not a unit, or it has another dimension than `to`.
     """
     own = _spelled(unit)
     try:
         if not re.fullmatch(r"[\w\s/*^.µ%·-]{0,30}", own):
-            raise ValueError("no unit")
+            raise ValueError("not a unit")
         return float(_registry().Quantity(1.0, own or "dimensionless").to(to or "dimensionless").magnitude)
     except Exception as error:  # pint raises errors of several kinds
-        raise UserError(f"{where}: the unit {unit[:40]!r} is not one of {to or 'a ratio'}") from error
+        raise UserError(f"{where}: the unit {unit[:40]!r} cannot be converted to {to or 'a ratio'}") from error
 
 
 def parse_quantity(text: str, to: str, option: str) -> float:
-    """Return an option such as `25.4 mm` in another unit.
+    """Convert the text of an option, such as `25.4 mm`, to a number in the unit `to`.
 
     Raises:
-        UserError: No number with a unit, or not above 0.
+        UserError: The text is not a number with a unit, or the number is not positive.
     """
     found = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([^\s\d].*)", str(text))
     if found is None or found[1].count(".") > 1:
-        raise UserError(f"--{option} = {text!r} must be a number and its unit, for example '25.4 mm'")
+        raise UserError(f"--{option} = {text!r} must be a number with a unit, for example '25.4 mm'")
     value = float(found[1]) * conversion_factor(found[2].strip(), to, f"--{option}")
     if not value > 0:
         raise UserError(f"--{option} = {text!r} must be above 0")
@@ -63,7 +72,7 @@ def parse_quantity(text: str, to: str, option: str) -> float:
 
 
 def is_unit(text: str) -> bool:
-    """Whether a cell of a row of units names one."""
+    """Whether a cell contains a unit; an empty cell counts as one."""
     text = text.strip().strip("()[]")
     if not text or _spelled(text) == "":
         return True
@@ -75,5 +84,6 @@ def is_unit(text: str) -> bool:
 
 
 def _spelled(unit: str) -> str:
+    """Return a unit in pint's spelling."""
     unit = unit.strip().strip("()[]").strip()
     return _SPELLED.get(unit.lower(), unit.replace("²", "^2"))

@@ -1,4 +1,4 @@
-"""What the readers of measured data share: columns of a CSV file, effects that a model declares, roles. The files are not trusted."""
+"""Shared parts of the readers of measured data: headers, CSV columns, declared effects and roles. The files are not trusted."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
@@ -21,24 +21,29 @@ WAVES = ["frequency", *(f"{part}{a}" for part in "sc" for a in "xyz")]
 
 
 def read_header(folder: Path, name: str, form: str) -> tuple[Path, dict[str, Any]]:
-    """Return the YAML file `name` of a folder (or given itself) and its content, whose `format` must be `form`.
+    """Read the YAML file of a folder of measured data; return its path and content.
+
+    Args:
+        folder: The folder, or the file itself.
+        name: Name of the file in the folder.
+        form: Required value of the key `format`.
 
     Raises:
-        UserError: The file is missing, no YAML, or of another format.
+        UserError: The file is missing, not valid YAML, or has another format.
     """
     given = Path(folder).expanduser()
     file = given if given.is_file() else given / name
     if not file.is_file():
-        raise UserError(f"{file} is missing: {given} is no folder of the format {form}")
+        raise UserError(f"{file} is missing: {given} is not a folder of the format {form}")
     content = read_yaml(file)
     if content.get("format") != form:
-        raise UserError(f"{file}: format is {content.get('format')!r}, not {form!r}")
+        raise UserError(f"{file}: format = {content.get('format')!r} must be {form!r}")
     return file, content
 
 
 @contextlib.contextmanager
 def errors_of(file: Path) -> Iterator[None]:
-    """Add the file's name to errors in its content."""
+    """Add the path of the file to errors about its content."""
     try:
         yield
     except UserError as error:
@@ -48,16 +53,16 @@ def errors_of(file: Path) -> Iterator[None]:
 
 
 def read_entries(given: Any, key: str, what: str, read: Callable[[Any, str], Entry]) -> tuple[Entry, ...]:
-    """Return the entries of a list that is not empty, each of another name.
+    """Read the entries of a non-empty list; require distinct names.
 
     Args:
         given: The list.
-        key: What it is called in an error.
-        what: What an entry is.
-        read: Of an entry and what it is called; its result has a `name`.
+        key: Name of the list in error messages.
+        what: What an entry is, in error messages.
+        read: Reads an entry, given its name in error messages; the result has an attribute `name`.
 
     Raises:
-        UserError: No such list, or a name that comes twice.
+        UserError: It is not a non-empty list, or two entries have the same name.
     """
     if not isinstance(given, list) or not given:
         raise UserError(f"{key} must be a list of at least one {what}, got {given!r}")
@@ -65,24 +70,24 @@ def read_entries(given: Any, key: str, what: str, read: Callable[[Any, str], Ent
     for i, entry in enumerate(given):
         entries.append(read(entry, f"{key}[{i}]"))
         if entries[-1].name in [other.name for other in entries[:-1]]:  # type: ignore[attr-defined]
-            raise UserError(f"{key}[{i}].name = {entries[-1].name!r} is taken by another {what}")  # type: ignore[attr-defined]
+            raise UserError(f"{key}[{i}].name = {entries[-1].name!r} is the name of another {what}: rename one of them")  # type: ignore[attr-defined]
     return tuple(entries)
 
 
 def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: Mapping[str, float]) -> tuple[dict[str, np.ndarray], range]:
-    """Return the columns that `entry` names of its CSV file.
+    """Read the columns of a CSV file that `entry` names.
 
     Args:
-        folder: The folder that must hold the file.
-        entry: Has `file`, `columns` (key: the file's own column name) and perhaps `rows`, a half-open range of data rows.
-        where: What the entry is called in an error.
-        scale: Factors by key; 1 where absent.
+        folder: The folder that must contain the file.
+        entry: `file`; `columns`, the title in the file of each key; and optionally `rows`, a half-open range of data rows.
+        where: Name of the entry in error messages.
+        scale: Factor of each key; 1 if absent.
 
     Returns:
-        key -> (n,) float64, and which rows of the file they are.
+        The columns by key, (n,) float64, and the range of the data rows that were read.
 
     Raises:
-        UserError: A missing file or column, a cell that is no finite number, rows that are not there.
+        UserError: The file or a column is missing, a cell is not a finite number, or `rows` is outside the file.
     """
     path = path_inside(folder, entry["file"], f"{where}.file")
     if not path.is_file():
@@ -107,21 +112,21 @@ def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: M
         with np.errstate(over="ignore"):
             out[key] = cells * scale.get(key, 1.0)
         if not np.isfinite(out[key]).all():
-            raise UserError(f"{where}: {path.name}, {title}: a figure is too large once scaled")
+            raise UserError(f"{where}: {path.name}, {title}: a number exceeds the range of floating point after scaling: check scale")
     return out, rows
 
 
 def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str, float]:
-    """Read the effects that a model declares, as flat parameters, for example {"drag_quadratic.k": 0.01}.
+    """Read the effects that a model declares; return their parameters by flat names, for example {"drag_quadratic.k": 0.01}.
 
     Args:
-        given: "name.parameter" -> number, or name -> a mapping of its parameters, a list in their order, or a number where there is one
-            alone; what is left out is absent.
-        where: What it is called in an error.
-        known: Names of the effects that make sense there.
+        given: The key `effects`: a number for "name.parameter"; or, for a name, a mapping of its parameters, a list of them in the order of
+            the library, or a number if the effect has one parameter. Effects that are not listed are absent.
+        where: Name of the key in error messages.
+        known: Names of the effects that the kind of data supports.
 
     Raises:
-        UserError: An unknown name or parameter, no number, or a parameter that needs another beside it.
+        UserError: An effect or parameter is unknown, a value is not a number, or a parameter lacks another one that it needs.
     """
     library = {entry.name: [parameter.name for parameter in entry.parameters] for entry in LIBRARY}
     library["time_force"] += WAVES
@@ -130,7 +135,7 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
         name, _, part = str(name).partition(".")
         value = {part: value} if part else value
         if name not in known:
-            raise UserError(f"{where} has {name!r}, which is no effect here; one of {', '.join(known)}")
+            raise UserError(f"{where} has the unknown effect {name!r}: choose from {', '.join(known)}")
         own = library[name]
         if not isinstance(value, Mapping):
             values = value if isinstance(value, list) else [value]
@@ -141,7 +146,7 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
         for key, figure in value.items():
             flat[f"{name}.{key}"] = number(figure, f"{where}.{name}.{key}")
     try:
-        later = [f"time_force.{key}" for key in WAVES]  # `discrepancy.problems.candidates` makes knots of them; a gradient needs a body
+        later = [f"time_force.{key}" for key in WAVES]  # `discrepancy.problems.candidates` converts them to knots; a gradient needs a body
         Effects.of({key: figure for key, figure in flat.items() if not key.startswith("stiffness_gradient.") and key not in later})
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
@@ -149,45 +154,60 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
 
 
 def read_free(given: Any, known: tuple[str, ...], where: str = "model.free") -> tuple[str, ...]:
-    """Return the figures of a model that are to be fitted."""
+    """Validate the list of parameters to fit; return it as a tuple.
+
+    Raises:
+        UserError: It is not a list, or a parameter is unknown or listed twice.
+    """
     if not isinstance(given, list):
-        raise UserError(f"{where} must be a list of figures, got {given!r}")
+        raise UserError(f"{where} must be a list of parameters, got {given!r}")
     for key in given:
         if key not in known:
-            raise UserError(f"{where} has {key!r}, which the model lacks; one of {', '.join(known)}")
+            raise UserError(f"{where} has the unknown parameter {key!r}: choose from {', '.join(known)}")
     if len(set(given)) < len(given):
-        raise UserError(f"{where} names a figure twice: {given}")
+        raise UserError(f"{where} lists a parameter twice: {given}")
     return tuple(given)
 
 
 def read_text(given: Any, where: str) -> str:
-    """Return text that is not blank."""
+    """Validate text that is not blank; return it.
+
+    Raises:
+        UserError: The value is not text, or is blank.
+    """
     if not isinstance(given, str) or not given.strip():
         raise UserError(f"{where} must be text, got {given!r}")
     return given
 
 
 def read_role(given: Any, where: str) -> str:
-    """Return a role, `fit` or `held_out`."""
+    """Validate a role, `fit` or `held_out`; return it.
+
+    Raises:
+        UserError: The role is unknown.
+    """
     if given not in ROLES:
-        raise UserError(f"{where}.role = {given!r} is not known; one of {', '.join(ROLES)}")
+        raise UserError(f"{where}.role = {given!r} is unknown: choose from {', '.join(ROLES)}")
     return given
 
 
 def check_increasing(t: np.ndarray, where: str) -> np.ndarray:
-    """Return times [s] (n,), which must increase from row to row.
+    """Check that times [s] (n,) increase from row to row; return them.
 
     Raises:
-        UserError: They do not.
+        UserError: A time does not exceed the one before.
     """
     if (np.diff(t) <= 0).any():
         i = int(np.argmax(np.diff(t) <= 0))
-        raise UserError(f"{where}: times must rise, got {t[i]:g} s and then {t[i + 1]:g} s")
+        raise UserError(f"{where}: times must increase from row to row, but {t[i + 1]:g} s follows {t[i]:g} s (data row {i + 1})")
     return t
 
 
 def _titles(table: list[list[str]], wanted: list[str]) -> tuple[list[str], list[list[str]]]:
-    """Return the titles of a table and its data rows; the titles are the first row with all that are wanted, a row of units is left out."""
+    """Split a table into titles and data rows.
+
+    The titles are the first row that has all `wanted` ones. A row of units below the titles is skipped.
+    """
     first = next((i for i, row in enumerate(table) if set(wanted) <= set(row)), 0)
     lines = table[first + 1 :]
     if lines and len(lines[0]) > 1 and not any(is_number(cell) or cell.lower() in ("nan", "inf") for cell in lines[0]) and all(lines[0]):
@@ -201,9 +221,9 @@ def _rows(given: Any, count: int, where: str) -> range:
     else:
         whole = isinstance(given, list) and len(given) == 2 and all(isinstance(i, int) and not isinstance(i, bool) for i in given)
         if not whole or not 0 <= given[0] < given[1]:
-            raise UserError(f"{where}.rows must be [first row, end], got {given!r}")
+            raise UserError(f"{where}.rows must be [first row, row after the last], got {given!r}")
         if given[1] > count:
-            raise UserError(f"{where}.rows = {given} ends after the last of {count} data rows")
+            raise UserError(f"{where}.rows = {given} exceeds the {count} data rows of the file")
         rows = range(*given)
     if len(rows) < 3:
         raise UserError(f"{where} has {len(rows)} data rows; at least 3 are needed")
@@ -216,5 +236,5 @@ def _cell(line: list[str], index: int, where: str) -> float:
     except (IndexError, ValueError):
         value = np.nan
     if not np.isfinite(value):
-        raise UserError(f"{where} is {line[index]!r}, no finite number" if index < len(line) else f"{where} is missing")
+        raise UserError(f"{where} is {line[index]!r}, which is not a finite number" if index < len(line) else f"{where} is missing")
     return value

@@ -60,7 +60,7 @@ class Recording:
     def seen(self) -> Tensor:
         """Whether point n was seen in frame t, (T, N)."""
         if self.x is None:
-            raise UserError(f"recording {self.name} has no tracked points: it lacks particles.npz")
+            raise UserError(f"recording {self.name} has no tracked points: particles.npz is missing")
         return ~self.x[..., 0].isnan()
 
 
@@ -83,7 +83,7 @@ class Experiment:
         for recording in self.recordings:
             if recording.name == name:
                 return recording
-        raise UserError(f"recording = {name!r} is not in {self.name}; one of {', '.join(r.name for r in self.recordings)}")
+        raise UserError(f"recording = {name!r} is not in {self.name}: choose from {', '.join(r.name for r in self.recordings)}")
 
     def of(self, role: str) -> tuple[Recording, ...]:
         """Return the recordings with this role."""
@@ -122,7 +122,7 @@ def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
     """
     folder = Path(path).expanduser()
     if (folder / "experiment.yaml").exists():
-        raise UserError(f"{folder} holds an experiment already; give another folder")
+        raise UserError(f"{folder} contains an experiment already: give another folder")
     scene, discretisation = scene_to_dict(experiment.scene)
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -145,7 +145,7 @@ def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
 
 
 def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the keys `scene` and `discretisation` of an experiment, the inverse of `scenes.scene_from_dict`."""
+    """Convert a scene to the keys `scene` and `discretisation` of an experiment file; the inverse of `scene_from_dict`."""
 
     def corners(box: Box) -> list[list[float]]:
         return [list(box.lower), list(box.upper)]
@@ -243,7 +243,11 @@ def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path)
 
 
 def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
-    """Return the arrays of particles.npz, checked."""
+    """Read and validate particles.npz; return it as fields of `Recording`.
+
+    Raises:
+        UserError: An array is missing or malformed, shapes do not match, or values are implausible.
+    """
     arrays = _arrays(path)
     shapes = {"x": ("T", "N", 3), "t": ("T",), "x0": ("P", 3), "v0": ("P", 3), "volume": ("P",), "F0": ("P", 3, 3), "track": ("N",),
               "anchor": ("N", 3)}  # fmt: skip
@@ -257,18 +261,18 @@ def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
             raise UserError(f"{path}: {key} must have the shape ({wanted}), got {array.shape}")
         for n, m in zip(shape, array.shape):
             if isinstance(n, str) and sizes.setdefault(n, m) != m:
-                raise UserError(f"{path}: {key} has the shape {array.shape}; as ({wanted}) it does not fit {n} = {sizes[n]}")
+                raise UserError(f"{path}: {key} has the shape {array.shape}; it must be ({wanted}) with {n} = {sizes[n]}")
         if array.dtype.kind not in ("iu" if key == "track" else "f"):
             raise UserError(f"{path}: {key} must hold {'whole numbers' if key == 'track' else 'floating-point numbers'}, got {array.dtype}")
         if key != "x" and not np.isfinite(array).all():
-            raise UserError(f"{path}: {key} holds a NaN or an infinity")
+            raise UserError(f"{path}: {key} contains a NaN or an infinity")
     if min(sizes.values()) < 1:
         raise UserError(f"{path}: {', '.join(f'{n} = {m}' for n, m in sizes.items())}; all must be at least 1")
     x, t = arrays["x"], arrays["t"]
     if not np.isinf(x).any():
         x = arrays["x"] = mask_unseen(x, str(path))
     if np.isinf(x).any() or (np.isnan(x).any(axis=2) != np.isnan(x).all(axis=2)).any():
-        raise UserError(f"{path}: x holds an infinity, or a point that is NaN in one coordinate only")
+        raise UserError(f"{path}: x contains an infinity, or a point that is NaN in some coordinates only")
     if t[0] != 0 or (np.diff(t) <= 0).any():
         raise UserError(f"{path}: t must increase from 0, got {', '.join(f'{time:g}' for time in t[:4])}, ...")
     if len(t) > 1 and not 0.5 < t[-1] / (len(t) - 1) / interval < 2:
@@ -310,7 +314,7 @@ def _check_boxes(scene: Scene, x: Tensor, where: str) -> None:
     boxes += [(f"attached_masses[{i}]", attached.box) for i, attached in enumerate(scene.attached_masses)]
     for key, box in boxes:
         if not bool(((x >= x.new_tensor(box.lower)) & (x <= x.new_tensor(box.upper))).all(dim=1).any()):
-            raise UserError(f"{where}: {key}.box = {[list(box.lower), list(box.upper)]} picks no particle of x0")
+            raise UserError(f"{where}: {key}.box = {[list(box.lower), list(box.upper)]} contains no particle of x0")
 
 
 def _write_files(recording: Recording, folder: Path) -> None:
@@ -324,7 +328,9 @@ def _write_files(recording: Recording, folder: Path) -> None:
     if recording.video is not None:
         source = recording.video.folder
         if not (source / "transforms.json").is_file():
-            raise UserError(f"the video of {recording.name} is no folder with transforms.json: write its images with nerfstudio.write")
+            raise UserError(
+                f"the video of recording {recording.name} has no transforms.json in {source}: write its images with nerfstudio.write"
+            )
         for path in (path for grid in (recording.video.images, recording.video.masks or ()) for row in grid for path in row if path):
             target = folder / path.relative_to(source)
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The video of a recording in an experiment's folder (`neuido-experiment/1`); `data.experiments` reads the whole of it."""
+"""Reader of the video of one recording in an experiment folder; `read_experiment` reads the whole experiment."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,15 +12,15 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
     """Read the cameras and images of a recording, with its particles and Gaussians.
 
     Args:
-        path: The experiment's folder.
-        recording: Its name; needed where several recordings have images.
-        frame_interval: Not taken: `transforms.json` has the times.
+        path: The experiment folder.
+        recording: Name of the recording. Needed if several recordings have images.
+        frame_interval: Not accepted, because `transforms.json` has the times.
 
     Raises:
-        UserError: As `read_experiment`, or the recording has no images.
+        UserError: As `read_experiment`; or the recording has no images, or `frame_interval` is given.
     """
     if frame_interval is not None:
-        raise UserError("frame_interval is not for experiments: their transforms.json has the times")
+        raise UserError("frame_interval cannot be given for an experiment: its transforms.json has the times")
     experiment = read_experiment(path)
     filmed = [one.name for one in experiment.recordings if one.video is not None]
     if recording is None and len(filmed) != 1:

@@ -1,4 +1,4 @@
-"""Material tests: measured stress against stretch of one material, in the folder format `neuido-material-test/1`, read and checked."""
+"""Material tests: measured stress over stretch of one material, in the folder format `neuido-material-test/1`."""
 
 import os
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ from neuido.types import Vector
 FORMAT = "neuido-material-test/1"
 STRAINS = {"stretch": "log_strain", "stretch_1": "log_strain_1", "stretch_2": "log_strain_2"}
 STRESSES = {"nominal_stress": "true_stress", "nominal_stress_1": "true_stress_1", "nominal_stress_2": "true_stress_2"}
-MODES = {  # mode: what is prescribed, what was measured
+MODES = {  # mode: prescribed columns, measured columns
     "uniaxial": (("stretch",), ("nominal_stress",)),
     "equibiaxial": (("stretch",), ("nominal_stress",)),
     "pure_shear": (("stretch",), ("nominal_stress",)),
@@ -38,38 +38,38 @@ EFFECTS = (
     "viscosity_shear", "viscosity_bulk", "maxwell", "hysteresis", "strain_stiffening", "second_invariant", "tension_compression", "fibre",
     "yield", "hardening", "softening", "kinematic_hardening", "rate_yield", "stiffness_change",
 )  # fmt: skip
-"""The effects of the vocabulary that act on a law itself."""
+"""Effects of the library that act on a material law; the others need a body."""
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialTest:
-    """One test of one specimen, n rows."""
+    """One material test of one specimen, with n rows."""
 
     name: str
     role: str
-    """`fit`, or `held_out`: only ever scored."""
+    """`fit` or `held_out`; held-out tests are scored but never fitted."""
     mode: str
     """One of `MODES`."""
     path: np.ndarray
-    """What was prescribed: stretches [-], or the amount of shear [-], (n, 1) or (n, 2), float64."""
+    """Prescribed stretches [-], or amount of shear [-], (n, 1) or (n, 2) float64."""
     stress: np.ndarray
-    """What was measured [Pa], (n, 1) or (n, 2)."""
+    """Measured stress [Pa], (n, 1) or (n, 2) float64."""
     true_stress: bool
-    """Whether `stress` is Cauchy's, not the nominal one."""
+    """Whether `stress` is the Cauchy stress; otherwise it is the nominal stress."""
     file: Path
     columns: tuple[str, ...]
-    """The titles of the columns that were read."""
+    """Titles of the columns that were read."""
     rows: range
-    """Which data rows of the file these are."""
+    """Range of the data rows of the file that were read."""
     time: np.ndarray | None = None
-    """Times [s], (n,), rising; none: a quasi-static path in the order of the rows."""
+    """Times [s] (n,), increasing; None: a quasi-static path in the order of the rows."""
     direction: Vector = (1.0, 0.0, 0.0)
-    """The loading axis in the material's own frame, a unit vector."""
+    """Loading axis in the frame of the material, a unit vector."""
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialTests:
-    """All tests of one material."""
+    """All material tests of one material."""
 
     name: str
     folder: Path
@@ -78,20 +78,20 @@ class MaterialTests:
     free: tuple[str, ...]
     """The parameters of the model to fit; all others are taken as exact."""
     incompressible: bool
-    """Whether the lateral stress is zero by pressure."""
+    """Whether the material is incompressible, so that a pressure makes the lateral stress zero."""
     effects: dict[str, float]
-    """Effects that the declared model includes, by flat names, for example {"strain_stiffening.k": 0.01}."""
+    """Effects of the declared model by flat names, for example {"strain_stiffening.k": 0.01}."""
     tests: tuple[MaterialTest, ...]
 
     def of(self, role: str) -> tuple[MaterialTest, ...]:
-        """Return the tests of a role."""
+        """Return the tests with this role."""
         return tuple(test for test in self.tests if test.role == role)
 
     def histories(self) -> tuple[tuple[int, ...], ...]:
-        """Group the tests of one and the same specimen, in order, by index.
+        """Group the tests into loading histories; return the indices of the tests of each history, in order.
 
-        Tests of one file whose row ranges adjoin, with the same columns, mode and direction, are one loading history: the later one
-        starts in the state in which the earlier one ends. Every other test starts with a virgin specimen.
+        Tests form one history if they have the same file, columns, mode and direction, and their row ranges adjoin. The later test then
+        starts in the final state of the earlier one. Every other test starts with a virgin specimen.
         """
 
         def specimen(test: MaterialTest) -> tuple:
@@ -114,11 +114,15 @@ class MaterialTests:
 
 
 def read_material_tests(path: str | os.PathLike, *, model: Mapping[str, Any] | None = None) -> MaterialTests:
-    """Read a material test's folder, or its `test.yaml`; `model` takes the place of the file's own.
+    """Read a folder of material tests, or its `test.yaml`.
+
+    Args:
+        path: The folder or the file.
+        model: Replaces the key `model` of the file.
 
     Raises:
-        UserError: An unknown or missing key, mode, law, column or file, a NaN, stretches that are not positive, times that do not rise;
-            one line that names the file and the key.
+        UserError: A key, mode, law, column or file is unknown or missing, a value is a NaN, a stretch is not positive, times do not
+            increase, or the values are implausible for their unit. The message names the file and the key.
     """
     file, content = read_header(Path(path), "test.yaml", FORMAT)
     folder = file.parent
@@ -133,10 +137,10 @@ def read_material_tests(path: str | os.PathLike, *, model: Mapping[str, Any] | N
         declared, free = read_model(given)
         tests = read_entries(content["tests"], "tests", "test", lambda entry, where: _test(entry, where, folder))
         if not any(test.role == "fit" for test in tests):
-            raise UserError("tests has none whose role is fit")
+            raise UserError("tests has no entry with role fit: give at least one")
         _check(tests, declared)
         if incompressible and declared["plasticity"]["law"] == "drucker_prager":
-            raise UserError("model.incompressible: drucker_prager depends on the pressure, which an incompressible law does not know")
+            raise UserError("model.incompressible: drucker_prager depends on the pressure, which is then unknown: set it to false")
     return MaterialTests(name, folder, declared, free, incompressible, effects, tests)
 
 
@@ -146,7 +150,7 @@ def _test(entry: Any, where: str, folder: Path) -> MaterialTest:
     name = file_name(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     if not isinstance(entry["mode"], str) or entry["mode"] not in MODES:
-        raise UserError(f"{where}.mode = {entry['mode']!r} is not known; one of {', '.join(MODES)}")
+        raise UserError(f"{where}.mode = {entry['mode']!r} is unknown: choose from {', '.join(MODES)}")
     role = read_role(entry["role"], where)
     path_keys, stress_keys = MODES[entry["mode"]]
     columns = mapping(entry["columns"], f"{where}.columns")
@@ -185,7 +189,7 @@ def _test(entry: Any, where: str, folder: Path) -> MaterialTest:
 
 
 def _check(tests: tuple[MaterialTest, ...], model: Mapping[str, Any]) -> None:
-    """Refuse what the tests cannot have measured; those of one specimen together, as the rows of one may be far from rest."""
+    """Check that the values are plausible; tests of one specimen together, because the rows of one test may be far from rest."""
     groups: dict[tuple, list[int]] = {}
     for i, test in enumerate(tests):
         groups.setdefault((test.file, test.columns, test.mode, test.direction), []).append(i)
@@ -202,11 +206,15 @@ def _check(tests: tuple[MaterialTest, ...], model: Mapping[str, Any]) -> None:
 
 
 def _choose(columns: Mapping[str, Any], keys: tuple[str, ...], others: Mapping[str, str], where: str) -> tuple[str, ...]:
-    """Return the keys, or their alternatives (logarithmic strain, true stress) where the columns have these."""
+    """Choose the keys of columns, or their alternatives (logarithmic strain, true stress) if the file has these.
+
+    Raises:
+        UserError: The file has both kinds.
+    """
     other = tuple(others.get(key, key) for key in keys)
     if other == keys:
         return keys
     chosen = other if any(key in columns for key in other) else keys
     if chosen == other and any(key in columns for key in keys):
-        raise UserError(f"{where}.columns has both {', '.join(k for k in (*keys, *other) if k in columns)}: give one kind")
+        raise UserError(f"{where}.columns has both {', '.join(k for k in (*keys, *other) if k in columns)}: give one of the two")
     return chosen

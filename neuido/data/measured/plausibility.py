@@ -1,4 +1,7 @@
-"""What measured data cannot be: units, signs, order and markers, checked at reading; a refusal is one line that names what to change."""
+"""Plausibility checks of measured data: units, signs, order of rows and unseen markers.
+
+Each error is one line that says what is implausible and what to change.
+"""
 
 import math
 import warnings
@@ -10,34 +13,35 @@ import numpy as np
 from neuido.errors import UserError
 
 MAX_UNIT_FACTOR = 300.0
-"""How far a stiffness or an acceleration may be from the declared one before a unit is to blame."""
+"""Ratio of measured to declared stiffness above which, or below whose inverse, the unit is taken to be wrong."""
 MAX_REST_FACTOR = 3.0
-"""A path of stretches must come this near to 1 (as a factor), and none may be above `MOST`."""
+"""Factor from 1 within which at least one stretch of a test must lie."""
 MAX_STRETCH = 20.0
+"""Largest plausible stretch."""
 SENTINELS = (0.0, -9999.0, 9999.0, -999999.0)
-"""What trackers write in all three coordinates of a marker that they did not see."""
+"""Values that trackers write into all three coordinates of a marker that they did not see."""
 
 
 def check_stretches(path: np.ndarray, where: str) -> None:
-    """Refuse stretches (n, A) that look like a strain in percent, or a length.
+    """Check that stretches (n, A) are not strains in percent, or lengths.
 
     Raises:
-        UserError: None is near 1, or one is far above what any material bears.
+        UserError: No stretch is near 1, or one exceeds `MAX_STRETCH`.
     """
     away = np.maximum(path, 1 / np.maximum(path, 1e-300)).max(axis=1)
     row = int(np.argmax(away))
     if away.min() > MAX_REST_FACTOR or path.max() > MAX_STRETCH:
         raise UserError(
-            f"{where}: stretches run from {path.min():g} to {path.max():g} (data row {row}), and a stretch is 1 at rest: a strain in "
-            "percent or a length? Let `neuido import` turn it into a stretch (--strain_unit percent, --length)"
+            f"{where}: stretches range from {path.min():g} to {path.max():g} (data row {row}), but a stretch is 1 at rest; are they "
+            "strains in percent, or lengths? `neuido import` converts them (--units.strain percent, --length)"
         )
 
 
 def check_order(path: np.ndarray, where: str) -> None:
-    """Refuse the rows (n,) of a path without times that jump to and fro.
+    """Check that the rows (n,) of a path without times are in loading order.
 
     Raises:
-        UserError: They are in no order, as of a table that was shuffled.
+        UserError: The values jump up and down between rows, as in a shuffled table.
     """
     steps = np.diff(path)
     moved = steps[steps != 0]
@@ -47,29 +51,33 @@ def check_order(path: np.ndarray, where: str) -> None:
     if turns > 0.4 and np.median(np.abs(moved)) > 0.12 * np.ptp(path):
         row = int(np.argmax(np.abs(steps)))
         raise UserError(
-            f"{where}: the rows jump to and fro (data row {row}: {path[row]:g}, then {path[row + 1]:g}), which is no path: sort them in "
-            "the order of the test, or give columns.time"
+            f"{where}: values jump up and down between rows (data row {row}: {path[row]:g}, then {path[row + 1]:g}): sort the rows in "
+            "loading order, or give columns.time"
         )
 
 
 def check_stress(path: np.ndarray, stress: np.ndarray, model: Mapping[str, Any], where: str, *, timed: bool, rest: float = 1.0) -> None:
-    """Refuse stresses that are zero, constant, of the wrong sign, or a thousand or a million times what the declared modulus gives.
+    """Check that stresses are not zero, constant, of the wrong sign, or in another unit than Pa.
 
     Args:
         path: Stretches or shears (n, A).
         stress: [Pa], (n, A).
-        model: Has `elasticity`, perhaps with `young` [Pa].
-        where: What the test is called in an error.
-        timed: Whether it has times, so that it may be a creep test.
-        rest: The path's value of the unloaded specimen.
+        model: The declared model, with `elasticity`, which may have `young` [Pa].
+        where: Name of the test in error messages.
+        timed: Whether the test has times; it may then be a creep test.
+        rest: Value of the path at rest: 1 for a stretch, 0 for a shear.
 
     Raises:
-        UserError: One of these.
+        UserError: The stresses fail one of these checks.
     """
     if not stress.any():
-        raise UserError(f"{where}: the stress is zero in all {len(stress)} rows: another column is meant (columns), or the channel was off")
+        raise UserError(
+            f"{where}: the stress is zero in all {len(stress)} rows: name the right column (columns), or check the force channel"
+        )
     if not timed and len(stress) > 4 and np.ptp(stress) == 0 and np.ptp(path) > 0:
-        raise UserError(f"{where}: the stress is {stress[0, 0]:g} Pa in all {len(stress)} rows while the specimen deforms: see columns")
+        raise UserError(
+            f"{where}: the stress is {stress[0, 0]:g} Pa in all rows although the specimen deforms: name the right column (columns)"
+        )
     strain, force = path[:, 0] - rest, stress[:, 0]
     kept = (np.abs(strain) > 0.05 * np.abs(strain).max()) & (force != 0)
     if kept.sum() < 3:
@@ -78,8 +86,8 @@ def check_stress(path: np.ndarray, stress: np.ndarray, model: Mapping[str, Any],
     young = model.get("elasticity", {}).get("young")
     if np.mean(secant < 0) > 0.9:
         raise UserError(
-            f"{where}: the stress is {force[kept][0]:g} Pa at {path[kept][0, 0]:g}, and tension (above {rest:g}) is positive here, "
-            "compression negative: give scale a negative factor, or a stretch in place of a strain"
+            f"{where}: the stress is {force[kept][0]:g} Pa at {path[kept][0, 0]:g}, but tension (above {rest:g}) must be positive and "
+            "compression negative: give scale a negative factor, or give a stretch and not a strain"
         )
     if not isinstance(young, int | float) or not young > 0:
         return
@@ -88,22 +96,22 @@ def check_stress(path: np.ndarray, stress: np.ndarray, model: Mapping[str, Any],
         power = 10.0 ** (3 * round(math.log10(float(np.median(ratios))) / 3))
         raise UserError(
             f"{where}: stress over strain is {np.median(np.abs(secant)):.3g} Pa, about {power:g} times model.elasticity.young = {young:g} "
-            f"Pa: are stresses in Pa? Give scale 1.0e{round(-math.log10(power)):+d} for the stress, or another young"
+            f"Pa; are the stresses in Pa? Give the stress the scale 1.0e{round(-math.log10(power)):+d}, or correct young"
         )
 
 
 def check_flight(t: np.ndarray, x: np.ndarray, gravity: float, axis: str, where: str) -> None:
-    """Refuse heights in pixels, in millimetres, or with y down, told from the acceleration of a flight.
+    """Check that the coordinates of a flight are in metres with the declared direction of gravity.
 
     Args:
         t: Times [s], (n,).
         x: Coordinates along one axis, (n,).
-        gravity: The declared acceleration along it [m/s^2].
-        axis: Its name.
-        where: What the recording is called in an error.
+        gravity: Declared gravity along this axis [m/s^2].
+        axis: Name of the axis.
+        where: Name of the recording in error messages.
 
     Raises:
-        UserError: The body flies along a parabola whose acceleration is gravity's by another unit or sign.
+        UserError: The path is a parabola whose acceleration differs from gravity by a unit (pixels, millimetres) or by its sign.
     """
     if len(t) < 6 or abs(gravity) < 1 or np.ptp(x) == 0:
         return
@@ -114,16 +122,16 @@ def check_flight(t: np.ndarray, x: np.ndarray, gravity: float, axis: str, where:
     ratio = acceleration / gravity
     if left > 0.03 or not (abs(ratio) > 30 or -1.3 < ratio < -0.7):
         return
-    down = f" and {axis} points down" if ratio < 0 else ""
-    unit = "no metres" if abs(ratio) > 30 else "metres"
+    sign = f"{axis} points down" if ratio < 0 else ""
+    unit = "the unit is not metres" if abs(ratio) > 30 else ""
     raise UserError(
-        f"{where}: the acceleration along {axis} is {acceleration:.4g} /s^2, {ratio:.3g} times model.gravity: its figures are {unit}{down}"
-        f"; give scale: {{{axis}: {1 / ratio:.3g}}} or the like, or use `neuido import --scale`"
+        f"{where}: the acceleration along {axis} is {acceleration:.4g} /s^2, {ratio:.3g} times model.gravity: "
+        f"{' and '.join(filter(None, (unit, sign)))}; give about scale: {{{axis}: {1 / ratio:.3g}}}, or use `neuido import --scale`"
     )
 
 
 def mask_unseen(x: np.ndarray, where: str) -> np.ndarray:
-    """Return positions (T, N, 3) with NaN where a marker that was not seen sits at a sentinel; a warning says how many.
+    """Replace sentinel positions (T, N, 3) of markers that were not seen by NaN, with a warning that counts them.
 
     Raises:
         UserError: No point was seen in any frame.
@@ -135,7 +143,7 @@ def mask_unseen(x: np.ndarray, where: str) -> np.ndarray:
         if not hit.any():
             continue
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of points that were never seen
+            warnings.simplefilter("ignore", RuntimeWarning)  # points that were never seen
             usual = np.nanmedian(np.where(hit[..., None], np.nan, x), axis=0)
         far = ~(np.abs(usual - value).max(axis=1) < 1e-3 * size)
         hit &= far & (hit.sum(axis=0) > 0)
@@ -144,22 +152,23 @@ def mask_unseen(x: np.ndarray, where: str) -> np.ndarray:
     if not np.isfinite(x).any():
         raise UserError(f"{where}: no point of x was seen in any frame (all NaN): export the positions again")
     if count:
-        warnings.warn(f"{where}: {count} points that sit at exactly 0 or -9999 are taken as not seen", stacklevel=2)
+        warnings.warn(f"{where}: {count} positions of exactly 0 or -9999 count as not seen", stacklevel=2)
     return x
 
 
 def check_positions(x: np.ndarray, x0: np.ndarray, track: np.ndarray | None, lower: np.ndarray, upper: np.ndarray, where: str) -> None:
-    """Refuse positions (T, N, 3) that are in another unit or frame than the body x0 (P, 3) or the domain.
+    """Check that positions x (T, N, 3) have the unit and frame of the particles x0 (P, 3) and of the domain.
 
     Raises:
-        UserError: Most lie a domain's size outside of it, or the first frame is far from the particles that it follows.
+        UserError: The median position is farther outside the domain than the size of the domain, or the points of the first frame are
+            farther from their particles (`track`) than the size of the body.
     """
     size = float((upper - lower).max())
     middle = np.nanmedian(x.reshape(-1, 3), axis=0)
     if ((middle < lower - size) | (middle > upper + size)).any():
         raise UserError(
-            f"{where}: half of the positions lie beyond {', '.join(f'{v:.3g}' for v in middle)} m, and scene.domain ends at "
-            f"{', '.join(f'{v:g}' for v in upper)}: is x in millimetres? Give metres, as of x0"
+            f"{where}: the median position is {', '.join(f'{v:.3g}' for v in middle)} m, but scene.domain ends at "
+            f"{', '.join(f'{v:g}' for v in upper)} m; is x in millimetres? Give metres, as for x0"
         )
     if track is None:
         return
@@ -170,5 +179,5 @@ def check_positions(x: np.ndarray, x0: np.ndarray, track: np.ndarray | None, low
         if len(x0) > 1 and np.median(gap) > max(body, 1e-12):
             raise UserError(
                 f"{where}: in the first frame the points are {np.median(gap):.3g} m from the particles of x0 that they follow (track), "
-                f"more than the body's size of {body:.3g} m: x and x0 are in different units or frames"
+                f"more than the size of the body, {body:.3g} m: give x and x0 in the same unit and frame"
             )

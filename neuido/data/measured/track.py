@@ -1,4 +1,4 @@
-"""Tracks: measured motion of bodies as points, in the folder format `neuido-track/1`, read and checked."""
+"""Tracks: measured motion of bodies as points, in the folder format `neuido-track/1`."""
 
 import os
 from collections.abc import Mapping
@@ -31,58 +31,62 @@ FIGURES = ("mass", "diameter")
 EFFECTS = (
     "gravity", "uniform_acceleration", "drag_linear", "drag_quadratic", "magnus", "position_force", "time_force", "added_mass",
 )  # fmt: skip
-"""The effects of the vocabulary that act on a centre of mass."""
+"""Effects of the library that act on the centre of mass of a body."""
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One recorded motion, n frames."""
+    """Recorded motion of one body as a point, with n frames."""
 
     name: str
     body: str
     role: str
-    """`fit`, or `held_out`: only ever scored."""
+    """`fit` or `held_out`; held-out recordings are scored but never fitted."""
     t: np.ndarray
-    """Times [s], (n,) float64, rising."""
+    """Times [s], (n,) float64, increasing."""
     x: np.ndarray
-    """Measured coordinates [m], (n, A)."""
+    """Measured coordinates [m], (n, A) float64."""
     axes: tuple[int, ...]
-    """Which coordinates those A are: 0, 1, 2 for x, y, z."""
+    """Axes of the A coordinates: 0, 1, 2 for x, y, z."""
     spin: Vector | None = None
-    """Angular velocity at the start [rad/s]; none: not known."""
+    """Angular velocity at the start [rad/s]; None if unknown."""
     noise: float | None = None
-    """Standard deviation of the position error [m]; none: not known."""
+    """Standard deviation of the position error [m]; None if unknown."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """All recordings of some bodies in the same surroundings."""
+    """All recordings of one or more bodies in the same surroundings."""
 
     name: str
     folder: Path
     gravity: Vector = (0.0, -9.81, 0.0)
-    """[m/s^2]"""
+    """Declared gravity [m/s^2]."""
     effects: dict[str, float] = field(default_factory=dict)
-    """Effects that the model has already, as flat figures, for example {"drag_quadratic.k": 0.01}."""
+    """Effects of the declared model by flat names, for example {"drag_quadratic.k": 0.01}."""
     free: tuple[str, ...] = ()
-    """The figures of the model that are to be fitted: `gravity` (its size) or one of `effects`."""
+    """Parameters of the model to fit: `gravity` (its magnitude) or names of `effects`."""
     nuisances: dict[str, float] = field(default_factory=lambda: dict.fromkeys(NUISANCES, 0.0))
-    """Standard deviation of what may be off in every recording: release_time [s], length_scale and time_base (relative)."""
+    """Standard deviation of the nuisance parameters of a recording: release_time [s], length_scale [-] and time_base [-] (relative)."""
     bodies: dict[str, dict[str, float]] = field(default_factory=dict)
-    """mass [kg] and diameter [m] of each body, where known."""
+    """mass [kg] and diameter [m] of each body, if known."""
     recordings: tuple[Track, ...] = ()
 
     def of(self, role: str, body: str | None = None) -> tuple[Track, ...]:
-        """Return the recordings of a role, of one body or of all."""
+        """Return the recordings with this role, of one body or of all bodies."""
         return tuple(track for track in self.recordings if track.role == role and body in (None, track.body))
 
 
 def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = None) -> Tracks:
-    """Read a track folder, or its `track.yaml`; `model` takes the place of the file's own.
+    """Read a track folder, or its `track.yaml`.
+
+    Args:
+        path: The folder or the file.
+        model: Replaces the key `model` of the file.
 
     Raises:
-        UserError: An unknown or missing key, body, effect, column or file, a NaN, times that do not rise, a figure outside its range;
-            one line that names the file and the key.
+        UserError: A key, body, effect, column or file is unknown or missing, a value is a NaN or outside its range, times do not
+            increase, or the unit of a flight is not metres. The message names the file and the key.
     """
     file, content = read_header(Path(path), "track.yaml", FORMAT)
     with errors_of(file):
@@ -102,7 +106,7 @@ def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = No
                 check_flight(track.t, track.x[:, column], gravity[a], AXES[a], f"recordings[{i}] ({track.name})")
         for body in bodies:
             if not any(track.body == body and track.role == "fit" for track in recordings):
-                raise UserError(f"recordings has none of the body {body!r} whose role is fit")
+                raise UserError(f"recordings has no entry of the body {body!r} with role fit: give at least one")
     return Tracks(name, file.parent, gravity, effects, free, nuisances, bodies, recordings)
 
 
@@ -116,7 +120,7 @@ def _model(given: Any) -> tuple[Vector, dict[str, float], tuple[str, ...]]:
 def _bodies(given: Any) -> dict[str, dict[str, float]]:
     bodies = mapping(given, "bodies")
     if not bodies:
-        raise UserError("bodies names no body")
+        raise UserError("bodies is empty: give at least one body")
     out = {}
     for name, figures in bodies.items():
         file_name(name, "the name of a body")
@@ -132,13 +136,13 @@ def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) 
     name = file_name(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     if not isinstance(entry["body"], str) or entry["body"] not in bodies:
-        raise UserError(f"{where}.body = {entry['body']!r} is not known; one of {', '.join(bodies)}")
+        raise UserError(f"{where}.body = {entry['body']!r} is unknown: choose from {', '.join(bodies)}")
     role = read_role(entry["role"], where)
     columns = mapping(entry["columns"], f"{where}.columns")
     check_keys(columns, f"{where}.columns", ("t", *AXES), AXES)
     axes = tuple(a for a, key in enumerate(AXES) if key in columns)
     if not axes:
-        raise UserError(f"{where}.columns names none of {', '.join(AXES)}")
+        raise UserError(f"{where}.columns has none of {', '.join(AXES)}: give at least one coordinate")
     scale = mapping(entry.get("scale", {}), f"{where}.scale")
     check_keys(scale, f"{where}.scale", ("t", *AXES), ("t", *AXES))
     for key, factor in scale.items():

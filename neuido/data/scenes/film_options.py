@@ -1,25 +1,25 @@
-"""The options of a synthetic film, without torch: the help of `neuido simulate` reads them."""
+"""Options for filming synthetic scenes. This module does not load torch, so that `--help` stays fast."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Film:
-    """How scenes are filmed.
+    """Cameras, frames and images of a synthetic film.
 
     Args:
-        views: Cameras, evenly around the middle of the scene.
-        held_out: Which of them are for scoring only.
+        views: Number of cameras, spaced evenly around the target.
+        held_out: Views that are used for scoring only.
         width: Width of the images, px.
         height: Height of the images, px.
-        frames: Frames, the first at t = 0.
-        substeps: Substeps from one frame to the next; the paper takes one frame of five.
-        radius: Distance of the cameras from the point they look at, m.
-        target: The point they look at, m.
-        elevations: Heights of the cameras above the horizon, degrees, taken in turn.
+        frames: Number of frames, the first at t = 0.
+        substeps: Substeps between frames; 5 in the paper.
+        radius: Distance of the cameras from the target, m.
+        target: Point that the cameras look at, m.
+        elevations: Elevation angles of the cameras above the horizon, degrees, used in turn.
         angle: Horizontal angle of view, degrees.
-        density: Gaussians for each particle; the images come from these, and no model is given them.
-        compression: Of the PNG files, 0 to 9.
+        density: Gaussians per particle that are rendered; models do not see them.
+        compression: Compression level of the PNG files, 0 to 9.
     """
 
     views: int = 10

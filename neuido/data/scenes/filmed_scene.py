@@ -1,20 +1,20 @@
-"""One filmed body as Stage II takes it: images and cameras, the reconstructed body, the scene, and the truth where it is known.
+"""A filmed and reconstructed body, the sample of Stage II: images, cameras, particles, scene, and the truth if it is known.
 
-The folder, with what writes each part:
+Files of the folder:
 
     <folder>/
-      experiment.yaml         an experiment (`data.experiments`); or only transforms.json and images of one's own
+      experiment.yaml         an experiment; or transforms.json and images/ of a recording in another format
       <recording>/            transforms.json, images/
-      motion.yaml             the body's motion at t = 0 where it is known: velocity, angular_velocity, centre
-      truth.npz, truth.yaml   of synthetic scenes alone: x (T, P, 3), x0, volume, times; law and figures. Only scores read them.
-      reconstruction/         of `neuido reconstruct <folder>`, or in another place
-        gaussians.ply         the first frame, in the simulation's coordinates
+      motion.yaml             initial motion of the body, if known: velocity, angular_velocity, centre
+      truth.npz, truth.yaml   synthetic scenes only: x (T, P, 3), x0, volume, times; law and options. Only scoring reads them.
+      reconstruction/         output of `neuido reconstruct <folder>`; it may lie elsewhere
+        gaussians.ply         the first frame, in simulation coordinates
         body.npz              x0 (P, 3), v0 (P, 3), volume (P,)
-        scene.yaml            scene, model and discretisation, and how the recording's world lies in the simulation's domain
-        report.json           PSNR, SSIM, and the errors against the truth where it is known
-        comparison.png, log/  pictures and the losses of the optimisation as CSV
+        scene.yaml            scene, model and discretisation, and the transformation from recording to simulation coordinates
+        report.json           PSNR, SSIM, and the errors if the truth is known
+        comparison.png, log/  pictures, and the losses of the optimisation as CSV
 
-The `model` of an experiment is the declared one; the true law is only in truth.yaml.
+The `model` of an experiment is the declared model; the true law stands in truth.yaml only.
 """
 
 import os
@@ -45,34 +45,34 @@ RECONSTRUCTION = "reconstruction"
 
 
 class Truth(NamedTuple):
-    """What a synthetic scene knows of itself."""
+    """True motion and material law of a synthetic scene."""
 
     x: Tensor
-    """Positions of all frames [m], (T, P, 3) float32."""
+    """Positions of the particles in all frames [m], (T, P, 3) float32."""
     x0: Tensor
-    """Positions at t = 0 [m], (P, 3)."""
+    """Positions of the particles at t = 0 [m], (P, 3) float32."""
     volume: Tensor
-    """Volumes at t = 0 [m^3], (P,)."""
+    """Volumes of the particles at t = 0 [m^3], (P,) float32."""
     times: Tensor
     """Times of the frames [s], (T,) float64."""
     law: dict[str, Any]
-    """density [kg/m^3], elasticity and plasticity, as `physics.laws.material` takes them."""
+    """density [kg/m^3], and elasticity and plasticity as arguments of `physics.laws.material`."""
 
 
 class Motion(NamedTuple):
-    """A rigid motion at t = 0."""
+    """Initial rigid motion of a body."""
 
     velocity: Vector = (0.0, 0.0, 0.0)
-    """Of the centre [m/s]."""
+    """Velocity of the centre [m/s]."""
     angular_velocity: Vector = (0.0, 0.0, 0.0)
-    """About the centre [rad/s]."""
+    """Angular velocity about the centre [rad/s]."""
     centre: Vector | None = None
-    """[m]; none: the mean of the particles."""
+    """Centre of the rotation [m]; None: the mean of the particles."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """x -> scale R x + shift from the recording's world to the simulation's domain; R turns the axis `up` upwards (as `SceneViews`)."""
+    """Transformation x -> scale R x + shift from recording to simulation coordinates; R rotates the axis `up` to +y."""
 
     scale: float = 1.0
     shift: Vector = (0.0, 0.0, 0.0)
@@ -80,34 +80,34 @@ class Placement:
 
 
 class SceneSetting(NamedTuple):
-    """What is known of a body's surroundings and material, without any image."""
+    """Scene and declared material of a filmed body, without its images."""
 
     name: str
     scene: Scene
     density: float
-    """[kg/m^3]"""
+    """Declared density [kg/m^3]."""
     model: dict[str, Any]
-    """The declared material: density, elasticity, plasticity."""
+    """Declared material: density, elasticity and plasticity."""
     placing: Placement = Placement()
 
 
 class VisualScene(NamedTuple):
-    """One filmed body, reconstructed."""
+    """A filmed body, reconstructed or with known particles."""
 
     name: str
     scene: Scene
     density: float
-    """[kg/m^3]"""
+    """Declared density [kg/m^3]."""
     model: dict[str, Any]
-    """The declared material: density, elasticity, plasticity; not the true one."""
+    """Declared material: density, elasticity and plasticity; not the true material."""
     body: Body
-    """The reconstructed particles at t = 0, with the velocity that is known."""
+    """Particles at t = 0, with the initial velocity if it is known."""
     gaussians: Path | None
-    """The reconstructed first frame, a 3DGS PLY in the simulation's coordinates; none: the particles stand for it."""
+    """Path of the reconstructed first frame, a 3DGS PLY file in simulation coordinates; None: the particles are rendered."""
     batch: MultiViewBatch
-    """Images of all views (held-out ones marked) and frames, with the cameras in the simulation's coordinates."""
+    """Images of all views and frames, and cameras in simulation coordinates; `held_out` marks the held-out views."""
     truth: Truth | None
-    """None where it is not known."""
+    """True motion and law; None if unknown."""
 
 
 def load_visual_scene(
@@ -122,27 +122,29 @@ def load_visual_scene(
     background: str = "white",
     frame_interval: float | None = None,
 ) -> VisualScene:
-    """Read a filmed and reconstructed body.
+    """Read a filmed body and its reconstruction.
 
     Args:
-        folder: An experiment's folder, or any recording that `data.formats` reads.
-        reconstruction: What `neuido reconstruct` wrote; `<folder>/reconstruction` where absent.
-        recording: Which recording of an experiment with several.
-        views: Names of the views; all where absent.
-        frame_step: Take each n-th frame.
-        frame_count: Number of frames; all where absent.
-        width: Width of the images [px]; as recorded where absent.
-        background: `white` or `black`, where a mask is known.
-        frame_interval: Seconds between frames where the recording does not say.
+        folder: An experiment folder, or a recording in any format that `read_recording` reads.
+        reconstruction: Output folder of `neuido reconstruct`; None: `<folder>/reconstruction`.
+        recording: Name of the recording, if the experiment has several.
+        views: Names of the views; None: all.
+        frame_step: Use every n-th frame.
+        frame_count: Number of frames; None: all.
+        width: Width of the images [px]; None: as recorded.
+        background: Colour behind the object if a mask is known, `white` or `black`.
+        frame_interval: Time between frames [s], if the recording has no times.
 
     Raises:
-        UserError: A missing or malformed file; one line that names it.
+        UserError: A file is missing or malformed; the message names it.
     """
     folder = Path(folder).expanduser()
     own = Path(reconstruction).expanduser() if reconstruction is not None else folder / RECONSTRUCTION
     for name in ("scene.yaml", "body.npz", "gaussians.ply"):
         if not (own / name).is_file():
-            raise UserError(f"{own / name} is missing: run `neuido reconstruct {folder}` first, or name its folder by reconstruction")
+            raise UserError(
+                f"{own / name} is missing: run `neuido reconstruct {folder}` first, or give its output folder as reconstruction"
+            )
     setting = read_setting(own / "scene.yaml")
     options = {"views": views, "frame_step": frame_step, "frame_count": frame_count, "width": width, "background": background}
     batch = load_views(folder, placing=setting.placing, recording=recording, frame_interval=frame_interval, **options)
@@ -160,21 +162,21 @@ def load_views(
     workers: int | None = None,
     **options: Any,
 ) -> MultiViewBatch:
-    """Read images and cameras of one recording, in the simulation's coordinates.
+    """Read images and cameras of one recording, in simulation coordinates.
 
-    The mask of an image that has none is what differs from the colour of the images' rims, which needs a plain background. Where no image
-    has a mask, the images keep their background, and the batch's `background` is that colour.
+    The mask of an image without one is computed from its difference from the background colour, which is that of the image borders. This
+    requires a plain background. If no image has a mask, the images keep their background, and `background` of the batch is its colour.
 
     Args:
-        folder: Any recording that `data.formats` reads.
-        placing: How the recording's world lies in the simulation's domain.
-        recording: Which recording of an experiment with several.
-        frame_interval: Seconds between frames where the recording does not say.
-        workers: Threads that read images; as many as cores where absent.
-        options: As `SceneViews` takes them.
+        folder: A recording in any format that `read_recording` reads.
+        placing: Transformation from recording to simulation coordinates.
+        recording: Name of the recording, if the experiment has several.
+        frame_interval: Time between frames [s], if the recording has no times.
+        workers: Number of threads that read images; None: the number of cores.
+        options: Options of `SceneViews`.
 
     Raises:
-        UserError: As `readers.read` and `SceneViews`.
+        UserError: As `read_recording` and `SceneViews`.
     """
     found = read(folder, recording=recording, frame_interval=frame_interval)
     views = SceneViews(found, scale=placing.scale, shift=placing.shift, up=placing.up, cache=False, find_masks=True, **options)
@@ -182,7 +184,7 @@ def load_views(
     shape = (len(views.chosen), len(views.frames), views.cameras.height, views.cameras.width)
     images, masks = torch.empty(*shape, 3), torch.empty(shape)
 
-    _ = views.unmasked, views.plain_background  # once, before several threads ask for it
+    _ = views.unmasked, views.plain_background  # computed once, before several threads use it
 
     def fill(pair: tuple[int, int]) -> None:
         image, mask = views.load([pair[0]], [pair[1]])
@@ -197,14 +199,15 @@ def load_views(
 
 
 def read_setting(path: Path, *, recording: str | None = None) -> SceneSetting:
-    """Read `scene.yaml` of a reconstruction, or `experiment.yaml`.
+    """Read scene and declared material from `scene.yaml` of a reconstruction, or from `experiment.yaml`.
 
     Args:
         path: The file.
-        recording: Of an experiment, whose gravity and colliders may be its own; the only filmed one where absent.
+        recording: Name of the recording of an experiment, because gravity and colliders may differ between recordings; None: the only
+            recording with images.
 
     Raises:
-        UserError: A missing file, an unknown or missing key, a figure outside its range.
+        UserError: The file is missing, a key is unknown or missing, or a value is outside its range.
     """
     if path.name == "experiment.yaml":
         experiment = read_experiment(path)
@@ -218,13 +221,13 @@ def read_setting(path: Path, *, recording: str | None = None) -> SceneSetting:
     try:
         check_keys(content, "the file", ("format", "name", "scene", "discretisation", "model", "placing"))
         if content["format"] != FORMAT:
-            raise UserError(f"format is {content['format']!r}, not {FORMAT!r}")
+            raise UserError(f"format = {content['format']!r} must be {FORMAT!r}")
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
         model = scenes.model_from_dict(content["model"])
         given = mapping(content["placing"], "placing")
         check_keys(given, "placing", ("scale", "shift", "up"))
         if given["up"] not in UP:
-            raise UserError(f"placing.up = {given['up']!r}; one of {', '.join(UP)}")
+            raise UserError(f"placing.up = {given['up']!r} is unknown: choose from {', '.join(UP)}")
         scale = number(given["scale"], "placing.scale", above=0.0)
         placing = Placement(scale, vector(given["shift"], "placing.shift"), given["up"])
     except UserError as error:
@@ -233,7 +236,7 @@ def read_setting(path: Path, *, recording: str | None = None) -> SceneSetting:
 
 
 def write_setting(setting: SceneSetting, path: Path) -> None:
-    """Write `scene.yaml` of a reconstruction."""
+    """Write scene, declared material and placement to `scene.yaml` of a reconstruction."""
     scene, discretisation = scene_to_dict(setting.scene)
     placing = {"scale": setting.placing.scale, "shift": list(setting.placing.shift), "up": setting.placing.up}
     content = {"format": FORMAT, "name": setting.name, "scene": scene, "discretisation": discretisation}
@@ -242,10 +245,10 @@ def write_setting(setting: SceneSetting, path: Path) -> None:
 
 
 def read_motion(folder: Path) -> Motion | None:
-    """Read `motion.yaml`, none where it is missing.
+    """Read the initial motion of a body from `motion.yaml` of a folder; return None if the file is missing.
 
     Raises:
-        UserError: An unknown key, or a value that is no vector.
+        UserError: A key is unknown, or a value is not a vector.
     """
     path = folder / "motion.yaml"
     if not path.is_file():
@@ -254,7 +257,7 @@ def read_motion(folder: Path) -> Motion | None:
     try:
         check_keys(content, "the file", ("format", "velocity", "angular_velocity", "centre"), ("angular_velocity", "centre"))
         if content["format"] != MOTION:
-            raise UserError(f"format is {content['format']!r}, not {MOTION!r}")
+            raise UserError(f"format = {content['format']!r} must be {MOTION!r}")
         vectors = {key: vector(value, key) for key, value in content.items() if key != "format"}
     except UserError as error:
         raise located(path, error) from error
@@ -262,42 +265,42 @@ def read_motion(folder: Path) -> Motion | None:
 
 
 def write_motion(motion: Motion, folder: Path) -> None:
-    """Write `motion.yaml`."""
+    """Write the initial motion of a body to `motion.yaml` of a folder."""
     content: dict[str, Any] = {"format": MOTION}
     content |= {key: list(value) for key, value in motion._asdict().items() if value is not None}
     write_text(folder / "motion.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 
 def read_body(path: Path) -> Body:
-    """Read `body.npz` of a reconstruction.
+    """Read the particles of a reconstruction from `body.npz`.
 
     Raises:
-        UserError: A missing array, a shape that does not fit, a number that is not finite.
+        UserError: An array is missing, a shape does not match, or a value is not finite.
     """
     arrays = _arrays(path, {"x0": (-1, 3), "v0": (-1, 3), "volume": (-1,)})
     if len({len(array) for array in arrays.values()}) != 1 or not (arrays["volume"] > 0).all():
-        raise UserError(f"{path}: x0, v0 and volume must have one length, and volumes be positive")
+        raise UserError(f"{path}: x0, v0 and volume must have the same length, and volumes must be positive")
     x, v, volume = (torch.from_numpy(arrays[key].astype(np.float32)) for key in ("x0", "v0", "volume"))
     return Body(x, v, volume)
 
 
 def read_truth(folder: Path, *, frame_step: int = 1, frames: int | None = None) -> Truth | None:
-    """Read truth.npz and truth.yaml of a synthetic scene, none where they are missing.
+    """Read the truth of a synthetic scene from truth.npz and truth.yaml; return None if they are missing.
 
     Args:
-        folder: The scene's folder.
-        frame_step: Take each n-th frame.
-        frames: Number of frames; all where absent.
+        folder: Folder of the scene.
+        frame_step: Use every n-th frame.
+        frames: Number of frames; None: all.
 
     Raises:
-        UserError: A file that is malformed, or the truth of another motion.
+        UserError: A file is malformed, or has fewer frames than `frames`.
     """
     if not (folder / "truth.npz").is_file() or not (folder / "truth.yaml").is_file():
         return None
     path = folder / "truth.npz"
     arrays = _arrays(path, {"x": (-1, -1, 3), "x0": (-1, 3), "volume": (-1,), "times": (-1,)})
     if len({arrays["x"].shape[1], len(arrays["x0"]), len(arrays["volume"])}) != 1 or len(arrays["x"]) != len(arrays["times"]):
-        raise UserError(f"{path}: the shapes of x, x0, volume and times do not fit one another")
+        raise UserError(f"{path}: the shapes of x, x0, volume and times do not match")
     content = read_yaml(folder / "truth.yaml")
     try:
         law = scenes.model_from_dict(content.get("law", {}))
@@ -305,7 +308,7 @@ def read_truth(folder: Path, *, frame_step: int = 1, frames: int | None = None) 
         raise UserError(f"{folder / 'truth.yaml'}: {error}") from error
     x, times = torch.from_numpy(arrays["x"])[::frame_step][:frames].float(), torch.from_numpy(arrays["times"])[::frame_step][:frames]
     if frames is not None and len(times) < frames:
-        raise UserError(f"{path} has {len(times)} frames, the recording {frames}")
+        raise UserError(f"{path} has {len(times)} frames, but the recording has {frames}: it is the truth of another motion")
     return Truth(x, torch.from_numpy(arrays["x0"]).float(), torch.from_numpy(arrays["volume"]).float(), times.double(), law)
 
 
@@ -314,5 +317,5 @@ def _arrays(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndar
     for key, shape in shapes.items():
         array = arrays[key]
         if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape)) or not np.isfinite(array).all():
-            raise UserError(f"{path}: {key} has the shape {array.shape}, or holds a NaN or an infinity")
+            raise UserError(f"{path}: {key} has the wrong shape {array.shape}, or contains a NaN or an infinity")
     return arrays

@@ -1,4 +1,4 @@
-"""Filmed and reconstructed bodies as data for Stage II, scoring and prediction: a batch is one scene."""
+"""Lightning data module of filmed bodies for Stage II, scoring and prediction; a batch is one scene."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -22,15 +22,17 @@ KEYS = {
     "reconstruction": ("reconstruction", "recording", "views", "frame_interval"),
     "particles": ("recording", "views", "dt", "crop", "frame_interval"),
 }
-"""What a scene's mapping takes beside `path`, by where its body comes from (`body`)."""
+"""Keys of a scene's mapping beside `path`, by the source of its body (key `body`)."""
 
 
 def ordered_loader(scenes: Sequence[VisualScene], *, rank: int = 0, ranks: int = 1) -> DataLoader:
-    """Load scenes in their order, each by one of the processes."""
-    return DataLoader(_Listed(scenes[rank::ranks]), batch_size=1, collate_fn=_only)
+    """Create a loader of scenes in the given order; process `rank` of `ranks` loads every `ranks`-th scene."""
+    return DataLoader(_SceneList(scenes[rank::ranks]), batch_size=1, collate_fn=_only)
 
 
-class _Listed(Dataset):
+class _SceneList(Dataset):
+    """List of scenes as a dataset."""
+
     def __init__(self, scenes: Sequence[VisualScene]) -> None:
         self.scenes = list(scenes)
 
@@ -46,13 +48,13 @@ def _only(samples: list[VisualScene]) -> VisualScene:
 
 
 class ShuffledScenes(ResumableLoader[VisualScene]):
-    """Scenes one after the other, in an order that is a function of seed and epoch alone.
+    """Resumable loader of scenes in random order, a function of seed and epoch only.
 
     Args:
         scenes: The scenes.
         seed: Seed of the order.
-        rank: This process among those that share the scenes; where their number does not divide, the first scenes of the order come twice.
-        ranks: Number of processes.
+        rank: Index of this process.
+        ranks: Number of processes. If it does not divide the number of scenes, the first scenes of the order are loaded twice.
     """
 
     def __init__(self, scenes: Sequence[VisualScene], *, seed: int = 0, rank: int = 0, ranks: int = 1) -> None:
@@ -69,7 +71,7 @@ class ShuffledScenes(ResumableLoader[VisualScene]):
 
 
 class SequentialScenes(ResumableLoader[VisualScene]):
-    """Each scene for so many steps: an epoch is one scene, in the order given."""
+    """Resumable loader whose epoch e repeats scene e for `steps` steps."""
 
     def __init__(self, scenes: Sequence[VisualScene], *, steps: int) -> None:
         super().__init__({"scenes": len(scenes), "steps": steps})
@@ -83,47 +85,47 @@ class SequentialScenes(ResumableLoader[VisualScene]):
 
 
 def select_training_views(batch: MultiViewBatch, views: int | list[int]) -> MultiViewBatch:
-    """Return the batch without the views that training is not to see; those that are held out stay.
+    """Select training views of a scene; held-out views stay.
 
     Args:
         batch: Images of V views.
-        views: How many training views, taken evenly, or their numbers among those that are not held out.
+        views: Number of training views, spaced evenly, or their indices among the views that are not held out.
 
     Raises:
-        UserError: More views than there are, or a number that is none of theirs.
+        UserError: The scene has fewer training views, or an index is out of range.
     """
     there = (~batch.held_out).nonzero()[:, 0].tolist()
     if isinstance(views, int):
         if not 0 < views <= len(there):
-            raise UserError(f"data.training_views = {views}: {batch.name} has {len(there)} views that are not held out")
+            raise UserError(f"data.training_views = {views}: {batch.name} has only {len(there)} views that are not held out")
         chosen = torch.linspace(0, len(there) * (1 - 1 / views), views).round().long().tolist()
     else:
         chosen = sorted(set(views))
         if not chosen or not all(0 <= view < len(there) for view in chosen):
-            raise UserError(f"data.training_views = {views}: {batch.name} has the training views 0 to {len(there) - 1}")
+            raise UserError(f"data.training_views = {views}: the indices of {batch.name} range from 0 to {len(there) - 1}")
     kept = sorted([*(there[i] for i in chosen), *batch.held_out.nonzero()[:, 0].tolist()])
     cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats[kept], Ks=batch.cameras.Ks[kept])
     return batch._replace(images=batch.images[kept], masks=batch.masks[kept], cameras=cameras, held_out=batch.held_out[kept])
 
 
 class VisualDataModule(LightningDataModule):
-    """Scenes of `neuido scenes` or of one's own, each with what `neuido reconstruct` made of it (`data.visual`).
+    """Lightning data module of filmed bodies, each with the output of `neuido reconstruct`.
 
-    Training and validation take `scenes`; test and predict take `scenes` and `unseen`. Under several processes each trains on its own.
+    Training and validation use `scenes`; test and predict use `scenes` and `unseen`. Several processes share the scenes.
 
     Args:
         scenes: Folders, or mappings with `path` and options of `load_visual_scene`: `reconstruction`, `recording`, `views`,
             `frame_interval`. With `body: particles`, the options are those of `load_known_body`: `recording`, `views`, `dt`, `crop`,
             `frame_interval`.
-        unseen: Scenes that training never sees.
-        root: Folder to which the paths of scenes are relative; none: the current one, and what is not there is sought in NEUIDO_DATA.
-        reconstructions: Folder that holds a reconstruction for each scene under the name of the scene's folder; none: inside each scene.
-        frame_step: Take each n-th frame.
-        frame_count: Number of frames; none: all.
-        width: Width of the images [px]; none: as recorded.
-        background: `white` or `black`, where a mask is known.
-        training_views: How many of the views that are not held out training sees, taken evenly, or their numbers; none: all.
-        seed: Seed of the order of the scenes, which is another one in each epoch.
+        unseen: Scenes that training does not use.
+        root: Folder that the paths of scenes are relative to. None: the current folder, and then NEUIDO_DATA.
+        reconstructions: Folder with a reconstruction of each scene under the name of the scene folder. None: inside each scene folder.
+        frame_step: Use every n-th frame.
+        frame_count: Number of frames; None: all.
+        width: Width of the images [px]; None: as recorded.
+        background: Colour behind the object if a mask is known, `white` or `black`.
+        training_views: Number of training views, spaced evenly, or their indices among the views that are not held out; None: all.
+        seed: Seed of the order of the scenes, which differs between epochs.
     """
 
     def __init__(
@@ -147,16 +149,16 @@ class VisualDataModule(LightningDataModule):
         self.root, self.reconstructions, self.training_views = root, reconstructions, training_views
         self.options: dict[str, Any] = {"frame_step": frame_step, "frame_count": frame_count, "width": width, "background": background}
         self.steps_in_a_row: int | None = None
-        """Set by a model that fits one scene after the other: how many steps each takes, and an epoch is then one scene."""
+        """Steps per scene, set by a model that fits the scenes one after another; an epoch is then one scene."""
 
     @cached_property
     def scenes(self) -> list[VisualScene]:
-        """The scenes that training sees."""
+        """Scenes that training uses."""
         return self._all(self.given, "data.scenes")
 
     @cached_property
     def unseen(self) -> list[VisualScene]:
-        """The scenes that it does not see."""
+        """Scenes that training does not use."""
         return self._all(self.given_unseen, "data.unseen")
 
     @property
@@ -167,10 +169,10 @@ class VisualDataModule(LightningDataModule):
         names = [scene.name for scene in [*self.scenes, *(self.unseen if stage in ("test", "predict") else [])]]
         for name in names:
             if names.count(name) > 1:
-                raise UserError(f"data.scenes: two scenes have the name {name}; give one of them another in its experiment.yaml")
+                raise UserError(f"data.scenes: two scenes have the name {name}: rename one of them in its experiment.yaml")
         for scene in self.scenes:
             if bool(scene.batch.held_out.all()):
-                raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} are held out")
+                raise UserError(f"{scene.name} has no training view: all {len(scene.batch.held_out)} views are held out")
 
     def train_dataloader(self) -> ShuffledScenes | SequentialScenes:
         if self.steps_in_a_row is not None:
@@ -190,11 +192,11 @@ class VisualDataModule(LightningDataModule):
         return self.test_dataloader()
 
     def __str__(self) -> str:
-        """Return a summary without opening the loaders, as Lightning's own would."""
+        """Summarise the module without opening scenes; that of Lightning opens the loaders."""
         return f"VisualDataModule({len(self.given)} scenes, {len(self.given_unseen)} unseen)"
 
     def transfer_batch_to_device(self, batch: VisualScene, device: torch.device, dataloader_idx: int) -> VisualScene:
-        """Return the batch as it is: the model moves a scene to the device once."""
+        """Return the batch unchanged, because the model moves each scene to the device once."""
         return batch
 
     def _all(self, given: list[str | dict[str, Any]], where: str) -> list[VisualScene]:
@@ -215,7 +217,7 @@ class VisualDataModule(LightningDataModule):
             raise UserError(f"{where} lacks the key 'path'")
         body = options.pop("body", "reconstruction")
         if body not in KEYS:
-            raise UserError(f"{where}.body = {body!r}; one of {', '.join(KEYS)}")
+            raise UserError(f"{where}.body = {body!r} is unknown: choose from {', '.join(KEYS)}")
         known = ("path", "body", *KEYS[body])
         for key in options:
             if key not in known:

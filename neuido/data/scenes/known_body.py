@@ -1,4 +1,4 @@
-"""A filmed experiment whose body is known: its particles are those of `particles.npz`, and no reconstruction is needed."""
+"""Reader of filmed experiments whose particles are known (`particles.npz`), so that no reconstruction is needed."""
 
 import os
 from collections.abc import Sequence
@@ -20,17 +20,17 @@ def load_known_body(
 ) -> VisualScene:
     """Read a recording of an experiment that has both images and particles.
 
-    The body is drawn by its particles, so that its silhouette can be compared and its colours cannot.
+    The body is rendered from its particles: its silhouette can be compared with the images, its colours cannot.
 
     Args:
-        folder: The experiment's folder.
-        recording: Which recording; the only one with images where absent.
-        dt: Substep [s] in place of the experiment's suggestion.
-        crop: Part of the images that counts [px], left, top, right, bottom, after a change of their width.
-        options: `views`, `frame_step`, `frame_count`, `width`, `background` of `load_views`.
+        folder: The experiment folder.
+        recording: Name of the recording; None: the only one with images.
+        dt: Substep [s]; None: that of the experiment.
+        crop: Part of the images to use [px]: left, top, right, bottom, after resizing to `width`.
+        options: `views`, `frame_step`, `frame_count`, `width`, `background` and `frame_interval` of `load_views`.
 
     Raises:
-        UserError: No such recording, images or particles that are missing, an impossible step or crop.
+        UserError: There is no such recording, it lacks images or particles, or `dt` or `crop` is invalid.
     """
     experiment = read_experiment(folder)
     filmed = [one.name for one in experiment.recordings if one.video is not None]
@@ -41,7 +41,7 @@ def load_known_body(
         lacking = "particles.npz" if chosen.body is None else "transforms.json"
         raise UserError(f"recording {chosen.name} of {folder} lacks {lacking}, which body: particles needs")
     if dt is not None and not dt > 0:
-        raise UserError(f"dt = {dt}: it must be positive")
+        raise UserError(f"dt = {dt} must be positive")
     batch = load_views(experiment.folder, recording=chosen.name, **options)
     scene = chosen.scene if dt is None else replace(chosen.scene, dt=dt)
     if crop is not None:
@@ -50,17 +50,17 @@ def load_known_body(
 
 
 def crop_images(batch: MultiViewBatch, crop: Sequence[int]) -> MultiViewBatch:
-    """Return the part of the images from column `left` to before `right` and row `top` to before `bottom`, with cameras to match.
+    """Crop images to the columns [left, right) and rows [top, bottom); shift the principal points of the cameras accordingly.
 
     Raises:
-        UserError: No part of the images.
+        UserError: `crop` is not four whole numbers, or not a part of the images.
     """
     height, width = batch.images.shape[2:4]
     if len(crop) != 4 or any(isinstance(n, bool) or not isinstance(n, int) for n in crop):
-        raise UserError(f"crop = {crop}: give left, top, right, bottom in whole pixels")
+        raise UserError(f"crop = {crop} must be left, top, right, bottom in whole pixels")
     left, top, right, bottom = crop
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
-        raise UserError(f"crop = {list(crop)}: it must lie in the images of {width} x {height} pixels")
+        raise UserError(f"crop = {list(crop)} must lie within the images of {width} x {height} pixels")
     Ks = batch.cameras.Ks.clone()
     Ks[:, 0, 2] -= left
     Ks[:, 1, 2] -= top

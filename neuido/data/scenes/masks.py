@@ -1,4 +1,4 @@
-"""Masks of an object: read from files of any usual encoding, or found before a plain or a known background."""
+"""Object masks: read from files of any usual encoding, or computed from a plain or a known background."""
 
 from pathlib import Path
 
@@ -10,14 +10,17 @@ from torch import Tensor
 from neuido.data.files.parsing import image_size, read_image
 from neuido.errors import UserError
 
-MIN_DIFFERENCE = 0.06  # of the colour range: more than what noise and a soft shadow change
+MIN_DIFFERENCE = 0.06  # fraction of the colour range; noise and soft shadows change less
 
 
 def mask_channel(path: Path) -> np.ndarray:
-    """Return a mask file as the object's share of each pixel, (H, W) float32 in [0, 1].
+    """Read a mask file as the object's share of each pixel, (H, W) float32 in [0, 1].
 
-    The mask is the alpha channel where it says anything, the indices of a palette that are not zero, or else the largest channel. A file
-    with zero and one other value says yes or no, whatever that value is (0 and 1, 0 and 255, a label); with more values it is a soft mask.
+    The mask is the alpha channel if it is not opaque everywhere, the non-zero indices of a palette image, or else the largest channel. A
+    file with zero and one other value is a binary mask, whatever that value is. With more values it is a soft mask.
+
+    Raises:
+        UserError: The file is not an image, or its values are labels of several objects.
     """
     labels = _palette_indices(path)
     if labels is not None:
@@ -35,44 +38,44 @@ def mask_channel(path: Path) -> np.ndarray:
     if values[-1] <= 20 and len(values) > 2 and (np.diff(values) == 1).all():
         raise UserError(
             f"{path} has the values {', '.join(map(str, values[:5]))}{', ...' if len(values) > 5 else ''}: labels of several objects; "
-            "write a mask of one object, 0 and 255"
+            "write a mask of one object with the values 0 and 255"
         )
     return plane.astype(np.float32) / np.iinfo(raw.dtype).max
 
 
 def _palette_indices(path: Path) -> np.ndarray | None:
-    """Return the indices (H, W) of an image with a palette; none of any other image."""
+    """Read the indices (H, W) of a palette image; return None for any other image."""
     from PIL import Image
 
-    image_size(path)  # which refuses what is missing or too large
+    image_size(path)  # raises if the file is missing or too large
     try:
         with Image.open(path) as image:
             return np.asarray(image) if image.mode == "P" and "transparency" not in image.info else None
-    except Exception:  # what Pillow cannot read, OpenCV may
+    except Exception:  # OpenCV may read what Pillow cannot
         return None
 
 
 def rim_colour(rims: np.ndarray) -> np.ndarray:
-    """Return the colour (3,) of a plain background from the pixels of images' rims (N, 3).
+    """Estimate the colour (3,) of a plain background from border pixels of images (N, 3).
 
     Raises:
-        UserError: The rims have no one colour.
+        UserError: More than 20 % of the pixels differ from the median colour.
     """
     colour = np.median(rims, axis=0).astype(np.float32)
     far = float((np.abs(rims - colour).max(axis=1) > MIN_DIFFERENCE).mean())
     if far > 0.2:
         raise UserError(
-            f"the images have no masks, and {far:.0%} of their rims differ from one colour: give an alpha channel, mask_path in "
+            f"the images have no masks, and {far:.0%} of their border pixels differ from one colour: give an alpha channel, mask_path in "
             "transforms.json, or masks/<image name>.png beside a COLMAP model"
         )
     return colour
 
 
 def mask_on_plain_background(image: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """Return the mask (H, W) of an object before a plain background, for an image (H, W, 3).
+    """Compute the mask (H, W) of an object in front of a plain background, for an image (H, W, 3).
 
-    A pixel at the outline is a mixture: its share of the object is its difference from the background over the largest one within two
-    pixels; further inside it is one.
+    A pixel at the outline mixes object and background. Its value is its difference from the background, divided by the largest difference
+    within two pixels. Further inside, the value is one.
     """
     difference = np.abs(image - colour).max(axis=2)
     differs = (difference > MIN_DIFFERENCE).astype(np.float32)
@@ -83,18 +86,18 @@ def mask_on_plain_background(image: np.ndarray, colour: np.ndarray) -> np.ndarra
 
 
 def mask_from_empty(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """Return a rough mask (H, W): where an image differs from that of the empty scene, without single pixels."""
+    """Compute a binary mask (H, W): the pixels in which an image differs from that of the empty scene, median-filtered."""
     differs = (np.abs(image - empty).max(axis=2) > MIN_DIFFERENCE).astype(np.uint8)
     return cv2.medianBlur(differs, 3).astype(np.float32)
 
 
 def masks_from_background(images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the colour (3,) of the plain background of images (V, T, H, W, 3), and their masks (V, T, H, W) in 0..1.
+    """Compute the background colour (3,) and the masks (V, T, H, W) in [0, 1] of images (V, T, H, W, 3) with a plain background.
 
-    The colour is the median of the rims of the first frames.
+    The colour is the median of the border pixels of the first frames.
 
     Raises:
-        UserError: The rims have no one colour.
+        UserError: The border pixels do not have one colour.
     """
     first = images[:, 0].numpy()
     rims = [part.reshape(-1, 3) for part in (first[:, 0], first[:, -1], first[:, :, 0], first[:, :, -1])]

@@ -1,4 +1,4 @@
-"""Multi-view recordings as data: a scene is one sample, its images read when they are wanted."""
+"""Lightning data module of multi-view recordings; a sample is one scene, whose images are loaded on access."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -28,29 +28,29 @@ UP = {
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
 }
-"""Rotations that carry the axis which points upwards in a recording to +y."""
+"""Rotation to +y of the axis that points upwards in a recording, by its name."""
 
 
 class SceneViews:
-    """The chosen frames of a recording, at the chosen size.
+    """Selected views and frames of a recording, resized, masked and undistorted on access.
 
     Args:
         found: The recording.
-        views: Names of the views to use; none: all.
-        held_out_views: Names of the views for scoring only; none: those that the format holds out.
+        views: Names of the views to use; None: all.
+        held_out_views: Names of the views for scoring only; None: those that the files hold out.
         frame_start: First frame.
-        frame_step: Take each n-th frame (the paper takes one of five).
-        frame_count: Number of frames; none: all there are.
-        width: Width of the images [px]; their height follows. None: as recorded.
-        background: `white` or `black`, behind the object where a mask is known.
-        masked: False leaves the recorded background in, whatever the mask.
-        scale, shift [m], up: The similarity x -> scale R x + shift from the recording's world to the simulation's domain, where R turns
-            the axis `up` (y, -y, z, -z) upwards.
-        cache: Keep images in memory once they are read (four bytes a pixel).
-        find_masks: Find the mask of an image that has none by its difference from a plain background, before any undistortion.
+        frame_step: Use every n-th frame; 5 in the paper.
+        frame_count: Number of frames; None: all.
+        width: Width of the images [px]; the height follows from the aspect ratio. None: as recorded.
+        background: Colour behind the object if a mask is known, `white` or `black`.
+        masked: False: keep the recorded background.
+        scale, shift [m], up: Transformation x -> scale R x + shift from recording to simulation coordinates. R rotates the axis `up` (y,
+            -y, z or -z) to +y.
+        cache: Keep loaded images in memory (four bytes per pixel).
+        find_masks: Compute the mask of an image without one from its difference from a plain background, before undistortion.
 
     Raises:
-        UserError: An unknown view, no frame left, a view that lacks a chosen frame.
+        UserError: A view is unknown, too few frames remain, or a view lacks a selected frame.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class SceneViews:
     ) -> None:
         self.find_masks = find_masks
         if background not in BACKGROUNDS or up not in UP:
-            raise UserError(f"background = {background!r} must be one of {', '.join(BACKGROUNDS)}, and up = {up!r} of {', '.join(UP)}")
+            raise UserError(f"background = {background!r} must be one of {', '.join(BACKGROUNDS)}, and up = {up!r} one of {', '.join(UP)}")
         counts = (
             ("frame_start", frame_start, 0),
             ("frame_step", frame_step, 1),
@@ -93,13 +93,13 @@ class SceneViews:
         self.frames = list(range(frame_start, len(found.times), frame_step))[:frame_count]
         if len(self.frames) < (frame_count or 1):
             raise UserError(
-                f"{found.name} has {len(found.times)} frames: from frame_start {frame_start} by frame_step {frame_step} there are "
-                f"{len(self.frames)}, not frame_count {frame_count or 1}"
+                f"{found.name} has {len(found.times)} frames: frame_start = {frame_start} and frame_step = {frame_step} leave "
+                f"{len(self.frames)}, fewer than frame_count = {frame_count or 1}"
             )
         for v in self.chosen:
             for t in self.frames:
                 if found.images[v][t] is None:
-                    raise UserError(f"{found.name}: view {found.views[v]} has no image at {float(found.times[t]):g} s; choose other views")
+                    raise UserError(f"{found.name}: view {found.views[v]} has no image at {float(found.times[t]):g} s: select other views")
         self.times = found.times[self.frames] - found.times[self.frames[0]]
         size = (width or found.cameras.width, round(found.cameras.height * (width or found.cameras.width) / found.cameras.width))
         moved = convert.move(found.cameras, scale=scale, rotation=torch.tensor(UP[up]).double(), shift=shift)
@@ -116,10 +116,14 @@ class SceneViews:
         return [self.found.views[v] for v in self.chosen]
 
     def load(self, views: Sequence[int], frames: Sequence[int] | None = None) -> tuple[Tensor, Tensor]:
-        """Load images (V, T, H, W, 3) and masks (V, T, H, W), float32 in [0, 1], of chosen views and frames by position.
+        """Load images (V, T, H, W, 3) and masks (V, T, H, W), float32 in [0, 1].
+
+        Args:
+            views: Positions in the selected views.
+            frames: Positions in the selected frames; None: all.
 
         Raises:
-            UserError: A file that is no image, or one of another shape than its camera's.
+            UserError: A file is not an image, or has another aspect ratio than its camera.
         """
         frames = range(len(self.frames)) if frames is None else frames
         shape = (len(views), len(frames), self.cameras.height, self.cameras.width, 4)
@@ -132,10 +136,10 @@ class SceneViews:
 
     @cached_property
     def plain_background(self) -> np.ndarray | None:
-        """The colour (3,) of the first frames' rims where an image there has no mask; none where all have one, or none is sought.
+        """Colour (3,) of the borders of the first frames without a mask; None if all have one, or if `find_masks` is off.
 
         Raises:
-            UserError: The rims have no one colour.
+            UserError: The border pixels do not have one colour.
         """
         if not self.find_masks:
             return None
@@ -148,18 +152,18 @@ class SceneViews:
 
     @cached_property
     def unmasked(self) -> bool:
-        """Whether no first frame has a mask: then images keep their background, whose colour is `plain_background`."""
+        """Whether no first frame has a mask; images then keep their background, whose colour is `plain_background`."""
         return self.find_masks and not any(self._recorded(v, self.frames[0])[1] for v in self.chosen)
 
     @property
     def background_colour(self) -> np.ndarray:
-        """The colour (3,) behind the object."""
+        """Colour (3,) behind the object, in [0, 1]."""
         if self.unmasked and self.plain_background is not None:
             return self.plain_background
         return np.full(3, BACKGROUNDS[self.background], np.float32)
 
     def _recorded(self, v: int, t: int) -> tuple[np.ndarray, bool]:
-        """Return an image as recorded with its mask as alpha, (H, W, 4), and whether anything says what the mask is."""
+        """Load an image as recorded, with its mask as alpha channel, (H, W, 4); return also whether its mask is known."""
         found = self.found
         path, mask = found.images[v][t], found.masks[v][t] if found.masks else None
         rgba = _read(path, found.cameras)
@@ -176,8 +180,8 @@ class SceneViews:
     def _image(self, v: int, t: int) -> np.ndarray:
         """Return RGB over the background, and the mask, (H, W, 4) in 0..255.
 
-        The array is uint8; where masks are sought it is float32, and a mask that was found keeps its digits: half a step of eight bits
-        changes which pixels of an outline count as the body's.
+        The array is uint8, or float32 with `find_masks`. A computed mask is not rounded to eight bits, because the rounding changes which
+        pixels of an outline count as the object.
         """
         if (v, t) in self._kept:
             return self._kept[v, t]
@@ -185,12 +189,12 @@ class SceneViews:
         rgba, masked = self._recorded(v, t)
         if not masked and self.find_masks:
             colour = self.plain_background
-            if colour is None:  # the first frames have masks, this one has none
+            if colour is None:  # the first frames have masks, but this image has none
                 colour = rim_colour(np.concatenate([rgba[0, :, :3], rgba[-1, :, :3], rgba[:, 0, :3], rgba[:, -1, :3]]))
             rgba[..., 3] = mask_on_plain_background(rgba[..., :3], colour)
         keeps = not self.masked or (not masked and (self.unmasked or not self.find_masks))
         shown = np.ones_like(rgba[..., 3:]) if keeps else rgba[..., 3:]
-        # premultiplied, so that no colour from outside the mask bleeds in when pixels are averaged
+        # premultiplied, so that averaging pixels mixes in no colour from outside the mask
         layers = np.concatenate([rgba[..., :3] * shown, rgba[..., 3:], shown], axis=2)
         if found.distortion is not None:
             layers = _undistort(layers, found.cameras.Ks[v].double().numpy(), found.distortion[v].numpy())
@@ -208,12 +212,12 @@ class SceneViews:
 
 
 class MultiViewDataset(Dataset):
-    """Scenes as samples of type `MultiViewBatch`.
+    """Dataset of scenes; a sample is a `MultiViewBatch`.
 
     Args:
         scenes: The scenes.
-        part: Which views: `train` (those not held out), `held_out` (in a scene without any: its training views), or `all`.
-        first: Index of the first scene.
+        part: Views to load: `train` (not held out), `held_out` (the training views if a scene has none), or `all`.
+        first: Index of the first scene in `MultiViewBatch.scene`.
     """
 
     def __init__(self, scenes: Sequence[SceneViews], part: str = "all", *, first: int = 0) -> None:
@@ -244,22 +248,23 @@ class MultiViewDataset(Dataset):
 
 
 class MultiViewDataModule(LightningDataModule):
-    """Multi-view scenes for Stage II, adaptation and scoring; a batch is one scene (`MultiViewBatch`).
+    """Lightning data module of multi-view recordings for Stage II, adaptation and scoring; a batch is one scene (`MultiViewBatch`).
 
-    Training takes the training views of `scenes`, validation their held-out views (their training views in a scene that holds none
-    out), test and predict all views of `scenes` and `unseen`, which are numbered on. Under several processes each takes its own scenes.
+    Training uses the training views of `scenes`. Validation uses their held-out views, or the training views of a scene without any. Test
+    and predict use all views of `scenes` and `unseen`; scene numbers of `unseen` follow those of `scenes`. Several processes share the
+    scenes.
 
     Args:
-        scenes: Folders in any format of `data.formats`, or mappings with `path` and any of `format`, `recording`, `frame_interval`
-            (as `readers.read` takes them), `views`, `held_out_views`, `scale`, `shift`, `up` (as `SceneViews` takes them).
-        unseen: Scenes that training never sees.
-        frame_start, frame_step, frame_count: Which frames.
+        scenes: Folders in any format of `read_recording`, or mappings with `path` and options: `format`, `recording`, `frame_interval` of
+            `read_recording`; `views`, `held_out_views`, `scale`, `shift`, `up` of `SceneViews`.
+        unseen: Scenes that training does not use.
+        frame_start, frame_step, frame_count: Frames to use: the first, every n-th, and their number.
         width: Width of the images [px].
-        background: `white` or `black`.
-        masked: Whether the recorded background is replaced where a mask is known.
-        cache: Keep images in memory once they are read.
-        num_workers: Worker processes that read.
-        seed: Seed of the order of the scenes, which is another one in each epoch.
+        background: Colour behind the object if a mask is known, `white` or `black`.
+        masked: Whether to replace the recorded background if a mask is known.
+        cache: Keep loaded images in memory.
+        num_workers: Number of worker processes that read.
+        seed: Seed of the order of the scenes, which differs between epochs.
     """
 
     def __init__(
@@ -293,18 +298,18 @@ class MultiViewDataModule(LightningDataModule):
 
     @cached_property
     def scenes(self) -> list[SceneViews]:
-        """The scenes that training sees."""
+        """Scenes that training uses."""
         return [self._open(given, f"scenes[{i}]") for i, given in enumerate(self.given)]
 
     @cached_property
     def unseen(self) -> list[SceneViews]:
-        """The scenes that it does not see."""
+        """Scenes that training does not use."""
         return [self._open(given, f"unseen[{i}]") for i, given in enumerate(self.given_unseen)]
 
     def setup(self, stage: str | None = None) -> None:
         for scene in self.scenes:
             if all(scene.held_out):
-                raise UserError(f"{scene.name} has no training view: all of {', '.join(scene.views)} are held out")
+                raise UserError(f"{scene.name} has no training view: all its views ({', '.join(scene.views)}) are held out")
         _ = self.unseen
 
     def train_dataloader(self) -> DataLoader:
@@ -350,21 +355,23 @@ def _indices(found: MultiView, names: Sequence[Any], option: str) -> list[int]:
     names = [str(name) for name in names]
     for name in names:
         if name not in found.views:
-            raise UserError(f"{option} has {name!r}, which {found.name} lacks; it has {', '.join(found.views[:20])}")
+            raise UserError(f"{option} has the unknown view {name!r}: {found.name} has {', '.join(found.views[:20])}")
     if len(set(names)) < len(names):
-        raise UserError(f"{option} names a view twice: {', '.join(names)}")
+        raise UserError(f"{option} lists a view twice: {', '.join(names)}")
     return [found.views.index(name) for name in names]
 
 
 def _read(path: Path | None, cameras: Cameras, *, channel: bool = False) -> np.ndarray:
-    """Return an image as RGBA (H, W, 4), or as one channel (H, W), float32 in [0, 1], in the size of the cameras."""
+    """Load an image as RGBA (H, W, 4), or a mask (H, W) if `channel`, float32 in [0, 1], resized to the image size of the cameras."""
     if path is None:
         raise UserError("an image is missing")
     image = mask_channel(path) if channel else _rgba(path)
     height, width = image.shape[:2]
     if (width, height) != (cameras.width, cameras.height):
         if abs(width * cameras.height / (height * cameras.width) - 1) > SAME_SHAPE:
-            raise UserError(f"{path} has {width} x {height} pixels, its camera {cameras.width} x {cameras.height}")
+            raise UserError(
+                f"{path} has {width} x {height} pixels, but its camera has {cameras.width} x {cameras.height}, another aspect ratio"
+            )
         image = cv2.resize(image, (cameras.width, cameras.height), interpolation=cv2.INTER_AREA)
     return image
 
@@ -380,14 +387,14 @@ def _rgba(path: Path) -> np.ndarray:
 
 
 def _resize(layers: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return layers (H, W, C) in another size; OpenCV averages areas of four channels at most at ratios that are no whole numbers."""
+    """Resize layers (H, W, C), each on its own: at fractional ratios, OpenCV averages areas of at most four channels."""
     method = cv2.INTER_AREA if size[0] < layers.shape[1] else cv2.INTER_LINEAR
     parts = [cv2.resize(np.ascontiguousarray(layers[..., c : c + 1]), size, interpolation=method) for c in range(layers.shape[2])]
     return np.stack(parts, axis=2)
 
 
 def _undistort(layers: np.ndarray, K: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Return layers (H, W, C) as a pinhole with the same K sees them; OpenCV has pixel centres at whole numbers."""
+    """Undistort layers (H, W, C) to a pinhole with the same K; for OpenCV, pixel centres lie at whole numbers."""
     K = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     parts = [cv2.undistort(np.ascontiguousarray(layers[..., c]), K, distortion) for c in range(layers.shape[2])]
     return np.stack(parts, axis=2)

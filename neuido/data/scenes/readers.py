@@ -1,4 +1,4 @@
-"""Multi-view recordings of any known format: find the format of a folder, and read it."""
+"""Read multi-view recordings of any supported format; detect the format of a folder."""
 
 import os
 from pathlib import Path
@@ -18,7 +18,7 @@ MARKS = {
     "nerfstudio": ("transforms.json", "transforms_train.json"),
     "colmap": tuple(f"{place}images.{kind}" for place in ("sparse/0/", "sparse/", "") for kind in ("bin", "txt")),
 }
-"""By which entries of a folder its format is known, in the order of the search."""
+"""Files and folders that identify each format, in the order of the search."""
 FORMATS = tuple(MARKS)
 READERS = {
     "experiment": experiment_video.read,
@@ -31,17 +31,17 @@ READERS = {
 
 
 def read(path: str | os.PathLike, format: str = "auto", *, recording: str | None = None, frame_interval: float | None = None) -> MultiView:
-    """Read a recording.
+    """Read a multi-view recording: cameras, times and the paths of its images.
 
     Args:
-        path: Its folder; for `nerfstudio` also a JSON file.
-        format: One of `experiment`, `pacnerf`, `neuma` (synthetic and real), `springgaus` (mpm_synthetic and real_capture),
-            `nerfstudio` (Blender's included) and `colmap` (one frame), or `auto`.
-        recording: Which one, where a folder holds several: a recording's name (experiment), `<object>/<sequence>` (springgaus).
-        frame_interval: Seconds from one frame to the next, where a format does not say; it replaces the times of one that does.
+        path: Folder of the recording; for `nerfstudio` also a JSON file.
+        format: `experiment`, `pacnerf`, `neuma` (synthetic and real), `springgaus` (mpm_synthetic and real_capture), `nerfstudio` (also
+            Blender), `colmap` (one frame), or `auto` to detect it.
+        recording: Recording to read, if the folder has several: its name (experiment) or `<object>/<sequence>` (springgaus).
+        frame_interval: Time between frames [s], for formats without times; it replaces the times of other formats.
 
     Raises:
-        UserError: An unknown format, a file that is missing or malformed, an image outside the folder.
+        UserError: The format is unknown, a file is missing or malformed, or an image lies outside the folder.
     """
     folder = Path(path).expanduser()
     if not folder.exists():
@@ -56,10 +56,10 @@ def read(path: str | os.PathLike, format: str = "auto", *, recording: str | None
 
 
 def detect(folder: Path) -> str:
-    """Return the format of a folder, by the files in it.
+    """Detect the format of a recording from the files in its folder.
 
     Raises:
-        UserError: None is known by them.
+        UserError: No format matches.
     """
     if folder.is_file():
         return "nerfstudio"
@@ -67,4 +67,4 @@ def detect(folder: Path) -> str:
         if any((folder / mark).exists() for mark in marks):
             return format
     marks = ", ".join(mark for group in MARKS.values() for mark in group)
-    raise UserError(f"the format of {folder} is not known: it has none of {marks}")
+    raise UserError(f"the format of {folder} is unknown: it has none of {marks}")

@@ -1,8 +1,8 @@
-"""Synthetic scenes: a body of known material moves, is filmed from several views, and is written with the truth beside.
+"""Synthetic scenes: simulate a body of known material, film it from several views, and write images and truth.
 
-The images come from a denser set of Gaussians than any model is given: each particle carries several, coloured by a solid texture
-over the position at t = 0, and they move with its x and F. Each scene is an experiment folder with one recording, `drop`;
-`data.visual` says what lies where. A scene appears under its name only when it is whole, so a run that was killed goes on.
+The images are rendered from a denser set of Gaussians than any model sees. Each particle carries several Gaussians, which move with its x
+and F and are coloured by a solid texture of the position at t = 0. A scene is an experiment folder with one recording, `drop`;
+`neuido.data.scenes.filmed_scene` describes it. Scenes are written atomically, so a killed run continues with the missing ones.
 """
 
 import json
@@ -44,23 +44,23 @@ PARTS = ("scene", "model", "body", "discretisation")
 SCENE_KEYS = ("name", "base", "velocity", "angular_velocity", "shift", "declared", "belief", "split", "substeps")
 SPLITS = ("train", "unseen")
 JELLY = {"density": 1000.0, "elasticity": {"law": "fixed_corotated", "young": 1e5, "poisson": 0.2}, "plasticity": {"law": "identity"}}
-"""The declared model if a scene gives none: NCLaw's jelly, which NeuMA starts from too."""
+"""Declared model of a scene that gives none: NCLaw's jelly, from which NeuMA starts too."""
 
 IMAGES_AT_ONCE = {"cpu": 8, "cuda": 80}
 WIDTH = 0.45
-"""Standard deviation of a Gaussian over the spacing of the dense set; with the layers behind them, the Gaussians are then opaque."""
+"""Standard deviation of a Gaussian over the spacing of the dense set; the overlapping Gaussians then look opaque."""
 
 INSET = 0.8
-"""Distance of the Gaussians from the border of a particle's share of the body, in standard deviations; keeps the apparent size true."""
+"""Distance of the Gaussians from the border of the volume of their particle, in standard deviations; preserves the apparent size."""
 
 OPACITY = 0.9
 Draw = Callable[..., tuple[Tensor, Tensor]]
-"""`models.splatting.rasterize`, which `data` may not import."""
+"""Type of `neuido.models.rasterize`, which is passed in because `neuido.data` does not import `neuido.models`."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """One scene to generate."""
+    """A synthetic scene to generate."""
 
     name: str
     scene: Scene
@@ -76,45 +76,45 @@ class Plan:
 
 
 class DenseGaussians(NamedTuple):
-    """The rendered Gaussians: M for each of P particles."""
+    """Gaussians to render: M for each of P particles."""
 
     offset: Tensor
-    """From the particle at t = 0 [m], (P, M, 3)."""
+    """Offset from the particle at t = 0 [m], (P, M, 3)."""
     spread: Tensor
-    """Standard deviation at t = 0, equal in all directions [m], (P,)."""
+    """Isotropic standard deviation at t = 0 [m], (P,)."""
     colour: Tensor
-    """RGB, (P M, 3)."""
+    """RGB colours in [0, 1], (P M, 3)."""
 
     def at(self, x: Tensor, F: Tensor) -> tuple[Tensor, Tensor]:
-        """Return centres (T, P M, 3) [m], covariances (T, P M, 3, 3) [m^2] for particles at x (T, P, 3) with F (T, P, 3, 3)."""
+        """Compute centres [m] (T, P M, 3) and covariances [m^2] (T, P M, 3, 3) for particles at x [m] (T, P, 3) with F (T, P, 3, 3)."""
         centres = x.unsqueeze(2) + torch.einsum("tpij,pmj->tpmi", F, self.offset)
         covariances = self.spread.square()[:, None, None] * (F @ F.mT)
         return centres.flatten(1, 2), covariances.repeat_interleave(self.offset.shape[1], dim=1)
 
 
 def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.PathLike | None = None) -> Plan:
-    """Read one entry of `scenes`.
+    """Read one entry of the list `scenes` of `neuido scenes`.
 
     Args:
-        given: `name`; the keys scene, model, body and discretisation of a scene file, or `base`, the name of one, with keys of the
-            four that differ; optional velocity [m/s] and angular_velocity [rad/s] of the whole body, shift [m], declared (a model;
-            the former name `belief` is accepted), split (train, unseen), substeps between frames.
+        given: `name`, and the keys scene, model, body and discretisation of a scene file; or `base`, the name of a built-in scene, and the
+            keys that differ from it. Optionally velocity [m/s] and angular_velocity [rad/s] of the body, shift [m], declared (a model; the
+            former name `belief` is accepted), split (train or unseen), and substeps between frames.
         film: Cameras and rendering options.
         data_root: Folder of the particle files.
 
     Raises:
-        UserError: An unknown or missing key, a value outside its range, a body outside the domain.
+        UserError: A key is unknown or missing, a value is outside its range, or the body lies outside the domain.
     """
     given = mapping(given, "a scene")
     name = given.get("name")
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
-        raise UserError(f"scenes: a name must be letters, digits, - and _, got {name!r}")
+        raise UserError(f"scenes: a name must consist of letters, digits, - and _, got {name!r}")
     try:
         content, source = dict[str, Any](), ""
         if "base" in given:
             path = scenes.scenes_folder() / f"{given['base']}.yaml"
             if given["base"] not in scenes.scene_names():
-                raise UserError(f"base = {given['base']!r} is no scene; known: {', '.join(scenes.scene_names())}")
+                raise UserError(f"base = {given['base']!r} is unknown: choose from {', '.join(scenes.scene_names())}")
             content = read_yaml(path)
             source = str(content.get("source", ""))
         for part in PARTS:
@@ -124,7 +124,7 @@ def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.Path
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
         law = scenes.model_from_dict(content["model"])
         if "declared" in given and "belief" in given:
-            raise UserError("declared and belief are two names of one key; give declared")
+            raise UserError("declared and its former name belief are both given: remove belief")
         own_model = given.get("declared") or given.get("belief")
         declared = scenes.model_from_dict(own_model or {**JELLY, "density": law["density"]})
         body = scenes.body_from_dict(content["body"], data_root)
@@ -133,11 +133,11 @@ def plan_scene(given: Mapping[str, Any], film: Film, *, data_root: str | os.Path
         body, motion = _set_velocity(body, given)
         split, substeps = given.get("split", "train"), given.get("substeps", film.substeps)
         if split not in SPLITS:
-            raise UserError(f"split = {split!r}; one of {', '.join(SPLITS)}")
+            raise UserError(f"split = {split!r} is unknown: choose from {', '.join(SPLITS)}")
         if not isinstance(substeps, int) or substeps < 1:
             raise UserError(f"substeps must be a positive whole number, got {substeps!r}")
         if bool(((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any()):
-            raise UserError("particles of the body lie outside scene.domain")
+            raise UserError("particles of the body lie outside scene.domain: enlarge the domain or shift the body")
         Simulator(scene, body, density=law["density"], device="cpu").check_step(material(law["elasticity"], law["plasticity"])[0])
     except UserError as error:
         raise UserError(f"scenes: {name}: {error}") from error
@@ -154,31 +154,31 @@ def make_scenes(
     device: str = "auto",
     progress: bool = True,
 ) -> list[Path]:
-    """Make the scenes that are missing, and `index.json` when none is missing any more.
+    """Generate the missing scenes of a list; write `index.json` when all are complete.
 
     Args:
-        entries: As `plan_scene` takes them.
-        film: How they are filmed.
-        out: Folder; each scene becomes a folder in it.
-        draw: The renderer, `models.splatting.rasterize`.
-        data_root: Folder of the particles; NEUIDO_DATA where absent.
+        entries: The scenes, as `plan_scene` reads them.
+        film: Cameras and rendering options.
+        out: Output folder, with one folder per scene.
+        draw: The renderer, `neuido.models.rasterize`.
+        data_root: Folder of the particle files; None: NEUIDO_DATA.
         device: auto, cpu or cuda.
         progress: Show a progress bar.
 
     Returns:
-        The scenes' folders.
+        The folders of the scenes.
 
     Raises:
-        UserError: What `plan_scene` and the simulator refuse, or a folder that holds other scenes.
+        UserError: A scene is invalid, the simulation fails, or `out` holds other scenes.
     """
     _check(film)
     chosen = choose_device(device)
     plans = [plan_scene(entry, film, data_root=data_root) for entry in entries]
     if not plans or len({plan.name for plan in plans}) < len(plans):
-        raise UserError("scenes must name at least one scene, and each once")
+        raise UserError("scenes must list at least one scene, and each name once")
     folder = Path(out).expanduser()
     text = json.dumps({"format": FORMAT, "film": asdict(film), "scenes": entries}, indent=1, default=list) + "\n"
-    claim_folder(folder, text, "other scenes, or the same filmed otherwise")
+    claim_folder(folder, text, "other scenes, or the same scenes with other film options")
     paths = [folder / plan.name for plan in plans]
     missing = [(plan, path) for plan, path in zip(plans, paths) if not (path / "experiment.yaml").is_file()]
     images = film.views * film.frames
@@ -200,7 +200,7 @@ def make_scenes(
 def make_scene(
     plan: Plan, film: Film, folder: Path, *, draw: Draw, device: torch.device, advance: Callable[[int], Any] = lambda images: None
 ) -> None:
-    """Simulate, film and write one scene; `advance` is called with the number of images done."""
+    """Simulate, film and write one scene; call `advance` with the number of images written."""
     frames = simulate_motion(plan, film, device)
     times = torch.arange(film.frames, dtype=torch.float64) * plan.substeps * plan.scene.dt
     cameras = film_cameras(film)
@@ -224,7 +224,7 @@ def make_scene(
 
 
 def simulate_motion(plan: Plan, film: Film, device: torch.device) -> ParticleState:
-    """Simulate the true motion; return frames with x (T, P, 3) and F (T, P, 3, 3)."""
+    """Simulate the true motion of a scene; return its frames, with x (T, P, 3) and F (T, P, 3, 3)."""
     simulator = Simulator(plan.scene, plan.body, density=plan.law["density"], device=device)
     if film.frames == 1:
         return ParticleState(*(part[None] for part in simulator.state))
@@ -234,13 +234,13 @@ def simulate_motion(plan: Plan, film: Film, device: torch.device) -> ParticleSta
 
 
 def film_cameras(film: Film) -> Cameras:
-    """Return the cameras of a film."""
+    """Place the cameras of a film around its target."""
     options = {"target": film.target, "radius": film.radius, "elevations": film.elevations, "angle": film.angle}
     return convert.orbit(film.views, width=film.width, height=film.height, start=18.0, **options)
 
 
 def surround_with_gaussians(body: Body, density: int, *, seed: str, device: torch.device | str = "cpu") -> DenseGaussians:
-    """Surround the particles of a body with Gaussians, textured by this seed."""
+    """Draw `density` textured Gaussians in the volume of each particle of a body; `seed` is any text."""
     generator = np.random.default_rng(list(seed.encode()))
     edge = body.volume.double().pow(1 / 3).numpy()
     spread = WIDTH * edge / density ** (1 / 3)
@@ -251,9 +251,9 @@ def surround_with_gaussians(body: Body, density: int, *, seed: str, device: torc
 
 
 def solid_texture(x: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Return a solid texture: RGB in 0..1 (N, 3) of points x (N, 3), patches of four colours with a fine grain.
+    """Compute a random solid texture at points x (N, 3): RGB in [0, 1] (N, 3), patches of four colours with a fine grain.
 
-    The patches are some tenths of the body's size wide, so that optical flow finds something to follow everywhere.
+    The width of the patches is some tenths of the size of the body, so that optical flow finds structure everywhere.
     """
     size = float(np.ptp(x, axis=0).max())
     hue = generator.uniform(0, 1) + np.array([0.0, 0.18, 0.5, 0.68])
@@ -270,7 +270,7 @@ def solid_texture(x: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 
 def _waves(x: np.ndarray, generator: np.random.Generator, length: float, count: int = 8) -> np.ndarray:
-    """Return a random field of mean square one half: waves of about this length in all directions."""
+    """Compute a random field at x (N, 3) from waves of about this length in all directions; its mean square is 1/2."""
     k = generator.normal(size=(count, 3))
     k *= 2 * np.pi / (length * generator.uniform(0.7, 1.4, (count, 1)) * np.linalg.norm(k, axis=1, keepdims=True))
     return np.sin(x @ k.T + generator.uniform(0, 2 * np.pi, count)).sum(1) / np.sqrt(count)
@@ -286,7 +286,7 @@ def _film(
     pool: ThreadPoolExecutor,
     advance: Callable[[int], Any],
 ) -> np.ndarray:
-    """Draw and write all images; returns those of the first view at eight times and of a second one (2, 8, H, W, 4)."""
+    """Render and write all images; return those of two views at eight times for the preview, (2, 8, H, W, 4) uint8."""
     device = frames.x.device
     opacity = torch.full((len(dense.colour),), OPACITY, device=device)
     viewmats, Ks = cameras.viewmats.to(device), cameras.Ks.to(device)
@@ -299,7 +299,7 @@ def _film(
         means, covariances = dense.at(frames.x[some], frames.F[some])
         with torch.no_grad():
             images, alphas = draw(means, covariances, opacity, dense.colour, viewmats, Ks, film.width, film.height)
-        straight = images / alphas.unsqueeze(-1).clamp(min=1 / 255)  # PNG wants colours that are not multiplied by alpha
+        straight = images / alphas.unsqueeze(-1).clamp(min=1 / 255)  # PNG stores colours that are not multiplied by alpha
         pixels = torch.cat([straight, alphas.unsqueeze(-1)], -1).clamp(0, 1).mul(255).round().byte().cpu().numpy()
         for t, v in np.ndindex(*pixels.shape[:2]):
             path = folder / "images" / f"{v}_{start + t:03d}.png"
@@ -317,11 +317,11 @@ def _film(
 
 def _write_png(path: Path, rgba: np.ndarray, compression: int) -> None:
     if not cv2.imwrite(str(path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, compression]):
-        raise UserError(f"cannot write the image {path}")
+        raise UserError(f"the image {path} cannot be written")
 
 
 def _write_preview(images: np.ndarray, path: Path, side: int = 160) -> None:
-    """Return a sheet of two views over time, on white."""
+    """Write a contact sheet of two views over time, on white."""
     rows = []
     for row in images:
         rgb = [(i[..., :3] * (i[..., 3:] / 255) + 255 - i[..., 3:]).astype(np.uint8) for i in row]
@@ -330,7 +330,7 @@ def _write_preview(images: np.ndarray, path: Path, side: int = 160) -> None:
 
 
 def _set_velocity(body: Body, given: Mapping[str, Any]) -> tuple[Body, Motion]:
-    """Return the body with the velocity that the entry gives, else with its own, and that motion, which must be rigid."""
+    """Give the body the rigid motion of the entry, or else its own if that is rigid; return body and motion."""
     centre = tuple(round(c, 6) for c in body.x.double().mean(0).tolist())
     if "velocity" in given or "angular_velocity" in given:
         velocity = vector(given.get("velocity", [0.0, 0.0, 0.0]), "velocity")
@@ -343,14 +343,18 @@ def _set_velocity(body: Body, given: Mapping[str, Any]) -> tuple[Body, Motion]:
 
 
 def _rigid(body: Body, centre: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the velocity of the centre and the angular velocity of a body that moves as a rigid one."""
+    """Compute the velocity of the centre [m/s] and the angular velocity [rad/s] of a rigidly moving body.
+
+    Raises:
+        UserError: The motion is not rigid.
+    """
     r, v = body.x.double() - torch.tensor(centre, dtype=torch.float64), body.v.double()
     mean = v.mean(0)
     inertia = r.square().sum() * torch.eye(3, dtype=torch.float64) - r.T @ r
     spin = torch.linalg.solve(inertia, torch.linalg.cross(r, v - mean).sum(0))
     rest = (v - mean - torch.linalg.cross(spin.expand_as(r), r)).norm(dim=1).max()
     if rest > 1e-3 * v.norm(dim=1).max() + 1e-9:
-        raise UserError("the body does not start as a rigid one: give velocity and angular_velocity")
+        raise UserError("the initial motion of the body is not rigid: give velocity and angular_velocity")
     return tuple(round(c, 6) for c in mean.tolist()), tuple(round(c, 6) for c in spin.tolist())
 
 
@@ -359,6 +363,6 @@ def _check(film: Film) -> None:
         if getattr(film, name) < 1:
             raise UserError(f"film.{name} must be at least 1, got {getattr(film, name)}")
     if any(not 0 <= v < film.views for v in film.held_out) or len(set(film.held_out)) >= film.views:
-        raise UserError(f"film.held_out = {list(film.held_out)} must name some of the views 0..{film.views - 1}, not all")
+        raise UserError(f"film.held_out = {list(film.held_out)} must list some of the views 0..{film.views - 1}, not all")
     if not 0 <= film.compression <= 9:
         raise UserError(f"film.compression must lie in 0..9, got {film.compression}")

@@ -1,6 +1,6 @@
-"""The generation of the Stage I trajectories behind `neuido trajectories`: plan, simulation, files.
+"""Generate the Stage I trajectories for `neuido trajectories`: plan, simulation and files.
 
-`storage.py` says what the folder holds.
+`neuido.data.files.storage` describes the folder.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ SEGMENT = 100  # substeps held in memory at a time
 
 @dataclass(frozen=True)
 class Setup:
-    """What decides the content of the files; `neuido trajectories --help` explains each figure."""
+    """Options that determine the content of the files; `neuido trajectories --help` explains each one."""
 
     families: dict[str, dict[str, tuple[float, float]]]
     instances: int
@@ -57,27 +57,29 @@ class Setup:
             if not 0 < getattr(self, name) < math.inf:
                 raise UserError(f"{name} must be positive, got {getattr(self, name)}")
         if self.record_every > self.steps:
-            raise UserError(f"record_every {self.record_every} leaves nothing of {self.steps} steps: lower it or raise steps")
+            raise UserError(
+                f"record_every = {self.record_every} exceeds steps = {self.steps}, so nothing is recorded: lower it or raise steps"
+            )
         if not self.families:
-            raise UserError(f"families is empty: name at least one of {', '.join(PARAMETERS)}")
+            raise UserError(f"families is empty: give at least one of {', '.join(PARAMETERS)}")
         for family, ranges in self.families.items():
             check_ranges(family, ranges)
 
     @property
     def scene(self) -> Scene:
-        """The box into which the cube is thrown."""
+        """Scene with the box into which the cube is thrown."""
         walls = Walls(contact="separate", friction=0.0, inset=self.wall_inset)
         return Scene(cells=self.cells, dt=self.dt, gravity=self.gravity, walls=walls)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape of a trajectory's array: recorded substeps, particles, columns."""
+        """Shape of the array of a trajectory: recorded substeps, particles, columns."""
         return self.steps // self.record_every, self.particles_per_side**3, COLUMNS
 
 
 @dataclass(frozen=True)
 class Instance:
-    """One trajectory to be made."""
+    """One trajectory of the plan: its name, material and split (`train` or `held_out`)."""
 
     name: str
     family: str
@@ -86,7 +88,7 @@ class Instance:
 
 
 def plan(setup: Setup) -> list[Instance]:
-    """Return all trajectories in their order: the training instances family by family, then the held-out ones."""
+    """List all trajectories in file order: the training instances by family, then the held-out instances by family."""
     made = []
     for split, numbers in (
         ("train", range(setup.instances)),
@@ -99,38 +101,47 @@ def plan(setup: Setup) -> list[Instance]:
 def generate(
     setup: Setup, out: str | os.PathLike, *, shard: int = 0, shards: int = 1, device: str = "auto", batch: int = 0, progress: bool = True
 ) -> None:
-    """Make what is missing of one shard, and the index when no trajectory is missing any more.
+    """Simulate the missing trajectories of one shard; write `index.json` when all trajectories are complete.
+
+    Args:
+        setup: Options that determine the content.
+        out: Output folder.
+        shard: Number of the shard, from 0.
+        shards: Number of shards; trajectory i belongs to shard i modulo `shards`.
+        device: auto, cpu or cuda.
+        batch: Trajectories per launch; 0: 1 on the CPU and 10 on a GPU.
+        progress: Show a progress bar.
 
     Raises:
-        UserError: A shard outside the shards, an unknown device, a folder that cannot be one or that holds another set-up, and
-            what the simulator refuses (a step above the stability limit, a NaN).
+        UserError: `shard`, `batch` or `device` is invalid, `out` cannot be written or holds trajectories of other options, or the
+            simulation fails (a substep above the stability limit, a NaN).
     """
     if not 0 <= shard < shards:
         raise UserError(f"shard must lie in 0..{shards - 1} (shards = {shards}), got {shard}")
     if batch < 0:
         raise UserError(f"batch must be 0 (automatic) or positive, got {batch}")
     chosen = choose_device(device)
-    everything = plan(setup)
-    _check_steps(setup, everything)
+    instances = plan(setup)
+    _check_steps(setup, instances)
     folder = Path(out)
-    content = {"format": FORMAT, "setup": asdict(setup), "trajectories": [asdict(instance) for instance in everything]}
-    claim_folder(folder, _json(content), "trajectories of another set-up", compared="setup")
-    files = {instance.name: folder / f"{instance.name}.npy" for instance in everything}
+    content = {"format": FORMAT, "setup": asdict(setup), "trajectories": [asdict(instance) for instance in instances]}
+    claim_folder(folder, _json(content), "trajectories of other options", compared="setup")
+    files = {instance.name: folder / f"{instance.name}.npy" for instance in instances}
 
-    mine = [instance for i, instance in enumerate(everything) if i % shards == shard]
-    missing = [instance for instance in mine if not is_complete(files[instance.name], setup.shape)]
+    in_shard = [instance for i, instance in enumerate(instances) if i % shards == shard]
+    missing = [instance for instance in in_shard if not is_complete(files[instance.name], setup.shape)]
     size = batch or (10 if chosen.type == "cuda" else 1)
-    with Progress("trajectories", len(mine), done=len(mine) - len(missing), shown=progress) as work:
+    with Progress("trajectories", len(in_shard), done=len(in_shard) - len(missing), shown=progress) as work:
         for family in PARAMETERS:
-            wanted = [instance for instance in missing if instance.family == family]
-            for start in range(0, len(wanted), size):
-                group = wanted[start : start + size]
+            in_family = [instance for instance in missing if instance.family == family]
+            for start in range(0, len(in_family), size):
+                group = in_family[start : start + size]
                 _simulate(setup, group, [files[instance.name] for instance in group], chosen)
                 work.update(len(group))
 
     if missing or not (folder / "index.json").exists():
         if all(is_complete(path, setup.shape) for path in files.values()):
-            _write_index(folder, setup, everything)
+            _write_index(folder, setup, instances)
 
 
 def _body(setup: Setup) -> Body:
@@ -142,10 +153,10 @@ def _body(setup: Setup) -> Body:
     )
 
 
-def _check_steps(setup: Setup, wanted: list[Instance]) -> None:
-    """Refuse an unstable step of the last instance before the first one is simulated."""
+def _check_steps(setup: Setup, instances: list[Instance]) -> None:
+    """Check that the substep is stable for every instance before any is simulated."""
     simulator = Simulator(setup.scene, _body(setup), density=setup.density, device="cpu")
-    for instance in wanted:
+    for instance in instances:
         try:
             simulator.check_step(laws(instance.family, [instance.parameters])[0])
         except UserError as error:
@@ -153,7 +164,7 @@ def _check_steps(setup: Setup, wanted: list[Instance]) -> None:
 
 
 def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: torch.device) -> None:
-    """Simulate instances of one family in one launch and write their files, a segment of substeps at a time."""
+    """Simulate instances of one family in one launch; write their files one segment of substeps at a time."""
     frames, count, _ = setup.shape
     body = _body(setup)
     elastic, plastic = laws(group[0].family, [instance.parameters for instance in group])
@@ -174,19 +185,19 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
                 out = simulator.rollout(steps, elastic, plastic, state=state)
                 state = ParticleState(*(part[-1].clone() for part in out))
                 for k, file in enumerate(files):
-                    mine = slice(k * count, (k + 1) * count)
-                    file.write(_samples(setup, out.F[:, mine], out.C[:, mine], *exact[k]).cpu().numpy().tobytes())
+                    own = slice(k * count, (k + 1) * count)
+                    file.write(_samples(setup, out.F[:, own], out.C[:, own], *exact[k]).cpu().numpy().tobytes())
     except UserError as error:
         raise UserError(f"{names}: {error}") from error
     except OSError as error:
-        raise UserError(f"{names}: cannot write to {paths[0].parent}: {error.strerror}; give another out") from error
+        raise UserError(f"{names}: cannot write to {paths[0].parent}: {str(error.strerror).lower()}: give another out") from error
 
 
 def _samples(setup: Setup, F: Tensor, C: Tensor, elastic: ElasticLaw, plastic: PlasticLaw) -> Tensor:
-    """Return the recorded columns (T, P, 27) of a rollout's frames F, C (K, P, 3, 3).
+    """Compute the recorded columns (T, P, 27) from the frames F, C (K, P, 3, 3) of a rollout.
 
-    The targets are the laws in float64 of the float32 inputs that are stored, so that they are exact for them; the rollout's own
-    F differs from them by its rounding.
+    The targets are the laws evaluated in float64 at the stored float32 inputs, so they are exact for these inputs. The F of the rollout
+    itself differs by rounding.
     """
     last = torch.arange(setup.record_every, len(F), setup.record_every, device=F.device)
     trial = (F[last - 1].double() + setup.dt * C[last].double() @ F[last - 1].double()).float()
@@ -203,15 +214,15 @@ def _instance(setup: Setup, family: str, number: int, split: str) -> Instance:
     return Instance(f"{family}-{number:03d}", family, draw_parameters(family, setup.families[family], random), split)
 
 
-def _write_index(folder: Path, setup: Setup, everything: list[Instance]) -> None:
+def _write_index(folder: Path, setup: Setup, instances: list[Instance]) -> None:
     from neuido import __version__
 
-    entries = [{**asdict(instance), **_statistics(folder / f"{instance.name}.npy")} for instance in everything]
+    entries = [{**asdict(instance), **_statistics(folder / f"{instance.name}.npy")} for instance in instances]
     write_text(folder / "index.json", _json({"format": FORMAT, "version": __version__, "setup": asdict(setup), "trajectories": entries}))
 
 
 def _statistics(path: Path) -> dict[str, float]:
-    """Return the RMS over the samples of the Frobenius norms of the stress [Pa] and of the plastic correction F_hat - F_tr [-]."""
+    """Compute the RMS over all samples of the Frobenius norm of the stress [Pa] and of the plastic correction F_hat - F_tr [-]."""
     array = np.load(path, mmap_mode="r")
     stress = residual = 0.0
     for rows in np.array_split(array, max(1, len(array) // 100)):

@@ -1,4 +1,4 @@
-"""The options of trajectories: signatures and help alone, so that `--help` loads no torch."""
+"""Options of `neuido trajectories`: signatures and help only, so that `--help` does not load torch."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -16,7 +16,7 @@ FAMILIES: dict[str, dict[str, Range]] = {
 
 @dataclass(frozen=True)
 class Throw:
-    """The cube, its throw, the box and the substeps of the trajectories of Stage I.
+    """Cube, throw, box and substeps of the Stage I trajectories.
 
     Args:
         length: Edge of the cube, m; it starts in the middle of the unit cube.
@@ -26,9 +26,9 @@ class Throw:
         density: Density, kg/m^3.
         gravity: Gravity, m/s^2.
         cells: Grid cells along the unit cube.
-        wall_inset: Distance of the frictionless walls from the domain's faces, in cells.
-        dt: Substep, s.
-        steps: Substeps of a trajectory.
+        wall_inset: Distance of the frictionless walls from the faces of the domain, in cells.
+        dt: Time of a substep, s.
+        steps: Number of substeps of a trajectory.
         record_every: Record every n-th substep.
     """
 
@@ -60,24 +60,27 @@ def make_trajectories(
     progress: bool = True,
     **throw: Any,
 ) -> None:
-    """Simulate the trajectories of Stage I; the options are those of `neuido trajectories`.
+    """Simulate the constitutive trajectories of Stage I: a spinning cube is thrown into a box, for many materials.
+
+    The options are those of `neuido trajectories`.
 
     Args:
-        out: Folder to write.
+        out: Output folder.
         families: Parameter ranges of each family.
         instances: Training instances of each family.
-        held_out: Further instances of each family that are never trained on.
+        held_out: Additional instances of each family that are never used for training.
         seed: Seed of the parameters.
-        setup: The cube, its throw, the box and the substeps.
-        shard: Which share of the trajectories to simulate, counted from 0.
-        shards: Number of shares.
+        setup: Cube, throw, box and substeps.
+        shard: Number of the shard to simulate, from 0.
+        shards: Number of shards.
         device: auto, cpu or cuda.
-        batch: Trajectories simulated in one launch; 0 chooses 1 on the CPU and 10 on a GPU.
+        batch: Trajectories simulated in one launch; 0: 1 on the CPU and 10 on a GPU.
         progress: Show a progress bar.
         throw: Fields of `Throw` that differ from `setup`.
 
     Raises:
-        UserError: An impossible material, a reversed range, a step above the stability limit, a folder that holds another set-up.
+        UserError: A parameter range is invalid, the substep is above the stability limit, or the folder holds trajectories of other
+            options.
     """
     from neuido.data.trajectories.generation import Setup, generate
 

@@ -1,4 +1,4 @@
-"""The Stage I samples (F_tr, F_hat, stress, trajectory) in balanced batches from the files of `neuido trajectories`."""
+"""Lightning data module of the Stage I samples (F_tr, F_hat, stress, trajectory) in balanced batches."""
 
 import inspect
 from dataclasses import fields
@@ -19,33 +19,35 @@ from neuido.errors import UserError
 from neuido.types import TrajectoryBatch
 
 BLOCKS = 50
-"""Held-out steps are whole blocks of time, so that a held-out sample has no neighbour one substep away in the training set."""
+"""Number of blocks of time. Held-out steps are whole blocks, so the training set has hardly any sample one substep from a held-out one."""
 
 
 class TrajectoryDataModule(LightningDataModule):
-    """Samples of the constitutive trajectories of Stage I (paper, "Training on constitutive trajectories").
+    """Lightning data module of the constitutive trajectories of Stage I (paper, "Training on constitutive trajectories").
 
-    Training takes the training instances without the held-out particles and without the held-out steps; validation and test take
-    a fixed number of exactly those. `instance_batches` gives the held-out instances: one half to fit a latent, one to score it.
+    Training uses the training instances without held-out particles and steps. Validation and test use a fixed number of samples of the
+    held-out particles and steps. `instance_batches` returns samples of the held-out instances: one half to fit a latent, the other half to
+    score it.
 
     Args:
         root: Folder written by `neuido trajectories`.
-        batch_size: Samples of a batch, shared equally by the trajectories: each gets batch_size // M (the paper's 10^4).
-        held_out_particles: Fraction of the particles that is held out, the same ones in each trajectory.
+        batch_size: Samples of a batch; each of the M trajectories gets batch_size // M. The paper uses 10^4.
+        held_out_particles: Fraction of the particles that is held out; the same particles in every trajectory.
         held_out_steps: Fraction of the steps that is held out, in whole blocks of time.
-        validation_samples: Held-out samples of each training trajectory in a validation.
-        instance_samples: Samples of each held-out instance in each half.
+        validation_samples: Held-out samples of each training trajectory that validation uses.
+        instance_samples: Samples of each held-out instance in each half of `instance_batches`.
         seed: Seed of the split and of the order.
-        preload: Whether the training set is put on the trainer's device (fast); false reads memory-mapped files instead, and
-            `auto` decides by the memory there is.
-        num_workers: Worker processes that read when the training set is not preloaded.
-        drop_last: Leave out the last batch of an epoch if it would be smaller than the others.
-        generate: Options of `neuido trajectories` with which the folder is made if it is missing; none: a missing folder is an error.
+        preload: True: copy the training set to the device of the trainer, which is fast. False: read memory-mapped files. `auto`: copy it
+            if it fits into half of the free GPU memory, or into 2 GiB on the CPU.
+        num_workers: Number of worker processes that read if the training set is not preloaded.
+        drop_last: Omit the last batch of an epoch if it is smaller than the others.
+        generate: Options of `neuido trajectories` that generate a missing folder. None: a missing folder is an error.
 
     Attributes:
         trajectory_count, names, families, parameters: Of the training instances, in the order of the trajectory index.
-        stress_rms, residual_rms: (M,) float32, root mean squares of the Frobenius norms of stress [Pa] and F_hat - F_tr [-].
-        instance_names, instance_families, instance_parameters, instance_stress_rms, instance_residual_rms: Of the held-out ones.
+        stress_rms, residual_rms: Root mean square of the Frobenius norm of the stress [Pa] and of F_hat - F_tr [-], (M,) float32.
+        instance_names, instance_families, instance_parameters, instance_stress_rms, instance_residual_rms: The same of the held-out
+            instances.
     """
 
     def __init__(
@@ -84,7 +86,7 @@ class TrajectoryDataModule(LightningDataModule):
         self.generate = generate
         self._resident: Tensor | None = None
 
-    # What there is, from index.json; no torch data is read for it.
+    # The content of index.json.
 
     @cached_property
     def index(self) -> dict[str, Any]:
@@ -98,18 +100,18 @@ class TrajectoryDataModule(LightningDataModule):
         path = self.root / "index.json"
         command = f"neuido trajectories --config configs/trajectories.yaml --out {self.root}"
         if not path.is_file():
-            state = "is not complete" if (self.root / "plan.json").is_file() else "holds no trajectories"
-            raise UserError(f"data.root = {self.root} {state} (no index.json): make it with `{command}`")
+            state = "is incomplete" if (self.root / "plan.json").is_file() else "has no trajectories"
+            raise UserError(f"data.root = {self.root} {state} (index.json is missing): generate them with `{command}`")
         content = read_json(path)
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             content = content if isinstance(content, dict) else {}
-            raise UserError(f"{path} has format {content.get('format')!r}, not {FORMAT!r}: make it anew with `{command}`")
+            raise UserError(f"{path} has the format {content.get('format')!r}, not {FORMAT!r}: generate it again with `{command}`")
         for i, entry in enumerate(list_of_mappings(require_key(content, "trajectories", str(path)), f"{path}: trajectories")):
             for key in ("name", "family", "split", "parameters", "stress_rms", "residual_rms"):
                 require_key(entry, key, f"{path}: trajectories[{i}]")
             file_name(entry["name"], f"{path}: trajectories[{i}].name")
             if not is_complete(self.root / f"{entry['name']}.npy", self._shape(content)):
-                raise UserError(f"{self.root / entry['name']}.npy is missing or cut short: repair it with `{command}`")
+                raise UserError(f"{self.root / entry['name']}.npy is missing or truncated: generate it again with `{command}`")
         return content
 
     @property
@@ -171,7 +173,7 @@ class TrajectoryDataModule(LightningDataModule):
 
     @cached_property
     def held_out(self) -> tuple[Tensor, Tensor]:
-        """Held-out steps (T,) and particles (P,), boolean, the same for all trajectories."""
+        """Boolean masks of the held-out steps (T,) and particles (P,), the same for all trajectories."""
         steps, particles, _ = self._shape(self.index)
         generator = torch.Generator().manual_seed(self.seed)
         blocks = min(BLOCKS, steps)
@@ -182,7 +184,7 @@ class TrajectoryDataModule(LightningDataModule):
         return torch.isin(block, chosen), points
 
     def rows(self, part: str) -> Tensor:
-        """Return row numbers t P + p of a part of each trajectory: `train`, or held out by `particles` or by `steps`."""
+        """Return the row numbers t P + p of a part of a trajectory: `train`, or the held-out `particles` or `steps`."""
         late, points = (m for m in self.held_out)
         masks = {
             "train": ~late[:, None] & ~points,
@@ -200,7 +202,9 @@ class TrajectoryDataModule(LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         samples = self.batch_size // self.trajectory_count
         if samples == 0:
-            raise UserError(f"batch_size = {self.batch_size} is less than one sample for each of {self.trajectory_count} trajectories")
+            raise UserError(
+                f"batch_size = {self.batch_size} gives less than one sample to each of {self.trajectory_count} trajectories: raise it"
+            )
         self.files = self._files("train")
         self.order = SampleOrder(self.rows("train"), self.trajectory_count, samples, seed=self.seed, drop_last=self.drop_last)
 
@@ -220,7 +224,7 @@ class TrajectoryDataModule(LightningDataModule):
         if not isinstance(batch, Step):
             return batch
         if self._resident is None:
-            raise RuntimeError("a Step was handed out and the training set is not on the device")
+            raise RuntimeError("a Step was loaded, but the training set is not on the device")
         rows = self.order(*batch, self._resident.device)
         rows = rows + self._resident.shape[1] * torch.arange(len(rows), device=rows.device)[:, None]
         picked = self._resident.view(-1, self._resident.shape[-1]).index_select(0, rows.view(-1))
@@ -232,21 +236,21 @@ class TrajectoryDataModule(LightningDataModule):
     # Samples.
 
     def gather(self, epoch: int, step: int) -> TrajectoryBatch:
-        """Return the training batch of a step, read from the files: M n samples sorted by trajectory."""
+        """Read the training batch of a step from the files: M n samples sorted by trajectory."""
         return self.files.gather(self.order(epoch, step, torch.device("cpu")))
 
     def instance_batches(self) -> tuple[TrajectoryBatch, TrajectoryBatch]:
-        """Return samples of the held-out instances: (to fit a latent with, to score it with).
+        """Draw samples of the held-out instances: one batch to fit latents, one batch to score them.
 
-        The first come from the steps and particles that training uses, the second from the held-out ones. Both are sorted by
-        instance (`trajectory` counts the held-out instances from 0) with min(instance_samples, all there are) samples each.
+        The first batch has steps and particles that training uses, the second has held-out ones. Both are sorted by instance and have at
+        most `instance_samples` samples of each; `trajectory` counts the held-out instances from 0.
 
         Raises:
-            UserError: The folder was made without held-out instances.
+            UserError: The folder has no held-out instances.
         """
         files = self._files("held_out")
         if not files.paths:
-            raise UserError(f"{self.root} has no held-out instances: make it with `neuido trajectories --held_out 10 ...`")
+            raise UserError(f"{self.root} has no held-out instances: generate it with `neuido trajectories --held_out 10 ...`")
         fit = self._draw(self.rows("train"), self.instance_samples, len(files.paths), salt=1)
         return files.gather(fit), files.gather(self._held_out_rows(self.instance_samples, len(files.paths), salt=2))
 
@@ -257,7 +261,7 @@ class TrajectoryDataModule(LightningDataModule):
         return FixedBatches([files.gather(part) for part in rows.split(samples, dim=1)])
 
     def _held_out_rows(self, samples: int, trajectories: int, *, salt: int) -> Tensor:
-        """Draw half from the held-out particles, half from the held-out steps, (trajectories, <= samples)."""
+        """Draw half of the rows from held-out particles and half from held-out steps, (trajectories, <= samples)."""
         points = self._draw(self.rows("particles"), (samples + 1) // 2, trajectories, salt=salt)
         late = self._draw(self.rows("steps"), samples // 2, trajectories, salt=salt + 100)
         return torch.cat([points, late], dim=1)
@@ -267,7 +271,7 @@ class TrajectoryDataModule(LightningDataModule):
         return torch.stack([rows[torch.randperm(len(rows), generator=generator)[:samples]] for _ in range(trajectories)])
 
     def _preload(self, device: torch.device) -> bool:
-        """Put the training set on the device if that is asked for and possible; return whether it is there."""
+        """Copy the training set to the device if `preload` asks for it and it fits; return whether it is on the device."""
         if self.preload is False:
             return False
         if self._resident is not None and self._resident.device == device:

@@ -1,4 +1,4 @@
-"""Experiments whose model lacks an effect, each with a sealed key that names it."""
+"""Generate test cases: measured data whose declared model lacks an effect, with a sealed key that names the effect."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ __all__ = ["Case", "make_undeclared"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
+    """Import a public name on first use."""
     from importlib import import_module
 
     modules = {"Case": "case", "make_undeclared": "making"}

@@ -1,4 +1,4 @@
-"""One moving body with an undeclared effect: everything drawn, the effect sized by simulation, two recordings, the truth."""
+"""Generate experiments with an undeclared effect: draw body and effect, scale the effect, simulate two recordings."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -34,13 +34,13 @@ from neuido.types import Body
 
 SOLVERS = ("same", "finer", "elements")
 MARGIN = 0.03
-"""Particles keep so far from the domain's sides [m]."""
+"""Smallest distance of particles from the faces of the domain [m]."""
 SLOW_LOSS = ("drag_linear", "viscosity_shear", "restitution")
-"""Kinds of dissipation that a coarse step feigns; half of their cases suggest half the step."""
+"""Kinds of dissipation that a coarse substep imitates; half of these cases suggest half the substep."""
 
 
 def draw_kinds(rng: np.random.Generator, case: Case) -> tuple[str, ...]:
-    """Draw the effects of a case: none, one, two, or one outside the library."""
+    """Draw the effects of a case: none, one or two of the library, or one outside the library."""
     if case.kind is not None:
         return () if case.kind == "none" else tuple(case.kind.split("+"))
     u = rng.random()
@@ -58,10 +58,11 @@ def draw_kinds(rng: np.random.Generator, case: Case) -> tuple[str, ...]:
 def body_case(
     rng: np.random.Generator, case: Case, name: str, device: str, advance: Callable[[int], Any]
 ) -> tuple[Callable[[Path], None], dict[str, Any]]:
-    """Return a function that writes the folder, and the key.
+    """Draw an experiment; return a function that writes its folder, and the content of its key.
 
     Raises:
-        Redraw: What was drawn does not make a case.
+        Redraw: The drawn values make no usable case.
+        UserError: The options of `case` do not suit each other.
     """
     made = BodyCase(rng, case, device, advance)
     made.size_effects(case.separation)
@@ -71,7 +72,14 @@ def body_case(
 
 
 class BodyCase:
-    """The draws of one case, in their order."""
+    """Random choices of one experiment, in a fixed order, and its simulations.
+
+    Args:
+        rng: Random generator.
+        case: Fixed properties of the case.
+        device: auto, cpu or cuda.
+        advance: Called with 1 after each simulation.
+    """
 
     def __init__(self, rng: np.random.Generator, case: Case, device: str, advance: Callable[[int], Any]) -> None:
         self.rng, self.device, self.advance = rng, device, advance
@@ -109,17 +117,17 @@ class BodyCase:
         self.effects: list[Drawn] = []
 
     def _solver(self, case: Case, entries: Sequence[Kind]) -> tuple[str, list[str]]:
-        """Draw a solver, and return the declared plasticities that suit it and the effects."""
+        """Draw a solver; return it and the declared plasticities that suit it and the effects."""
         models = [m for m in ANY if all(m in e.models for e in entries)]
         if not models:
-            raise UserError(f"case.kind = {'+'.join(self.kinds)}: no declared plasticity suits both")
+            raise UserError(f"case.kind = {'+'.join(self.kinds)}: no plasticity suits both effects: give another pair")
         chosen = case.solver or str(self.rng.choice(SOLVERS))
         if chosen == "elements":
             solid = [m for m in models if m in SOLID]
             if not any(e.grid for e in entries) and solid:
                 return chosen, solid
             if case.solver is not None and case.kind is not None:
-                raise UserError(f"case.solver = elements does not suit {'+'.join(self.kinds)}: give same or finer")
+                raise UserError(f"case.solver = elements does not support {'+'.join(self.kinds)}: give same or finer")
             if case.solver is not None:
                 raise Redraw(f"elements do not suit {'+'.join(self.kinds)}")
             chosen = "finer"
@@ -129,11 +137,21 @@ class BodyCase:
 
     @property
     def values(self) -> dict[str, float]:
-        """All effects, by flat names."""
+        """Parameters of all effects by flat names."""
         return {key: value for one in self.effects for key, value in one.values.items()}
 
     def run(self, solver: Solver, values: Mapping[str, float], started: list[Body] | None = None, extra: float = 0.0) -> Motion:
-        """Move the body from every launch, or from the states `started`."""
+        """Simulate all recordings with effects `values`, from the launches or from the bodies `started`.
+
+        Args:
+            solver: The solver.
+            values: Parameters of the effects by flat names.
+            started: Initial bodies; None: those of the launches.
+            extra: Time beyond the duration of the recordings [s].
+
+        Raises:
+            Redraw: The simulation fails, or the body leaves the domain.
+        """
         law = {"density": self.material.density, "elasticity": self.material.elasticity, "plasticity": self.material.plasticity}
         started = self.declared if started is None else started
         seconds = self.seconds + extra
@@ -149,14 +167,14 @@ class BodyCase:
             raise Redraw("the body leaves the domain")
         return moved
 
-    def seen(self, motion: Motion) -> np.ndarray:
-        """Return the marked points at the frames, (S, T, N, 3)."""
+    def marker_positions(self, motion: Motion) -> np.ndarray:
+        """Return the positions of the markers at the frames [m], (S, T, N, 3)."""
         return np.stack([self.markers.follow(motion.at(self.at, i)[0], i) for i in range(len(motion.x))])
 
     def size_effects(self, separation: float | None) -> None:
-        """Draw the effects, each so large that it moves the points by a drawn multiple of the noise."""
-        self.plain = self.seen(self.run(self.suggested, {}))
-        self.bare = self.plain if self.solver == self.suggested else self.seen(self.run(self.solver, {}))
+        """Draw the effects; scale each to move the markers by `separation` times the noise, or by a random multiple if None."""
+        self.plain = self.marker_positions(self.run(self.suggested, {}))
+        self.bare = self.plain if self.solver == self.suggested else self.marker_positions(self.run(self.solver, {}))
         floor = rms(self.bare[0] - self.plain[0])
         extent = np.ptp(self.points, axis=0)
         scales = Scales(
@@ -173,16 +191,20 @@ class BodyCase:
         )
 
         def moved_by(one: Drawn) -> float:
-            return rms(self.seen(self.run(self.suggested, one.values, self.declared[:1]))[0] - self.plain[0])
+            return rms(self.marker_positions(self.run(self.suggested, one.values, self.declared[:1]))[0] - self.plain[0])
 
-        least = 1.2 * max(MIN_SEPARATION * self.noise, OVER_FLOOR * floor)
+        smallest = 1.2 * max(MIN_SEPARATION * self.noise, OVER_FLOOR * floor)
         for kind in self.kinds:
             ratio = separation or float(np.exp(self.rng.uniform(np.log(20.0), np.log(110.0))))
             target = min(max(ratio * self.noise, 1.5 * OVER_FLOOR * floor), 0.9 * MAX_SEPARATION * self.noise)
-            self.effects.append(scale_to_separation(draw_effect(kind, self.rng, scales), target, moved_by, least).rounded())
+            self.effects.append(scale_to_separation(draw_effect(kind, self.rng, scales), target, moved_by, smallest).rounded())
 
     def record(self, nuisances: bool | None) -> None:
-        """Simulate with all effects, without each one, and at the suggested setting."""
+        """Simulate the recordings, and the references without each effect and with the suggested solver.
+
+        Raises:
+            Redraw: An effect moves the markers too little or too much.
+        """
         wanted = nuisances if nuisances is not None else not self.kinds and self.rng.random() < 0.5
         self.off = wrong_nuisances(self.rng, self.plain, self.interval, float(np.ptp(self.points, axis=0).max())) if wanted else []
         started = [
@@ -191,7 +213,7 @@ class BodyCase:
             )
             for launch, own in zip(self.launches, self.off)
         ]
-        extra = 3 * self.interval  # a clock that is ahead sees more
+        extra = 3 * self.interval  # a fast clock records beyond the end
         true = self.run(self.solver, self.values, started or None, extra)
         same = true if self.solver == self.suggested else self.run(self.suggested, self.values, started or None, extra)
         self.recorded, reference = (
@@ -201,18 +223,18 @@ class BodyCase:
         self.separations = [math.inf, math.inf]
         for one in self.effects:
             rest = {key: value for key, value in self.values.items() if key not in one.values}
-            without = self.seen(self.run(self.solver, rest)) if rest else self.bare
+            without = self.marker_positions(self.run(self.solver, rest)) if rest else self.bare
             self.separations = [min(a, rms(x - y)) for a, x, y in zip(self.separations, self.recorded, without)]
         self.reference = [rms(x - y) for x, y in zip(self.recorded, reference)]
         if self.effects and not (
             MIN_SEPARATION <= self.separations[0] / self.noise <= MAX_SEPARATION and self.separations[1] >= MIN_SEPARATION * self.noise
         ):
-            raise Redraw(f"the effect moves the points by {self.separations[0]:.2g} and {self.separations[1]:.2g} m")
+            raise Redraw(f"the effect moves the points by {self.separations[0]:.2g} m and {self.separations[1]:.2g} m")
         if self.effects and self.separations[0] < OVER_FLOOR * self.reference[0]:
             raise Redraw("the effect moves the points by little more than the solvers differ")
 
     def truth(self) -> dict[str, Any]:
-        """Return the key, in the form of an experiment's truth.yaml."""
+        """Return the content of the key."""
         rows = []
         for i in range(2):
             row: dict[str, Any] = {"name": f"take{i + 1}", "role": ("fit", "held_out")[i]}
@@ -229,7 +251,7 @@ class BodyCase:
             "undeclared": [truth_entry(one, free=material.free) for one in self.effects],
             "material": {**laws, **figures, "density": material.density},
             "started_from": material.declared,
-            "simulated_with": self.solver.words(),
+            "simulated_with": self.solver.describe(),
             "solver": self.solver.name,
             "noise": self.noise,
             "recordings": rows,
@@ -237,7 +259,7 @@ class BodyCase:
         return truth | ({"nuisances": {row["name"]: own for row, own in zip(rows, self.off)}} if self.off else {})
 
     def writer(self, name: str) -> Callable[[Path], None]:
-        """Return a function that writes the experiment, with noise and gaps, and reads it again."""
+        """Return a function that writes the experiment, with noise and gaps, to a folder and reads it back."""
         gaps = self.rng.random() < 0.3
         recordings = []
         for i, x in enumerate(self.recorded):
@@ -261,6 +283,6 @@ class BodyCase:
 
         def write_folder(folder: Path) -> None:
             write_experiment(experiment, folder)
-            read_experiment(folder)  # what cannot be read again is not published
+            read_experiment(folder)  # raises if the written files cannot be read
 
         return write_folder

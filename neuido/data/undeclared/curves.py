@@ -1,4 +1,4 @@
-"""Material tests and tracks with an undeclared effect: curves, beside the moving bodies of `case`."""
+"""Generate material tests and tracks with an undeclared effect."""
 
 import csv
 import functools
@@ -28,19 +28,26 @@ TEST_KINDS = ("viscosity_shear", "maxwell", "hysteresis", "strain_stiffening", "
               "hardening", "kinematic_hardening", "rate_yield", "softening", "stiffness_change")  # fmt: skip
 TRACK_KINDS = ("gravity", "uniform_acceleration", "drag_linear", "drag_quadratic", "magnus", "position_force")
 PERIOD = 2.0
-"""Of the loading of a specimen [s]."""
+"""Period of the loading of a specimen [s]."""
 
 
 def curve_case(
     rng: np.random.Generator, case: Case, name: str, device: str, advance: Callable[[int], Any]
 ) -> tuple[Callable[[Path], None], dict[str, Any]]:
-    """Return a function that writes the folder, and the key; the CPU computes it, whatever the device."""
+    """Draw a material test or a track; return a function that writes its folder, and the content of its key.
+
+    The computation runs on the CPU; `device` is not used.
+
+    Raises:
+        UserError: An option does not apply to the kind of data.
+        Redraw: The drawn values make no usable case.
+    """
     for option in ("solver", "nuisances", "particles", "seconds"):
         if getattr(case, option):
-            raise UserError(f"case.{option} = {getattr(case, option)} is for bodies; leave it out with case.measured = {case.measured}")
+            raise UserError(f"case.{option} = {getattr(case, option)} applies to bodies only: remove it, or give case.measured = body")
     kinds = TEST_KINDS if case.measured == "material_test" else TRACK_KINDS
     if case.kind is not None and case.kind != "none" and case.kind not in kinds:
-        raise UserError(f"case.kind = {case.kind!r} with case.measured = {case.measured}; one of none, {', '.join(kinds)}")
+        raise UserError(f"case.kind = {case.kind!r} does not suit case.measured = {case.measured}: choose from none, {', '.join(kinds)}")
     kind = case.kind or ("none" if rng.random() < 1 / 3 else str(rng.choice(kinds)))
     ratio = case.separation or float(np.exp(rng.uniform(np.log(20.0), np.log(80.0))))
     return (_test if case.measured == "material_test" else _track)(rng, kind, ratio, name, advance)
@@ -51,8 +58,10 @@ def _effect(
 ) -> Drawn | None:
     if kind == "none":
         return None
-    values, names, least, most = sizes[kind]
-    drawn = Drawn(kind, {f"{kind}.{k}": float(v) for k, v in values.items()}, tuple(f"{kind}.{k}" for k in names.split()), least, most)
+    values, names, smallest, largest = sizes[kind]
+    drawn = Drawn(
+        kind, {f"{kind}.{k}": float(v) for k, v in values.items()}, tuple(f"{kind}.{k}" for k in names.split()), smallest, largest
+    )
     found = scale_to_separation(drawn, target, lambda one: separation(one.values), 16.0 * noise)
     return found.rounded()
 
@@ -98,7 +107,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
             found.append(stress_along(specimen, mode, given, time=torch.from_numpy(t))[0, :, 0].numpy())
         advance(1)
         if not all(np.isfinite(one).all() for one in found):
-            raise Redraw("the specimen finds no equilibrium")
+            raise Redraw("the stress of the specimen does not converge")
         return found
 
     plain = stresses({})
@@ -134,7 +143,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
 
 
 def _test_sizes(rng: np.random.Generator, young: float, flow: float) -> Sizes:
-    """Return for each effect its starting values, the parameters that are sized, and their smallest and largest values."""
+    """Return for each effect: initial values, names of the parameters to scale, and the smallest and largest scale factor."""
     return {
         "viscosity_shear": ({"eta": 0.01 * young * PERIOD}, "eta", 0.01, 30),
         "maxwell": ({"ratio": 0.3, "time": PERIOD * 10 ** rng.uniform(-1.3, 0.0)}, "ratio", 0.05, 8),
@@ -204,7 +213,7 @@ def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance
 
 
 def _track_sizes(rng: np.random.Generator) -> Sizes:
-    """Return for each effect of a track what `_test_sizes` returns for a test."""
+    """Return for each effect of a track the same as `_test_sizes`."""
     level = np.array([1.0, 0.2, 1.0]) * rng.normal(size=3)
     level /= np.linalg.norm(level)
     turn = rng.normal(size=3)

@@ -1,4 +1,4 @@
-"""What instruments see of a motion: marked points, with a clock, a ruler and a launch that may be off."""
+"""Simulated measurement of a motion: marked points, seen with errors of clock, ruler and launch."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,7 +9,7 @@ from neuido.data.undeclared.motion import Motion
 from neuido.data.undeclared.random_bodies import Launch
 from neuido.physics.fem.meshing import follow
 
-WRONG_NUISANCES = (  # name, unit, standard deviation: of the frame interval, of one, of the fastest speed, of that over the body's size
+WRONG_NUISANCES = (  # name, unit, standard deviation relative to: frame interval, 1, 1, largest speed, largest speed over size of the body
     ("release_time", "s", 0.1),
     ("time_base", "1", 0.003),
     ("length_scale", "1", 0.003),
@@ -19,7 +19,7 @@ WRONG_NUISANCES = (  # name, unit, standard deviation: of the frame interval, of
 
 
 class Markers:
-    """The recorded points: particles, or places glued to the material."""
+    """Recorded points of a body: particles, or points attached to the material between particles."""
 
     def __init__(self, rng: np.random.Generator, points: np.ndarray, count: int) -> None:
         self.glued = rng.random() < 0.4
@@ -28,7 +28,7 @@ class Markers:
         self.shift = rng.uniform(-0.4, 0.4, (count, 3)) * gap if self.glued else np.zeros((count, 3))
 
     def fix(self, launches: Sequence[Launch], points: np.ndarray) -> None:
-        """Find them in the launched bodies."""
+        """Locate the markers in the launched bodies; `points` (P, 3) is the body about its mean [m]."""
         self.places, self.maps = [], []
         for launch in launches:
             x = launch.centre + points @ launch.rotation.T
@@ -38,21 +38,31 @@ class Markers:
             self.maps.append((index.numpy(), weight.numpy()))
 
     def follow(self, x: np.ndarray, recording: int) -> np.ndarray:
-        """Return the markers' positions (T, N, 3) for particles at x (T, P, 3)."""
+        """Compute the positions of the markers (T, N, 3) from those of the particles x (T, P, 3) of a recording."""
         if not self.glued:
             return x[:, self.track]
         index, weight = self.maps[recording]
         return np.einsum("nk,tnkc->tnc", weight, x[:, index])
 
     def named(self, recording: int) -> dict[str, torch.Tensor]:
-        """Return `track` or `anchor` of a recording."""
+        """Return the field `track` or `anchor` of a `Recording`, which says how its points follow the body."""
         if self.glued:
             return {"anchor": torch.from_numpy(self.places[recording]).float()}
         return {"track": torch.from_numpy(self.track.astype(np.int64))}
 
 
 def wrong_nuisances(rng: np.random.Generator, plain: np.ndarray, interval: float, length: float) -> list[dict[str, float]]:
-    """Draw the nuisances of two recordings whose motion without nuisances is (2, T, N, 3) [m]."""
+    """Draw measurement errors of two recordings.
+
+    Args:
+        rng: Random generator.
+        plain: Positions without errors [m], (2, T, N, 3).
+        interval: Time between frames [s].
+        length: Size of the body [m].
+
+    Returns:
+        For each recording, the errors by nuisance parameter (`WRONG_NUISANCES`); many are zero.
+    """
     out = []
     for i in range(2):
         speed = max_speed(plain[i], interval)
@@ -67,7 +77,7 @@ def wrong_nuisances(rng: np.random.Generator, plain: np.ndarray, interval: float
 
 
 def measured_positions(motion: Motion, markers: Markers, i: int, at: np.ndarray, off: Mapping[str, float]) -> np.ndarray:
-    """Return the positions that the instruments measure; clock and ruler may be off."""
+    """Return the measured positions (T, N, 3) of recording `i` at the times `at` [s], with the errors `off` of clock and ruler."""
     place, _ = motion.at(at * (1 + off.get("time_base", 0.0)) + off.get("release_time", 0.0), i)
     x = markers.follow(place, i)
     centre = x[0].mean(axis=0)
@@ -75,10 +85,10 @@ def measured_positions(motion: Motion, markers: Markers, i: int, at: np.ndarray,
 
 
 def nuisance_vector(own: Mapping[str, float], name: str) -> np.ndarray:
-    """Return the velocity or the spin of some nuisances."""
+    """Collect the components of `velocity` [m/s] or `spin` [rad/s] from nuisance parameters, (3,)."""
     return np.array([own[f"{name}_{a}"] for a in "xyz"])
 
 
 def max_speed(x: np.ndarray, interval: float) -> float:
-    """Return the largest speed of the mean point [m/s], (T, N, 3)."""
+    """Return the largest speed [m/s] of the mean of points x (T, N, 3) [m] between frames."""
     return float(np.linalg.norm(np.diff(x.mean(axis=1), axis=0), axis=1).max() / interval)

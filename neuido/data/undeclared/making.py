@@ -1,4 +1,4 @@
-"""The entry to the making of undeclared cases. No torch at import, so that `--help` stays light."""
+"""Entry point of `neuido undeclared`. This module does not load torch, so that `--help` stays fast."""
 
 from pathlib import Path
 
@@ -13,22 +13,23 @@ def make_undeclared(
     device: str = "auto",
     progress: bool = True,
 ) -> Path:
-    """Make one folder to diagnose, and its key at `<out>/../keys/<name>.yaml`; the folder's README has the key's SHA-256.
+    """Generate a folder of measured data whose declared model may lack an effect, and a key that names the effect.
 
-    On the CPU the same seed and options give the same folder, byte for byte. Nothing that diagnoses reads the key.
+    The key is `<out>/../keys/<name>.yaml`; the README of the folder has its SHA-256. `neuido diagnose` does not read the key. On the CPU,
+    the same seed and options give identical files.
 
     Args:
-        seed: Of everything that is drawn.
-        out: The folder to make; its name is the name of the case.
-        case: What is not to be drawn.
+        seed: Seed of all random choices.
+        out: The folder to create; its name is the name of the case.
+        case: Fixed properties of the case; the others are drawn at random.
         device: auto, cpu or cuda.
         progress: Show a progress bar.
 
     Returns:
-        The key.
+        The path of the key.
 
     Raises:
-        UserError: An unknown kind or option, a kind that does not fit the others, or a folder that holds something else.
+        UserError: An option is unknown or does not suit the others, or `out` exists and is another case.
     """
     from neuido.data.undeclared.sealed_folder import make_sealed_case
 

@@ -1,4 +1,4 @@
-"""The true motion of a case: any of the solvers, the library's effects, and those outside it by operator splitting."""
+"""Simulate the true motion of a case with any solver and effect; effects outside the library act by operator splitting."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -16,18 +16,18 @@ from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, ParticleState, Scene
 
 SPLIT = 2e-3
-"""Longest time between two kicks of a force that no rollout knows [s]."""
+"""Longest time between two velocity updates by an effect outside the library [s]."""
 CORE = 0.08
-"""Within it a magnet's pull grows no more [m]."""
+"""Distance below which the force of a magnet stays constant [m]."""
 SLOW = 0.05
 """Speed below which dry drag falls to zero [m/s]."""
 
 Field = Callable[[Tensor, Tensor], Tensor]
-"""Positions and velocities (P, 3) -> acceleration (P, 3)."""
+"""Acceleration [m/s^2] (P, 3) as a function of positions [m] and velocities [m/s] (P, 3)."""
 
 
 class Solver(NamedTuple):
-    """Which code moves a body, on which grid."""
+    """Solver of the motion of a body, with grid and substep."""
 
     name: str = "same"
     """same, finer or elements."""
@@ -35,27 +35,27 @@ class Solver(NamedTuple):
     dt: float = 5e-4
     tetrahedra: int = 5
     density: float = 1.0
-    """Elements a particle."""
+    """Elements per particle."""
 
-    def words(self) -> str:
-        """Return the solver in words, for the key."""
+    def describe(self) -> str:
+        """Describe the solver in words, for the key."""
         if self.name == "elements":
-            return f"explicit finite elements, {self.tetrahedra} linear tetrahedra a cell, {self.density:.2f} elements a particle"
-        return f"a material point method, {self.cells} cells a side, {self.dt:g} s a substep"
+            return f"explicit finite elements, {self.tetrahedra} linear tetrahedra per cell, {self.density:.2f} elements per particle"
+        return f"a material point method, {self.cells} cells per side, substep {self.dt:g} s"
 
 
 class Motion(NamedTuple):
-    """Frames of several recordings of one body."""
+    """Frames of S recordings of one body."""
 
     x: np.ndarray
-    """[m], (S, K, P, 3)."""
+    """Positions [m], (S, K, P, 3)."""
     v: np.ndarray
-    """[m/s], (S, K, P, 3)."""
+    """Velocities [m/s], (S, K, P, 3)."""
     interval: float
-    """From frame to frame [s]."""
+    """Time between frames [s]."""
 
     def at(self, times: np.ndarray, recording: int) -> tuple[np.ndarray, np.ndarray]:
-        """Interpolate positions and velocities (T, P, 3) of a recording by cubic Hermite splines; uniform motion before 0."""
+        """Interpolate positions and velocities (T, P, 3) at times [s] (T,) by cubic Hermite splines; before 0 the motion is uniform."""
         x, v, h = self.x[recording], self.v[recording], self.interval
         k = np.clip(np.floor(times / h + 1e-9).astype(int), 0, len(x) - 2)
         u = (times / h - k)[:, None, None]
@@ -76,20 +76,20 @@ def simulate_motion(
     interval: float,
     device: str = "cpu",
 ) -> Motion:
-    """Move bodies of one material for some time.
+    """Simulate the motion of bodies of one material, with effects of the library and outside it.
 
     Args:
-        solver: Grid and step, or finite elements.
-        scene: The declared one.
-        bodies: The body at the start of each recording.
-        law: density, elasticity, plasticity: the truth.
-        values: Effects by flat names, of the library or outside it.
-        seconds: How long.
-        interval: Between frames [s], a multiple of the step.
-        device: Where.
+        solver: Grid and substep, or finite elements.
+        scene: The declared scene.
+        bodies: The body at t = 0 of each recording.
+        law: The true density, elasticity and plasticity.
+        values: Parameters of the effects by flat names.
+        seconds: Duration [s].
+        interval: Time between frames [s], a multiple of the substep.
+        device: auto, cpu or cuda.
 
     Raises:
-        UserError: A step above the stability limit, a particle lost.
+        UserError: The substep is above the stability limit, or a particle leaves the domain.
     """
     scene = replace(scene, cells=solver.cells, dt=solver.dt)
     simulator = _simulator(solver, scene, bodies, law["density"], device)
@@ -108,7 +108,7 @@ def simulate_motion(
         else:
             out = simulator.rollout(frames * every, elasticity, plasticity, every=every, effects=effects, mass=mass)
     place, velocity = (t.double().cpu().numpy().reshape(frames + 1, len(bodies), -1, 3).swapaxes(0, 1) for t in (out.x, out.v))
-    if lift is not None:  # back from the frame of the floor
+    if lift is not None:  # transform back from the frame of the floor
         t = np.arange(frames + 1) * interval
         w = 2 * math.pi * lift["frequency"]
         up = np.array([0.0, 1.0, 0.0])
@@ -129,7 +129,7 @@ def _simulator(solver: Solver, scene: Scene, bodies: Sequence[Body], density: fl
 
 
 def _split_by_library(values: Mapping[str, float]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Return the effects of the library by flat names, and those outside it by name and parameter."""
+    """Separate effects of the library, by flat names, from those outside it, by name and parameter."""
     known: dict[str, float] = {}
     own: dict[str, dict[str, float]] = {}
     for name, value in values.items():
@@ -142,7 +142,7 @@ def _split_by_library(values: Mapping[str, float]) -> tuple[dict[str, float], di
 
 
 def _graded_masses(simulator: Simulator | FiniteElements, slope: Mapping[str, float]) -> Tensor:
-    """Return masses with a gradient over each body, the same in all."""
+    """Compute particle masses with a density gradient over each body; the total mass does not change."""
     x, mass = simulator.state.x.double(), simulator.mass.double()
     s = torch.tensor([slope[a] for a in "xyz"], dtype=torch.float64, device=x.device)
     factor = torch.cat([linear_gradient(x[i:j], s) for i, j in zip(simulator.particles.offsets[:-1], simulator.particles.offsets[1:])])
@@ -151,7 +151,10 @@ def _graded_masses(simulator: Simulator | FiniteElements, slope: Mapping[str, fl
 
 
 def _moving_floor_force(lift: Mapping[str, float], steps: int, dt: float) -> dict[str, Any]:
-    """Return the inertia in the frame of a floor at amplitude (1 - cos w t), which starts at rest: velocities agree in both frames."""
+    """Return the inertial force in the frame of a floor at height amplitude (1 - cos w t), as a `time_force`.
+
+    The floor starts at rest, so initial velocities are equal in both frames.
+    """
     w = 2 * math.pi * lift["frequency"]
     t = torch.arange(steps + 1, dtype=torch.float64) * dt
     force = torch.zeros(steps + 1, 3, dtype=torch.float64)
@@ -162,7 +165,10 @@ def _moving_floor_force(lift: Mapping[str, float], steps: int, dt: float) -> dic
 def _rollout_with_kicks(
     simulator: Simulator, elasticity, plasticity, effects: Effects, own: dict[str, dict[str, float]], frames: int, every: int
 ) -> ParticleState:
-    """Alternate rollouts and kicks (Strang's splitting); effects of the library beside them must have no memory."""
+    """Alternate rollouts and velocity updates (Strang splitting).
+
+    Effects of the library with an internal state, such as `maxwell`, cannot be combined with this.
+    """
     dt = float(simulator.dt[0])
     pieces = max(1, math.ceil(every * dt / SPLIT - 1e-9))
     while every % pieces:
@@ -214,7 +220,7 @@ def _fields(own: Mapping[str, Mapping[str, float]], mean, scene: Tensor, state: 
 
 
 def _kick(state: ParticleState, fields: Sequence[Field], h: float) -> ParticleState:
-    """Return velocities, and their gradients by central differences across a millimetre."""
+    """Apply accelerations for a time h [s]; update velocity gradients by central differences over 2 mm."""
     x, v, C, F = state
     reach = 1e-3
     for field in fields:

@@ -1,4 +1,4 @@
-"""Bodies, launches and materials of cases with an undeclared effect, drawn at random."""
+"""Random bodies, launches, materials and scenes of cases with an undeclared effect."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,24 +11,24 @@ from neuido.types import Body, Plane, Scene
 SHAPES = ("box", "ball", "cylinder", "ellipsoid", "tee", "angle", "cross", "tube")
 FLOORS = (0.13, 0.14, 0.15, 0.16)
 WRONG = {"young": (0.6, 1.6), "yield_stress": (0.65, 1.5), "friction_angle": (0.8, 1.25)}
-"""Ranges of the factor between a starting value and the truth."""
+"""Range of the ratio of starting value to true value, by parameter."""
 
 
 class Launch(NamedTuple):
-    """How a body starts."""
+    """Initial pose and velocity of a body."""
 
     rotation: np.ndarray
-    """(3, 3)."""
+    """Rotation matrix, (3, 3)."""
     centre: np.ndarray
-    """Of mass [m], (3,)."""
+    """Centre of mass [m], (3,)."""
     velocity: np.ndarray
-    """[m/s], (3,)."""
+    """Velocity of the centre of mass [m/s], (3,)."""
     gradient: np.ndarray
-    """Of the velocity: spin, stretching and shearing [1/s], (3, 3)."""
+    """Velocity gradient: spin, stretching and shearing [1/s], (3, 3)."""
 
 
 class Material(NamedTuple):
-    """The true material of a body, and the parameters declared for it."""
+    """True material of a body, and its declared parameters."""
 
     density: float
     elasticity: dict[str, Any]
@@ -38,7 +38,7 @@ class Material(NamedTuple):
     """Starting values of `free`."""
 
     def model(self) -> dict[str, Any]:
-        """Return the `model` of an experiment file, with the assumed parameters."""
+        """Return the key `model` of an experiment file, with the declared parameters."""
 
         def part(given: dict[str, Any]) -> dict[str, Any]:
             return {key: self.declared.get(key, value) for key, value in given.items()}
@@ -47,12 +47,16 @@ class Material(NamedTuple):
 
 
 def draw_body(rng: np.random.Generator, count: int) -> tuple[str, np.ndarray, float]:
-    """Draw a shape: its name, lattice points in it about their mean (P, 3) [m], and the volume of each [m^3]."""
+    """Draw a random shape with about `count` particles.
+
+    Returns:
+        Name of the shape, particles about their mean (P, 3) [m], and volume of a particle [m^3].
+    """
     name = str(rng.choice(SHAPES))
     half = rng.uniform([0.1, 0.08, 0.08], [0.16, 0.13, 0.13])
     if name in ("ball", "cross"):
         half = np.full(3, rng.uniform(0.115, 0.15))
-    thick = rng.uniform(0.38, 0.55)  # of the limbs, in half widths
+    thick = rng.uniform(0.38, 0.55)  # thickness of the limbs in half widths
 
     def inside(p: np.ndarray) -> np.ndarray:
         x, y, z = (p / half).T
@@ -81,16 +85,16 @@ def draw_body(rng: np.random.Generator, count: int) -> tuple[str, np.ndarray, fl
 def draw_launches(
     rng: np.random.Generator, points: np.ndarray, floor: float, seconds: float, *, turned: bool, sliding: bool, hard: bool
 ) -> list[Launch]:
-    """Draw two launches of a body [m] (P, 3) over a floor, in opposite directions and with different spins.
+    """Draw two launches of a body above a floor, in opposite directions and with different spins.
 
     Args:
-        rng: Source.
+        rng: Random generator.
         points: The body about its mean [m], (P, 3).
         floor: Height of the floor [m].
-        seconds: Length of the recordings.
-        turned: Whether the second launch may start in another orientation: not where the material has directions.
-        sliding: Whether both need a large horizontal speed.
-        hard: Whether both need large strains.
+        seconds: Duration of the recordings [s].
+        turned: Whether the second launch may have another orientation, which an anisotropic material excludes.
+        sliding: Whether both launches have a large horizontal speed.
+        hard: Whether both launches cause large strains.
     """
     side = rng.choice([-1.0, 1.0])
     first = rotation(rng, rng.uniform(0.0, 0.5) if rng.random() < 0.5 else 0.0)
@@ -121,7 +125,7 @@ def draw_launches(
 
 
 def rotation(rng: np.random.Generator, angle: float) -> np.ndarray:
-    """Draw a rotation by `angle` [rad] about a random axis, (3, 3)."""
+    """Draw a rotation matrix (3, 3) by `angle` [rad] about a random axis."""
     a = rng.normal(size=3)
     x, y, z = a / np.linalg.norm(a)
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -131,7 +135,15 @@ def rotation(rng: np.random.Generator, angle: float) -> np.ndarray:
 def launched_body(
     points: np.ndarray, volume: float, launch: Launch, *, velocity: np.ndarray | None = None, spin: np.ndarray | None = None
 ) -> Body:
-    """Return the body at t = 0; `velocity` [m/s] and `spin` [rad/s] are added to the launch's."""
+    """Create the body at t = 0 of a launch; `velocity` [m/s] and `spin` [rad/s] are added to those of the launch.
+
+    Args:
+        points: The body about its mean [m], (P, 3).
+        volume: Volume of a particle [m^3].
+        launch: The launch.
+        velocity: Additional velocity [m/s], (3,).
+        spin: Additional angular velocity [rad/s], (3,).
+    """
     arm = points @ launch.rotation.T
     v = launch.velocity + (0.0 if velocity is None else velocity) + arm @ launch.gradient.T
     if spin is not None:
@@ -141,9 +153,12 @@ def launched_body(
 
 
 def draw_material(rng: np.random.Generator, plastic: str, *, soft: bool = False) -> Material:
-    """Draw a material of a kind of plasticity (identity, von_mises, drucker_prager), its free parameters with wrong starting values.
+    """Draw a material with this plasticity, and wrong starting values of its free parameters.
 
-    Of a `soft` one the modulus is below 1e5 Pa.
+    Args:
+        rng: Random generator.
+        plastic: identity, von_mises or drucker_prager.
+        soft: Whether Young's modulus is below 9e4 Pa.
     """
     wrong: dict[str, float] = {}
     if plastic == "drucker_prager":
@@ -174,7 +189,7 @@ def draw_material(rng: np.random.Generator, plastic: str, *, soft: bool = False)
 
 
 def draw_scene(rng: np.random.Generator, material: Material, *, slippery: bool = False) -> Scene:
-    """Draw the declared scene with the suggested grid and step; a `slippery` floor has no friction."""
+    """Draw the declared scene with the suggested grid and substep; a `slippery` floor has no friction."""
     floor = float(rng.choice(FLOORS))
     sand = material.plasticity["law"] == "drucker_prager"
     mu = 0.4 if sand else 0.0 if slippery else float(rng.choice([0.0, 0.0, 0.2, 0.3]))

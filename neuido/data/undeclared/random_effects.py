@@ -1,4 +1,4 @@
-"""The effects that a case may leave undeclared: the whole library, and some that are outside it. Which figures, and how large."""
+"""Random undeclared effects of a case: all effects of the library, and some outside it, with random parameters."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -14,16 +14,16 @@ KNOTS = 5
 
 
 class Scales(NamedTuple):
-    """Typical sizes of a case, from which an effect's size starts."""
+    """Typical scales of a case, which set the initial size of an effect."""
 
     young: float
     density: float
     length: float
     """Largest extent of the body [m]."""
     half: np.ndarray
-    """Half its extents [m], (3,)."""
+    """Half the extents of the body [m], (3,)."""
     centre: np.ndarray
-    """Of the first recording's body at the start [m], (3,)."""
+    """Centre of the body at t = 0 of the first recording [m], (3,)."""
     duration: float
     speed: float
     dt: float
@@ -32,52 +32,55 @@ class Scales(NamedTuple):
 
     @property
     def wave(self) -> float:
-        """Time of a shear wave through the body [s]."""
+        """Travel time of a shear wave through the body [s]."""
         return self.length * math.sqrt(2.6 * self.density / self.young)
 
 
 class Drawn(NamedTuple):
-    """An effect with all its figures."""
+    """An effect with random values of its parameters."""
 
     kind: str
     values: dict[str, float]
-    """Flat names."""
+    """Values of the parameters by flat names."""
     sizes: tuple[str, ...]
-    """Those that are zero where the effect is absent; they are scaled together."""
-    least: float
-    most: float
-    """Factors on the sizes as drawn."""
+    """Names of the parameters that are zero without the effect; they are scaled together."""
+    smallest: float
+    largest: float
+    """Range of the scale factor of the sizes."""
 
-    def times(self, factor: float) -> "Drawn":
-        """Return the effect with its sizes multiplied by `factor`."""
+    def scaled(self, factor: float) -> "Drawn":
+        """Multiply the sizes of the effect by `factor`."""
         values = {name: value * factor if name in self.sizes else value for name, value in self.values.items()}
-        return self._replace(values=values, least=self.least / factor, most=self.most / factor)
+        return self._replace(values=values, smallest=self.smallest / factor, largest=self.largest / factor)
 
     def rounded(self, digits: int = 4) -> "Drawn":
-        """Return the effect with rounded parameters."""
+        """Round the parameters to significant digits."""
         return self._replace(values={name: float(f"{value:.{digits}g}") for name, value in self.values.items()})
 
 
 class Kind(NamedTuple):
-    """One sort of effect."""
+    """Definition of one kind of effect."""
 
     draw: Callable[[np.random.Generator, Scales], tuple[dict[str, float], str, float, float]]
-    """Figures without the effect's name, which of them are sizes (space between), and the factors' range."""
+    """Draws values by parameter, names of the sizes separated by spaces, and the smallest and largest scale factor."""
     models: tuple[str, ...]
-    """Declared plasticities that it can be added to."""
+    """Declared plasticities that the effect can be combined with."""
     stage: str
-    """flight, contact or material."""
+    """Part of the motion in which the effect acts: flight, contact or material."""
     names: tuple[str, ...]
-    """What a diagnosis may call it: the same motion to the last digit."""
+    """Names that a diagnosis may give, because they produce the same motion."""
     meaning: str
+    """The effect in words or as an equation."""
     directed: bool = False
-    """Whether it has a direction in the material."""
+    """Whether the effect has a direction in the material."""
     outside: bool = False
+    """Whether the effect is outside the library."""
     near: tuple[str, ...] = ()
-    """Of an effect outside the library: which effects of it come near."""
+    """For an effect outside the library: the effects of the library that resemble it."""
     grid: bool = False
-    """Whether it acts through the grid, or between steps, so that finite elements do not have it alike."""
+    """Whether the effect acts on the grid or between substeps, so that finite elements do not support it equally."""
     units: Mapping[str, str] = {}
+    """Unit of each parameter, for an effect outside the library."""
 
 
 def _direction(rng: np.random.Generator, *, level: bool = False) -> np.ndarray:
@@ -93,16 +96,16 @@ def _xyz(v: np.ndarray, names: str = "xyz") -> dict[str, float]:
     return dict(zip(names.split() if " " in names else names, map(float, v), strict=True))
 
 
-def _vector(size: Callable[[Scales], float], most: float, *, level: bool = False):
-    return lambda rng, s: (_xyz(size(s) * _direction(rng, level=level)), "x y z", 0.05, most)
+def _vector(size: Callable[[Scales], float], largest: float, *, level: bool = False):
+    return lambda rng, s: (_xyz(size(s) * _direction(rng, level=level)), "x y z", 0.05, largest)
 
 
-def _scalar(name: str, size: Callable[[Scales], float], most: float, *, least: float = 0.02, negative: float = 0.0, low: float = 1.0):
-    """Return a drawer of one number; `low` is the share of `most` that a negative size may reach."""
+def _scalar(name: str, size: Callable[[Scales], float], largest: float, *, smallest: float = 0.02, negative: float = 0.0, low: float = 1.0):
+    """Return a function that draws one parameter; a negative size may reach the fraction `low` of `largest`."""
 
     def draw(rng: np.random.Generator, s: Scales):
         sign = _sign(rng, negative) if negative else 1.0
-        return {name: sign * size(s)}, name, least, most * (low if sign < 0 else 1.0)
+        return {name: sign * size(s)}, name, smallest, largest * (low if sign < 0 else 1.0)
 
     return draw
 
@@ -121,7 +124,7 @@ def _pulse(rng: np.random.Generator, s: Scales):
 
 def _viscous(name: str, share: float, relative: float):
     def draw(rng: np.random.Generator, s: Scales):
-        largest = relative * s.density * s.dx**2 / s.dt  # of an explicit step, on finer cells too
+        largest = relative * s.density * s.dx**2 / s.dt  # stability limit of an explicit substep, on finer cells too
         size = min(share * s.young * s.wave, 0.5 * largest)
         return {name: size}, name, 0.01, largest / size
 
@@ -175,13 +178,14 @@ KINDS: dict[str, Kind] = {
     "viscosity_shear": Kind(_viscous("eta", 0.03, 0.2), ANY, "material", ("viscosity_shear",), "Cauchy stress 2 eta D"),
     "viscosity_bulk": Kind(_viscous("zeta", 0.2, 0.4), ANY, "material", ("viscosity_bulk",), "Cauchy stress zeta tr(D) I"),
     "maxwell": Kind(_maxwell, SOLID, "material", ("maxwell",), "a parallel branch that relaxes"),
-    "hysteresis": Kind(_scalar("eta", lambda s: 0.2, 3.0, least=0.1), SOLID, "material", ("hysteresis",), "loss at any rate"),
+    "hysteresis": Kind(_scalar("eta", lambda s: 0.2, 3.0, smallest=0.1), SOLID, "material", ("hysteresis",), "loss at any rate"),
     "strain_stiffening": Kind(_scalar("k", lambda s: 2.0, 10.0), (ELASTIC,), "material", ("strain_stiffening",), "stiffer at large strain"),
     "second_invariant": Kind(_scalar("c", lambda s: 0.5, 6.0), (ELASTIC,), "material", ("second_invariant",), "Mooney's second term"),
     "tension_compression": Kind(_scalar("r", lambda s: 0.5, 8.0, negative=0.3, low=0.15), (ELASTIC,), "material", ("tension_compression",),
                                 "another stiffness in compression"),
     "fibre": Kind(_fibre, (ELASTIC,), "material", ("fibre",), "one direction is stiffer", directed=True),
-    "yield": Kind(_scalar("inverse", lambda s: 1 / (0.1 * s.young), 12.0, least=0.2), (ELASTIC,), "material", ("yield",), "von Mises flow"),
+    "yield": Kind(_scalar("inverse", lambda s: 1 / (0.1 * s.young), 12.0, smallest=0.2), (ELASTIC,), "material", ("yield",),
+                  "von Mises flow"),
     "hardening": Kind(_scalar("h", lambda s: 0.3 * s.young, 8.0), (PLASTIC,), "material", ("hardening",), "yield stress + h alpha"),
     "kinematic_hardening": Kind(_scalar("h", lambda s: 0.3 * s.young, 8.0), (PLASTIC,), "material", ("kinematic_hardening",), "backstress"),
     "softening": Kind(_scalar("s", lambda s: 1.0, 12.0), SOLID, "material", ("softening",), "softer after large strain"),
@@ -192,13 +196,13 @@ KINDS: dict[str, Kind] = {
     "stiffness_gradient:inclusion": Kind(_inclusion, (ELASTIC,), "material", ("stiffness_gradient",), "a stiffer ball", directed=True),
     "stiffness_change": Kind(_scalar("rate", lambda s: 0.6 / s.duration, 4.0, negative=0.5, low=0.8), (ELASTIC,), "material",
                              ("stiffness_change",), "elastic stress times exp(rate t)"),
-    "friction": Kind(_scalar("mu", lambda s: 0.2, 4.0, least=0.1), ANY, "contact", ("friction",), "added to the declared coefficient"),
+    "friction": Kind(_scalar("mu", lambda s: 0.2, 4.0, smallest=0.1), ANY, "contact", ("friction",), "added to the declared coefficient"),
     "stick": Kind(_scalar("rate", lambda s: 0.1 / s.dt, 50.0), SOLID, "contact", ("stick",), "velocity at the floor decays", grid=True),
     "restitution": Kind(_scalar("rate", lambda s: 0.5 / s.dt, 30.0), SOLID, "contact", ("restitution",), "its normal part alone",
                         grid=True),
     "cohesion": Kind(_scalar("c", lambda s: 0.3 * s.density * 9.8 * s.length, 10.0), (GRAINS,), "material", ("cohesion",), "Coulomb's c"),
 }  # fmt: skip
-"""The library, by name and form."""
+"""Effects of the library, by name."""
 
 OUTSIDE: dict[str, Kind] = {
     "dry_drag": Kind(_scalar("c", lambda s: 1.5, 5.0), SOLID, "flight", (), "acceleration -c v / |v|", outside=True,
@@ -220,28 +224,28 @@ OUTSIDE: dict[str, Kind] = {
                      grid=True,
                        near=("drag_linear", "viscosity_shear", "maxwell"), units={"k": "1/s"}),
 }  # fmt: skip
-"""What no parameter of the library can say."""
+"""Effects that the library cannot express, by name."""
 
 
 def draw_effect(kind: str, rng: np.random.Generator, scales: Scales) -> Drawn:
-    """Draw an effect of a kind with parameters of a usual size."""
+    """Draw an effect of a kind with typical values of its parameters."""
     entry = KINDS[kind] if kind in KINDS else OUTSIDE[kind]
-    values, sizes, least, most = entry.draw(rng, scales)
+    values, sizes, smallest, largest = entry.draw(rng, scales)
     name = kind.partition(":")[0]
     return Drawn(
-        kind, {f"{name}.{key}": value for key, value in values.items()}, tuple(f"{name}.{key}" for key in sizes.split()), least, most
+        kind, {f"{name}.{key}": value for key, value in values.items()}, tuple(f"{name}.{key}" for key in sizes.split()), smallest, largest
     )
 
 
 def truth_entry(drawn: Drawn, *, free: tuple[str, ...] = ()) -> dict:
-    """Return the key's entry for an effect, in the form of an experiment's `undeclared` list."""
+    """Describe an effect for the list `undeclared` of the key of a case."""
     kind = KINDS[drawn.kind] if drawn.kind in KINDS else OUTSIDE[drawn.kind]
     name = drawn.kind.partition(":")[0]
     values = {key.partition(".")[2]: value for key, value in drawn.values.items()}
     known = {p.name: p.unit for entry in LIBRARY if entry.name == name for p in entry.parameters}
     units = {key: kind.units.get(key) or known.get(key) or known.get(f"{key[0]}0", "1") for key in values}
     names = kind.names
-    if name == "added_mass" and "young" in free:  # the modulus takes up the inertia: what stays is a smaller weight
+    if name == "added_mass" and "young" in free:  # a free modulus absorbs the inertia; a smaller weight remains
         names = (*names, *GRAVITY_ALIKE)
     return {
         "kind": drawn.kind,

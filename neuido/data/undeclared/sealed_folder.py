@@ -1,4 +1,4 @@
-"""From a seed to a folder that `neuido diagnose` reads and a sealed key, both written all at once."""
+"""Write a case with an undeclared effect: a folder for `neuido diagnose` and a sealed key."""
 
 import hashlib
 import re
@@ -22,14 +22,14 @@ from neuido.errors import UserError
 from neuido.physics.runtime.device import choose_device
 
 TRIES = 12
-"""Draws before a seed is given up."""
+"""Largest number of random draws for a seed."""
 
 
 def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, progress: bool) -> Path:
-    """Do the work of `undeclared.make_undeclared`."""
+    """Generate a case as `make_undeclared`, which documents arguments, result and errors."""
     folder = Path(out).expanduser().absolute()
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", folder.name):
-        raise UserError(f"out = {out}: the folder's name is the case's; give letters, digits, - and _")
+        raise UserError(f"out = {out}: the name of the folder must consist of letters, digits, -, _ and dots")
     _check(case)
     key = folder.parent / "keys" / f"{folder.name}.yaml"
     plan = {"seed": int(seed), "options": asdict(case)}
@@ -49,7 +49,7 @@ def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, pro
                 reason = str(again)
                 work.say(f"drawn again: {reason}")
         else:
-            raise UserError(f"no case of seed {seed} with these options in {TRIES} draws (the last: {reason}); give another seed or kind")
+            raise UserError(f"seed {seed} gives no usable case in {TRIES} draws (last reason: {reason}): give another seed or kind")
     text = yaml.safe_dump(
         {**truth, "sealed": {**plan, "attempt": attempt, "salt": rng.bytes(16).hex()}}, sort_keys=False, default_flow_style=None, width=140
     )
@@ -66,24 +66,24 @@ def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, pro
 
 def _check(case: Case) -> None:
     if case.measured not in ("body", "material_test", "track"):
-        raise UserError(f"case.measured = {case.measured!r}; one of body, material_test, track")
+        raise UserError(f"case.measured = {case.measured!r} is unknown: choose from body, material_test, track")
     if case.solver is not None and case.solver not in SOLVERS:
-        raise UserError(f"case.solver = {case.solver!r}; one of {', '.join(SOLVERS)}")
+        raise UserError(f"case.solver = {case.solver!r} is unknown: choose from {', '.join(SOLVERS)}")
     if case.kind is not None and case.kind != "none":
         for kind in case.kind.split("+"):
             if kind not in KINDS and kind not in OUTSIDE:
-                raise UserError(f"case.kind = {kind!r}; one of none, {', '.join((*KINDS, *OUTSIDE))}, or two of them joined by +")
+                raise UserError(f"case.kind = {kind!r} is unknown: choose from none, {', '.join((*KINDS, *OUTSIDE))}, or join two by +")
         kinds = case.kind.split("+")
         if len(kinds) > 2 or len(set(kinds)) < len(kinds) or (len(kinds) == 2 and any(k in OUTSIDE for k in kinds)):
-            raise UserError(f"case.kind = {case.kind!r}; at most two different ones, and two only of the library")
+            raise UserError(f"case.kind = {case.kind!r}: give one effect, or two different effects of the library")
     if case.nuisances and case.kind not in (None, "none"):
-        raise UserError("case.nuisances goes with case.kind none: an effect beside them could not be scored")
+        raise UserError("case.nuisances requires case.kind = none: an effect beside them could not be scored")
     if case.separation is not None and not MIN_SEPARATION <= case.separation <= MAX_SEPARATION:
         raise UserError(
             f"case.separation = {case.separation}; it must lie in {MIN_SEPARATION:g} to {MAX_SEPARATION:g} standard deviations of the noise"
         )
     if case.particles < 0 or (0 < case.particles < 100) or case.seconds < 0 or (0 < case.seconds < 0.05):
-        raise UserError(f"case.particles = {case.particles}, case.seconds = {case.seconds}: give at least 100 and 0.05, or 0 to draw them")
+        raise UserError(f"case.particles = {case.particles} must be 0 or at least 100, case.seconds = {case.seconds} 0 or at least 0.05 s")
 
 
 def _plan_of(key: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""How large an effect is made: until the recorded points part by so many times the noise."""
+"""Scale an effect until it moves the recorded points by a given multiple of the noise."""
 
 import math
 from collections.abc import Callable
@@ -8,19 +8,29 @@ import numpy as np
 from neuido.data.undeclared.random_effects import Drawn
 
 MIN_SEPARATION, MAX_SEPARATION = 15.0, 150.0
-"""Separation over noise that a case may have."""
+"""Range of the ratio of separation to noise of a case."""
 OVER_FLOOR = 2.0
-"""Separation over what the solvers differ by, at the least; an effect below it could not be named by anybody."""
+"""Smallest ratio of separation to the difference between solvers; a smaller effect cannot be identified."""
 
 
 class Redraw(Exception):
-    """What was drawn does not make a case."""
+    """The drawn values make no usable case; draw again."""
 
 
-def scale_to_separation(drawn: Drawn, target: float, separation: Callable[[Drawn], float], least: float) -> Drawn:
-    """Scale an effect until it moves the points by `target` [m], as near as its range allows, and by at least `least`."""
+def scale_to_separation(drawn: Drawn, target: float, separation: Callable[[Drawn], float], smallest: float) -> Drawn:
+    """Scale an effect until it moves the points by about `target`.
+
+    Args:
+        drawn: The effect.
+        target: Wanted separation, in the unit of the measured values.
+        separation: Simulates an effect; returns its separation.
+        smallest: Smallest acceptable separation.
+
+    Raises:
+        Redraw: The range of the effect allows no separation between `smallest` and twice `target`.
+    """
     s = separation(drawn)
-    low, high = drawn.least, drawn.most
+    low, high = drawn.smallest, drawn.largest
     factor, slope, previous = 1.0, 1.0, None
     for _ in range(5):
         if 0.85 < s / target < 1.18:
@@ -32,17 +42,17 @@ def scale_to_separation(drawn: Drawn, target: float, separation: Callable[[Drawn
         factor = float(np.clip(factor * np.clip(step, 1 / 6, 6.0), low, high))
         if factor == previous[0]:
             break
-        s = separation(drawn.times(factor))
-    if not least < s < 2.0 * target:
-        raise Redraw(f"{drawn.kind} moves the points by {s:.2g} m and not by {target:.2g} m")
-    return drawn.times(factor)
+        s = separation(drawn.scaled(factor))
+    if not smallest < s < 2.0 * target:
+        raise Redraw(f"{drawn.kind} has a separation of {s:.2g}, not {target:.2g}")
+    return drawn.scaled(factor)
 
 
 def rms(d: np.ndarray) -> float:
-    """Return the root mean square."""
+    """Return the root mean square of all entries."""
     return float(np.sqrt(np.mean(d**2)))
 
 
 def rounded_to_4(value: float) -> float:
-    """Round to four digits."""
+    """Round to four significant digits."""
     return float(f"{value:.4g}")

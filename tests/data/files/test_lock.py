@@ -45,7 +45,7 @@ def test_child_that_outlives_its_owner_holds_on(tmp_path):
         .replace(
             'print("held", flush=True)',
             'import os, subprocess\n    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=sys.stdin)\n'
-            "    lock.hand_to(child.pid)\n    print(child.pid, flush=True)\n    os._exit(0)",
+            "    lock.share_with_child(child.pid)\n    print(child.pid, flush=True)\n    os._exit(0)",
         )
     )
     with subprocess.Popen(

@@ -27,12 +27,12 @@ def refused(call, path, match):
         (b"a: " + b"9" * 5000, "not valid YAML: Exceeds the limit"),
         (b"a: !!timestamp x", "not valid YAML"),
         (b"? [a]\n: 1", "not valid YAML: while constructing a mapping"),
-        (b"a: &a [*a]", "not valid YAML: an alias refers to what holds it, line 1"),
+        (b"a: &a [*a]", "not valid YAML: line 1: an alias refers to a node that contains it"),
         (b"a: *b", "not valid YAML: found undefined alias"),
         (b"a: \xff", "not valid YAML: 'utf-8' codec"),
         (b"a: \x01", "not valid YAML: unacceptable character"),
         (b"a: !!python/object/apply:os.getcwd []", "not valid YAML: could not determine a constructor"),
-        (b"", "holds no mapping"),
+        (b"", "must contain a mapping"),
     ],
 )
 def test_yaml_that_cannot_be_read(tmp_path, content, match):
@@ -75,7 +75,7 @@ def test_byte_order_mark_is_no_content(tmp_path):
 def test_csv_that_cannot_be_read(tmp_path, content):
     path = tmp_path / "a.csv"
     path.write_bytes(content)
-    refused(read_table, path, "is no CSV file: .")
+    refused(read_table, path, "is not a valid CSV file: .")
 
 
 def npy(header: str, data: bytes = b"", version: bytes = b"\x01\x00") -> bytes:
@@ -95,7 +95,7 @@ def archive(path, member: bytes, name: str = "x.npy"):
             npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 1000000), }"),
             "has 1000000000000 elements, .*NEUIDO_MAX_ARRAY_ELEMENTS",
         ),
-        (npy("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }"), "no plain numbers"),
+        (npy("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }"), "not numbers"),
         (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (4,), }", b"abc"), "is not a valid archive of x: "),
         (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (4,)"), "is not a valid archive of x: "),
         (npy("x" * 30000), "is not a valid archive of x: "),

@@ -78,7 +78,7 @@ def test_what_only_the_user_knows(tmp_path):
         ({"specimen": Specimen("50 mm")}, "--width"),
         ({"specimen": Specimen("50 mm", "1 cm", "2 mm")}, "--units.force"),
         ({"specimen": Specimen("50")}, "its unit"),
-        ({"specimen": Specimen("50 mm", "1 s", "2 mm")}, "not one of m"),
+        ({"specimen": Specimen("50 mm", "1 s", "2 mm")}, "cannot be converted to m"),
     ):
         with pytest.raises(UserError, match=words):
             neuido.import_file(path, tmp_path / "out", **options)

@@ -51,7 +51,7 @@ def test_unseen_markers():
     x = np.random.default_rng(0).normal(1, 0.1, (5, 4, 3))
     gaps = x.copy()
     gaps[1, 2], gaps[3, 0] = 0, -9999
-    with pytest.warns(UserWarning, match="are taken as not seen"):
+    with pytest.warns(UserWarning, match="count as not seen"):
         seen = mask_unseen(gaps, "a")
     assert np.isnan(seen).all(axis=2).sum() == 2 and (seen[0] == x[0]).all()
     still = x.copy()
@@ -79,6 +79,6 @@ def test_cases_are_refused(data_root, name, reader, words):
 
 
 def test_case_of_markers_at_zero(data_root):
-    with pytest.warns(UserWarning, match="taken as not seen"):
+    with pytest.warns(UserWarning, match="count as not seen"):
         take, _ = neuido.read_experiment(data_root / "cases" / "27-experiment-marker-zeros").recordings
     assert 0.03 < 1 - take.seen.float().mean() < 0.07

@@ -171,7 +171,7 @@ def test_lists_of_scenes(name, request):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"name": "../x"}, "name must be letters"),
+        ({"name": "../x"}, "name must consist of letters"),
         ({"base": "bouncy-bull"}, "base = 'bouncy-bull' is no scene"),
         ({"colour": 1}, "unknown key 'colour'"),
         ({"split": "test"}, "split = 'test'"),
@@ -213,5 +213,5 @@ def test_the_declared_model_may_have_its_former_name():
     model = {**BALL["model"], "plasticity": {"law": "identity"}}
     plans = [plan_scene({**BALL, name: model}, FILM) for name in ("declared", "belief")]
     assert plans[0].declared == plans[1].declared == scenes.model_from_dict(model) != plan_scene(BALL, FILM).declared
-    with pytest.raises(UserError, match="two names of one key"):
+    with pytest.raises(UserError, match="are both given"):
         plan_scene({**BALL, "declared": model, "belief": model}, FILM)

@@ -255,7 +255,7 @@ def test_missing_and_incomplete_folders(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "cut")
     whole = (tmp_path / "cut" / "sand.npy").read_bytes()
     (tmp_path / "cut" / "sand.npy").write_bytes(whole[:-1])
-    with pytest.raises(UserError, match=r"sand.npy is missing or cut short"):
+    with pytest.raises(UserError, match=r"sand.npy is missing or truncated"):
         module(tmp_path / "cut")
 
 

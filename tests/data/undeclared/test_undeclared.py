@@ -149,7 +149,7 @@ def test_kinds_cover_the_vocabulary_and_what_is_outside_is_outside():
         assert set(drawn.sizes) <= set(drawn.values) and any(drawn.values[s] for s in drawn.sizes)
         assert (set(drawn.values) <= known) == (kind in KINDS)
         assert set(truth_entry(drawn)["units"].values()) - {None}
-        twice = drawn.times(2.0)
+        twice = drawn.scaled(2.0)
         assert all(twice.values[s] == 2 * drawn.values[s] for s in drawn.sizes)
 
 
