@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 
 import neuido
 
@@ -169,6 +170,8 @@ def test_diagnose_names_the_drag(tmp_path):
 
 @pytest.mark.slow
 def test_video_gives_a_law(tmp_path):
-    young = float(re.search(r"E = ([\d.]+) kPa", run_example("law_from_video", tmp_path))[1])
-    assert 5 < young < 500  # the truth is of this order: a soft ball
+    """The modulus of a ball of 30 kPa is read within the factor of two that the tutorial states."""
+    young = 1e3 * float(re.search(r"E = ([\d.]+) kPa", run_example("law_from_video", tmp_path))[1])
+    truth = yaml.safe_load((tmp_path / "film" / "Ball" / "truth.yaml").read_text())["law"]["elasticity"]["young"]
+    assert 0.5 < young / truth < 2
     assert (tmp_path / "law.safetensors").is_file()

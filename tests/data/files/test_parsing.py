@@ -46,11 +46,15 @@ def test_yaml_whose_aliases_expand(tmp_path, monkeypatch):
     path.write_text(
         "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 9))
     )
-    refused(read_yaml, path, "aliases expand to too many values, more than 1000000: set the environment variable NEUIDO_MAX_YAML_NODES")
+    refused(
+        read_yaml,
+        path,
+        "aliases expand to too many values, more than the limit of 1000000: raise it with the environment variable NEUIDO_MAX_YAML_NODES",
+    )
     path.write_text("a: &a [1, 2]\nb: *a\nc: 1e5\n")
     assert read_yaml(path) == {"a": [1, 2], "b": [1, 2], "c": 1e5}
     monkeypatch.setenv("NEUIDO_MAX_YAML_NODES", "5")
-    refused(read_yaml, path, "more than 5")
+    refused(read_yaml, path, "more than the limit of 5")
     monkeypatch.setenv("NEUIDO_MAX_YAML_NODES", "many")
     with pytest.raises(UserError, match="NEUIDO_MAX_YAML_NODES must be a positive whole number, got 'many'"):
         limit("NEUIDO_MAX_YAML_NODES")
@@ -142,7 +146,7 @@ def test_images(tmp_path):
         + bytes(13)
     )
     for call in (image_size, read_image):
-        refused(call, path, "has more than 134217728 pixels: set the environment variable NEUIDO_MAX_IMAGE_PIXELS")
+        refused(call, path, "has more than the limit of 134217728 pixels: raise it with the environment variable NEUIDO_MAX_IMAGE_PIXELS")
     path.write_bytes(io.BytesIO(b"no image").getvalue())
     for call in (image_size, read_image):
-        refused(call, path, "no image")
+        refused(call, path, "not an image")

@@ -77,7 +77,7 @@ def test_what_only_the_user_knows(tmp_path):
         ({}, "--length"),
         ({"specimen": Specimen("50 mm")}, "--width"),
         ({"specimen": Specimen("50 mm", "1 cm", "2 mm")}, "--units.force"),
-        ({"specimen": Specimen("50")}, "its unit"),
+        ({"specimen": Specimen("50")}, "with a unit"),
         ({"specimen": Specimen("50 mm", "1 s", "2 mm")}, "cannot be converted to m"),
     ):
         with pytest.raises(UserError, match=words):
@@ -87,7 +87,7 @@ def test_what_only_the_user_knows(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["bare.csv"]
     neuido.import_file(path, tmp_path / "out", specimen=Specimen("50 mm", "1 cm", "2 mm"), units={"force": "N"})
     np.testing.assert_allclose(neuido.read_material_tests(tmp_path / "out").tests[0].stress[:, 0], STRESS, rtol=1e-3, atol=1)
-    with pytest.raises(UserError, match=r"--out .* is there already"):
+    with pytest.raises(UserError, match=r"--out .* exists already"):
         neuido.import_file(path, tmp_path / "out")
 
 

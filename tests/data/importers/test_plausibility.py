@@ -32,12 +32,13 @@ def test_stretches_and_order():
     check_order(1 + 0.3 * np.sin(np.linspace(0, 40, 300)), "cycles")
     with pytest.raises(UserError, match="percent"):
         check_stretches(100 * (PATH - 0.95), "a")
-    with pytest.raises(UserError, match="no path"):
+    with pytest.raises(UserError, match="loading order"):
         check_order(np.random.default_rng(0).permutation(PATH[:, 0]), "a")
 
 
 @pytest.mark.parametrize(
-    ("scale", "words"), [(-200, "no metres and y points down"), (1000, "no metres;"), (-1, "are metres and y points down")]
+    ("scale", "words"),
+    [(-200, "the unit is not metres and y points down"), (1000, "the unit is not metres;"), (-1, "model.gravity: y points down")],
 )
 def test_flight(scale, words):
     t = np.linspace(12.3, 13.3, 31)
@@ -66,8 +67,8 @@ def test_unseen_markers():
     [
         ("21-track-pixels-y-down", "read_tracks", "scale: {y: -0.005}"),
         ("22-material-MPa-unscaled", "read_material_tests", r"scale 1.0e\+6"),
-        ("23-material-strain-percent", "read_material_tests", "strain in percent"),
-        ("25-material-unsorted", "read_material_tests", "no path"),
+        ("23-material-strain-percent", "read_material_tests", "strains in percent"),
+        ("25-material-unsorted", "read_material_tests", "loading order"),
         ("28-experiment-x-in-mm", "read_experiment", "millimetres"),
         ("29-experiment-all-unseen", "read_experiment", "no point of x was seen"),
         ("30-material-zero-stress", "read_material_tests", "zero in all 25 rows"),
