@@ -42,7 +42,7 @@ def test_setting_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("format: neuido-visual/1", "format: neuido-visual/2", "format is 'neuido-visual/2'"),
+        ("format: neuido-visual/1", "format: neuido-visual/2", "format = 'neuido-visual/2'"),
         ("scale: 0.5", "scale: 0.0", "placing.scale must be above 0"),
         ("up: z", "up: x", "placing.up = 'x'"),
         ("up: z\n", "up: z\n  turn: 3\n", "unknown key 'turn'"),
@@ -60,7 +60,7 @@ def test_setting_errors(tmp_path, old, new, words):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("format: neuido-motion/2\nvelocity: [0, 0, 0]\n", "format is"),
+        ("format: neuido-motion/2\nvelocity: [0, 0, 0]\n", "format = "),
         ("format: neuido-motion/1\n", "lacks the key 'velocity'"),
         ("format: neuido-motion/1\nvelocity: [0, .nan, 0]\n", "velocity must be a finite number"),
         ("format: neuido-motion/1\nvelocity: [0, 0, 0]\nspin: [0, 0, 0]\n", "unknown key 'spin'"),
@@ -83,7 +83,7 @@ def test_truth(tmp_path):
     truth = read_truth(tmp_path, frame_step=3, frames=2)
     np.testing.assert_array_equal(truth.x, x[[0, 3]])
     assert truth.times.tolist() == [0.0, 0.03] and truth.law["elasticity"]["law"] == "sigma"
-    with pytest.raises(UserError, match="7 frames, the recording 8"):
+    with pytest.raises(UserError, match="7 frames, but the recording has 8"):
         read_truth(tmp_path, frames=8)
     for wrong in ({"x": x[:, :4]}, {"times": np.arange(6) * 0.01}, {"x": x * np.nan}, {"volume": np.ones((5, 1))}):
         np.savez(tmp_path / "truth.npz", **(arrays | wrong))

@@ -172,7 +172,7 @@ def test_lists_of_scenes(name, request):
     ("change", "words"),
     [
         ({"name": "../x"}, "name must consist of letters"),
-        ({"base": "bouncy-bull"}, "base = 'bouncy-bull' is no scene"),
+        ({"base": "bouncy-bull"}, "base = 'bouncy-bull' is unknown"),
         ({"colour": 1}, "unknown key 'colour'"),
         ({"split": "test"}, "split = 'test'"),
         ({"substeps": 0}, "substeps must be"),

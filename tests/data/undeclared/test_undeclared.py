@@ -92,12 +92,12 @@ def test_command(tmp_path, capsys):
         with pytest.raises(SystemExit) as end:
             main(["undeclared", "--seed", "1", "--out", out, "--progress", "false", *options])
         assert end.value.code == status
-    assert "one of none, gravity" in capsys.readouterr().err
+    assert "choose from none, gravity" in capsys.readouterr().err
     assert read_tracks(tmp_path / "a").name == "a" and (tmp_path / "keys" / "a.yaml").is_file()
 
 
 def test_a_wanted_case_that_cannot_be_made_leaves_nothing(tmp_path):
-    with pytest.raises(UserError, match=r"in 12 draws \(the last: "):
+    with pytest.raises(UserError, match=r"in 12 draws \(last reason: "):
         made(tmp_path, kind="friction", separation=140.0, particles=100, seconds=0.05)
     assert not list(tmp_path.iterdir())
 
