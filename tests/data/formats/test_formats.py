@@ -69,7 +69,7 @@ def test_format_is_found(tmp_path, case):
 
 def test_unknown_format(tmp_path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match=r"format of .* is not known"):
+    with pytest.raises(UserError, match=r"format of .* is unknown"):
         read(tmp_path / "empty")
     with pytest.raises(UserError, match="format = 'kitti'"):
         read(tmp_path / "empty", "kitti")
