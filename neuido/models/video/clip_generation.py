@@ -93,7 +93,7 @@ def generate_clips(
     if batch < 0:
         raise UserError(f"batch must be 0 (automatic) or positive, got {batch}")
     text = json.dumps({"format": FORMAT, "plan": asdict(plan)}, indent=1) + "\n"
-    claim_folder(folder, text, "clips of another set-up", compared="plan")
+    claim_folder(folder, text, "clips of other options", compared="plan")
     names = [f"clip-{i:05d}" for i in range(plan.count)]
     own = range(shard, plan.count, shards)
     missing = [i for i in own if not is_complete(folder / f"{names[i]}.npz")]

@@ -179,5 +179,5 @@ def test_folders_that_cannot_be_written(folder, tmp_path):
         make_trajectories(str(tmp_path / "file"), **TINY)
     with pytest.raises(UserError, match="is a file"):
         make_trajectories(str(tmp_path / "file" / "below"), **TINY)
-    with pytest.raises(UserError, match=r"another set-up \(steps 30 there, 31 here\)"):
+    with pytest.raises(UserError, match=r"other options \(steps is 30 there and 31 here\)"):
         make_trajectories(str(folder), **(TINY | {"steps": 31}))

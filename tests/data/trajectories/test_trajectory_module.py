@@ -237,7 +237,7 @@ def test_resume_of_a_run_counted_in_steps(folder, tmp_path):
 def test_resume_with_other_data_options_is_refused(folder, tmp_path):
     fit(module(folder), tmp_path, stop=5)
     checkpoint = next((tmp_path / "saved").glob("*.ckpt"))
-    with pytest.raises(UserError, match=r"samples 100 then, 50 now"):
+    with pytest.raises(UserError, match=r"samples was 100 and is 50"):
         fit(module(folder, batch_size=450), tmp_path, resume=checkpoint)
 
 

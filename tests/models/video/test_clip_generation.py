@@ -77,7 +77,7 @@ def test_it_resumes_and_repeats(folder, tmp_path, monkeypatch):
         with np.load(folder / "clip-00000.npz") as old, np.load(tmp_path / "a" / "clip-00000.npz") as new:
             assert np.array_equal(old[name], new[name])
     assert len(json.loads((tmp_path / "a" / "index.json").read_text())["clips"]) == 2
-    with pytest.raises(UserError, match="count 2 there, 3 here"):
+    with pytest.raises(UserError, match="count is 2 there and 3 here"):
         film(str(tmp_path / "a"), **{**TINY, "count": 3})
     with pytest.raises(UserError, match="neuido film"):
         _ = FilmDataModule(str(tmp_path / "b")).index
