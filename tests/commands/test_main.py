@@ -58,7 +58,7 @@ def test_help_names_every_command(capsys):
 def test_light_help_comes_from_the_docstring(capsys):
     status, out, _ = run(capsys, "trajectories", "--help")
     assert status == 0
-    for word in ("neuido trajectories", "--config", "--print_config", "--held_out", "Substep, s."):
+    for word in ("neuido trajectories", "--config", "--print_config", "--held_out", "Time of a substep, s."):
         assert word in out
 
 

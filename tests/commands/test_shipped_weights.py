@@ -31,7 +31,7 @@ def test_weights_come_with_neuido_or_a_command_makes_them(path, tmp_path, monkey
         if name in PRETRAINED:
             assert PRETRAINED[name].is_file()
             continue
-        with pytest.raises(UserError, match=r"`neuido fit --config configs/[\w/]+\.yaml` makes them") as error:
+        with pytest.raises(UserError, match=r"create them with `neuido fit --config configs/[\w/]+\.yaml`") as error:
             DynamicsEncoder.load(name)
         maker = ROOT / re.search(r"configs/([\w/]+\.yaml)", str(error.value))[1]
         assert read_configuration(maker)["model"]["init_args"]["save_to"] == name
