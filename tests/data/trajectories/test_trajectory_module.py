@@ -245,7 +245,7 @@ def test_resume_with_other_data_options_is_refused(folder, tmp_path):
 
 
 def test_missing_and_incomplete_folders(folder, tmp_path):
-    for state, word in ((tmp_path / "none", "has no trajectories"), (tmp_path / "half", "is not complete")):
+    for state, word in ((tmp_path / "none", "has no trajectories"), (tmp_path / "half", "is incomplete")):
         if state.name == "half":
             state.mkdir()
             shutil.copy(folder / "plan.json", state)
