@@ -7,7 +7,7 @@ import torch
 
 from neuido.data.undeclared.motion import Motion
 from neuido.data.undeclared.random_bodies import Launch
-from neuido.physics.fem.meshing import follow
+from neuido.physics.fem.particle_weights import interpolation_weights
 
 WRONG_NUISANCES = (  # name, unit, standard deviation relative to: frame interval, 1, 1, largest speed, largest speed over size of the body
     ("release_time", "s", 0.1),
@@ -33,7 +33,7 @@ class Markers:
         for launch in launches:
             x = launch.centre + points @ launch.rotation.T
             places = launch.centre + (points[self.track] + self.shift) @ launch.rotation.T
-            index, weight = follow(torch.from_numpy(x), torch.from_numpy(places))
+            index, weight = interpolation_weights(torch.from_numpy(x), torch.from_numpy(places))
             self.places.append(places)
             self.maps.append((index.numpy(), weight.numpy()))
 

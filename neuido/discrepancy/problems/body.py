@@ -22,10 +22,10 @@ from neuido.discrepancy.problems.problem import Ask, Parameter, Point, Recording
 from neuido.discrepancy.problems.rollouts import BodyRollouts, Motions, substeps
 from neuido.discrepancy.problems.settings import EVERY, SETTINGS, SOLVERS
 from neuido.errors import UserError, is_out_of_memory
-from neuido.physics.effects import stress_kernels as effect_kernels
+from neuido.physics.effects import stress_kernels
 from neuido.physics.effects.library import KNOTS
-from neuido.physics.fem.meshing import follow
-from neuido.physics.laws import classical_kernels as law_kernels
+from neuido.physics.fem.particle_weights import interpolation_weights
+from neuido.physics.laws import classical_kernels
 from neuido.physics.runtime.device import real_of
 from neuido.physics.runtime.once import cached
 from neuido.physics.runtime.threads import one_thread_each, scene_pool
@@ -251,7 +251,7 @@ class BodyProblem(BodyRollouts):
                 places, known = r.anchor.double(), torch.full((len(r.anchor),), -1)
             else:
                 places, known = _first_seen(r), r.track
-            index, weight = follow(x, places, near=NEIGHBOURS, falloff=2.0)
+            index, weight = interpolation_weights(x, places, near=NEIGHBOURS, falloff=2.0)
             for n in torch.nonzero(known >= 0)[:, 0].tolist():
                 index[n], weight[n] = known[n], 0.0
                 weight[n, 0] = 1.0
@@ -311,7 +311,7 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
 @cached
 def _workers() -> ThreadPoolExecutor:
     """Threads for single scenes; what they launch is built before, for two threads must not build the same kernels."""
-    for build in (effect_kernels.build, law_kernels.kernels):
+    for build in (stress_kernels.build, classical_kernels.kernels):
         build(real_of(torch.float32))
     return scene_pool()
 

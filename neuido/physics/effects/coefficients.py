@@ -15,6 +15,7 @@ from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws import classical_kernels
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, StackedElastic
+from neuido.physics.laws.parametric import ParametricLaw
 from neuido.types import Particles
 
 NO_FLOW, VON_MISES, DRUCKER_PRAGER = classical_kernels.IDENTITY, classical_kernels.VON_MISES, classical_kernels.DRUCKER_PRAGER
@@ -136,7 +137,7 @@ def _kinds(plasticity: PlasticLaw | None, scene_count: int) -> tuple[int, ...] |
     """Return the kind of each scene's base plasticity; None for a law that is not classical."""
     if plasticity is None or plasticity.identity:
         return (NO_FLOW,) * scene_count
-    if not hasattr(plasticity, "scene_laws"):
+    if not isinstance(plasticity, ParametricLaw):
         return None
     kinds = tuple(law.kind for law in plasticity.scene_laws())
     return kinds * scene_count if len(kinds) == 1 else kinds

@@ -212,16 +212,15 @@ class Constitutive:
             history = history._replace(branches=torch.exp(-x) * turned - T * torch.expm1(-x) * D)
         if self.tables.flow is not None:
             backstress = R @ history.backstress @ R.mT if layout.backstress else history.backstress
-            F, history = self._flow(trial, history._replace(backstress=backstress), dt, self._scale(time))
+            F, history = self._flow(self.tables.flow[self.scene], trial, history._replace(backstress=backstress), dt, self._scale(time))
         else:
             F = trial if self.plasticity is None else self.plasticity(trial, self.particles)
         if layout.e_max:
             history = history._replace(e_max=torch.maximum(history.e_max, _norm(deviator(hencky(F)))))
         return F, history
 
-    def _flow(self, trial: Tensor, history: History, dt: Tensor, scale: Tensor) -> tuple[Tensor, History]:
+    def _flow(self, row: Tensor, trial: Tensor, history: History, dt: Tensor, scale: Tensor) -> tuple[Tensor, History]:
         F = trial
-        row = self.tables.flow[self.scene]
         if VON_MISES in self.tables.kinds:
             two_mu, inverse, H, s, H_k, eta = row[:, :6].unbind(1)
             two_mu = two_mu * scale

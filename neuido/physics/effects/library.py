@@ -4,6 +4,7 @@ The ranges are physical priors for bodies of a centimetre to a metre that move f
 rejects an explanation whose value lies outside. The confusions were measured in a pilot study, or seen in recordings.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 
@@ -40,7 +41,7 @@ class Entry(NamedTuple):
     """Effects with fewer parameters that this one becomes at an end of its range."""
 
 
-def _vector(field: str, unit: str, size: float, names: str = "xyz") -> tuple[Parameter, ...]:
+def _vector(field: str, unit: str, size: float, names: Sequence[str] = "xyz") -> tuple[Parameter, ...]:
     return tuple(Parameter(name, field, unit, -size, size, True) for name in names)
 
 

@@ -8,7 +8,7 @@ effects act on the stress and on a history (`coefficients`, `stress_kernels`, an
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -313,9 +313,9 @@ _FIELDS = {
 """The field of `Effects` that each parameter name of `LIBRARY` sets, whole or as its component x, y or z."""
 
 
-def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tensor | None) -> dict[str, Tensor | float]:
+def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tensor | None) -> dict[str, Any]:
     given = {name: value for name, value in values.items() if value is not None}
-    out: dict[str, Tensor | float] = {}
+    out: dict[str, Any] = {}
     vectors: dict[str, dict[str, Tensor | float]] = {}
     gradient: dict[str, Tensor | float] = {}
     for name, value in given.items():

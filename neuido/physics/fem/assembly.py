@@ -14,7 +14,8 @@ from torch import Tensor
 
 from neuido.physics.colliders.tables import NEAR, ColliderTable, box_corners
 from neuido.physics.effects.coefficients import Tables
-from neuido.physics.fem.meshing import Mesh, follow, locate, stiffness_bound
+from neuido.physics.fem.meshing import Mesh, stiffness_bound
+from neuido.physics.fem.particle_weights import interpolation_weights, locate
 from neuido.types import Particles, ParticleState, Scene
 
 DENSE = 3.0
@@ -81,8 +82,8 @@ def body_mesh(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype
     nodes, own = mesh.nodes, mesh.volume
     element_of, weights = locate(mesh, x)
     centroid = nodes[mesh.elements].mean(dim=1)
-    to_nodes = follow(x, nodes)
-    to_elements = follow(x, centroid, near=8, degree=0)
+    to_nodes = interpolation_weights(x, nodes)
+    to_elements = interpolation_weights(x, centroid, near=8, degree=0)
 
     def real(t: Tensor) -> Tensor:
         return t.to(device, dtype)

@@ -11,7 +11,7 @@ from neuido.physics.fem import element_loop
 from neuido.physics.fem.assembly import Assembly
 from neuido.physics.fem.element_loop import Fields, Loop
 from neuido.physics.laws.base import ElasticLaw, Law, PlasticLaw
-from neuido.physics.runtime.events import Notes
+from neuido.physics.runtime.events import MarkRecorder
 from neuido.types import ParticleState
 
 CAPACITY = 8
@@ -64,7 +64,7 @@ class AssemblyRollout:
         plasticity: PlasticLaw | None,
         given: Inputs,
         frames: ParticleState,
-    ) -> Notes:
+    ) -> MarkRecorder:
         """Simulate and write the frames.
 
         Args:
@@ -89,14 +89,15 @@ class AssemblyRollout:
         loop = self._loop(elasticity, plasticity, given.tables, fields, laws, count)
         loop.begin((x, v, C, F), fields, laws)
         assembly.frame(frames, 0, *loop.state)
-        notes = Notes(len(F), F)
+        recorder = MarkRecorder(len(F), F)
         for k in range(steps // every):
             own = slice(k * count, (k + 1) * count)
             loop.advance(given.pull[own] if len(given.pull) > 1 else None, None if given.growth is None else given.growth[own])
             assembly.frame(frames, k + 1, *loop.state)
-            notes.add(loop.lowest, loop.since, start=k * count)
-        assembly.last = (ParticleState(*(t[-1].clone() for t in frames)), *(t.clone() for t in loop.state))
-        return notes
+            recorder.add(loop.lowest, loop.since, start=k * count)
+        x, v, C, F = (t.clone() for t in loop.state)
+        assembly.last = (ParticleState(*(t[-1].clone() for t in frames)), x, v, C, F)
+        return recorder
 
     def _rows(self, law: Law) -> list[Tensor]:
         """Return the tensors of a law, restricted to the scenes of the assembly."""

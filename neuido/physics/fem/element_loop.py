@@ -14,7 +14,7 @@ from torch import Tensor
 from neuido.physics.effects import stress_kernels
 from neuido.physics.effects.coefficients import Layout, Tables
 from neuido.physics.fem.assembly import Assembly
-from neuido.physics.laws.base import ElasticLaw, Engine, Law, PlasticLaw
+from neuido.physics.laws.base import Engine, Law
 from neuido.physics.mpm.graphs import capture
 from neuido.physics.runtime.device import launch, real_of, torch_stream
 from neuido.physics.runtime.launches import LaunchRecordings
@@ -65,8 +65,8 @@ class Loop:
     def __init__(
         self,
         assembly: Assembly,
-        elasticity: ElasticLaw,
-        plasticity: PlasticLaw | None,
+        elasticity: Law,
+        plasticity: Law | None,
         tables: Tables | None,
         fields: Fields,
         laws: Sequence[Sequence[Tensor]],
@@ -75,7 +75,8 @@ class Loop:
     ) -> None:
         solver = assembly.solver
         self.assembly, self.elasticity, self.plasticity, self.count, self.captured = assembly, elasticity, plasticity, count, captured
-        self.fields = Fields(*(None if t is None else t.clone(memory_format=torch.contiguous_format) for t in fields))
+        copies = {name: t.clone(memory_format=torch.contiguous_format) for name, t in zip(fields._fields, fields) if t is not None}
+        self.fields = fields._replace(**copies)
         self.laws = [[t.clone(memory_format=torch.contiguous_format) for t in tensors] for tensors in laws]
         self.layout = Layout() if tables is None else tables.layout
         self.spectral = tables is not None and tables.spectral
@@ -134,7 +135,7 @@ class Loop:
         """
         self.since.fill_(-1)
         for own, value in ((self.fields.pull, pull), (self.fields.growth, growth)):
-            if value is not None:
+            if own is not None and value is not None:
                 own.copy_(value)
         if not self.warm:  # the first interval compiles and loads the kernels
             self.run()
@@ -208,6 +209,7 @@ class Loop:
     def _update_history(self, growth: Tensor | None) -> None:
         """Advance the history by a step, and correct the trial F if a plastic effect is present."""
         f, scene, layout, k = self.fields, self.assembly.particles.scene, self.layout, self.material
+        assert k is not None  # a history or a flow comes from an effect
         if f.branches is not None:
             self._launch(k.relax, len(self.F), scene, f.dt, f.branches, False, self.C, self.history, self.history_next)
         if self.flows:

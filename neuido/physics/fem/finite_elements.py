@@ -23,7 +23,7 @@ from neuido.physics.mpm import inputs
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.deprecated import renamed_option
 from neuido.physics.runtime.device import real_of
-from neuido.physics.runtime.events import Marks, Notes, OnInversion, checked_option, raise_inversions
+from neuido.physics.runtime.events import MarkRecorder, Marks, OnInversion, checked_option, raise_inversions
 from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.threads import one_thread_each, scene_pool
@@ -289,7 +289,7 @@ class FiniteElements:
             strain_limit=strain_limit(elasticity, plasticity),
         )
 
-        def one(run: AssemblyRollout) -> Notes:
+        def one(run: AssemblyRollout) -> MarkRecorder:
             assembly = run.assembly
             a, b = assembly.a, assembly.b
             n = inner_of[a]
@@ -311,11 +311,11 @@ class FiniteElements:
             return run.run(steps, every, n, elasticity, plasticity, part, ParticleState(*(t[:, own] for t in frames)))
 
         if self.pool is None:
-            notes = [one(run) for run in self.runs]
+            recorders = [one(run) for run in self.runs]
         else:
             with one_thread_each():
-                notes = list(self.pool.map(one, self.runs))
-        frames.marks = self._marks(notes, every, inner_of)
+                recorders = list(self.pool.map(one, self.runs))
+        frames.marks = self._marks(recorders, every, inner_of)
         scene = self.particles.scene.long()
         dt = self.dt / torch.tensor(inner_of).to(self.dt)
         limit = (torch.tensor(self.sizes).to(self.dt) / dt)[scene]  # a point must not cross an element within an inner step
@@ -335,11 +335,11 @@ class FiniteElements:
                 self._raise(fine, steps, every, inner_of)
         return frames
 
-    def _marks(self, notes: Sequence[Notes], every: int, inner: Sequence[int]) -> Marks:
+    def _marks(self, recorders: Sequence[MarkRecorder], every: int, inner: Sequence[int]) -> Marks:
         """Return what was noted of the elements of all scenes; a step is an inner one."""
         scene = torch.cat([assembly.particles.scene + assembly.a for assembly in self.assemblies])
         dt = tuple(own.dt / n for own, n in zip(self.scenes, inner))
-        lowest, since = (torch.cat([getattr(note, name) for note in notes]) for name in ("lowest", "since"))
+        lowest, since = (torch.cat([getattr(recorder, name) for recorder in recorders]) for name in ("lowest", "since"))
         return Marks(lowest, since, scene, dt, tuple(every * n for n in inner), "elements")
 
     def _raise(self, fine: Tensor, steps: int, every: int, inner: list[int]) -> NoReturn:

@@ -21,6 +21,9 @@ Parameter = float | Tensor
 class Law:
     """Base class of elastic and plastic laws for S scenes."""
 
+    identity: bool = False
+    """Whether the law returns F unchanged in every scene, so that a rollout may skip it."""
+
     strain_limit: float | None = None
     """Largest logarithmic stretch up to which the law is known to hold; None: any."""
 
@@ -157,9 +160,6 @@ class ElasticLaw(Law):
 
 class PlasticLaw(Law):
     """Map the trial deformation gradient to the corrected one."""
-
-    identity: bool = False
-    """Whether the law returns F unchanged in every scene, so that a rollout may skip it."""
 
 
 class AutogradLaw(Law):

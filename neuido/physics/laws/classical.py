@@ -246,6 +246,7 @@ class StackedElastic(_Stacked, ElasticLaw):
     """
 
     _plastic = False
+    laws: tuple["_ClassicalElastic | StackedElastic", ...]
 
     def modulus(self) -> Tensor:
         return torch.cat([law.modulus() for law in self.laws])
@@ -278,12 +279,14 @@ def stack(laws: Sequence[Law]) -> StackedElastic | StackedPlastic:
         UserError: No laws, elastic and plastic laws together, or a law that is not classical.
     """
     names = [type(law).__name__ for law in laws]
-    if not laws or not all(isinstance(law, ParametricLaw) for law in laws):
+    elastic = [law for law in laws if isinstance(law, (_ClassicalElastic, StackedElastic))]
+    plastic = [law for law in laws if isinstance(law, (_ClassicalPlastic, StackedPlastic))]
+    if not laws or len(elastic) + len(plastic) < len(laws):
         raise UserError(f"stack() takes one or more classical laws, got {names}; run other laws in a simulator of their own")
-    if all(isinstance(law, ElasticLaw) for law in laws):
-        return StackedElastic(laws)
-    if all(isinstance(law, PlasticLaw) for law in laws):
-        return StackedPlastic(laws)
+    if not plastic:
+        return StackedElastic(elastic)
+    if not elastic:
+        return StackedPlastic(plastic)
     raise UserError(f"stack() takes elastic laws or plastic laws, not both: {names}")
 
 

@@ -44,7 +44,7 @@ class _Composite(Law):
     def forward(self, tensors: Sequence[Tensor], F: Tensor, out: Tensor, particles: Particles) -> None:
         for law, rows, own, part in self._parts(tensors):
             result = torch.empty_like(F[rows])
-            if getattr(law, "identity", False):
+            if law.identity:
                 result = F[rows]
             else:
                 law.forward(part, F[rows].contiguous(), result, own)
@@ -60,7 +60,7 @@ class _Composite(Law):
         particles: Particles,
     ) -> None:
         for (law, rows, own, part), (*_, grads) in zip(self._parts(tensors), self._parts(grad_tensors)):
-            if getattr(law, "identity", False):
+            if law.identity:
                 grad_F[rows] += grad_out[rows]
                 continue
             own_grad = torch.zeros_like(F[rows])

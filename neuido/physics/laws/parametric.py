@@ -75,7 +75,10 @@ def checked_parameters(law: type, **values: Parameter) -> tuple[Tensor, ...]:
 
 
 class ParametricLaw(Law):
-    """Base class of the classical laws: one (S, n) tensor of parameters, and the number of a law for each scene."""
+    """Base class of the classical laws, which may differ between scenes.
+
+    A subclass defines `tensors`, with one tensor (S, n) of the n parameters of each scene's law, and `twin`, the law in plain torch.
+    """
 
     kind: int
     """Number of the law in `classical_kernels`."""
@@ -135,10 +138,11 @@ class ParametricLaw(Law):
     ) -> None:
         name = "correct_adjoint" if self._plastic else "stress_adjoint"
         wanted = grad_tensors[0]
-        direct = wanted is None or (wanted.dtype == F.dtype and wanted.device == F.device and wanted.is_contiguous())
-        sink = wanted if direct else torch.zeros(wanted.shape, dtype=F.dtype, device=F.device)
-        self._launch(name, tensors, [F, grad_out, grad_F], sink, particles)
-        if not direct:
+        if wanted is None or (wanted.dtype == F.dtype and wanted.device == F.device and wanted.is_contiguous()):
+            self._launch(name, tensors, [F, grad_out, grad_F], wanted, particles)
+        else:
+            sink = torch.zeros(wanted.shape, dtype=F.dtype, device=F.device)
+            self._launch(name, tensors, [F, grad_out, grad_F], sink, particles)
             wanted += sink.to(wanted)
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:

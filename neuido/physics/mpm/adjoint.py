@@ -57,9 +57,10 @@ def run_backward(
             if plan.corrects:
                 trial = trial_gradient(plan, F, C_next, other) if tape.trial is None else tape.trial[n]
                 a_out = a_trial.zero_()
-            if material is not None:
+            if material is not None and a_material is not None:
                 update_history_adjoint(plan, material, a_material, trial, C_next, history, F_next, now, a_out, a_history.zero_())
             if plastic is not None:
+                assert trial is not None  # a plastic law corrects it
                 plastic.adjoint(trial, now[3], a_trial)
             plan.launch(k.grid_to_particles_adjoint, len(x),
                         [setup.particles.scene, setup.sorted_held, setup.origin, setup.dx, setup.dt, setup.nodes, velocity, x, F, v_next,
@@ -73,7 +74,8 @@ def run_backward(
             if viscosity.numel():
                 plan.launch(k.add_viscous_stress_adjoint, len(x),
                             [setup.particles.scene, viscosity, C, F, a_tau, a_C, a_F, a_viscosity])  # fmt: skip
-            if material is not None:
+            if material is not None and a_material is not None:
+                assert plan.effects is not None  # the kernels of the tables
                 if material.stiffness is not None or material.growth is not None or plan.layout.e_max:
                     elastic.forward(F, other)
                 plan.launch(plan.effects.add_effect_stress_adjoint, len(x),
@@ -95,7 +97,18 @@ def recompute(
     material: Material | None,
     scratch: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return stress, nodal momentum and nodal velocity of substep n, from the tape or recomputed from the state before it."""
+    """Return stress, nodal momentum and nodal velocity of a substep, from the tape or recomputed from the state before it.
+
+    Args:
+        plan: The rollout.
+        inputs: Inputs of the forward pass.
+        tape: Tape of the forward pass.
+        n: Number of the substep.
+        state: x, v, C, F and the history before the substep.
+        elastic: Engine of the elastic law.
+        material: Tables of material effects in the substep, or None.
+        scratch: Memory for a recomputed stress, (P, 3, 3).
+    """
     setup = plan.setup
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
     x, v, C, F, history = state
@@ -126,6 +139,7 @@ def update_history_adjoint(
     Adds to the adjoints of C and F after the substep (in `a_next`), of the trial gradient and of the history before the substep.
     """
     setup, k = plan.setup, plan.effects
+    assert k is not None  # the kernels of the tables
     a_C, a_F, a_history_next = a_next[2:]
     if plan.layout.e_max:
         plan.launch(k.remember_adjoint, len(F), [F, plan.layout.e_max_column, history, a_history_next, a_F, a_history])
@@ -138,7 +152,14 @@ def update_history_adjoint(
 
 
 def trial_gradient(plan: Plan, F: Tensor, C_next: Tensor, out: Tensor) -> Tensor:
-    """Compute the trial gradient F_tr = (I + dt C) F in `out`, as the forward pass did."""
+    """Compute the trial gradient F_tr = (I + dt C) F of a substep, as the forward pass did.
+
+    Args:
+        plan: The rollout.
+        F: Deformation gradient before the substep [-], (P, 3, 3).
+        C_next: Affine velocity after the substep [1/s], (P, 3, 3).
+        out: The trial gradient [-], (P, 3, 3); overwritten and returned.
+    """
     plan.launch(plan.setup.kernels.trial_gradient, len(F), [plan.setup.particles.scene, plan.setup.dt, F, C_next, out])
     return out
 

@@ -181,7 +181,7 @@ class SingleScenes:
             total = torch.zeros_like(t)
             for s, (i, j) in enumerate(self.ranges):
                 part = parts[s][n]
-                if not t.numel():
+                if part is None or not t.numel():
                     continue
                 if kind == "particle":
                     total[i:j] = part

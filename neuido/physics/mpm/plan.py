@@ -10,10 +10,10 @@ from torch import Tensor
 
 from neuido.physics.effects import stress_kernels
 from neuido.physics.effects.coefficients import Layout, Tables
-from neuido.physics.laws.base import ElasticLaw, Engine, PlasticLaw
+from neuido.physics.laws.base import Engine, Law
 from neuido.physics.mpm.state import Setup
 from neuido.physics.runtime.device import launch, real_of
-from neuido.physics.runtime.events import Notes
+from neuido.physics.runtime.events import MarkRecorder
 
 STATES = 5
 """Number of inputs that form the initial state: x, v, C, F and the history (no columns if no effect has a history)."""
@@ -50,7 +50,7 @@ class Plan:
         every: Substeps between frames.
         tables: Tables of the material effects, if any; they decide which kernels are launched.
         nan_on_failure: Set the frames of a failed scene to NaN instead of raising.
-        notes: Where the events of the run are noted, the particles in the order of the kernels.
+        recorder: Collects the marks of the rollout, with the particles in the order of the kernels; by default a new one.
 
     Attributes:
         offset: Substeps of the whole rollout before those of this plan.
@@ -60,15 +60,15 @@ class Plan:
     def __init__(
         self,
         setup: Setup,
-        elasticity: ElasticLaw,
-        plasticity: PlasticLaw | None,
+        elasticity: Law,
+        plasticity: Law | None,
         steps: int,
         every: int,
         tables: Tables | None = None,
         nan_on_failure: bool = False,
-        notes: Notes | None = None,
+        recorder: MarkRecorder | None = None,
     ) -> None:
-        self.notes = Notes(len(setup.mass), setup.mass) if notes is None else notes
+        self.recorder = MarkRecorder(len(setup.mass), setup.mass) if recorder is None else recorder
         self.offset, self.total = 0, steps
         self.setup, self.elasticity, self.steps, self.every = setup, elasticity, steps, every
         self.nan_on_failure = nan_on_failure
@@ -113,7 +113,7 @@ class Plan:
         plastic = None if self.plasticity is None else self.plasticity.single_scene(s)
         tables = None if self.tables is None else self.tables._replace(kinds=self.flow_kinds[s : s + 1])
         elastic = self.elasticity.single_scene(s)
-        plan = Plan(self.setup.single_scene(s), elastic, plastic, self.steps, self.every, tables, self.nan_on_failure, self.notes)
+        plan = Plan(self.setup.single_scene(s), elastic, plastic, self.steps, self.every, tables, self.nan_on_failure, self.recorder)
         plan.split = self.split
         return plan
 
@@ -131,7 +131,9 @@ class Plan:
         if self.tables is None:
             return None
         stiffness, growth, *tables = inputs[STATES + 5 : FIXED]
-        return Material(*(t if t.numel() else None for t in (stiffness, at_step(growth, n), *tables)), all_branches)
+        given = (stiffness, at_step(growth, n), *tables)
+        stiffness, growth, material, branches, flow = (t if t.numel() else None for t in given)
+        return Material(stiffness, growth, material, branches, flow, all_branches)
 
 
 def at_step(t: Tensor, n: int) -> Tensor:

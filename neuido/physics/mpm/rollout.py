@@ -52,22 +52,34 @@ class Tape(NamedTuple):
 
 
 def new_tape(plan: Plan, keep_all: bool) -> Tape:
-    """Allocate the memory of a forward pass, with `keep_all` for every substep, as a backward pass needs it."""
+    """Allocate the memory of a forward pass.
+
+    Args:
+        plan: The rollout.
+        keep_all: Whether to store every substep, as a backward pass needs it, or the frames alone.
+    """
     setup = plan.setup
     count = plan.steps if keep_all else plan.steps // plan.every
     history = setup.mass.new_empty(len(setup.mass), plan.layout.width)
-    states = (t.new_empty(count + 1, *t.shape) for t in (*setup.state, history))
+    x, v, C, F, history = (t.new_empty(count + 1, *t.shape) for t in (*setup.state, history))
     status = torch.zeros(3 * setup.scene_count, dtype=torch.int32, device=setup.device)
     lowest, since = torch.empty_like(setup.mass), torch.empty(len(setup.mass), dtype=torch.int32, device=setup.device)
     more = keep_all and setup.keep_grid
     tau = setup.state.F.new_empty(plan.steps, *setup.state.F.shape) if more else None
     trial = torch.empty_like(tau) if tau is not None and plan.corrects else None
-    nodal = [setup.mass.new_empty(plan.steps, setup.node_count, 4) if more else None for _ in range(2)]
-    return Tape(*states, status, lowest, since, tau, trial, *nodal, keep_all)
+    grid, velocity = (setup.mass.new_empty(plan.steps, setup.node_count, 4) if more else None for _ in range(2))
+    return Tape(x, v, C, F, history, status, lowest, since, tau, trial, grid, velocity, keep_all)
 
 
 def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
-    """Launch all substeps, or the first `steps`, without checking the result."""
+    """Launch the substeps of a rollout, without checking the result.
+
+    Args:
+        plan: The rollout.
+        inputs: The inputs in the order of `plan.KINDS`, then the tensors of the laws.
+        tape: Memory for the result; overwritten.
+        steps: Number of substeps; by default those of the plan.
+    """
     setup = plan.setup
     pull, force, friction = inputs[STATES + 1 : STATES + 4]
     stride = plan.steps // (len(tape.x) - 1)
@@ -121,7 +133,17 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
 def scatter(
     plan: Plan, inputs: Sequence[Tensor], now: Sequence[Tensor], material: Material | None, elastic: Engine, tau: Tensor, grid: Tensor
 ) -> None:
-    """Compute the stress and scatter momentum and mass to the nodes (P2G); `grid` must be zero before."""
+    """Compute the stress, and add momentum and mass of the particles to the nodes (P2G).
+
+    Args:
+        plan: The rollout.
+        inputs: Inputs of the rollout.
+        now: x, v, C, F and the history before the substep.
+        material: Tables of material effects in the substep, or None.
+        elastic: Engine of the elastic law.
+        tau: Kirchhoff stress [Pa], (P, 3, 3); overwritten.
+        grid: Momentum and mass of the nodes, (nodes, 4); added to, and zero before.
+    """
     x, v, C, F, history = now
     stress(plan, elastic, F, C, history, inputs[STATES + 4], material, tau)
     add_to_grid(plan, x, v, C, tau, inputs[STATES], grid)
@@ -138,7 +160,19 @@ def gather(
     trial: Tensor,
     tape: Tape,
 ) -> None:
-    """Write the particles of the next substep from the nodal velocities (G2P), then correct F and advance the history."""
+    """Update the particles from the nodal velocities (G2P), then correct F and advance the history.
+
+    Args:
+        plan: The rollout.
+        n: Number of the substep.
+        now: x, v, C, F and the history before the substep.
+        then: The same after the substep; overwritten.
+        material: Tables of material effects in the substep, or None.
+        plastic: Engine of the plastic law, or None.
+        velocity: Velocity of the nodes, (nodes, 4).
+        trial: Memory for the trial gradient, (P, 3, 3).
+        tape: Receives failures and events.
+    """
     setup = plan.setup
     x, _, _, F, history = now
     plan.launch(setup.kernels.grid_to_particles, len(x),
@@ -153,10 +187,22 @@ def gather(
 def stress(
     plan: Plan, elastic: Engine, F: Tensor, C: Tensor, history: Tensor, viscosity: Tensor, material: Material | None, tau: Tensor
 ) -> None:
-    """Compute the Kirchhoff stress with effects and viscosity in `tau`."""
+    """Compute the Kirchhoff stress with effects and viscosity.
+
+    Args:
+        plan: The rollout.
+        elastic: Engine of the elastic law.
+        F: Deformation gradient [-], (P, 3, 3).
+        C: Affine velocity [1/s], (P, 3, 3).
+        history: History at F.
+        viscosity: `Effects.viscosity` [Pa s], (S, 2), or empty.
+        material: Tables of material effects in the substep, or None.
+        tau: Kirchhoff stress [Pa], (P, 3, 3); overwritten.
+    """
     setup = plan.setup
     elastic.forward(F, tau)
     if material is not None:
+        assert plan.effects is not None  # the kernels of the tables
         plan.launch(plan.effects.add_effect_stress, len(F), [*stress_inputs(plan, material), material.all_branches, F, history, tau])
     if viscosity.numel():
         plan.launch(setup.kernels.add_viscous_stress, len(F), [setup.particles.scene, viscosity, C, F, tau])
@@ -175,8 +221,19 @@ def flow_inputs(plan: Plan, material: Material) -> list:
 
 
 def update_history(plan: Plan, material: Material, trial: Tensor, C: Tensor, history: Tensor, F: Tensor, history_next: Tensor) -> None:
-    """Write the history of the next substep, and F if a plastic effect corrects the trial gradient."""
+    """Advance the history, and correct the trial gradient if a plastic effect does so.
+
+    Args:
+        plan: The rollout.
+        material: Tables of material effects in the substep.
+        trial: Trial gradient [-], (P, 3, 3).
+        C: Affine velocity after the substep [1/s], (P, 3, 3).
+        history: History before the substep.
+        F: Corrected gradient [-], (P, 3, 3); overwritten by a plastic effect.
+        history_next: History after the substep; overwritten.
+    """
     setup, k = plan.setup, plan.effects
+    assert k is not None  # the kernels of the tables
     if material.branches is not None:
         plan.launch(k.relax, len(F), [setup.particles.scene, setup.dt, material.branches, material.all_branches, C, history, history_next])
     if material.flow is not None:
@@ -192,7 +249,7 @@ def node_range(plan: Plan, x: Tensor | None) -> slice:
     elsewhere all nodes. The particles are at x or, if x is None, where the last `gather` left them.
     """
     setup = plan.setup
-    if not len(setup.span):
+    if setup.ends is None:
         return slice(None)
     low, high = setup.ends.tolist() if x is None else [float(t) for t in torch.aminmax(x[:, 0])]
     setup.ends[:] = math.inf, -math.inf
@@ -227,7 +284,18 @@ def update_nodes(
     reach: slice = slice(None),
     clear: bool = False,
 ) -> None:
-    """Compute the velocities of the nodes in `reach`; `clear` zeroes the momentum for the next scatter."""
+    """Compute the velocities of the nodes from their momentum: gravity, body forces, colliders and clamps.
+
+    Args:
+        plan: The rollout.
+        grid: Momentum and mass, (nodes, 4).
+        pull: Gravity and other uniform accelerations [m/s^2], (S, 3).
+        force: `Effects.force_table`.
+        friction: Friction coefficients [-], (S, K).
+        velocity: Velocity, (nodes, 4); overwritten.
+        reach: Range of nodes to update.
+        clear: Whether to zero `grid` for the next substep.
+    """
     setup = plan.setup
     inputs = [*grid_inputs(plan, pull, force, friction, reach), grid[reach], velocity[reach], clear]
     plan.launch(setup.kernels.update_grid, len(grid[reach]) // setup.chunk, inputs)
@@ -262,7 +330,7 @@ def check(plan: Plan, tape: Tape) -> None:
         UserError: A particle lost, too fast, or not finite.
     """
     setup, found = plan.setup, tape.status.view(-1, 3)
-    plan.notes.add(tape.lowest, tape.since, setup.first_particle, plan.offset)
+    plan.recorder.add(tape.lowest, tape.since, setup.first_particle, plan.offset)
     finite = torch.isfinite(tape.F[-1]).all(dim=(1, 2))
     if bool(finite.all()) and not bool(found.any()):
         return

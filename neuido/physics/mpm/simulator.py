@@ -270,8 +270,8 @@ class Simulator:
             frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, self.pool)
             x, v, C, F, history = (t[:, self.inverse] for t in frames)
         dts = tuple(scene.dt for scene in self.scenes)
-        notes = plan.notes
-        marks = Marks(notes.lowest[self.inverse], notes.since[self.inverse], self.particles.scene, dts, (every,) * len(dts))
+        recorder = plan.recorder
+        marks = Marks(recorder.lowest[self.inverse], recorder.since[self.inverse], self.particles.scene, dts, (every,) * len(dts))
         limit = strain_limit(elasticity, plasticity)
         out = Frames(x, v, C, F, [dt * every for dt in dts], self.particles, history, marks=marks, strain_limit=limit)
         if nan_on_failure:

@@ -6,7 +6,7 @@ oblique fibre causes, are carried by the grips, so that F stays diagonal. Many p
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -178,7 +178,7 @@ class _Rig:
         zero = self.specimen.incompressible or self.mode == "simple_shear"
         return torch.zeros(*given.shape[:-1], self.free, dtype=given.dtype) if zero else -volume[..., : self.free]
 
-    def solve(self, u: Tensor, evaluate, scale: Tensor) -> tuple[Tensor, Tensor, object]:
+    def solve(self, u: Tensor, evaluate, scale: Tensor) -> tuple[Tensor, Tensor, Any]:
         """Solve for the unknowns by Newton's method, with the derivatives by finite differences in one evaluation.
 
         Args:

@@ -127,6 +127,7 @@ def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.dev
     _load(kernel, device, block)
     inputs = _inputs(kernel, [0, *arguments])
     command = wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), block_dim=block, record_cmd=True)
+    assert command is not None  # since it is recorded
 
     def again(step: int) -> None:
         command.set_param_at_index(0, step)

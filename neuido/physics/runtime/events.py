@@ -1,7 +1,7 @@
-"""Events of a rollout: matter that turned inside out or collapsed, and laws asked beyond the strains of their training.
+"""Events that make the result of a rollout doubtful: inverted or collapsed matter, and strains beyond the training of a law.
 
-Kernels note, for each particle or element, the smallest det F below `COLLAPSED` and the step in which it was first below. That is one
-determinant a substep, written only where there is an event; nothing is synchronised before somebody asks for the events.
+The kernels record, for each particle or element, the smallest det F below `COLLAPSED` and the first step below it. This costs one
+determinant per substep, and a write only where there is an event. The device is not synchronised before the events are read.
 """
 
 import math
@@ -14,38 +14,38 @@ from torch import Tensor
 from neuido.errors import UserError
 
 COLLAPSED = 1e-3
-"""det F below which matter counts as collapsed."""
+"""det F below which matter counts as collapsed [-]."""
 FLAT = 1e-6
-"""Size of det F up to which its sign may be rounding: matter is crushed flat, and beyond it turned inside out."""
+"""Absolute value of a negative det F above which matter counts as inverted; up to it the sign may be a rounding error."""
 INVERTED, CRUSHED, OUTSIDE = "inverted", "collapsed", "outside training"
 OnInversion = Literal["report", "error"]
 CHUNK = 1 << 20
-"""Deformation gradients that are looked at in one go."""
+"""Number of deformation gradients that are processed at a time."""
 
 
 class Event(NamedTuple):
-    """Something that happened in one scene of a rollout and makes its result doubtful."""
+    """An event in one scene of a rollout."""
 
     kind: str
-    """`inverted`: det F below zero. `collapsed`: det F below 0.001. `outside training`: a law was asked beyond the strains it knows."""
+    """`inverted`: det F below zero. `collapsed`: det F below 0.001. `outside training`: a strain beyond `Law.strain_limit`."""
     scene: int
     """Index of the scene."""
     count: int
-    """How many particles (or elements) it happened to."""
+    """Number of particles or elements that are affected."""
     total: int
-    """How many the scene has."""
+    """Number of particles or elements in the scene."""
     first: int
-    """Index of the first of them within the whole rollout."""
+    """Index, within the whole rollout, of the particle or element that was affected first."""
     step: int
-    """Step at whose end it was first seen; 0: at the start."""
+    """Step at whose end the event was first detected; 0: at the start."""
     time: float
-    """That time [s]."""
+    """Time of that step [s]."""
     frame: int
     """First frame at or after that time."""
     extreme: float
-    """Smallest det F, or largest absolute logarithmic stretch, that was seen."""
+    """Smallest det F, or largest absolute logarithmic stretch, of all steps [-]."""
     what: str = "particles"
-    """`particles` or `elements`."""
+    """What `count`, `total` and `first` refer to: `particles` or `elements`."""
 
     def __str__(self) -> str:
         plain = {
@@ -59,14 +59,14 @@ class Event(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """What the kernels noted of each particle or element."""
+    """The record of det F of N particles or elements that the kernels write."""
 
     lowest: Tensor
-    """Smallest det F below `COLLAPSED`, (N,); infinite where there was none."""
+    """Smallest det F below `COLLAPSED` [-], (N,); infinite if det F was never below."""
     since: Tensor
-    """Step, counted from 0, in which it was first below, (N,) int32; -1 where it never was."""
+    """First step with det F below `COLLAPSED`, counted from 0, (N,) int32; -1 if there was none."""
     scene: Tensor
-    """Scene of each, (N,)."""
+    """The scene of each particle or element, (N,)."""
     dt: tuple[float, ...]
     """Step of each scene [s]."""
     every: tuple[int, ...]
@@ -91,7 +91,7 @@ class Marks(NamedTuple):
 
 
 def checked_option(value: str) -> str:
-    """Return the value of `on_inversion`.
+    """Validate the option `on_inversion`, and return it.
 
     Raises:
         UserError: Neither `report` nor `error`.
@@ -102,7 +102,11 @@ def checked_option(value: str) -> str:
 
 
 def raise_inversions(marks: Marks) -> None:
-    """Raise UserError for the first event, if there is one."""
+    """Raise for the first inversion or collapse.
+
+    Raises:
+        UserError: There is such an event.
+    """
     found = sorted(marks.events(), key=lambda event: event.time)
     if found:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
@@ -110,20 +114,25 @@ def raise_inversions(marks: Marks) -> None:
                         "collapse; on_inversion = report goes on")  # fmt: skip
 
 
-class Notes:
-    """The marks of a rollout that runs in parts: one after the other, or scene by scene."""
+class MarkRecorder:
+    """Collect the marks of a rollout that runs in parts, one after the other or scene by scene.
+
+    Args:
+        count: Number of particles or elements N.
+        like: A tensor of the dtype and device of the marks.
+    """
 
     def __init__(self, count: int, like: Tensor) -> None:
         self.lowest = torch.full((count,), math.inf, dtype=like.dtype, device=like.device)
         self.since = torch.full((count,), -1, dtype=torch.int32, device=like.device)
 
     def add(self, lowest: Tensor, since: Tensor, begin: int = 0, start: int = 0) -> None:
-        """Add the marks of a part, on the device, without synchronisation.
+        """Add the marks of one part, without synchronisation of the device.
 
         Args:
-            lowest: As in `Marks`, of the particles from `begin` on.
-            since: Likewise, counted from the first step of the part.
-            begin: First particle of the part.
+            lowest: `Marks.lowest` of the particles of the part.
+            since: `Marks.since` of these particles, counted from the first step of the part.
+            begin: Index of the first particle of the part.
             start: First step of the part.
         """
         own = slice(begin, begin + len(since))
@@ -133,7 +142,13 @@ class Notes:
 
 
 def marks_of_frames(F: Tensor, scene: Tensor, dt: Sequence[float]) -> Marks:
-    """Return the marks of recorded frames F (K, P, 3, 3), where no kernel noted any; a step is the time between two frames."""
+    """Compute the marks of frames, for a rollout whose kernels recorded none.
+
+    Args:
+        F: Deformation gradients [-], (K, P, 3, 3).
+        scene: The scene of each particle, (P,).
+        dt: Time between two frames of each scene [s]; it takes the place of the step.
+    """
     lowest = F.new_full((F.shape[1],), math.inf)
     since = torch.full((F.shape[1],), -1, dtype=torch.int32, device=F.device)
     for k, frame in enumerate(F.detach()):
@@ -141,19 +156,29 @@ def marks_of_frames(F: Tensor, scene: Tensor, dt: Sequence[float]) -> Marks:
         low = J < COLLAPSED
         since = torch.where(low & (since < 0), k - 1, since)
         lowest = torch.where(low, torch.minimum(lowest, J), lowest)
-    # frame 0 is step -1 here, which would read as never
+    # frame 0 has step -1 here, which would mean never
     since = torch.where(torch.isfinite(lowest) & (since < 0), 0, since)
     return Marks(lowest, since, scene, tuple(dt), (1,) * len(dt))
 
 
 def determinant(F: Tensor) -> Tensor:
-    """Return det F of (..., 3, 3) by cofactors, which is faster than a factorisation of each."""
+    """Compute the determinants of matrices (..., 3, 3) by cofactors, which is faster than by a factorisation."""
     a, b, c = F.unbind(-1)
     return (a * torch.linalg.cross(b, c)).sum(-1)
 
 
-def outside(F: Tensor, limit: float, scene: Tensor, dt: Sequence[float]) -> list[Event]:
-    """Return where the logarithmic stretches of frames F (K, P, 3, 3) are beyond `limit`, an event for each scene."""
+def strain_events(F: Tensor, limit: float, scene: Tensor, dt: Sequence[float]) -> list[Event]:
+    """Find frames with logarithmic stretches beyond a limit.
+
+    Args:
+        F: Deformation gradients of the frames [-], (K, P, 3, 3).
+        limit: Largest absolute logarithmic stretch [-].
+        scene: The scene of each particle, (P,).
+        dt: Time between two frames of each scene [s].
+
+    Returns:
+        One event for each scene with such a stretch.
+    """
     K, P = F.shape[:2]
     F = F.detach()
     largest, since = F.new_zeros(P), torch.full((P,), -1, dtype=torch.long, device=F.device)
@@ -161,7 +186,7 @@ def outside(F: Tensor, limit: float, scene: Tensor, dt: Sequence[float]) -> list
     eye = torch.eye(3, dtype=F.dtype, device=F.device)
     for k in range(K):
         b = F[k] @ F[k].mT
-        far = ((b - eye).square().sum((-2, -1)) > near**2) & torch.isfinite(b).all(-1).all(-1)  # |b_i - 1| is no larger than this norm
+        far = ((b - eye).square().sum((-2, -1)) > near**2) & torch.isfinite(b).all(-1).all(-1)  # an upper bound of |b_i - 1|
         index = far.nonzero()[:, 0]
         for part in index.split(CHUNK):
             stretch = 0.5 * torch.linalg.eigvalsh(b[part].double()).clamp(min=1e-30).log().abs().amax(-1)

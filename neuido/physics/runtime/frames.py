@@ -29,7 +29,7 @@ class Frames(ParticleState):
         dt: Time between two frames [s], a number or one for each scene, (S,).
         particles: The scene of each particle; None: one scene.
         history: History of the effects, (K, P, width), with width 0 if no effect has one; None if the solver does not return it.
-        marks: What the kernels recorded about det F in every step; None: `events` uses the frames alone.
+        marks: Record of det F in every step; None: `events` uses the frames alone.
         strain_limit: Largest logarithmic stretch for which the law is known; None: no limit.
 
     Attributes:
@@ -77,10 +77,10 @@ class Frames(ParticleState):
 
     @functools.cached_property
     def events(self) -> tuple[Event, ...]:
-        """What makes the result doubtful: matter that turned inside out or collapsed, a law asked beyond its training.
+        """Events that make the result doubtful: inverted or collapsed matter, and strains beyond the training of the law.
 
-        Found when first asked for. Of det F every substep counts where the simulator made the frames, else the frames do; of the law's
-        strains the frames count.
+        They are computed at the first access. For frames of a simulator, inversion and collapse are those of every substep, else those
+        of the frames. Strains are always those of the frames.
         """
         if self.F is None or not self.F.numel():
             return ()
@@ -88,7 +88,7 @@ class Frames(ParticleState):
         scene, each = scene.to(self.F.device), self.dt.tolist()
         each = each if len(each) > 1 else each * (int(scene.max()) + 1)
         marks = events.marks_of_frames(self.F, scene, each) if self.marks is None else self.marks
-        beyond = [] if self.strain_limit is None else events.outside(self.F, self.strain_limit, scene, each)
+        beyond = [] if self.strain_limit is None else events.strain_events(self.F, self.strain_limit, scene, each)
         return (*marks.events(), *beyond)
 
     def __repr__(self) -> str:
@@ -127,7 +127,7 @@ class Frames(ParticleState):
         return np.zeros(self.x.shape[1], np.int32) if self.particles is None else self.particles.scene.cpu().numpy()
 
     def _save_npz(self, path: Path) -> list[Path]:
-        arrays = {name: t.detach().cpu().numpy() for name, t in zip(self._fields, self) if t is not None}
+        arrays: dict[str, Any] = {name: t.detach().cpu().numpy() for name, t in zip(self._fields, self) if t is not None}
         with whole_file(path) as hidden, open(hidden, "wb") as file:
             np.savez_compressed(file, times=self.times.numpy(), scene=self._scene(), **arrays)
         return [path]

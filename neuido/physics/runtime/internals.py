@@ -63,7 +63,7 @@ def describe_array(t: Tensor, dtype: type) -> Any:
     """Return Warp's descriptor of a tensor: address, shape and strides. It does not keep the tensor alive; the slower public call does."""
     if not WARP_TESTED:
         return wp.from_torch(t.detach(), dtype=dtype, requires_grad=False)
-    found = wp.from_torch(t.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    found: Any = wp.from_torch(t.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     found._ref = found._gradref = None  # else the descriptor would keep the tensor's memory alive
     return found
 
@@ -85,7 +85,7 @@ class PackedLaunch:
     __slots__ = ("arguments", "bounds", "enter", "module")
 
     def __init__(self, kernel: wp.Kernel, dim: int, inputs: Sequence) -> None:
-        recorded = wp.launch(kernel, dim=dim, inputs=inputs, device="cpu", record_cmd=True)
+        recorded: Any = wp.launch(kernel, dim=dim, inputs=inputs, device="cpu", record_cmd=True)
         layout = _layouts.get(kernel)
         if layout is None:
             fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, recorded.params[1:], strict=True)]
@@ -115,7 +115,7 @@ else:
 def silu_into(x: Tensor, out: Tensor) -> None:
     """Write SiLU of x into `out`."""
     if TORCH_TESTED:
-        torch._C._nn.silu(x, out=out)
+        torch._C._nn.silu(x, out=out)  # type: ignore[attr-defined]
     else:
         out.copy_(functional.silu(x))
 
@@ -132,7 +132,7 @@ def silu_adjoint_into(grad: Tensor, x: Tensor, out: Tensor) -> None:
 def gelu_into(x: Tensor, out: Tensor) -> None:
     """Write GELU of x into `out`."""
     if TORCH_TESTED:
-        torch._C._nn.gelu(x, out=out)
+        torch._C._nn.gelu(x, out=out)  # type: ignore[attr-defined]
     else:
         out.copy_(functional.gelu(x))
 

@@ -18,11 +18,14 @@ STEP = "step"
 
 
 class Launch(NamedTuple):
-    """The entry point of a compiled kernel with its packed arguments."""
+    """One recorded launch: the entry point of a compiled kernel and its packed arguments."""
 
     enter: Callable[[Any, Any], None]
+    """Entry point, called with bounds and arguments."""
     bounds: Any
+    """Number of threads, as a C structure of Warp."""
     arguments: ctypes.Structure
+    """Packed arguments of the kernel."""
     by_step: bool
     """Whether the kernel takes the step as an argument."""
     owner: object

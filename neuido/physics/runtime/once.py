@@ -4,16 +4,14 @@ import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any, TypeVar
-
-F = TypeVar("F", bound=Callable[..., Any])
+from typing import Any
 
 BUILDING = threading.RLock()
 """Lock that is held while kernels are built or loaded. There is one for the whole process, since Warp's tables of functions and modules are
 global. It is reentrant, since a builder may call another."""
 
 
-def cached(function: F | None = None, *, limit: int | None = None) -> Any:
+def cached(function: Callable[..., Any] | None = None, *, limit: int | None = None) -> Any:
     """Cache the results of a function by its arguments, and compute each only once even if several threads call it.
 
     With `functools.cache`, two threads may both compute a result. For a builder of Warp kernels that would create two modules of one name,

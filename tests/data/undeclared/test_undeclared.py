@@ -19,7 +19,7 @@ from neuido.data.undeclared.motion import Motion, Solver, simulate_motion
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE, Scales, draw_effect, truth_entry
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY
-from neuido.physics.fem.meshing import follow
+from neuido.physics.fem.particle_weights import interpolation_weights
 from neuido.types import Plane, Scene
 
 SMALL = Case(particles=150, seconds=0.15, solver="same")
@@ -60,7 +60,9 @@ def test_recorded_motion_is_that_of_the_key(drag):
     law["elasticity"] |= {"law": key["material"]["elasticity"], "young": key["material"]["young"], "poisson": key["material"]["poisson"]}
     scene = experiment.scene
     first = experiment.recordings[0]
-    index, weight = follow(first.body.x.double(), first.anchor.double()) if first.track is None else (first.track[:, None], None)
+    index, weight = (
+        interpolation_weights(first.body.x.double(), first.anchor.double()) if first.track is None else (first.track[:, None], None)
+    )
     weight = np.ones(index.shape) if weight is None else weight.numpy()
     values = {"drag_linear.k": key["undeclared"][0]["parameters"]["k"]}
     t = first.t.numpy()

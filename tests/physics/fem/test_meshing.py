@@ -7,7 +7,16 @@ import pytest
 import torch
 
 from neuido.errors import UserError
-from neuido.physics.fem.meshing import Mesh, box_axes, follow, lattice_of, locate, mesh_body, mesh_of_cells, oriented, tetrahedra_of
+from neuido.physics.fem.meshing import (
+    Mesh,
+    box_axes,
+    lattice_of,
+    mesh_body,
+    mesh_of_cells,
+    oriented,
+    tetrahedra_of,
+)
+from neuido.physics.fem.particle_weights import interpolation_weights, locate
 from tests.physics.bodies import block
 
 
@@ -131,10 +140,10 @@ def test_points_are_located_and_fields_are_followed():
     assert torch.allclose((weights[..., None] * mesh.nodes[mesh.elements[element]]).sum(dim=1), beyond, atol=1e-12)
 
     A = torch.randn(3, 3, generator=g, dtype=torch.float64)
-    index, weight = follow(body.x, mesh.nodes)
+    index, weight = interpolation_weights(body.x, mesh.nodes)
     got = torch.einsum("nk,nkc->nc", weight, (body.x @ A.T + 1.0)[index])
     assert torch.allclose(got, mesh.nodes @ A.T + 1.0, atol=1e-6)
-    index, weight = follow(body.x, mesh.nodes, degree=0)
+    index, weight = interpolation_weights(body.x, mesh.nodes, degree=0)
     assert float(weight.min()) > 0
 
 

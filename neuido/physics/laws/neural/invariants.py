@@ -34,6 +34,8 @@ class InvariantEngine(Engine):
         particles: The scene of each particle.
     """
 
+    law: "_Invariant"
+
     def __init__(self, law: "_Invariant", tensors: Sequence[Tensor], particles: Particles):
         super().__init__(law, [t.detach() for t in tensors], particles)
         count, like = particles.offsets[-1], self.tensors[0]

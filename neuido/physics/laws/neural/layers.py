@@ -42,13 +42,14 @@ def linear_adjoint(
     """
     count = gy.shape[0]
     for target, parameter in ((gx, W), (gW, gW), (gb, gb)):
-        if target is None:
+        if target is None or parameter is None:
             continue
         shared = parameter.shape[0] == 1
         for s, (i, j) in enumerate(((0, count),) if shared else zip(offsets[:-1], offsets[1:])):
             if target is gx:
-                torch.mm(gy[i:j], W[s], out=gx[i:j])
+                torch.mm(gy[i:j], W[s], out=target[i:j])
             elif target is gW:
-                gW[s].addmm_(gy[i:j].T, x[i:j])
+                target[s].addmm_(gy[i:j].T, x[i:j])
             else:
-                gb[s].addmv_(gy[i:j].T, ones[i:j])
+                assert ones is not None  # given with gb
+                target[s].addmv_(gy[i:j].T, ones[i:j])

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics.laws.base import ElasticLaw, Engine, PlasticLaw
+from neuido.physics.laws.base import ElasticLaw, Engine, Law, PlasticLaw
 from neuido.physics.laws.neural import fused, network_kernels
 from neuido.physics.laws.neural.layers import linear, linear_adjoint
 from neuido.physics.laws.neural.network_kernels import COARSE, DELTA, FINE, LINEAR, LODE
@@ -171,7 +171,7 @@ class _Workspace:
 _workspace = cached(_Workspace, limit=8)
 
 
-class _Network:
+class _Network(Law):
     """Base class of the four network laws.
 
     Args:
@@ -218,6 +218,10 @@ class _Network:
 
     def _fusable(self, W1: Tensor) -> bool:
         return W1.is_cuda and W1.dtype == torch.float32 and W1.shape[-2] in fused.WIDTHS and self.outputs < 9
+
+    def _features(self, F: Tensor, out: Tensor) -> None:
+        """Write the input features of F (P, 3, 3) into `out` (P, 9)."""
+        raise NotImplementedError
 
     def _buffers(self, F: Tensor, hidden: int) -> _Workspace:
         return _workspace(F.shape[0], hidden, self.outputs, F.dtype, F.device, threading.get_ident())

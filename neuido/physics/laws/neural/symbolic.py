@@ -40,6 +40,8 @@ class SymbolicEngine(Engine):
         particles: The scene of each particle.
     """
 
+    law: "_Symbolic"
+
     def __init__(self, law: "_Symbolic", tensors: Sequence[Tensor], particles: Particles):
         super().__init__(law, [t.detach() for t in tensors], particles)
         (W,) = self.tensors
