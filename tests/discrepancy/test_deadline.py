@@ -150,11 +150,13 @@ def test_more_minutes_go_on_from_there(block, tmp_path, capsys):
     assert (status, len(err.splitlines())) == (2, 1) and "minutes = -1.0 must not be negative" in err
     status, told, _ = command.run(capsys, *asked, "--minutes", "0.0001")
     content = json.loads((out / "diagnosis.json").read_text())
-    assert status == 0 and content["left_out"] and "give more minutes" in told
+    assert status == 0 and content["left_out"] and "with more minutes goes on" in told
     page = (out / "report.html").read_text()
-    assert content["answer"] == "unfinished" and content["effects"] == content["rejected"] == [] and "unfinished" in told
-    assert (out / ".work").is_dir() and "nothing is named yet" in page and "<h2>Rejected</h2>" not in page
+    assert (
+        content["answer"] == "unfinished" and content["effects"] == content["rejected"] == [] and told.startswith("The search was cut off")
+    )
+    assert (out / ".work").is_dir() and "nothing is named yet" in page and ">Rejected</h3>" not in page
     status, told, _ = command.run(capsys, *asked, "--minutes", "0")
     content = json.loads((out / "diagnosis.json").read_text())
-    assert status == 0 and content["left_out"] == [] and content["effects"][0]["name"] == "drag_linear" and "give more minutes" not in told
+    assert status == 0 and content["left_out"] == [] and content["effects"][0]["name"] == "drag_linear" and "more minutes" not in told
     assert not (out / ".work").exists()

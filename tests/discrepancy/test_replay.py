@@ -56,7 +56,7 @@ def test_diagnose_of_the_repeated_recordings_answers_none(folder, after, tmp_pat
     options = ["--effects", "drag_linear,viscosity_shear", "--draws", "19", "--device", "cpu"]
     status, out, err = run(capsys, "diagnose", tmp_path / "again", "--out", tmp_path / "out", *options)
     assert status == 0, err
-    assert out.startswith("none; ")
+    assert out.startswith("Nothing is missing")
     content = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert content["after"]["young"]["value"] == pytest.approx(6e4, rel=0.02)
 

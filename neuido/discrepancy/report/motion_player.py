@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.discrepancy.report.plots import heading, numbers
+from neuido.discrepancy.report.plots import heading, numbers, predictions
 from neuido.discrepancy.report.reader_units import Units
 
 MOST_POINTS, MOST_FRAMES = 400, 60
@@ -34,12 +34,12 @@ def player(motion: Mapping[str, Mapping[str, np.ndarray]], c: Mapping[str, Any],
     factor, unit = units.scaled("m")
     most = room / max(len(motion), 1)
     recordings = [_packed(name, arrays, c, factor, most) for name, arrays in motion.items()]
-    return {"unit": unit, "recordings": recordings}
+    return {"unit": unit, "called": ["measured", *(called for _, called in predictions(c))], "recordings": recordings}
 
 
 def _packed(name: str, arrays: Mapping[str, np.ndarray], c: Mapping[str, Any], factor: float, most: float) -> dict[str, Any]:
     frames, points = _budget(*arrays["measured"].shape[:2], most)
-    sets = [arrays[key][np.ix_(frames, points)] for key in SETS]
+    sets = [arrays[key][np.ix_(frames, points)] for key in SETS[: 1 + len(predictions(c))]]
     finite = np.concatenate([s[np.isfinite(s).all(axis=-1)] for s in sets])
     low, high = (finite.min(axis=0), finite.max(axis=0)) if len(finite) else (np.zeros(3), np.ones(3))
     middle, size = 0.5 * (low + high), 0.5 * float(np.max(high - low)) or 1.0
@@ -101,7 +101,7 @@ def _plane(plane: Mapping[str, Any], low: np.ndarray, high: np.ndarray, size: fl
     return {"corners": [numbers(factor * corner) for corner in corners], "contact": plane.get("contact", "")}
 
 
-def residual_map(motion: Mapping[str, Mapping[str, np.ndarray]], units: Units) -> dict[str, Any]:
+def residual_map(motion: Mapping[str, Mapping[str, np.ndarray]], c: Mapping[str, Any], units: Units) -> dict[str, Any]:
     """Return the root mean square of what is left at each point of the body, before and after, at the points' first places."""
     factor, unit = units.scaled("m")
     recordings = []
@@ -109,14 +109,14 @@ def residual_map(motion: Mapping[str, Mapping[str, np.ndarray]], units: Units) -
         points = _budget(*arrays["measured"].shape[:2], ROOM)[1]
         place = np.where(np.isfinite(arrays["measured"][0]), arrays["measured"][0], arrays["before"][0])[points]
         sizes = {}
-        for when in ("before", "after"):
+        for when, _ in predictions(c):
             square = np.sum((arrays["measured"] - arrays[when])[:, points] ** 2, axis=-1)
             count = np.isfinite(square).sum(axis=0)
             sizes[when] = factor * np.sqrt(np.nansum(square, axis=0) / np.maximum(count, 1))
         own: dict[str, Any] = {when: numbers(values, 4) for when, values in sizes.items()}
         top = {when: float(np.quantile(values, 0.98)) for when, values in sizes.items()}
         recordings.append({"name": name, "place": [numbers(factor * place[:, k]) for k in range(3)], **own, "top": top})
-    return {"unit": unit, "recordings": recordings}
+    return {"unit": unit, "shown": [when for when, _ in predictions(c)], "recordings": recordings}
 
 
 def reach(motions: Sequence[Mapping[str, Mapping[str, np.ndarray]]]) -> float:

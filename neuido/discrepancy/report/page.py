@@ -154,7 +154,7 @@ def _section(c: Mapping[str, Any], motion: Motion, units: Units, figures: list[d
     if bodies:
         add("Motion before and after", [motion_player.player(bodies, c, units, room=room)], form="player")
         add("Error over time", [plots.error_over_time(name, arrays, c, units, rows) for name, arrays in bodies.items()])
-        add("Where on the body", [motion_player.residual_map(bodies, units)], form="map", note=_places(c, units))
+        add("Where on the body", [motion_player.residual_map(bodies, c, units)], form="map", note=_places(c, units))
         add("Which stage", plots.stage_plots(c), note=WEAK)
     elif any("masks" in arrays for arrays in motion.values()):
         pictures = silhouette_pictures.pictures(motion, c)

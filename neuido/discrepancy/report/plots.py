@@ -43,6 +43,11 @@ def dots(name: str, x: Iterable[float], y: Iterable[float], role: str, *, symbol
     return {"type": "scatter", "mode": "markers", "name": safe(name), "x": numbers(x), "y": numbers(y), "marker": marker, **more}
 
 
+def predictions(c: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return which predictions are drawn, and how they are called; without an effect there is one."""
+    return [("before", "before"), ("after", "after")] if c["effects"] else [("before", "predicted")]
+
+
 def plot(heading: str, x: str, y: str, traces: Sequence[Plot], **layout: Any) -> Plot:
     """Return a plot with a title, two labelled axes and a legend."""
     axes = {name: {"title": {"text": safe(label)}} | layout.pop(name, {}) for name, label in (("xaxis", x), ("yaxis", y))}
@@ -58,18 +63,18 @@ def error_over_time(name: str, arrays: Arrays, c: Mapping[str, Any], units: Unit
     """Return the root mean square distance of a recording's points over time, before and after, with the floors."""
     factor, unit = units.scaled("m")
     times, traces = arrays["t"], []
-    for when in ("before", "after"):
+    for when, called in predictions(c):
         square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
         seen = np.isfinite(square).any(axis=1)
         curve = factor * np.sqrt(np.nanmean(square[seen], axis=1))
         rows = thinned(len(curve), most)
-        traces.append(line(when, times[seen][rows], curve[rows], when))
+        traces.append(line(called, times[seen][rows], curve[rows], when))
     ends = [float(times[0]), float(times[-1])]
     noise, grid = (c["error"].get(key) or 0.0 for key in ("noise_floor", "discretisation_floor"))
     traces.append(line("noise", ends, [factor * noise] * 2, "muted", width=1, dash="dot"))
     if grid > 0:
         traces.append(line("noise and discretisation", ends, [factor * math.hypot(noise, grid)] * 2, "muted", width=1, dash="dash"))
-    top = max((v for trace in traces[:2] for v in trace["y"] if v), default=0.0)
+    top = max((v for trace in traces for v in trace["y"] if v), default=0.0)
     wide = noise > 0 and top > LOG_FROM * factor * noise
     scale = {"type": "log"} if wide else {"rangemode": "tozero"}
     label = f"RMS distance [{unit}]"
@@ -101,16 +106,16 @@ def data_plots(name: str, arrays: Arrays, c: Mapping[str, Any], units: Units, mo
         curves.append(
             dots(f"measured{after}", x, factor * arrays["measured"][own], "measured", symbol=("circle", "square", "diamond")[i % 3])
         )
-        for when in ("before", "after"):
+        for when, called in predictions(c):
             made = factor * arrays[when][own]
             residual = factor * (arrays["measured"][own] - arrays[when][own])
             if scattered:
                 symbol = ("circle-open", "square-open", "diamond-open")[i % 3]
-                curves.append(dots(f"{when}{after}", x, made, when, symbol=symbol))
-                left.append(dots(f"{when}{after}", x, residual, when, symbol=symbol))
+                curves.append(dots(f"{called}{after}", x, made, when, symbol=symbol))
+                left.append(dots(f"{called}{after}", x, residual, when, symbol=symbol))
             else:
-                curves.append(line(f"{when}{after}", x, made, when, dash=look))
-                left.append(line(f"{when}{after}", x, residual, when, dash=look, width=1.5))
+                curves.append(line(f"{called}{after}", x, made, when, dash=look))
+                left.append(line(f"{called}{after}", x, residual, when, dash=look, width=1.5))
     noise = c["error"].get("noise_floor") or 0.0
     if noise > 0:
         ends = [float(np.nanmin(axis)), float(np.nanmax(axis))]
@@ -139,7 +144,7 @@ def stage_plots(c: Mapping[str, Any]) -> list[Plot]:
             unit = s["unit"].replace("^2", "²")
             traces = [
                 line("noise", s["times"], s["noise"], "muted", width=0, fill="tozeroy", fillcolor="@shade"),
-                *(line(when, s["times"], s[when], when, mode="lines+markers") for when in ("before", "after")),
+                *(line(called, s["times"], s[when], when, mode="lines+markers") for when, called in predictions(c)),
             ]
             label = f"{STAGE_QUANTITIES.get(s['stage'], 'missing')} [{unit}]"
             out.append(plot(f"{recording}: {s['stage']}", "time [s]", label, traces, yaxis={"rangemode": "tozero"}))
@@ -159,7 +164,7 @@ STAGE_QUANTITIES = {
 def ranking(models: Sequence[Mapping[str, Any]], chance: float | None) -> Plot | None:
     """Return by how much each model divides the error, the named ones in the colour of `after`."""
     rows = [m for m in models if m.get("error_ratio")][:MOST_BARS]
-    if not rows:
+    if len(rows) < 2:  # nothing to compare
         return None
     kept, other = ([m for m in rows if (m["verdict"] in ("named", "class")) == named] for named in (True, False))
     labels = [safe(label_of(m)) for m in rows]

@@ -38,6 +38,7 @@ class Units:
         found: dict[str, list[float]] = {"m": [reach], "Pa": []}
         for c in contents:
             error = c["error"]
+            found.setdefault(error["unit"], []).extend(v for v in (error["noise_floor"], error["discretisation_floor"]) if v)
             for when in ("before", "after"):
                 found.setdefault(error["unit"], []).extend(v for v in (error[when].get("fit"), error[when].get("held_out")) if v)
                 figures = c["declared" if when == "before" else "after"].values()

@@ -45,7 +45,11 @@ class Words(NamedTuple):
 def words_of(c: Content, units: Units | None = None) -> Words:
     """Return the words of one part of diagnosis.json."""
     units = units or Units.of([c])
-    notes = f"There was no time for {listed(c['left_out'])}: the same command with more minutes goes on." if c["left_out"] else ""
+    notes = (
+        f"There was no time for {listed([worded(step) for step in c['left_out']])}: the same command with more minutes goes on."
+        if c["left_out"]
+        else ""
+    )
     return Words(_finding(c, units), _error(c, units), _sure(c), _not_excluded(c, units), _next(c), notes)
 
 
@@ -78,7 +82,11 @@ def worded(text: str) -> str:
     import re
 
     words = titles()
-    return re.sub(r"[a-z]+(?:_[a-z]+)*", lambda found: words.get(found[0], found[0]) if "_" in found[0] else found[0], text)
+    return re.sub(
+        r"(?<![\w.])[a-z]+(?:_[a-z]+)*(?![\w.]*\.\w)(?!\w)",
+        lambda found: words.get(found[0], found[0]) if "_" in found[0] else found[0],
+        text,
+    )
 
 
 def listed(parts: Sequence[str], last: str = "and") -> str:

@@ -57,7 +57,7 @@ def test_drag_on_a_neural_law_is_named_and_the_model_goes_back(law, folder, tmp_
     options = ["--effects", "drag_linear,viscosity_shear", "--draws", "19", "--device", "cpu"]
     status, line, err = run(capsys, "diagnose", folder, "--law", law, "--out", out, *options)
     assert status == 0, err
-    assert line.startswith("effect: drag_linear")
+    assert line.startswith("The model lacks linear air drag: k = ")
     content = json.loads((out / "diagnosis.json").read_text())
     assert content["effects"][0]["parameters"]["k"]["value"] == pytest.approx(3.0, rel=0.1)
     assert content["after"]["stiffness"]["value"] == pytest.approx(FACTOR, rel=0.1)

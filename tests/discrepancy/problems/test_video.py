@@ -183,7 +183,7 @@ def test_command_writes_the_silhouettes(folders, tmp_path, capsys):
     options = ["--effects", "drag_linear", "--draws", "19", "--data", "video", "--device", "cpu"]
     status, out, err = run(capsys, folder, "--out", tmp_path / "out", *options)
     assert status == 0, err
-    assert out.startswith("effect: drag_linear; held-out error")
+    assert out.startswith("The model lacks linear air drag: k = ") and "Held-out error" in out and " px before" in out
     content = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert (content["error"]["measure"], content["error"]["unit"]) == ("outline", "px")
     own = content["silhouettes"]["drop"]
@@ -199,7 +199,7 @@ def test_command_writes_the_silhouettes(folders, tmp_path, capsys):
         capsys, folder, "--out", tmp_path / "second", *options, "--model", tmp_path / "out" / "model_after.yaml", "--most", "1"
     )
     assert status == 0, err
-    assert out.startswith("none; ")
+    assert out.startswith("Nothing is missing")
 
 
 def test_measured_film_shows_the_body_that_goes_with_it(data_root):

@@ -198,6 +198,13 @@ def test_player_begins_where_the_motions_lie_furthest_apart():
     assert motion_player.most_telling(x, moved) == 4
 
 
+def test_without_an_effect_there_is_one_prediction():
+    c = content(answer="none", effects=[], models=[])
+    made = figures(page.page([c], [motion()]))
+    assert made[0]["called"] == ["measured", "predicted"] and len(made[0]["recordings"][0]["sets"]) == 2 and made[3]["shown"] == ["before"]
+    assert [trace["name"] for trace in made[1]["data"]] == ["predicted", "noise", "noise and discretisation"]
+
+
 def test_a_ranking_shows_the_named_effect_apart_from_its_rivals():
     made = plots.ranking(content()["models"], 1.1)
     assert [trace["name"] for trace in made["data"]] == ["named, or not told from it", "other effects", "95 % of what chance brings"]

@@ -40,7 +40,13 @@ def test_none_says_what_could_have_been_seen_and_where_the_residual_stands():
 
 
 def test_unfinished_names_a_lead_and_what_was_not_tried():
-    c = content(answer="unfinished", effects=[], leads=[QUADRATIC], untried=["magnus"], left_out=["the intervals"])
+    c = content(
+        answer="unfinished",
+        effects=[],
+        leads=[QUADRATIC],
+        untried=["magnus"],
+        left_out=["the intervals", "a second effect beside drag_quadratic"],
+    )
     words = words_of(c)
     assert words.finding.startswith(
         "The search was cut off before every effect was tried: nothing is named yet. In the lead so far, and no answer: "
@@ -49,7 +55,7 @@ def test_unfinished_names_a_lead_and_what_was_not_tried():
         "quadratic air drag (k = 0.500 per metre), which divides the error by 3.2" in words.finding
         and "Not tried: a Magnus force." in words.finding
     )
-    assert "more minutes" in words.notes
+    assert "more minutes" in words.notes and "beside quadratic air drag" in words.notes
 
 
 def test_insufficient_says_why_first_and_what_would_help():
@@ -89,6 +95,7 @@ def test_every_effect_of_the_library_has_words():
     assert set(titles()) == {entry.name for entry in LIBRARY}
     assert title("of_my_own") == "of my own"
     assert worded("leaves 2 times the error of drag_linear, my_own") == "leaves 2 times the error of linear air drag, my_own"
+    assert worded("drag_linear.k ends at 5 1/s, the edge") == "drag_linear.k ends at 5 1/s, the edge"
     assert listed([]) == "" and listed(["a"]) == "a" and listed(["a", "b", "c"], "or") == "a, b or c"
 
 

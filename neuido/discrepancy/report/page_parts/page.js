@@ -71,12 +71,13 @@
       return lines;
     };
     const traces = k => {
-      const at = sets.map(s => place(s, k)), roles = ["measured", "before", "after"];
-      const data = at.map((x, i) => ({ type: "scatter3d", mode: "markers", name: roles[i], x: x[0], y: x[1], z: x[2], hoverinfo: "name+x+y+z",
+      const at = sets.map(s => place(s, k)), roles = ["measured", "before", "after"], called = figure.called;
+      const data = at.map((x, i) => ({ type: "scatter3d", mode: "markers", name: called[i], x: x[0], y: x[1], z: x[2], hoverinfo: "name+x+y+z",
         marker: { size: i ? 2.6 : 3.6, color: colour(roles[i]), opacity: i ? 0.9 : 0.65 } }));
-      [1, 2].forEach(i => {
+      at.slice(1).forEach((_, m) => {
+        const i = m + 1;
         const l = arrows(at[i], at[0]);
-        data.push({ type: "scatter3d", mode: "lines", name: "residual " + roles[i], x: l[0], y: l[1], z: l[2], hoverinfo: "skip",
+        data.push({ type: "scatter3d", mode: "lines", name: "residual " + called[i], x: l[0], y: l[1], z: l[2], hoverinfo: "skip",
           line: { color: colour(roles[i]), width: 2 } });
       });
       return data;
@@ -133,6 +134,7 @@
   const map = (box, figure) => {
     const pick = box.querySelector("select"), radios = [...box.querySelectorAll("input")], space = box.querySelector(".space");
     names(pick, figure.recordings);
+    radios.forEach(e => { e.parentElement.hidden = figure.shown.length < 2; });
     const show = () => {
       const r = figure.recordings[+pick.value], when = radios.find(e => e.checked).value;
       const layout = spatial([undefined, undefined, undefined], figure.unit, null);
