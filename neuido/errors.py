@@ -1,4 +1,4 @@
-"""`UserError`, for faults that a user can fix, and the conversion of any error to one line for the terminal.
+"""`UserError`, for mistakes that a user can fix, and the conversion of any error to one line for the terminal.
 
 The message of a `UserError` is one line: what is wrong, the value, and the option to change.
 """
@@ -30,7 +30,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 LONGEST = 300
-"""Largest number of characters of an error's line; a longer line loses its middle."""
+"""Largest number of characters in the line of an error; a longer line is shortened in the middle."""
 
 _NO_MEMORY = re.compile(r"can't allocate memory|bad_alloc|bad allocation|Unable to allocate|not enough memory", re.IGNORECASE)
 _NOT_WRITTEN = re.compile(r"No space left on device|os error 28|PytorchStreamWriter failed|file write failed|\d+ requested and \d+ written")

@@ -125,8 +125,11 @@ class MultiViewBatch(NamedTuple):
 class Plane:
     """A half-space collider; material stays on the side that the normal points to.
 
-    `contact` is `sticky` (velocity zero in the collider), `slip` (no normal velocity) or `separate` (no inward normal
-    velocity; `friction` is Coulomb's coefficient, and `inf` prevents all sliding while there is contact).
+    Args:
+        point: A point of the plane [m].
+        normal: Normal of the plane, of any length.
+        contact: `sticky` (zero velocity in the collider), `slip` (no normal velocity) or `separate` (no inward normal velocity).
+        friction: Coulomb's coefficient for `separate` [-]; infinity prevents all sliding in contact.
     """
 
     point: Vector
@@ -137,7 +140,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Box:
-    """An axis-aligned box [m]."""
+    """An axis-aligned box, given by its lower and upper corner [m]."""
 
     lower: Vector
     upper: Vector
@@ -145,7 +148,12 @@ class Box:
 
 @dataclass(frozen=True)
 class AttachedMass:
-    """A mass [kg] spread over the particles that lie in the box at t = 0, in proportion to their volume."""
+    """A mass that is added to the particles in a box at t = 0, in proportion to their volume.
+
+    Args:
+        box: The box [m].
+        mass: The mass [kg].
+    """
 
     box: Box
     mass: float
@@ -153,7 +161,13 @@ class AttachedMass:
 
 @dataclass(frozen=True)
 class Walls:
-    """The six walls of the domain, `inset` cells inside it."""
+    """The six walls of the domain.
+
+    Args:
+        contact: As for `Plane`.
+        friction: As for `Plane` [-].
+        inset: Distance of the walls from the faces of the domain, in cells.
+    """
 
     contact: str = "separate"
     friction: float = 0.0
@@ -164,8 +178,16 @@ class Walls:
 class Scene:
     """The set-up of one simulation: domain, grid, time step, gravity, colliders, clamps and attached masses.
 
-    `cells` counts the grid cells along the domain's longest side; `dt` is the substep [s]; `walls = None` leaves the domain
-    open (a particle that leaves it is then an error).
+    Args:
+        lower: Lower corner of the domain [m].
+        upper: Upper corner of the domain [m].
+        cells: Number of grid cells along the longest side of the domain.
+        dt: Substep [s].
+        gravity: Acceleration of gravity [m/s^2].
+        colliders: Planes that act on the grid, in this order and before the walls.
+        walls: Walls of the domain; None: the domain is open, and a particle that leaves it is an error.
+        clamps: Boxes whose particles and nodes are held at rest.
+        attached_masses: Masses that are added to the body.
     """
 
     lower: Vector = (0.0, 0.0, 0.0)

@@ -25,7 +25,7 @@ class Law:
     """Whether the law returns F unchanged in every scene, so that a rollout may skip it."""
 
     strain_limit: float | None = None
-    """Largest logarithmic stretch up to which the law is known to hold; None: any."""
+    """Largest absolute logarithmic stretch for which the law is valid [-]; None: no limit."""
 
     def tensors(self) -> tuple[Tensor, ...]:
         """Return the differentiable inputs of `forward`, each with a leading axis of S scenes.
@@ -92,7 +92,7 @@ class Law:
 
 
 def strain_limit(*laws: Law | None) -> float | None:
-    """Return the smallest `strain_limit` of the laws; None where none has one."""
+    """Return the smallest `strain_limit` of some laws; None if no law has a limit."""
     limits = [law.strain_limit for law in laws if law is not None and law.strain_limit is not None]
     return min(limits, default=None)
 

@@ -119,7 +119,7 @@ class Simulator:
         elasticity: ElasticLaw,
         viscosity: Tensor | None = None,
         mass: Tensor | None = None,
-        stiffer: tuple[Tensor, Tensor] | None = None,
+        stiffening: tuple[Tensor, Tensor] | None = None,
     ) -> list[StepLimit]:
         """Return the longest stable step of each scene; arguments are those of `check_step`.
 
@@ -127,7 +127,7 @@ class Simulator:
             UserError: A negative modulus.
         """
         out = []
-        for s, (modulus, density) in enumerate(inputs.waves(self, elasticity, mass, stiffer)):
+        for s, (modulus, density) in enumerate(inputs.waves(self, elasticity, mass, stiffening)):
             dx, viscous = self.scenes[s].dx, math.inf
             if viscosity is not None:
                 eta, zeta = viscosity.detach()[s].double().tolist()
@@ -157,7 +157,7 @@ class Simulator:
         elasticity: ElasticLaw,
         viscosity: Tensor | None = None,
         mass: Tensor | None = None,
-        stiffer: tuple[Tensor, Tensor] | None = None,
+        stiffening: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         """Raise where the time step is too long for the elastic wave, the viscosity or the initial speed.
 
@@ -165,22 +165,22 @@ class Simulator:
             elasticity: Elastic law; its P-wave modulus sets the wave speed.
             viscosity: `Effects.viscosity` [Pa s], (S, 2).
             mass: Particle masses [kg], (P,).
-            stiffer: What effects add to the P-wave modulus [Pa], and their largest factor on the sum, (S,) each.
+            stiffening: What effects add to the P-wave modulus [Pa], and their largest factor on the sum, (S,) each.
 
         Raises:
             UserError: A negative modulus, dt c / dx above `COURANT_LIMIT`, a viscosity too large for an explicit step, or a body that
                 starts faster than one cell a step.
         """
-        for why in self._refusals(elasticity, viscosity, mass, stiffer):
+        for why in self._refusals(elasticity, viscosity, mass, stiffening):
             if why:
                 raise UserError(why)
 
     def _refusals(
-        self, elasticity: ElasticLaw, viscosity: Tensor | None, mass: Tensor | None, stiffer: tuple[Tensor, Tensor] | None
+        self, elasticity: ElasticLaw, viscosity: Tensor | None, mass: Tensor | None, stiffening: tuple[Tensor, Tensor] | None
     ) -> list[str]:
         """Return for each scene why its step is too long, as `check_step` reports it; an empty string where the step is stable."""
         out = []
-        for s, limit in enumerate(self.step_limits(elasticity, viscosity, mass, stiffer)):
+        for s, limit in enumerate(self.step_limits(elasticity, viscosity, mass, stiffening)):
             why = ""
             scene = self.scenes[s]
             if scene.dt > limit.of_waves:
