@@ -106,6 +106,11 @@ def _dispatch(args: list[str]) -> int:
     if name == "--version":
         print(f"neuido {neuido.__version__}")
         return 0
+    if name.partition("=")[0] == "--print_completion":
+        from neuido.commands.completion import completion
+
+        print(completion(name.partition("=")[2] or "".join(args[1:2]), LIGHT))
+        return 0
     if name not in LIGHT and name not in HEAVY:
         known = [*HEAVY, *LIGHT]
         raise UserError(f"unknown command '{name}'{suggest(name, known) or ':'} The commands are {', '.join(known)}")
@@ -127,7 +132,8 @@ def _help() -> str:
     table = HEAVY | {name: text for name, (*_, text) in LIGHT.items()}
     commands = "\n".join(f"  {name:<14}{text}" for name, text in table.items())
     return (
-        f"usage: neuido [--help] [--version] COMMAND [--config FILE] [OPTIONS]\n\n{neuido.__doc__.splitlines()[0]}\n\n"
+        "usage: neuido [--help] [--version] [--print_completion SHELL] COMMAND [--config FILE] [OPTIONS]\n\n"
+        f"{neuido.__doc__.splitlines()[0]}\n\n"
         f"commands:\n{commands}\n\n`neuido COMMAND --help` lists the options of a command; `--print_config` writes them as YAML."
     )
 

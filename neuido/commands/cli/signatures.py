@@ -43,6 +43,8 @@ class Option(NamedTuple):
     """As YAML has it; None where a value must be given."""
     text: str
     """From the docstring; empty where it says nothing."""
+    choices: tuple[str, ...] = ()
+    """The values that there are, as YAML has them; empty where they cannot be listed."""
 
 
 class Signature(NamedTuple):
@@ -233,7 +235,8 @@ def _parameters(node: ast.FunctionDef, module: str, docs: dict[str, str], *, met
     options = {}
     for argument, default in pairs:
         value = None if default is None else _value(default)
-        options[argument.arg] = Option(argument.arg, _type(argument.annotation, module), value, docs.get(argument.arg, ""))
+        kind = argument.annotation
+        options[argument.arg] = Option(argument.arg, _type(kind, module), value, docs.get(argument.arg, ""), _choices(kind, module))
     return options, given.kwarg is not None
 
 
@@ -312,6 +315,26 @@ def _alias(module: str, name: str, depth: int = 0) -> tuple[str, ast.expr] | Non
                 return (module, node.value) if isinstance(node.value, ast.Subscript | ast.BinOp | ast.Name) else None
     origin = _imports(module).get(name, "").rpartition(".")
     return _alias(origin[0], origin[2], depth + 1) if origin[0] else None
+
+
+def _choices(node: ast.expr | None, module: str, depth: int = 0) -> tuple[str, ...]:
+    """Return the values that an annotation allows, where it names all of them."""
+    if isinstance(node, ast.Constant) and node.value is None:
+        return ("null",)
+    if isinstance(node, ast.BinOp):
+        parts = [_choices(side, module, depth) for side in (node.left, node.right)]
+        return (*parts[0], *parts[1]) if all(parts) else ()
+    if isinstance(node, ast.Subscript):
+        head = ast.unparse(node.value).rpartition(".")[2]
+        inner = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        if head == "Literal":
+            return tuple(yaml_word(ast.literal_eval(part)) for part in inner)
+        parts = [_choices(part, module, depth) for part in inner] if head in ("Optional", "Union") else [()]
+        return (*(word for part in parts for word in part), *["null"] * (head == "Optional")) if all(parts) else ()
+    if isinstance(node, ast.Name) and node.id == "bool":
+        return ("true", "false")
+    meant = _alias(module, node.id) if isinstance(node, ast.Name) and depth < 8 and node.id not in ("int", *_NAMES) else None
+    return _choices(meant[1], meant[0], depth + 1) if meant else ()
 
 
 def _first_line(node: ast.ClassDef | ast.FunctionDef) -> str:
