@@ -279,7 +279,7 @@ def linear_gradient(x: Tensor, slope: Tensor, *, mean: Tensor | None = None, len
         length: Reference length [m]; by default the largest extent of `x`.
     """
     mean = x.mean(dim=0) if mean is None else mean
-    length = (x.amax(dim=0) - x.amin(dim=0)).max() if length is None else length
+    length = (x.amax(dim=0) - x.amin(dim=0)).max().clamp(min=1e-30) if length is None else length  # one point: a factor of one
     return torch.exp(((x - mean) / length * slope).sum(-1))
 
 

@@ -145,8 +145,12 @@ def build(real: type) -> SimpleNamespace:
         force: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
+        rest: wp.array(dtype=vec3),
     ):
-        """Advance the nodes by symplectic Euler: the velocity from the forces, then the position from the new velocity."""
+        """Advance the nodes by symplectic Euler: the velocity from the forces, then the position from the new velocity.
+
+        `rest`, if given, accumulates what the rounding of x leaves out.
+        """
         i = wp.tid()
         if held[i] == wp.uint8(1):
             v[i] = vec3(zero, zero, zero)
@@ -158,7 +162,12 @@ def build(real: type) -> SimpleNamespace:
             f += force[corner[k]]
         u = push(v[i] + (h / mass[i]) * f, x[i], h, gravity[s], forces, s)
         u = touch(u, x[i], s, h, plane, kind, friction, forces)
-        y = x[i] + h * u
+        step = h * u
+        if rest:
+            step += rest[i]
+        y = x[i] + step
+        if rest:
+            rest[i] = step - (y - x[i])
         v[i] = u
         x[i] = y
 

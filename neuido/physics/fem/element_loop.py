@@ -95,6 +95,7 @@ class Loop:
         self.smoothed = torch.empty_like(self.F) if self.nodal else self.F
         self.J, self.J_mean, self.pressure = (like.new_empty(elements if self.nodal else 0) for _ in range(3))
         self.at_node = like.new_empty(nodes if self.nodal else 0)
+        self.rest = torch.empty_like(self.x) if solver.dtype == torch.float32 else None
         self.lowest = like.new_empty(elements)
         self.since = torch.empty(elements, dtype=torch.int32, device=like.device)
         self.graph: torch.cuda.CUDAGraph | None = None
@@ -121,6 +122,8 @@ class Loop:
                 t.copy_(value)
         self.history.zero_()
         self.lowest.fill_(math.inf)
+        if self.rest is not None:
+            self.rest.zero_()
         assembly = self.assembly
         with torch_stream(assembly.solver.device):
             self._launch(assembly.solver.kernels.reference, len(self.F), assembly.elements, self.x, self.gradients)
@@ -202,7 +205,7 @@ class Loop:
         rates = n == self.count - 1 or f.viscosity is not None or self.layout.width > 0
         self._launch(k.corner_forces, len(self.F), a.volume, self.gradients, self.tau, self.force)
         self._launch(k.move, len(self.x), a.first, a.corner, a.node_scene, a.held, f.mass, f.dt, pull, f.force, self.plane, self.kind,
-                     f.friction, self.force, self.x, self.v)  # fmt: skip
+                     f.friction, self.force, self.x, self.v, self.rest)  # fmt: skip
         self._launch(k.kinematics, len(self.F), a.elements, self.x, self.v, self.shape, rates, self.gradients, self.C,
                      self.trial if self.changes else self.F, n, self.lowest, self.since)  # fmt: skip
 

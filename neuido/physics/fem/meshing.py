@@ -376,7 +376,9 @@ def _best_counts(
         if full.any() and (best is None or cost < best[0]):
             best = (cost, n, full.reshape(counts), misfit)
     if best is None:
-        raise UserError("the particles fill no cell of the mesh; raise `elements`")
+        raise UserError(
+            f"the particles fill no cell of the mesh; raise `elements`, or check their volumes, {weight.sum():.3g} m^3 together"
+        )
     return best[1:]
 
 

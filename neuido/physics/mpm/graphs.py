@@ -149,7 +149,7 @@ class RolloutCache:
     def find(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> CachedRollout:
         """Return the cached rollout for a plan and inputs of these shapes, or make one; captured if graphs are on and the laws allow it."""
         own = plan.key(inputs) if self.graphs else None
-        key = (own, plan.steps, plan.every, plan.plasticity is None, keep_all, *(tuple(t.shape) for t in inputs))
+        key = (own, plan.steps, plan.every, plan.plasticity is None, plan.compensated, keep_all, *(tuple(t.shape) for t in inputs))
         if key not in self._rollouts:
             while len(self._rollouts) >= CAPACITY:
                 self._rollouts.popitem(last=False)

@@ -51,6 +51,7 @@ class Plan:
         tables: Tables of the material effects, if any; they decide which kernels are launched.
         nan_on_failure: Set the frames of a failed scene to NaN instead of raising.
         recorder: Collects the marks of the rollout, with the particles in the order of the kernels; by default a new one.
+        compensated: Carry what the rounding of x and F leaves out from substep to substep (Kahan 1965).
 
     Attributes:
         offset: Substeps of the whole rollout before those of this plan.
@@ -67,7 +68,9 @@ class Plan:
         tables: Tables | None = None,
         nan_on_failure: bool = False,
         recorder: MarkRecorder | None = None,
+        compensated: bool = False,
     ) -> None:
+        self.compensated = compensated
         self.recorder = MarkRecorder(len(setup.mass), setup.mass) if recorder is None else recorder
         self.offset, self.total = 0, steps
         self.setup, self.elasticity, self.steps, self.every = setup, elasticity, steps, every
@@ -93,7 +96,7 @@ class Plan:
         """Return the part of the cache key of the launches that shapes do not give; None if they must not be captured."""
         elastic = self.elasticity.key(inputs[FIXED : self.split])
         plastic = "none" if self.plasticity is None else self.plasticity.key(inputs[self.split :])
-        own = (self.steps, self.every, self.layout, self.spectral, self.flow_kinds)
+        own = (self.steps, self.every, self.layout, self.spectral, self.flow_kinds, self.compensated)
         return None if elastic is None or plastic is None else (*own, elastic, plastic)
 
     def shortened(self, steps: int) -> "Plan":
@@ -113,7 +116,8 @@ class Plan:
         plastic = None if self.plasticity is None else self.plasticity.single_scene(s)
         tables = None if self.tables is None else self.tables._replace(kinds=self.flow_kinds[s : s + 1])
         elastic = self.elasticity.single_scene(s)
-        plan = Plan(self.setup.single_scene(s), elastic, plastic, self.steps, self.every, tables, self.nan_on_failure, self.recorder)
+        whole = self.nan_on_failure, self.recorder, self.compensated
+        plan = Plan(self.setup.single_scene(s), elastic, plastic, self.steps, self.every, tables, *whole)
         plan.split = self.split
         return plan
 

@@ -34,6 +34,10 @@ class Tape(NamedTuple):
     """Smallest det F of each particle, of those below `COLLAPSED`, (P,)."""
     since: Tensor
     """First substep in which it was below, (P,) int32; -1: never."""
+    rest_x: Tensor | None
+    """What the rounding of x has left out so far, (P, 3); None: not kept."""
+    rest_F: Tensor | None
+    """The same of F, (P, 3, 3)."""
     tau: Tensor | None
     """Stress of each substep, (T, P, 3, 3), or None."""
     trial: Tensor | None
@@ -68,7 +72,8 @@ def new_tape(plan: Plan, keep_all: bool) -> Tape:
     tau = setup.state.F.new_empty(plan.steps, *setup.state.F.shape) if more else None
     trial = torch.empty_like(tau) if tau is not None and plan.corrects else None
     grid, velocity = (setup.mass.new_empty(plan.steps, setup.node_count, 4) if more else None for _ in range(2))
-    return Tape(x, v, C, F, history, status, lowest, since, tau, trial, grid, velocity, keep_all)
+    rest_x, rest_F = (torch.empty_like(t) if plan.compensated else None for t in (setup.state.x, setup.state.F))
+    return Tape(x, v, C, F, history, status, lowest, since, rest_x, rest_F, tau, trial, grid, velocity, keep_all)
 
 
 def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
@@ -97,6 +102,9 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
     tape.status.zero_()
     tape.lowest.fill_(math.inf)
     tape.since.fill_(-1)
+    for rest in (tape.rest_x, tape.rest_F):
+        if rest is not None:
+            rest.zero_()
     with torch_stream(setup.device):
         elastic, plastic = plan.engines(inputs)
         for n in range(plan.steps if steps is None else steps):
@@ -177,7 +185,8 @@ def gather(
     x, _, _, F, history = now
     plan.launch(setup.kernels.grid_to_particles, len(x),
                 [setup.particles.scene, setup.sorted_held, setup.origin, setup.dx, setup.dt, setup.nodes, velocity, x, F, *then[:3],
-                 trial if plan.corrects else then[3], n, tape.status, setup.span, tape.lowest, tape.since], plan.block)  # fmt: skip
+                 trial if plan.corrects else then[3], n, tape.status, setup.span, tape.lowest, tape.since,
+                 tape.rest_x, tape.rest_F], plan.block)  # fmt: skip
     if plastic is not None:
         plastic.forward(trial, then[3])
     if material is not None:

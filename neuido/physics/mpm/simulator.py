@@ -32,6 +32,10 @@ COURANT_LIMIT = 1.0
 """Upper bound of the Courant number dt c / dx and of 2 dt nu / dx^2; c: elastic P-wave speed, nu: kinematic P-viscosity."""
 
 
+RESOLUTION = 256.0
+"""Rounding units of a position that a step at the largest likely speed has at least; below, float32 carries what it rounds off."""
+
+
 class StepLimit(NamedTuple):
     """The longest stable time steps of one scene [s]."""
 
@@ -152,6 +156,15 @@ class Simulator:
         """Return the largest initial speed of the body of scene s [m/s]."""
         return float(self.state.v[self.particles.offsets[s] : self.particles.offsets[s + 1]].norm(dim=1).max())
 
+    def _rounds_off(self, state: ParticleState, pull: Tensor, steps: int) -> bool:
+        """Return whether a step at the largest likely speed is so short that float32 would lose a part of the motion (`RESOLUTION`)."""
+        if self.dtype != torch.float32:
+            return False
+        with torch.no_grad():
+            largest = [state.v.norm(dim=1).amax(), pull.norm(dim=-1).amax(), state.x.abs().amax(), self.dt.amin(), self.dt.amax()]
+            speed, acceleration, reach, shortest, longest = torch.stack(largest).tolist()
+        return (speed + acceleration * longest * steps) * shortest < RESOLUTION * torch.finfo(torch.float32).eps * reach
+
     def check_step(
         self,
         elasticity: ElasticLaw,
@@ -259,7 +272,8 @@ class Simulator:
         elif check:
             self.check_step(*step)
         tables, mass = given.tables, given.mass
-        plan = Plan(self.setup, elasticity, plasticity, steps, every, tables, nan_on_failure)
+        compensated = self._rounds_off(given.state, pull, steps)
+        plan = Plan(self.setup, elasticity, plasticity, steps, every, tables, nan_on_failure, compensated=compensated)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
         history = mass.new_zeros(len(mass), plan.layout.width)
         start = [t[self.order] for t in (*given.state, history, mass)]

@@ -211,12 +211,15 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         span: wp.array(dtype=real),
         lowest: wp.array(dtype=real),
         since: wp.array(dtype=wp.int32),
+        rest_x: wp.array(dtype=vec3),
+        rest_F: wp.array(dtype=mat33),
     ):
         """Compute x, v, C and the trial F of the particles from the nodal velocities.
 
         The first particle of a scene that is lost, too fast or not finite writes a code, its index and the step into `status`. If `span`
         is not empty, it becomes the smallest and the largest x of the particles. A particle with a trial det F below `COLLAPSED` writes
-        the smallest det F into `lowest` and the first such step into `since`.
+        the smallest det F into `lowest` and the first such step into `since`. `rest_x` and `rest_F`, if given, accumulate what the
+        rounding of x and F leaves out.
         """
         p = wp.tid()
         s = scene[p]
@@ -239,12 +242,20 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         m = moments(velocity, node, nodes[1], nodes[2], wx, wy, wz)
         v = m[0]
         C = (real(4.0) / h) * wp.matrix_from_cols(m[1] - f[0] * v, m[2] - f[1] * v, m[3] - f[2] * v)
-        y = x[p] + dt[s] * v
+        move = dt[s] * v
+        change = dt[s] * (C * F[p])
+        if rest_x:
+            move += rest_x[p]
+            change += rest_F[p]
+        y = x[p] + move
+        trial = F[p] + change
+        if rest_x:
+            rest_x[p] = move - (y - x[p])
+            rest_F[p] = change - (trial - F[p])
         x_next[p] = y
         extend_span(span, y[0])
         v_next[p] = v
         C_next[p] = C
-        trial = F[p] + dt[s] * (C * F[p])
         F_trial[p] = trial
         J = wp.determinant(trial)
         if J < wp.static(real(COLLAPSED)):

@@ -196,6 +196,7 @@ class _Rollout(torch.autograd.Function):
     def forward(ctx: Any, body: MassSpring, steps: int, dt: float, x: Tensor, v: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:
         xs, vs = x.new_empty(steps + 1, *x.shape), v.new_empty(steps + 1, *v.shape)
         before, parts = v.new_empty(steps, *v.shape), v.new_empty(len(v) * body.lanes, 3)
+        left_out = torch.zeros_like(v) if v.dtype == torch.float32 else None
         xs[0], vs[0] = x.detach(), v.detach()
         stiffness, damping, grip = (p.detach() for p in parameters)
         springs = [body.power, body.offsets, body.others, body.springs, body.rest, stiffness, damping]
@@ -203,7 +204,7 @@ class _Rollout(torch.autograd.Function):
         now = [xs, vs, body.lanes, parts]
         with torch_stream(body.device):
             pull = repeated(body.kernels.pull, len(parts), [*springs, *now], body.device, block=BLOCK)
-            move = repeated(body.kernels.move, len(x), [*masses, *now, before], body.device, block=BLOCK)
+            move = repeated(body.kernels.move, len(x), [*masses, *now, before, left_out], body.device, block=BLOCK)
             for n in range(steps):
                 pull(n)
                 move(n)

@@ -90,16 +90,21 @@ def build(real: type) -> SimpleNamespace:
     @kernel
     def move(
         n: int, dt: real, gravity: vec3, mass: reals, planes: planes_of, kinds: ints, grip: reals, x: frames, v: frames, lanes: int,
-        parts: vecs, before: frames,
+        parts: vecs, before: frames, left_out: vecs,
     ):  # fmt: skip
-        """Write the velocity before contact, and the next position and velocity."""
+        """Write the velocity before contact, and the next position and velocity; `left_out`, if given, accumulates what x rounds off."""
         i = wp.tid()
         force = vec3(zero, zero, zero)
         for k in range(lanes):
             force += parts[i * lanes + k]
         moved = v[n, i] + dt * (gravity + force / mass[i])
         before[n, i] = moved
-        place = x[n, i] + dt * moved
+        step = dt * moved
+        if left_out:
+            step += left_out[i]
+        place = x[n, i] + step
+        if left_out:
+            left_out[i] = step - (place - x[n, i])
         for k in range(planes.shape[0]):
             place, moved = touch(planes[k], kinds[k], grip[0], place, moved)
         x[n + 1, i] = place

@@ -128,7 +128,8 @@ def kernel_cases(stage: Stage):
     grid = stage.grid()
     velocity = torch.zeros_like(grid)
     moving = {"held": sim.held, "step": 0, "status": torch.zeros(3, dtype=torch.int32, device=DEVICE), "span": x.new_zeros(0),
-              "lowest": x.new_zeros(len(x)), "since": torch.zeros(len(x), dtype=torch.int32, device=DEVICE)}  # fmt: skip
+              "lowest": x.new_zeros(len(x)), "since": torch.zeros(len(x), dtype=torch.int32, device=DEVICE),
+              "rest_x": None, "rest_F": None}  # fmt: skip
     next_C = torch.zeros_like(C)
     field = 0.5 * stage.random(velocity)
     return {
