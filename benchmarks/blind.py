@@ -39,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import blind_scores
 
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.storage import write_text
+from neuido.data.files.writing import write_text
 from neuido.data.undeclared import Case, make_undeclared
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.errors import UserError

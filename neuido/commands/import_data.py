@@ -65,12 +65,17 @@ def import_data(
     Raises:
         UserError: What cannot be read or is missing.
     """
+    from pathlib import Path
+
+    from neuido.data.files.writing import check_writable
     from neuido.data.importers.importing import import_file
     from neuido.data.importers.testing_machine import Specimen
     from neuido.errors import UserError
 
     if out is None and not dry_run:
         raise UserError("give --out FOLDER, or --dry_run true")
+    if out is not None and not dry_run:
+        check_writable(Path(out).expanduser())
     lines = import_file(
         files,
         None if dry_run else out,

@@ -1,8 +1,11 @@
 """The `latents` command: signature and help alone, so that `--help` loads no torch."""
 
+import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuido.data.files.output_folder import claimed_folder
+from neuido.data.files.writing import check_writable
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 
@@ -52,9 +55,12 @@ def latents(
             raise UserError(f"parts: {part!r} is not known; choose from {', '.join(PARTS)}")
     from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 
-    opened, folder = IntrinsicDynamicsOperator.load(operator), Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    with Progress("latents", len(parts), unit="parts") as work:
+    folder = Path(out)
+    check_writable(folder)
+    opened = IntrinsicDynamicsOperator.load(operator)
+    plan = {"operator": _identity(operator), "ends": ends, "family": family, "count": count, "perplexity": perplexity, "seed": seed}
+    held = claimed_folder(folder, plan, "the latents of other options", file="setup.json")
+    with held, Progress("latents", len(parts), unit="parts") as work:
         if "space" in parts:
             work.say("silhouettes, t-SNE and directions")
             _space(opened, folder, perplexity, seed)
@@ -63,6 +69,12 @@ def latents(
             work.say("rollouts between two latents")
             _interpolation(opened, folder, ends, family, count, device)
     print(f"results in {folder}: tables (.csv), pictures (.png) and, of the interpolation, its motion (.npz)")
+
+
+def _identity(operator: str) -> str:
+    """Return what tells an operator from another: the digest of a file, or its name."""
+    path = Path(operator).expanduser()
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else operator
 
 
 def _space(operator: "IntrinsicDynamicsOperator", folder: Path, perplexity: float, seed: int) -> None:

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import neuido
-from neuido.commands import interruption
+from neuido.commands.cli import interruption
 from neuido.commands.cli.config_files import find_configs
 from neuido.commands.cli.functions import run_function
 from neuido.commands.cli.suggestions import refuse_abbreviations

@@ -84,41 +84,41 @@ def reconstruct(
 
     import torch
 
-    from neuido.data.files.storage import write_text
+    from neuido.data.files.output_folder import claimed_folder
+    from neuido.data.files.writing import check_writable, write_text
     from neuido.data.scenes.filmed_scene import RECONSTRUCTION, load_views, read_truth, write_setting
     from neuido.physics.runtime.device import choose_device
     from neuido.types import Gaussians
 
     source = Path(folder).expanduser()
     target = Path(out).expanduser() if out is not None else source / RECONSTRUCTION
+    check_writable(target)
     chosen = choose_device(device)
     around = _setting(source, setting, recording, scale, shift, up)
     batch = load_views(source, placing=around.placing, recording=recording, frame_interval=frame_interval, frame_count=1, width=width)
     if (trained := int((~batch.held_out).sum())) < 2:
         raise UserError(f"{source} has {trained} views to train on; a reconstruction needs at least two")
-    target.mkdir(parents=True, exist_ok=True)
-    shown = {key: value for key, value in options.items() if key not in ("out", "device", "progress", "save_every", "folder")}
-    text = json.dumps(shown, indent=1, default=list) + "\n"
-    if (target / SETUP).is_file() and (target / SETUP).read_text() != text:
-        raise UserError(f"{target} holds a reconstruction with other options: give another out, or remove the folder")
-    write_text(target / SETUP, text)
-    if (target / REPORT).is_file():
+    plan = {key: value for key, value in options.items() if key not in ("out", "device", "progress", "save_every", "folder")}
+    if out is not None:
+        plan["source"] = str(source.resolve())
+    with claimed_folder(target, plan, "a reconstruction with other options", file=SETUP):
+        if (target / REPORT).is_file():
+            _tell(target)
+            return
+        torch.manual_seed(seed)
+        module = _optimise(batch, around, target, chosen, options)
+        with torch.no_grad():
+            found = Gaussians(*(part.detach() for part in module.gaussians()[:4]))
+            body = _fill(found, module, batch, around, source, options)
+            figures = _score(module, batch) | _compare(body, found, read_truth(source) if source.is_dir() else None)
+        _write(target, found, body)
+        _draw(target / "comparison.png", module, batch, body)
+        write_setting(around, target / "scene.yaml")
+        figures |= {"gaussians": len(found.means), "particles": len(body.x), "volume": float(body.volume.double().sum())}
+        report = json.dumps({key: float(f"{value:.5g}") for key, value in figures.items()}, indent=1) + "\n"
+        write_text(target / REPORT, report)
+        (target / RESUME).unlink(missing_ok=True)
         _tell(target)
-        return
-    torch.manual_seed(seed)
-    module = _optimise(batch, around, target, chosen, options)
-    with torch.no_grad():
-        found = Gaussians(*(part.detach() for part in module.gaussians()[:4]))
-        body = _fill(found, module, batch, around, source, options)
-        figures = _score(module, batch) | _compare(body, found, read_truth(source) if source.is_dir() else None)
-    _write(target, found, body)
-    _draw(target / "comparison.png", module, batch, body)
-    write_setting(around, target / "scene.yaml")
-    figures |= {"gaussians": len(found.means), "particles": len(body.x), "volume": float(body.volume.double().sum())}
-    report = json.dumps({key: float(f"{value:.5g}") for key, value in figures.items()}, indent=1) + "\n"
-    write_text(target / REPORT, report)
-    (target / RESUME).unlink(missing_ok=True)
-    _tell(target)
 
 
 def _tell(target: Path) -> None:
@@ -165,8 +165,8 @@ def _optimise(batch: "MultiViewBatch", around: "SceneSetting", target: Path, dev
     from lightning.pytorch.loggers import CSVLogger
 
     from neuido.commands.cli.console import quiet_lightning
+    from neuido.commands.cli.interruption import stop_at_step
     from neuido.commands.cli.plain_progress import needs_plain_lines, plain_progress
-    from neuido.commands.interruption import stop_at_step
     from neuido.models.reconstruct.gaussian_fit import ReconstructModule
 
     class Views(LightningDataModule):

@@ -56,16 +56,19 @@ def report(
     Raises:
         UserError: A folder without results, a malformed table.
     """
-    from neuido.data.files.storage import write_text
+    from neuido.data.files.writing import check_writable, write_text
 
     if not runs:
         raise UserError("runs is empty: name at least one folder")
+    if Path(out).is_dir():
+        raise UserError(f"out = {out} is a folder: name the page, such as {Path(out) / 'report.html'}")
+    check_writable(Path(out).absolute().parent)
     diagnosed = _diagnoses(runs)
     if diagnosed is not None:
         target = Path(out)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_text(target, diagnosed)
-        print(f"report: {target}")
+        print(f"results in {target}")
         return
     entries = open_runs(runs)
     quoted = read_rows(paper) if paper else []

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from neuido.commands.cli.config_files import find_config
+from neuido.commands.cli.interruption import SIGNALS, STATE
 from neuido.commands.cli.sweep_file import Metric, Run, SweepFile, command_of, read_sweep, runs_of
-from neuido.commands.interruption import SIGNALS, STATE
 from neuido.data.files.lock import LockHeld, OwnedLock
 from neuido.data.files.score_tables import read_rows, write_rows
 from neuido.data.files.sweep_run import FOLDER, FORMAT, read_status, write_status
+from neuido.data.files.writing import check_writable
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 
@@ -58,6 +59,7 @@ def sweep(
         print("early_terminate is for wandb's server: all runs go to their end here", file=sys.stderr)
     runs = runs_of(plan, count=count, seed=seed)
     folder = Path(out or f"runs/sweeps/{plan.name}").absolute()
+    check_writable(folder)
     folder.mkdir(parents=True, exist_ok=True)
     own = runs[shard::shards]
     with Progress("sweep", len(own), unit="runs") as work:
@@ -69,7 +71,7 @@ def sweep(
     rows = collect(plan, runs, folder)
     _summarise(rows, plan.metric, folder)
     if report and any(name.startswith("scores/") for row in rows for name in row):
-        _report(folder, path)
+        _report([str(folder / row["run"]) for row in rows if row["status"] == "done"], folder, path)
     print(f"results in {folder}: results.csv, and a folder a run")
     return int(any(row["status"] in ("failed", "interrupted") for row in rows if row["run"] in {run.name for run in own}))
 
@@ -215,8 +217,8 @@ def _summarise(rows: list[dict[str, Any]], metric: Metric | None, folder: Path) 
     print(f"{', '.join(f'{n} {status}' for status, n in counts.items() if n) or 'no run'}")
 
 
-def _report(folder: Path, path: Path) -> None:
+def _report(runs: list[str], folder: Path, path: Path) -> None:
     from neuido.commands.report import report
 
     beside = path.with_suffix(".paper.csv")
-    report([str(folder)], out=str(folder / "report.html"), paper=str(beside) if beside.is_file() else None)
+    report(runs, out=str(folder / "report.html"), paper=str(beside) if beside.is_file() else None)

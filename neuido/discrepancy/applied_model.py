@@ -4,12 +4,12 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+from neuido.data.files.output_folder import check_unused
 from neuido.data.files.writing import new_folder
 from neuido.data.measured.experiment import Recording, read_experiment, write_experiment
 from neuido.data.progress import Progress
 from neuido.discrepancy.problems.declared_model import beside, read_model_file, ready
 from neuido.discrepancy.workflow import choose_device, experiment_problem
-from neuido.errors import UserError
 from neuido.models.fewshot.scene_fit import EffectSource
 from neuido.models.inference.prepared_scene import PreparedScene
 from neuido.physics.effects.parameters import Effects
@@ -37,17 +37,15 @@ def replay(
         UserError: What readers and rollouts refuse, or a folder that is there already.
     """
     target = Path(out).expanduser()
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise UserError(f"out = {out} is there already: give another folder")
+    check_unused(target)
     experiment = read_experiment(folder, model=None if model is None else read_model_file(model))
     problem = experiment_problem(experiment, "auto", choose_device(device))
     recordings = []
-    with Progress("recordings", len(problem.measured), shown=progress) as work:
-        for n in range(len(problem.measured)):
-            recordings.append(problem.simulated(n))
-            work.update()
-
     with new_folder(target) as hidden:
+        with Progress("recordings", len(problem.measured), shown=progress) as work:
+            for n in range(len(problem.measured)):
+                recordings.append(problem.simulated(n))
+                work.update()
         write_experiment(replace(experiment, model=beside(hidden, experiment.model), recordings=tuple(recordings)), hidden)
         read_experiment(hidden)  # what cannot be read again is not published
     return {r.name: _distance(r, experiment[r.name]) for r in recordings}

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuido.data.files.output_folder import held_folder
 from neuido.data.files.writing import check_writable, make_real_folder
 from neuido.data.progress import Progress, duration
 from neuido.discrepancy.report.diagnosis import Diagnosis
@@ -124,37 +125,38 @@ def diagnose(
     plan = "read-data" if folder is None else store.plan_of(place, options, out=target)
     made, untouched = not target.is_dir(), not target.is_dir() or not any(target.iterdir())
     target.mkdir(parents=True, exist_ok=True)
-    resumes = resume and folder is not None and not arrays and not candidates  # what a function does has no name to keep it by
-    outdated = store.outdated(target, plan) if resumes else []
-    work = store.workplace(target, plan, resume=resumes)
-    if not any(work.iterdir()):  # a run that continues keeps its log
-        (target / "log.csv").unlink(missing_ok=True)
-    if outdated:
-        print(f"{target / '.work'}: stored predictions of other data, options or code are ignored", file=sys.stderr)
-    found = []
-    with Log(target / "log.csv", shown=progress, begun=begun) as log:
-        for i, problem in enumerate(problems):
-            started = time.monotonic()
-            cached = store.CachedProblem(problem, work / str(i), tick=log.tick)
-            seconds = 60.0 * minutes or math.inf
-            log.begin(problem.name if len(problems) > 1 else "", seconds)
-            log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
-            try:
-                own = infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds, statistics=statistics)
-            except UserError:
-                if untouched:
-                    _forget(target, made)
-                raise
-            found.append((own, time.monotonic() - started))
-            if statistics:
-                write_fits(make_real_folder(target / "fits", "the folder of fits") / f"{i}.npz", own.case, own.statistics)
-        log.begin("", math.inf)
-        answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
-        if not any(own.left_out or own.deadline.cut for own, _ in found):  # otherwise a run with more minutes continues from what is kept
-            store.clear(target)
-        for own, _ in found:
-            log.work(own.work)
-        log("written")
+    with held_folder(target, made=made):
+        resumes = resume and folder is not None and not arrays and not candidates  # what a function does has no name to keep it by
+        outdated = store.outdated(target, plan) if resumes else []
+        work = store.workplace(target, plan, resume=resumes)
+        if not any(work.iterdir()):  # a run that continues keeps its log
+            (target / "log.csv").unlink(missing_ok=True)
+        if outdated:
+            print(f"{target / '.work'}: stored predictions of other data, options or code are ignored", file=sys.stderr)
+        found = []
+        with Log(target / "log.csv", shown=progress, begun=begun) as log:
+            for i, problem in enumerate(problems):
+                started = time.monotonic()
+                cached = store.CachedProblem(problem, work / str(i), tick=log.tick)
+                seconds = 60.0 * minutes or math.inf
+                log.begin(problem.name if len(problems) > 1 else "", seconds)
+                log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
+                try:
+                    own = infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds, statistics=statistics)
+                except UserError:
+                    if untouched:
+                        _forget(target, made)
+                    raise
+                found.append((own, time.monotonic() - started))
+                if statistics:
+                    write_fits(make_real_folder(target / "fits", "the folder of fits") / f"{i}.npz", own.case, own.statistics)
+            log.begin("", math.inf)
+            answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
+            if not any(own.left_out or own.deadline.cut for own, _ in found):  # otherwise more minutes continue from what is kept
+                store.clear(target)
+            for own, _ in found:
+                log.work(own.work)
+            log("written")
     if given_place is not None:
         given_place.cleanup()
     return Diagnosis.read(target, keep=temporary)

@@ -64,7 +64,7 @@ def test_help_of_a_scene(capsys, scene):
     ("words", "told"),
     [
         (["{scene}", "--out", "{scene}"], ["is a file"]),
-        (["{scene}", "--out", "{used}"], ["holds files already"]),
+        (["{scene}", "--out", "{used}"], ["is in use", "mine.txt"]),
         (["{scene}", "--out", "{new}", "--steps", "10", "--every", "3"], ["every is 3"]),
         (["{scene}", "--out", "{new}", "--steps", "0"], ["steps is 0"]),
         (["{scene}", "--out", "{new}", "--law", "absent.safetensors"], ["absent.safetensors", "neuido predict"]),

@@ -160,7 +160,7 @@ def test_a_run_that_a_signal_ended_is_not_done_and_starts_again(tmp_path, monkey
 
 
 def test_a_worker_that_was_forked_dies_of_its_signal():
-    from neuido.commands.interruption import watched
+    from neuido.commands.cli.interruption import watched
 
     with watched():
         child = os.fork()

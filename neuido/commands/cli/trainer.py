@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import neuido
-from neuido.commands import interruption
+from neuido.commands.cli import interruption
 from neuido.commands.cli.checkpoint_options import check_checkpoint, does_not_fit, numbers_of, stated_options, tell_differences
 from neuido.commands.cli.config_files import expanded
 from neuido.commands.cli.console import quiet_lightning

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuido.data.files.html_page import escaped, page, picture, table
+from neuido.data.files.output_folder import claimed_folder
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from neuido.commands.demo.learned_laws import LawsResult
 
 PARTS = ("laws", "video", "loop")
+MADE = ("trajectories", "lightning_logs", "csv", "demo.png", "video", "loop", "report.html")
+"""What a demonstration leaves in its folder; that of an earlier version has no demo.json."""
 
 
 def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "laws,video,loop") -> None:
@@ -41,16 +44,17 @@ def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "
     from neuido.physics.runtime.threads import one_thread_each
 
     folder, sections = Path(out), []
-    with one_thread_each():
-        for part in (part for part in PARTS if part in chosen):
-            begun = time.monotonic()
-            body = {"laws": _laws, "video": _video, "loop": _loop}[part](folder, settings)
-            spent = time.monotonic() - begun
-            print(f"{part}: {spent:.0f} s\n", flush=True)
-            sections.append(f'{body}<p class="note">{spent:.0f} s.</p>')
-    target = folder / "report.html"
-    _write(target, "\n".join(sections))
-    print(f"results in {folder}: open {target}")
+    with claimed_folder(folder, {"settings": settings}, "a demonstration with other settings", file="demo.json", keeps=MADE):
+        with one_thread_each():
+            for part in (part for part in PARTS if part in chosen):
+                begun = time.monotonic()
+                body = {"laws": _laws, "video": _video, "loop": _loop}[part](folder, settings)
+                spent = time.monotonic() - begun
+                print(f"{part}: {spent:.0f} s\n", flush=True)
+                sections.append(f'{body}<p class="note">{spent:.0f} s.</p>')
+        target = folder / "report.html"
+        _write(target, "\n".join(sections))
+        print(f"results in {folder}: open {target}")
 
 
 def _laws(folder: Path, settings: str) -> str:
@@ -134,6 +138,6 @@ def loop_section(result: "LoopResult", folder: Path) -> str:
 
 
 def _write(path: Path, body: str) -> None:
-    from neuido.data.files.storage import write_text
+    from neuido.data.files.writing import write_text
 
     write_text(path, page("neuido demo", f"<h1>neuido demo</h1>\n{body}"))

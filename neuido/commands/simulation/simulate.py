@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Literal
 
 from neuido import configs_root
+from neuido.data.files.output_folder import check_unused
+from neuido.data.files.writing import new_folder
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 
@@ -51,7 +53,8 @@ def simulate(
     from neuido.physics.laws.classical import material
     from neuido.physics.mpm.simulator import Simulator
 
-    folder = _unused(out)
+    folder = Path(out)
+    check_unused(folder)
     setup = load_scene(_one_scene(scene), data_root)
     count = setup.info["steps"] if steps is None else steps
     if count < 1:
@@ -61,14 +64,15 @@ def simulate(
     asked = on_inversion or setup.info["on_inversion"]
     simulator = Simulator(setup.scene, setup.body, density=setup.info["density"], device=device, on_inversion=asked)
     start = time.perf_counter()
-    with Progress(f"simulating {setup.info['name']}, {count} substeps in one run", shown=progress):
-        frames = simulator.rollout(count, *laws, every=spacing)
-    seconds = time.perf_counter() - start
-    try:
-        frames.save(folder / "frames.npz")
-        frames.save(folder / "ply" / "frame.ply")
-    except OSError as error:
-        raise UserError(f"out = {out}: {error.strerror or error}") from error
+    with new_folder(folder) as hidden:
+        with Progress(f"simulating {setup.info['name']}, {count} substeps in one run", shown=progress):
+            frames = simulator.rollout(count, *laws, every=spacing)
+        seconds = time.perf_counter() - start
+        try:
+            frames.save(hidden / "frames.npz")
+            frames.save(hidden / "ply" / "frame.ply")
+        except OSError as error:
+            raise UserError(f"out = {out}: {error.strerror or error}") from error
     told = f"the law of {law}" if law else ", ".join(_told(setup.info[part]) for part in ("elasticity", "plasticity"))
     print(
         f"simulated {setup.info['name']}: {frames.x.shape[1]} particles, {count} substeps of {setup.scene.dt:g} s, "
@@ -87,16 +91,6 @@ def simulate(
         f"results in {folder}: frames.npz opens with numpy.load (x, v, C, F, times), "
         "ply/frame_0000.ply and on in ParaView, MeshLab or Blender"
     )
-
-
-def _unused(out: str) -> Path:
-    """Return the folder to write, which must be new or empty."""
-    folder = Path(out)
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"out = {out} is a file: name a folder")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise UserError(f"out = {out} holds files already: name another folder, or empty this one")
-    return folder
 
 
 def _one_scene(scene: str) -> str:

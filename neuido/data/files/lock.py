@@ -1,5 +1,6 @@
 """File lock between processes that records its owner."""
 
+import contextlib
 import json
 import math
 import os
@@ -26,13 +27,14 @@ class OwnedLock:
     owner is killed.
 
     Args:
-        path: The lock file. It is never removed.
+        path: The lock file.
         purpose: What the lock guards, for error messages; for example "the run runs/a".
         wait: Longest time to wait for the lock [s]; negative: wait forever.
+        keep: Whether the lock file stays when the lock is released.
     """
 
-    def __init__(self, path: str | os.PathLike, purpose: str, *, wait: float = 0.0) -> None:
-        self.path, self.purpose, self.wait = Path(path), purpose, wait
+    def __init__(self, path: str | os.PathLike, purpose: str, *, wait: float = 0.0, keep: bool = True) -> None:
+        self.path, self.purpose, self.wait, self.keep = Path(path), purpose, wait, keep
         self.owner = self.path.with_name(self.path.name + ".owner")
         self._lock = FileLock(str(self.path))
 
@@ -67,11 +69,15 @@ class OwnedLock:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Release the lock."""
         self.owner.unlink(missing_ok=True)
+        if not self.keep:  # whoever opened it before sees that it has no name any more, and opens another
+            with contextlib.suppress(OSError):  # Windows removes no open file
+                self.path.unlink(missing_ok=True)
         self._lock.release()
 
     def _note(self, more: dict[str, Any]) -> None:
         hidden = self.owner.with_name(f"{self.owner.name}.{os.getpid()}.tmp")
-        hidden.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname(), **more}) + "\n")
+        since = time.strftime("%Y-%m-%d %H:%M:%S")
+        hidden.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since, **more}) + "\n")
         os.replace(hidden, self.owner)
 
     def _record(self) -> dict[str, Any]:
@@ -83,7 +89,8 @@ class OwnedLock:
 
     def _message(self, record: dict[str, Any]) -> str:
         who = f"process {record.get('child', record['pid'])} on {record.get('host')}" if "pid" in record else "another process"
-        return f"{self.purpose} is held by {who} (lock file {self.path}): wait until it ends, or stop it"
+        since = f" since {record['since']}" if "since" in record else ""
+        return f"{self.purpose} is held by {who}{since} (lock file {self.path}): wait until it ends, or stop it"
 
 
 def _started(pid: int) -> str | None:

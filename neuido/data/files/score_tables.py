@@ -12,7 +12,7 @@ from neuido.errors import UserError
 
 def write_rows(path: str | os.PathLike, rows: Sequence[dict[str, Any]]) -> None:
     """Write rows as a CSV file, atomically; a key that a row lacks gives an empty cell."""
-    from neuido.data.files.storage import write_text
+    from neuido.data.files.writing import write_text
 
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -21,7 +21,7 @@ def read_status(folder: Path) -> dict[str, Any]:
 
 def write_status(folder: Path, state: Mapping[str, Any]) -> None:
     """Write the status of a run to `run.json` in its folder."""
-    from neuido.data.files.storage import write_text
+    from neuido.data.files.writing import write_text
 
     write_text(folder / "run.json", json.dumps(state, indent=1) + "\n")
 

@@ -36,6 +36,12 @@ def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False) -> Itera
     _sync(path.parent)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a small file all at once; several processes may write the same one."""
+    with atomic_write(path) as hidden:
+        hidden.write_text(text)
+
+
 @contextlib.contextmanager
 def new_folder(path: str | os.PathLike) -> Iterator[Path]:
     """Create a folder atomically: yield an empty temporary folder, and rename it to `path` when the block ends.
@@ -43,9 +49,11 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
     If the block raises, the temporary folder is removed.
 
     Raises:
-        UserError: By then `path` exists, and is a file or a folder with content.
+        UserError: Another process of this machine is writing the folder; or by then `path` exists, and is a file or a folder with content.
     """
     path = Path(path)
+    _check_writer(path)
+    made = [parent for parent in path.parents if not parent.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     hidden = temporary_path(path)
     hidden.mkdir()
@@ -55,6 +63,7 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
             _sync(part)
         _sync(hidden)
         try:
+            _take_hidden_files(path, hidden)
             os.replace(hidden, path)
         except OSError as error:
             if path.exists():
@@ -62,8 +71,39 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
             raise
     except BaseException:
         remove(hidden)
+        for parent in made:
+            with contextlib.suppress(OSError):  # something else is in it by now
+                parent.rmdir()
         raise
     _sync(path.parent)
+
+
+def _take_hidden_files(path: Path, hidden: Path) -> None:
+    """Move what a folder has into a temporary one, where it has hidden files alone, so that this can take its place."""
+    there = list(path.iterdir()) if path.is_dir() and not path.is_symlink() else []
+    if all(entry.name.startswith(".") for entry in there):
+        for entry in there:
+            os.replace(entry, hidden / entry.name)
+
+
+def _check_writer(path: Path) -> None:
+    """Refuse a folder whose temporary folder belongs to another process of this machine that is alive."""
+    for other in path.parent.glob(f".{_literal(path.name)}.{_host()}-*.tmp"):
+        pid = _writer(other, path)
+        if pid is not None and pid != os.getpid() and process_lives(pid, unknown=False):
+            raise UserError(
+                f"{path} is being written by process {pid} on {socket.gethostname()}: wait for it or end it, or give another out"
+            )
+
+
+def _host() -> str:
+    return "".join(c for c in socket.gethostname() if c.isalnum())[:20]
+
+
+def _writer(hidden: Path, path: Path) -> int | None:
+    """Return the process that a temporary name belongs to."""
+    pid = hidden.name[len(path.name) + len(_host()) + 3 :].partition("-")[0]
+    return int(pid) if pid.isdigit() else None
 
 
 def temporary_path(path: Path, suffix: str = "") -> Path:
@@ -71,15 +111,14 @@ def temporary_path(path: Path, suffix: str = "") -> Path:
 
     Temporary files of this file that dead processes of this machine left are removed.
     """
-    host = "".join(c for c in socket.gethostname() if c.isalnum())[:20]
     old_name = path.with_name(f".{path.name}.tmp")  # of earlier versions
     if old_name.is_file():
         remove(old_name)
-    for old in path.parent.glob(f".{_literal(path.name)}.{host}-*.tmp{_literal(suffix)}"):
-        pid = old.name[len(path.name) + len(host) + 3 :].partition("-")[0]
-        if pid.isdigit() and not process_lives(int(pid), unknown=True):
+    for old in path.parent.glob(f".{_literal(path.name)}.{_host()}-*.tmp{_literal(suffix)}"):
+        pid = _writer(old, path)
+        if pid is not None and not process_lives(pid, unknown=True):
             remove(old)
-    return path.with_name(f".{path.name}.{host}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp{suffix}")
+    return path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp{suffix}")
 
 
 def remove(path: Path) -> None:

@@ -31,8 +31,8 @@ from torch import Tensor
 
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.files.parsing import read_arrays, read_yaml
-from neuido.data.files.storage import write_text
 from neuido.data.files.values import check_keys, mapping, number, vector
+from neuido.data.files.writing import write_text
 from neuido.data.files.yaml_files import located
 from neuido.data.measured.experiment import read_experiment, scene_to_dict
 from neuido.data.scenes.multiview import UP, SceneViews

@@ -8,7 +8,6 @@ and F and are coloured by a solid texture of the position at t = 0. A scene is a
 import json
 import os
 import re
-import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -24,9 +23,10 @@ from torch import Tensor
 from neuido.data import cameras as convert
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.bodies.shapes import rigid_velocity
+from neuido.data.files.output_folder import claimed_folder
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.storage import claim_folder, publish_folder, write_text
 from neuido.data.files.values import check_keys, mapping, vector
+from neuido.data.files.writing import new_folder, write_text
 from neuido.data.formats import nerfstudio
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
 from neuido.data.progress import Progress
@@ -177,23 +177,21 @@ def make_scenes(
     if not plans or len({plan.name for plan in plans}) < len(plans):
         raise UserError("scenes must list at least one scene, and each name once")
     folder = Path(out).expanduser()
-    text = json.dumps({"format": FORMAT, "film": asdict(film), "scenes": entries}, indent=1, default=list) + "\n"
-    claim_folder(folder, text, "other scenes, or the same scenes with other film options")
     paths = [folder / plan.name for plan in plans]
-    missing = [(plan, path) for plan, path in zip(plans, paths) if not (path / "experiment.yaml").is_file()]
-    images = film.views * film.frames
-    with Progress("scenes", images * len(plans), unit="images", done=images * (len(plans) - len(missing)), shown=progress) as work:
-        for plan, path in missing:
-            work.say(plan.name)
-            hidden = folder / f".{plan.name}.tmp"
-            shutil.rmtree(hidden, ignore_errors=True)
-            try:
-                make_scene(plan, film, hidden, draw=draw, device=chosen, advance=work.update)
-            except UserError as error:
-                raise UserError(f"scenes: {plan.name}: {error}") from error
-            publish_folder(hidden, path)
-    index = [{"name": p.name, "split": p.split, "law": p.law, "particles": len(p.body.x), "substeps": p.substeps} for p in plans]
-    write_text(folder / "index.json", json.dumps({"format": FORMAT, "scenes": index}, indent=1) + "\n")
+    content = {"format": FORMAT, "film": asdict(film), "scenes": entries}
+    with claimed_folder(folder, content, "other scenes, or the same scenes with other film options"):
+        missing = [(plan, path) for plan, path in zip(plans, paths) if not (path / "experiment.yaml").is_file()]
+        images = film.views * film.frames
+        with Progress("scenes", images * len(plans), unit="images", done=images * (len(plans) - len(missing)), shown=progress) as work:
+            for plan, path in missing:
+                work.say(plan.name)
+                try:
+                    with new_folder(path) as hidden:
+                        make_scene(plan, film, hidden, draw=draw, device=chosen, advance=work.update)
+                except UserError as error:
+                    raise UserError(f"scenes: {plan.name}: {error}") from error
+        index = [{"name": p.name, "split": p.split, "law": p.law, "particles": len(p.body.x), "substeps": p.substeps} for p in plans]
+        write_text(folder / "index.json", json.dumps({"format": FORMAT, "scenes": index}, indent=1) + "\n")
     return paths
 
 

@@ -1,6 +1,6 @@
 """Generate the Stage I trajectories for `neuido trajectories`: plan, simulation and files.
 
-`neuido.data.files.storage` describes the folder.
+`trajectory_files.py` describes the folder.
 """
 
 import contextlib
@@ -17,9 +17,10 @@ from torch import Tensor
 
 from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import cube
-from neuido.data.files.storage import COLUMNS, FORMAT, claim_folder, is_complete, write_text
-from neuido.data.files.writing import atomic_write
+from neuido.data.files.output_folder import claimed_folder
+from neuido.data.files.writing import atomic_write, write_text
 from neuido.data.progress import Progress
+from neuido.data.trajectories.trajectory_files import COLUMNS, FORMAT, is_complete
 from neuido.errors import UserError
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm.simulator import Simulator
@@ -125,23 +126,24 @@ def generate(
     _check_steps(setup, instances)
     folder = Path(out)
     content = {"format": FORMAT, "setup": asdict(setup), "trajectories": [asdict(instance) for instance in instances]}
-    claim_folder(folder, _json(content), "trajectories of other options", compared="setup")
-    files = {instance.name: folder / f"{instance.name}.npy" for instance in instances}
+    held = "trajectories of other options"
+    with claimed_folder(folder, content, held, compared="setup", shard=shard, shards=shards):
+        files = {instance.name: folder / f"{instance.name}.npy" for instance in instances}
 
-    in_shard = [instance for i, instance in enumerate(instances) if i % shards == shard]
-    missing = [instance for instance in in_shard if not is_complete(files[instance.name], setup.shape)]
-    size = batch or (10 if chosen.type == "cuda" else 1)
-    with Progress("trajectories", len(in_shard), done=len(in_shard) - len(missing), shown=progress) as work:
-        for family in PARAMETERS:
-            in_family = [instance for instance in missing if instance.family == family]
-            for start in range(0, len(in_family), size):
-                group = in_family[start : start + size]
-                _simulate(setup, group, [files[instance.name] for instance in group], chosen)
-                work.update(len(group))
+        in_shard = [instance for i, instance in enumerate(instances) if i % shards == shard]
+        missing = [instance for instance in in_shard if not is_complete(files[instance.name], setup.shape)]
+        size = batch or (10 if chosen.type == "cuda" else 1)
+        with Progress("trajectories", len(in_shard), done=len(in_shard) - len(missing), shown=progress) as work:
+            for family in PARAMETERS:
+                in_family = [instance for instance in missing if instance.family == family]
+                for start in range(0, len(in_family), size):
+                    group = in_family[start : start + size]
+                    _simulate(setup, group, [files[instance.name] for instance in group], chosen)
+                    work.update(len(group))
 
-    if missing or not (folder / "index.json").exists():
-        if all(is_complete(path, setup.shape) for path in files.values()):
-            _write_index(folder, setup, instances)
+        if missing or not (folder / "index.json").exists():
+            if all(is_complete(path, setup.shape) for path in files.values()):
+                _write_index(folder, setup, instances)
 
 
 def _body(setup: Setup) -> Body:

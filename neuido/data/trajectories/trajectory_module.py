@@ -11,10 +11,10 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from neuido.data.files.parsing import read_json
-from neuido.data.files.storage import COLUMNS, FORMAT, TrajectoryFiles, is_complete, to_batch
 from neuido.data.files.values import file_name, list_of_mappings, require_key
 from neuido.data.sampling import FixedBatches, SampleOrder, Step, TrainingSteps
 from neuido.data.trajectories.options import Throw, make_trajectories
+from neuido.data.trajectories.trajectory_files import COLUMNS, FORMAT, TrajectoryFiles, is_complete, to_batch
 from neuido.errors import UserError
 from neuido.types import TrajectoryBatch
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import re
-import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import yaml
 
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.storage import publish_folder, write_text
+from neuido.data.files.writing import new_folder, write_text
 from neuido.data.progress import Progress
 from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.case import Case
@@ -37,53 +36,56 @@ def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, pro
         if key.is_file() and _plan_of(key) == plan and (folder / "README.md").is_file():
             return key
         raise UserError(f"out = {folder} exists and is not the case of seed {seed} with these options: give another folder")
+    with new_folder(folder) as hidden:
+        text = _make(int(seed), hidden, folder.name, case, plan, str(choose_device(device)), progress)
+        if folder.exists():
+            raise UserError(f"out = {folder} was created by another process in the meantime; nothing was overwritten")
+        key.parent.mkdir(exist_ok=True)
+        write_text(key, text)
+    return key
+
+
+def _make(seed: int, hidden: Path, name: str, case: Case, plan: dict[str, Any], device: str, progress: bool) -> str:
+    """Fill a folder with a case, and return the text of its key."""
     maker = body_case if case.measured == "body" else curve_case
-    chosen = str(choose_device(device))
-    with Progress(f"case {folder.name}", unit="simulations", shown=progress) as work:
+    with Progress(f"case {name}", unit="simulations", shown=progress) as work:
         for attempt in range(TRIES):
-            rng = np.random.default_rng([int(seed), attempt])
+            rng = np.random.default_rng([seed, attempt])
             try:
-                write_folder, truth = maker(rng, case, folder.name, chosen, work.update)
+                write_folder, truth = maker(rng, case, name, device, work.update)
                 break
             except Redraw as again:
                 reason = str(again)
                 work.say(f"drawn again: {reason}")
         else:
             raise UserError(f"seed {seed} gives no usable case in {TRIES} draws (last reason: {reason}): give another seed or kind")
-    text = yaml.safe_dump(
-        {**truth, "sealed": {**plan, "attempt": attempt, "salt": rng.bytes(16).hex()}}, sort_keys=False, default_flow_style=None, width=140
-    )
-    hidden = folder.with_name(f".{folder.name}.tmp")
-    shutil.rmtree(hidden, ignore_errors=True)
-    hidden.mkdir(parents=True)
+    sealed = {**truth, "sealed": {**plan, "attempt": attempt, "salt": rng.bytes(16).hex()}}
+    text = yaml.safe_dump(sealed, sort_keys=False, default_flow_style=None, width=140)
     write_folder(hidden)
-    (hidden / "README.md").write_text(_readme(folder.name, text))
-    key.parent.mkdir(exist_ok=True)
-    write_text(key, text)
-    publish_folder(hidden, folder)
-    return key
+    (hidden / "README.md").write_text(_readme(name, text))
+    return text
 
 
 def _check(case: Case) -> None:
     if case.measured not in ("body", "material_test", "track"):
-        raise UserError(f"case.measured = {case.measured!r} is unknown: choose from body, material_test, track")
+        raise UserError(f"measured = {case.measured!r} is unknown: choose from body, material_test, track")
     if case.solver is not None and case.solver not in SOLVERS:
-        raise UserError(f"case.solver = {case.solver!r} is unknown: choose from {', '.join(SOLVERS)}")
+        raise UserError(f"solver = {case.solver!r} is unknown: choose from {', '.join(SOLVERS)}")
     if case.kind is not None and case.kind != "none":
         for kind in case.kind.split("+"):
             if kind not in KINDS and kind not in OUTSIDE:
-                raise UserError(f"case.kind = {kind!r} is unknown: choose from none, {', '.join((*KINDS, *OUTSIDE))}, or join two by +")
+                raise UserError(f"kind = {kind!r} is unknown: choose from none, {', '.join((*KINDS, *OUTSIDE))}, or join two by +")
         kinds = case.kind.split("+")
         if len(kinds) > 2 or len(set(kinds)) < len(kinds) or (len(kinds) == 2 and any(k in OUTSIDE for k in kinds)):
-            raise UserError(f"case.kind = {case.kind!r}: give one effect, or two different effects of the library")
+            raise UserError(f"kind = {case.kind!r}: give one effect, or two different effects of the library")
     if case.nuisances and case.kind not in (None, "none"):
-        raise UserError("case.nuisances requires case.kind = none: an effect beside them could not be scored")
+        raise UserError("nuisances requires kind = none: an effect beside them could not be scored")
     if case.separation is not None and not MIN_SEPARATION <= case.separation <= MAX_SEPARATION:
         raise UserError(
-            f"case.separation = {case.separation}; it must lie in {MIN_SEPARATION:g} to {MAX_SEPARATION:g} standard deviations of the noise"
+            f"separation = {case.separation}; it must lie in {MIN_SEPARATION:g} to {MAX_SEPARATION:g} standard deviations of the noise"
         )
     if case.particles < 0 or (0 < case.particles < 100) or case.seconds < 0 or (0 < case.seconds < 0.05):
-        raise UserError(f"case.particles = {case.particles} must be 0 or at least 100, case.seconds = {case.seconds} 0 or at least 0.05 s")
+        raise UserError(f"particles = {case.particles} must be 0 or at least 100, seconds = {case.seconds} 0 or at least 0.05 s")
 
 
 def _plan_of(key: Path) -> dict[str, Any]:

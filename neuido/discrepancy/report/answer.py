@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from neuido.data.files.storage import write_text
 from neuido.data.files.values import file_name
-from neuido.data.files.writing import atomic_write, make_real_folder
+from neuido.data.files.writing import atomic_write, make_real_folder, remove, write_text
 from neuido.discrepancy.inference.attribution import Diagnosis
 from neuido.discrepancy.inference.floors import Round, Trial
 from neuido.discrepancy.inference.judging import ALPHA
@@ -53,9 +52,12 @@ def write(
         made.append((plain(content), motion))
     tell("writing")
     predicted = make_real_folder(out / "predicted", "the folder")
-    for _, motion in made:
-        for name, arrays in motion.items():
-            _save(predicted / f"{file_name(name, 'the name of a recording')}.npz", arrays)
+    motions = {f"{file_name(name, 'the name of a recording')}.npz": arrays for _, motion in made for name, arrays in motion.items()}
+    for name, arrays in motions.items():
+        _save(predicted / name, arrays)
+    for other in predicted.glob("*.npz"):  # of an earlier diagnosis of other recordings
+        if other.name not in motions:
+            remove(other)
     models = {_body(d): beside(out, d.problem.model_after(d.after, [t.candidate.name for t in d.effects])) for d, _ in found}
     model = {"bodies": models} if len(found) > 1 else next(iter(models.values()))
     write_text(out / "model_after.yaml", yaml.safe_dump(plain(model), sort_keys=False, default_flow_style=None))

@@ -14,8 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from neuido.data.files.storage import write_text
-from neuido.data.files.writing import atomic_write
+from neuido.data.files.writing import atomic_write, write_text
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import rollout_laws
 from neuido.models.inference.prepared_scene import Laws, PreparedScene

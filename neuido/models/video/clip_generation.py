@@ -20,8 +20,8 @@ from neuido.data.bodies.families import PARAMETERS, check_ranges, draw_parameter
 from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
 from neuido.data.clips import FORMAT, is_complete
-from neuido.data.files.storage import claim_folder, write_text
-from neuido.data.files.writing import atomic_write
+from neuido.data.files.output_folder import claimed_folder
+from neuido.data.files.writing import atomic_write, write_text
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
@@ -92,10 +92,13 @@ def generate_clips(
         raise UserError(f"shard = {shard} must be from 0 to shards - 1 = {shards - 1}")
     if batch < 0:
         raise UserError(f"batch must be 0 (automatic) or positive, got {batch}")
-    text = json.dumps({"format": FORMAT, "plan": asdict(plan)}, indent=1) + "\n"
-    claim_folder(folder, text, "clips of other options", compared="plan")
+    content = {"format": FORMAT, "plan": asdict(plan)}
+    with claimed_folder(folder, content, "clips of other options", compared="plan", shard=shard, shards=shards):
+        _generate_shard(plan, folder, chosen, batch, range(shard, plan.count, shards), shards, progress)
+
+
+def _generate_shard(plan: ClipPlan, folder: Path, chosen: torch.device, batch: int, own: range, shards: int, progress: bool) -> None:
     names = [f"clip-{i:05d}" for i in range(plan.count)]
-    own = range(shard, plan.count, shards)
     missing = [i for i in own if not is_complete(folder / f"{names[i]}.npz")]
     size = batch or (16 if chosen.type == "cuda" else 1)
     kinds, workers = list(plan.families), max(1, (os.cpu_count() or 1) // shards)

@@ -10,9 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from neuido.data.files.storage import write_text
 from neuido.data.files.values import file_name
-from neuido.data.files.writing import atomic_write, check_writable, make_real_folder, new_folder, remove
+from neuido.data.files.writing import atomic_write, check_writable, make_real_folder, new_folder, remove, write_text
 from neuido.discrepancy import store
 from neuido.errors import UserError, one_line
 

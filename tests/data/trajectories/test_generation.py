@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from neuido.data.bodies import families
-from neuido.data.files import storage
 from neuido.data.trajectories import generation as generate
+from neuido.data.trajectories import trajectory_files
 from neuido.data.trajectories.options import FAMILIES, make_trajectories
 from neuido.errors import UserError
 
@@ -141,7 +141,7 @@ def test_killed_run_leaves_no_broken_file(tmp_path):
     assert made
     assert len(made) < 15
     assert not (tmp_path / "index.json").exists()
-    assert all(storage.is_complete(path, (400, 64, 27)) for path in made)
+    assert all(trajectory_files.is_complete(path, (400, 64, 27)) for path in made)
 
 
 @pytest.mark.parametrize(
