@@ -106,7 +106,7 @@ def test_wrong_option_is_one_line(more, word, folder, tmp_path, capsys):
 def test_a_folder_that_is_there_is_not_overwritten(folder, capsys):
     status, _, err = run(capsys, "replay", folder, "--out", folder)
     assert (status, len(err.splitlines())) == (2, 1)
-    assert "already" in err
+    assert "is in use" in err and "experiment.yaml" in err
 
 
 def test_long_recordings_run_in_pieces(folder, monkeypatch):
