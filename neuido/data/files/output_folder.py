@@ -136,7 +136,7 @@ def _difference(found: Any, wanted: Any, key: str | None) -> str:
     old, new = (content.get(key) if key and isinstance(content, dict) else content for content in (found, wanted))
     if not isinstance(old, dict) or not isinstance(new, dict):
         return ""
-    changed = [f"{name} {old.get(name)} there, {value} here" for name, value in new.items() if old.get(name) != value]
+    changed = [f"{name} is {old.get(name)} there and {value} here" for name, value in new.items() if old.get(name) != value]
     changed = [words if len(words) <= 100 else f"{words.split(' ')[0]} differs" for words in changed]
     return f" ({'; '.join(changed)})" if changed else ""
 

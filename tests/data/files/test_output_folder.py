@@ -40,7 +40,7 @@ def test_the_same_set_up_goes_on_and_another_is_refused(tmp_path):
     before = contents(folder)
     assert set(before) == {"plan.json", "film.npz"}  # no lock stays
     other = {**PLAN, "setup": {**PLAN["setup"], "steps": 4}}
-    with pytest.raises(UserError, match=r"films of another set-up \(steps 3 there, 4 here\): give another --out"):
+    with pytest.raises(UserError, match=r"films of another set-up \(steps is 3 there and 4 here\): give another --out"):
         with claimed_folder(folder, other, HELD, compared="setup", option="--out"):
             pytest.fail("a folder of another set-up was used")
     assert contents(folder) == before
