@@ -28,35 +28,35 @@ def film(
     shards: int = 1,
     progress: bool = True,
 ) -> None:
-    """Film simulated bodies of many materials: training data of the flow VAE and of the projector's warm-up.
+    """Film simulated bodies of many materials, as training data for the flow VAE and for the warm-up of the projector.
 
-    Each clip is a body of a random built-in shape, with a random velocity and texture, that falls onto a floor under a classical law with
-    random parameters; it is rendered from random directions, and kept as optical flow, with samples of its law. An interrupted run goes on
-    where it stopped when the same command is given again.
+    In each clip, a body of random shape, velocity and texture falls onto a floor, with a classical law of random parameters. The clip is
+    rendered from random directions and stored as optical flow, with samples of the law. An interrupted run continues if the same command
+    is repeated.
 
     Args:
-        out: Folder to write: one .npz file a clip, plan.json at the start and index.json when all are there.
-        count: Number of clips; the families take turns.
-        families: Parameter ranges, as `neuido trajectories` takes them.
-        views: Random views of each clip.
-        frames: Frames of a clip.
-        frame_steps: Substeps from one frame to the next.
-        dts: Substeps to draw from, s; a clip too stiff for its own takes the smallest.
+        out: Output folder: one .npz file per clip, plan.json at the start, and index.json when all clips are complete.
+        count: Number of clips; the material families alternate.
+        families: Parameter ranges of each family, as for `neuido trajectories`.
+        views: Number of random views of each clip.
+        frames: Number of frames of a clip.
+        frame_steps: Number of substeps between frames.
+        dts: Times of a substep to draw from, s; a clip that is too stiff for its own uses the smallest.
         cells: Grid cells along the unit cube.
-        particles: Particles of a body, about.
-        width: Width of the images of which the flow is taken, px.
-        flow_size: Side of the flow that is kept, px.
-        flow_preset: Of DIS: ultrafast, fast, medium.
-        samples: Samples of a clip's law.
-        seed: Seed; each clip depends on the seed and its number alone.
+        particles: Approximate number of particles of a body.
+        width: Width of the images from which the flow is computed, px.
+        flow_size: Side of the stored flow, px.
+        flow_preset: Preset of the DIS optical flow: ultrafast, fast or medium.
+        samples: Number of samples of the law of a clip.
+        seed: Seed; a clip depends on the seed and its number only.
         device: auto, cpu or cuda.
-        batch: Clips simulated in one launch; 0 chooses 1 on the CPU and 16 on a GPU.
-        shard: Number of this part of the clips, from 0; parts may be filmed side by side, into one folder.
-        shards: Number of parts.
+        batch: Clips simulated in one launch; 0: 1 on the CPU and 16 on a GPU.
+        shard: Number of the shard to film, from 0; shards may be filmed at the same time into one folder.
+        shards: Number of shards.
         progress: Show a progress bar.
 
     Raises:
-        UserError: An impossible material, a step above the stability limit, a folder that holds another set-up.
+        UserError: A parameter range is invalid, the substep is above the stability limit, or the folder holds clips of other options.
     """
     from neuido.models.video.clip_generation import ClipPlan, generate_clips
 

@@ -116,7 +116,7 @@ def _diagnoses(runs: Sequence[str]) -> str | None:
 
 
 class Line(NamedTuple):
-    """A line of a table of scores."""
+    """One line of a table of scores: label and score in each scene."""
 
     label: str
     values: dict[str, float]

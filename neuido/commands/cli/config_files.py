@@ -41,7 +41,7 @@ def given_configs(args: list[str]) -> list[tuple[int, str]]:
 
 
 def expanded(args: list[str]) -> list[str]:
-    """Return the arguments with the content of each configuration that has a base in the place of its file."""
+    """Replace each `--config` file that has a key `base` by its merged content; return the arguments."""
     found = list(args)
     for i, given in given_configs(args):
         if not given.lstrip().startswith("{") and _is_yaml(given) and len(chain(given)) > 1:

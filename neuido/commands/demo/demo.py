@@ -76,7 +76,7 @@ def _loop(folder: Path, settings: str) -> str:
 
 
 def laws_section(result: "LawsResult") -> str:
-    """Stage I on the page."""
+    """Format the section on learned laws (Stage I) of the demo page as HTML."""
     head = ("material", "stress error", "plastic error", "particle RMSE [m]", "RMSE over path")
     text = (
         "Trained on a thrown cube, tried on a falling ball: relative errors of the stress and of the plastic correction, held out "

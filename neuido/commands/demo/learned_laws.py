@@ -33,7 +33,7 @@ class Comparison(NamedTuple):
 
 
 class LawsResult(NamedTuple):
-    """What the demonstration shows."""
+    """Result of the demonstration of learned laws: true and learned motion and their errors."""
 
     rows: tuple[tuple[str, float, float, float, float], ...]
     """Material; relative errors of stress and of the plastic correction; particle RMSE [m], and that over the path."""
