@@ -12,6 +12,7 @@ The ablations `plain-bic`, `no-unknown` and `take-smallest-error` are computed f
 and `no-discretisation` need runs of their own. `--folders` scores the given folders instead, each with a truth.yaml or a key in ../keys.
 `--statistics` keeps the fits of each case in its answer's folder; then `--only replay` decides every case again from them, within seconds
 and without a simulation, and reports apart whether the search fitted the true effects and whether the decision named them (replay.csv).
+Beside it stands what the evidence of the same fits would say (`neuido.discrepancy.inference.evidence`, experimental).
 A GPU runs one case at a time unless `--workers` is given; with NVIDIA's MPS and twenty workers the throughput is about three times higher.
 """
 
@@ -240,6 +241,7 @@ def score_all(folders: list[Path], out: Path, ablations: list[str]) -> str:
 def replay_all(folders: list[Path], out: Path) -> str:
     """Decide all cases again from their kept fits, write replay.csv, and return the table of search recall and decision accuracy."""
     from neuido.discrepancy.inference.decision import decide
+    from neuido.discrepancy.inference.evidence import evidences, judged
     from neuido.discrepancy.inference.statistics import read_fits
 
     rows = []
@@ -247,8 +249,11 @@ def replay_all(folders: list[Path], out: Path) -> str:
         place = out / "answers" / "none" / folder.name
         for i, diagnosis in enumerate(answers(place) or []):
             if (place / "fits" / f"{i}.npz").is_file():
-                case, _ = read_fits(place / "fits" / f"{i}.npz")
-                rows.append({"case": folder.name} | blind_scores.replayed(key_of(folder), diagnosis, case, decide(case)))
+                case, fits = read_fits(place / "fits" / f"{i}.npz")
+                key = key_of(folder)
+                row = {"case": folder.name} | blind_scores.replayed(key, diagnosis, case, decide(case))
+                verdict = judged(evidences(case, fits)) if any(not fit.record.effects for fit in fits) else None
+                rows.append(row | blind_scores.by_evidence(key, diagnosis, verdict))
     hidden = out / ".replay.csv.tmp"
     hidden.unlink(missing_ok=True)
     for row in rows:

@@ -125,6 +125,24 @@ def replayed(key: Mapping[str, Any], diagnosis: Mapping[str, Any], case: Any, de
     }
 
 
+def by_evidence(key: Mapping[str, Any], diagnosis: Mapping[str, Any], verdict: Any) -> dict[str, Any]:
+    """Return what the evidence of stored fits says of a case; `verdict`: of `judged`, none where the declared model has no statistics.
+
+    An effect's class holds what takes its place in a set of the verdict that has the best one's other effects.
+    """
+    if verdict is None:
+        return {"evidence_answer": "", "evidence_sets": "", "evidence_lead": math.nan, "evidence_named": False}
+    sets = [[name.partition(":")[0] for name in one] for one in verdict.sets]
+    effects = []
+    for name in sets[0] if sets else []:
+        rest = [other for other in sets[0] if other != name]
+        others = {n for one in sets if len(one) == len(sets[0]) and set(rest) <= set(one) for n in set(one) - set(rest)}
+        effects.append({"name": name, "class": sorted({name} | others), "parameters": {}})
+    now = score(key, {**diagnosis, "answer": verdict.answer, "effects": effects})
+    named = " or ".join("+".join(one) for one in sets)
+    return {"evidence_answer": verdict.answer, "evidence_sets": named, "evidence_lead": verdict.lead, "evidence_named": now["in_class"]}
+
+
 def _is_of(effects: Sequence[str], known: Sequence[Mapping[str, Any]]) -> bool:
     """Whether a fit has the true effects and no others."""
     names = [{name.partition(":")[0]} for name in effects]
@@ -165,6 +183,20 @@ def recall(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     out["outside the library: unknown or insufficient"] = share(
         sum(r["answer"] in ("unknown", "insufficient") for r in rows if r["outside"]), sum(r["outside"] for r in rows)
     )
+    told = [r for r in rows if r.get("evidence_answer")]
+    if told:
+        out["evidence (experimental): nulls on which an effect is named"] = share(
+            sum(r["evidence_answer"] in NAMED for r in told if r in nulls), sum(r in nulls for r in told)
+        )
+        for name, group in {"one effect": "one", "two effects": "two"}.items():
+            own = [r for r in told if r["group"] == group and r["reached"]]
+            out[f"evidence (experimental): {name}, of those fitted near the optimum in class"] = share(
+                sum(r["evidence_named"] for r in own), len(own)
+            )
+        outside = [r for r in told if r["outside"]]
+        out["evidence (experimental): outside the library: unknown"] = share(
+            sum(r["evidence_answer"] == "unknown" for r in outside), len(outside)
+        )
     out["replay equal to the diagnosis"] = share(sum(r["same"] for r in rows), len(rows))
     efforts = [r["effort"] for r in rows]
     out["particle-substeps a case, median"] = f"{float(np.median(efforts)):.3g}" if efforts else "none"

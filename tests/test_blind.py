@@ -105,6 +105,19 @@ def test_search_and_decision_are_reported_apart():
     assert not null["tried"] and scores.recall([null])["nulls on which an effect is named"].startswith("0 of 1")
 
 
+def test_what_the_evidence_says_is_scored_beside_the_decision():
+    live, key = answer(kind="none"), truth("drag_linear", "yield")
+
+    def row(kind, *sets):
+        return scores.by_evidence(key, live, SimpleNamespace(answer=kind, sets=sets, lead=9.0))
+
+    assert row("effect", ("drag_linear", "yield"))["evidence_named"]
+    swapped = row("class", ("drag_quadratic", "yield"), ("drag_linear", "yield"), ("softening",))
+    assert swapped["evidence_named"] and swapped["evidence_sets"] == "drag_quadratic+yield or drag_linear+yield or softening"
+    assert not row("class", ("drag_quadratic", "yield"), ("drag_linear", "softening"))["evidence_named"]
+    assert not row("unknown")["evidence_named"] and scores.by_evidence(key, live, None)["evidence_answer"] == ""
+
+
 def test_one_effect_too_many_or_too_few():
     extra = scores.score(truth("drag_linear"), answer(effect("drag_linear"), effect("yield")))
     assert extra["found"] == 1 and not extra["in_class"] and not extra["exact"]

@@ -103,7 +103,7 @@ def test_light_modules_load_neither_torch_nor_lightning(module):
 # The drawn structure. The front doors (`__init__.py`), which import public names lazily, are drawn with what they lead to left out.
 
 FLOORS, FOLDER_FLOORS, FILES, LINES = 9, 12, 14, 450
-LARGER = {PACKAGE / "discrepancy" / "inference": 18}
+LARGER = {PACKAGE / "discrepancy" / "inference": 20}
 """Folders that may hold more files: two decisions stand side by side here until the older one is deleted."""
 COMMANDS = {path.stem for path in (PACKAGE / "commands").glob("*.py")}
 

@@ -1,159 +1,187 @@
-"""How far chance, the nuisances and the discretisation alone would go: a linear model of the fits and its parametric bootstrap.
+"""The evidence of each model: how well what was held out is foretold from what was fitted, less the price of the search.
 
-All directions (declared parameters, nuisances, discretisation, candidates) are brought to one orthonormal basis, so that a draw
-costs a few small products. Fits hold the differences of the settings beside the parameters, with a prior, and the nuisances are taken
-out of every recording, as in the errors of a diagnosis. Reference: Westfall and Young, Resampling-Based Multiple Testing, 1993 (the
-maximum over candidates).
+    E(M) = log p(y_validation | y_fitted, M) - log(k C(K, m))
+
+for a set of m of K effects, with k kinds of model (`KINDS`). The exponential of E is a prior weight times a predictive density, and the
+weights of all models sum to one at most. Under the declared model the mean of a ratio of densities is one; so by Markov's inequality the
+probability that any model leads it by more than log((k - 1) / alpha) is below alpha, whatever was tried.
+
+This is computed beside the present decision, from stored fits, and decides nothing yet.
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import logsumexp
 
-from neuido.discrepancy.inference.floors import past_nuisances, score
+from neuido.discrepancy.inference.journal import CaseRecord, FitRecord
+from neuido.discrepancy.inference.likelihood import SCALES, log_densities, log_mean, log_prior, rotated
+from neuido.discrepancy.inference.statistics import FitStatistics, PartStatistics
+from neuido.discrepancy.problems.problem import Parameter
 
-NOISE_ALONE = 1.8
-"""Mean squares up to so many times that of the noise are noise."""
-
-
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Directions in the data of one recording, each (n, k)."""
-
-    weight: np.ndarray
-    """Of each datum in the fit, one over its standard deviation, (n,)."""
-    noise: float
-    declared: np.ndarray
-    nuisances: np.ndarray
-    """Times their prior standard deviations."""
-    discretisation: np.ndarray
-    """Differences of the settings at the base."""
-    smooth: np.ndarray
-    """Patterns of an unknown part of it, times its size."""
-    candidates: Mapping[str, np.ndarray]
+KINDS = 5
+"""Kinds of model, of equal prior weight: none, one, two or three effects, and what no effect explains."""
+ALPHA = 0.05
+"""Probability of naming anything where nothing is missing, and of a class that lacks the true effect."""
+WIDE = 10.0
+"""Prior standard deviation of a parameter without a finite range, in its typical steps."""
+LEAST = 0.1
+"""Share of the noise that the patterns' scale is at the least: finer settings than those that were tried differ by something too."""
 
 
-class LinearModel:
-    """Fits of the base and of each candidate to draws from the null hypothesis.
+@dataclass(frozen=True)
+class Evidence:
+    """A model with its evidence."""
+
+    record: FitRecord
+    value: float
+    scale: float
+    """About which the patterns' scale is taken: what the settings leave of one another after a refit, in the unit of the data."""
+    unknown: bool = False
+    """Whether its patterns' scale is free, so that they stand for what no effect explains."""
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Keys of its effects, in alphabetical order."""
+        return tuple(sorted(self.record.effects))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the evidences of a case say."""
+
+    answer: str
+    """`effect`, `class`, `unknown` or `none`."""
+    sets: tuple[tuple[str, ...], ...]
+    """The smallest group of sets that holds all but a probability of `ALPHA`, the best first."""
+    lead: float
+    """Of the best model over the declared one."""
+
+
+def price(effects: int, candidates: int) -> float:
+    """Return the logarithm of one over the prior weight of a set of effects."""
+    return math.log(KINDS * math.comb(candidates, effects))
+
+
+def prior_of(case: CaseRecord, fit: FitRecord) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far a fit ended from the prior mean of each free parameter, and the prior variances, in the coordinates of fits.
+
+    The mean is what is declared, the absence of an effect for its size, and the middle of the range for a logarithm without such a value.
+    """
+    known = {p["name"]: Parameter(**p) for p in (*case.declared, *(p for c in case.candidates for p in c["parameters"]))}
+    away, variances = [], []
+    for name in fit.names:
+        p = known[name]
+        span = p.coordinate(p.upper) - p.coordinate(p.lower) if not (p.log and p.lower <= 0) else math.inf
+        if not (p.log and p.value <= 0):
+            mean = p.coordinate(p.value)
+        else:
+            mean = p.coordinate(p.lower) + 0.5 * span if math.isfinite(span) else p.coordinate(fit.point[name])
+        away.append(p.coordinate(fit.point[name]) - mean)
+        variances.append((p.prior if p.prior is not None else min(span / math.sqrt(12.0), WIDE)) ** 2)
+    return np.array(away), np.array(variances)
+
+
+def unseen(parts: Sequence[PartStatistics]) -> float:
+    """Return what the settings leave of one another, root mean square: each fitted by the slopes and by the other differences.
+
+    That is the scale of what another solver does that none of the settings shows, where the fit ended.
+    """
+    slopes, settings = (np.concatenate([getattr(p, name) for p in parts]) for name in ("slopes", "settings"))
+    rows, noise = sum(p.rows for p in parts), min(p.noise for p in parts)
+    able = [j for j in range(settings.shape[1]) if settings[:, j].any()]
+    left = []
+    for j in able:
+        others = np.concatenate([slopes, settings[:, [i for i in able if i != j]]], axis=1)
+        fit = others @ np.linalg.lstsq(others, settings[:, j], rcond=1e-8)[0] if others.shape[1] else 0.0
+        left.append(float(np.sum((settings[:, j] - fit) ** 2)) / rows)
+    return max(math.sqrt(float(np.mean(left))) if left else 0.0, LEAST * noise)
+
+
+def at_the_prior_mean(parts: Sequence[PartStatistics], away: np.ndarray) -> list[PartStatistics]:
+    """Return the parts with the residuals that the slopes promise at the prior mean of the parameters.
+
+    So the density is that of the model with its prior, however far the fit went: a set that fits whatever it meets pays for it.
+    """
+    return [replace(p, residual=p.residual - p.slopes @ away) for p in parts]
+
+
+def densities(
+    parts: Sequence[PartStatistics], recordings: Sequence[int], fitted: Sequence[bool], variances: np.ndarray, scale: float
+) -> tuple[float, float, float]:
+    """Return log-densities: of the validation parts given the fitted ones, and of all parts with a free scale and with the prior's.
+
+    Where nothing is held out the first is that of the fitted parts themselves.
 
     Args:
-        fit: Columns of the recordings that are fitted.
-        held_out: Of those that are only scored.
-        seed: Of the draws.
+        parts: Of all recordings, their residuals at the prior mean.
+        recordings: The recording of each part.
+        fitted: Which parts were fitted.
+        variances: Prior variances of the coordinates of the free parameters.
+        scale: About which the patterns' scale is taken; a free one is any of `SCALES` times it.
     """
+    shared = [np.concatenate([p.settings, p.slopes], axis=1) for p in parts]
+    prior = np.concatenate([np.ones(parts[0].settings.shape[1]), variances])
+    scales = SCALES * scale
+    weights = log_prior(scales, scale)
 
-    def __init__(self, fit: Sequence[Columns], held_out: Sequence[Columns], *, seed: int = 0) -> None:
-        self.keys = list(fit[0].candidates)
-        self.parts = [_Part(c, True) for c in fit] + [_Part(c, False) for c in held_out]
-        self.rng = np.random.default_rng(seed)
-        names = [(None, ())] + [(key, (key,)) for key in self.keys]
-        self.solvers = {name: _solver([p for p in self.parts if p.fitted], keys) for name, keys in names}
+    def by_scale(chosen: Sequence[int]) -> np.ndarray:
+        by_recording: dict[int, list[int]] = {}
+        for i in chosen:
+            by_recording.setdefault(recordings[i], []).append(i)
+        made = [rotated([parts[i] for i in own], [shared[i] for i in own]) for own in by_recording.values()]
+        return log_densities(made, prior, scales)
 
-    def draw(self, *, exact: bool = False) -> list[np.ndarray]:
-        """One residual of each part under the null, in its basis; `exact`: of noise and nuisances alone."""
-        return [p.draw(self.rng, exact) for p in self.parts]
-
-    def errors(self, draw: Sequence[np.ndarray]) -> dict[str | None, np.ndarray]:
-        """Mean squares of each part after the fit of the base (None) and of each candidate, (parts,)."""
-        out = {}
-        fitted = np.concatenate([p.weighted(r) for p, r in zip(self.parts, draw, strict=True) if p.fitted])
-        for name, solve in self.solvers.items():
-            keys = () if name is None else (name,)
-            q = solve @ fitted
-            out[name] = np.array([p.square(r - p.design(keys) @ q) for p, r in zip(self.parts, draw, strict=True)])
-        return out
-
-    def null(self, data: np.ndarray, count: int = 199, *, exact: bool = False) -> np.ndarray:
-        """The largest gain over the candidates in each of `count` draws, weighed as that of the data is; `data` as for `gain`."""
-        return np.array([self._largest(self.errors(self.draw(exact=exact)), data) for _ in range(count)])
-
-    def _largest(self, errors: Mapping[str | None, np.ndarray], data: np.ndarray) -> float:
-        fitted, noise = [p.fitted for p in self.parts], np.array([p.noise**2 for p in self.parts])
-        return max((gain(errors[None], errors[key], fitted, noise, data=data) for key in self.keys), default=0.0)
-
-    def cosine(self, a: str, b: str) -> float:
-        """Cosine of two candidates in the fit's metric, the declared parameters projected out (largest over their planes)."""
-        parts = [p for p in self.parts if p.fitted]
-        base = np.concatenate([p.design(()) * p.scale[:, None] for p in parts])
-        A, B = (np.concatenate([p.candidates[k] * p.scale[:, None] for p in parts]) for k in (a, b))
-        q, _ = np.linalg.qr(base)
-        A, B = (np.linalg.qr(M - q @ (q.T @ M))[0] for M in (A, B))
-        return float(np.linalg.svd(A.T @ B, compute_uv=False).max(initial=0.0))
+    early = [i for i, f in enumerate(fitted) if f]
+    everything = by_scale(range(len(parts)))
+    whole = log_mean(everything, weights)
+    foretold = whole - log_mean(by_scale(early), weights) if len(early) < len(parts) else whole
+    return foretold, log_mean(everything, np.full(len(scales), -math.log(len(scales)))), whole
 
 
-def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: np.ndarray, *, data: np.ndarray | None = None) -> float:
-    """Logarithm of the ratio of errors, before over after: the smaller of those of the fitted and of the held-out recordings.
+def evidences(case: CaseRecord, fits: Sequence[FitStatistics]) -> list[Evidence]:
+    """Return the evidence of every stored fit, the best first, and of the declared model with patterns of a free scale.
 
-    Each is the geometric mean over its recordings, as in the score: where one is far off whatever the effect, the others still count. Of
-    the held-out ones alone where the fitted ones are at the noise before and after: the declared parameters have taken the effect in
-    there, and what they predict of the others says so. All arguments but `fitted` are mean squares of the parts.
-
-    Args:
-        before: Of the base.
-        after: With an effect.
-        fitted: Which parts are fitted.
-        noise: Of the noise.
-        data: Of the base with the data themselves, where `before` is of a draw, which is at the noise whatever the data are.
+    What is unknown is told by the scale that all recordings show, for a scale that the fitted ones have shown foretells the others.
     """
-    own = np.array(fitted)
-    if own.all():
-        return ratio(before, after, own)
-    seen = [before, after] if data is None else [before, after, data]
-    if own.any() and not max(squares[own].mean() for squares in seen) < NOISE_ALONE * noise[own].mean():
-        return min(ratio(before, after, own), ratio(before, after, ~own))
-    return ratio(before, after, ~own)
+    recordings, fitted = [n for n, *_ in case.parts], [f for _, f, *_ in case.parts]
+    out = []
+    for fit in fits:
+        own = fit.record
+        scale = unseen([p for p, f in zip(fit.parts, fitted, strict=True) if f])
+        away, variances = prior_of(case, own)
+        foretold, free, whole = densities(at_the_prior_mean(fit.parts, away), recordings, fitted, variances, scale)
+        value = foretold - price(len(own.effects), len(case.candidates))
+        out.append(Evidence(own, value, scale))
+        if not own.effects:
+            out.append(Evidence(own, value + free - whole, scale, unknown=True))
+    return sorted(out, key=lambda e: -e.value)
 
 
-def ratio(before: np.ndarray, after: np.ndarray, group: np.ndarray) -> float:
-    """Logarithm of the ratio of errors, before over after, of a group of the parts; of their mean squares."""
-    return 0.5 * (score(np.minimum(before[group], 1e300)) - score(np.minimum(after[group], 1e300)))
+def judged(found: Sequence[Evidence], alpha: float = ALPHA) -> Verdict:
+    """Return what evidences say: each set counts by its best fit, of whatever method.
 
-
-class _Part:
-    """Columns of one recording in an orthonormal basis of their span; what is outside is noise alone."""
-
-    def __init__(self, columns: Columns, fitted: bool) -> None:
-        self.fitted = fitted
-        everything = np.concatenate(
-            [columns.declared, columns.nuisances, columns.discretisation, columns.smooth, *columns.candidates.values()], axis=1
-        )
-        values, vectors = np.linalg.eigh(everything.T @ everything)
-        keep = values > 1e-10 * max(values.max(initial=0.0), 1e-300)
-        basis = (everything @ vectors[:, keep]) / np.sqrt(values[keep])
-        self.count, self.noise = len(everything), columns.noise
-        self.outside = max(self.count - basis.shape[1], 0)
-        self.nuisances, self.smooth = basis.T @ columns.nuisances, basis.T @ columns.smooth
-        self.past = past = past_nuisances(self.nuisances, self.noise)
-        self.discretisation = basis.T @ columns.discretisation
-        self.declared = past(basis.T @ columns.declared)
-        self.settings = past(self.discretisation)
-        self.candidates = {key: past(basis.T @ value) for key, value in columns.candidates.items()}
-        # the weights vary slowly over the data: in the basis each direction gets its own mean weight
-        self.scale = np.sqrt(np.maximum((basis**2).T @ columns.weight**2, 1e-300))
-
-    def design(self, keys: Sequence[str]) -> np.ndarray:
-        """What a fit moves, the amounts of the settings' differences last."""
-        return np.concatenate([self.declared, *(self.candidates[key] for key in keys), self.settings], axis=1)
-
-    def weighted(self, r: np.ndarray) -> np.ndarray:
-        return r[: len(self.scale)] * self.scale
-
-    def draw(self, rng: np.random.Generator, exact: bool = False) -> np.ndarray:
-        k = len(self.scale)
-        r = self.noise * rng.standard_normal(k)
-        for columns in (self.nuisances,) if exact else (self.nuisances, self.discretisation, self.smooth):
-            r = r + columns @ rng.standard_normal(columns.shape[1])
-        self.rest = self.noise**2 * (rng.chisquare(self.outside) if self.outside else 0.0)
-        return self.past(r)
-
-    def square(self, r: np.ndarray) -> float:
-        """Mean square over all data of the recording."""
-        return (float(r @ r) + self.rest) / self.count
-
-
-def _solver(parts: Sequence[_Part], keys: Sequence[str]) -> np.ndarray:
-    A = np.concatenate([p.design(keys) * p.scale[:, None] for p in parts])
-    amounts = parts[0].settings.shape[1]
-    prior = np.eye(A.shape[1])[A.shape[1] - amounts :]
-    return np.linalg.pinv(np.concatenate([A, prior]), rcond=1e-8)[:, : len(A)]
+    Raises:
+        ValueError: The declared model is not among them.
+    """
+    best: dict[tuple[str, ...] | None, Evidence] = {}
+    for e in sorted(found, key=lambda e: -e.value):
+        best.setdefault(None if e.unknown else e.effects, e)
+    if () not in best:
+        raise ValueError("the declared model has no evidence")
+    base = best.pop(())
+    unknown = best.pop(None, None)
+    ranked: Mapping[tuple[str, ...] | None, Evidence] = best
+    top = max((e.value for e in ranked.values()), default=-math.inf)
+    other = unknown.value if unknown is not None else -math.inf
+    lead = max(top, other) - base.value
+    if lead < math.log((KINDS - 1) / alpha):
+        return Verdict("none", (), lead)
+    if other >= top:
+        return Verdict("unknown", (), lead)
+    order = sorted(ranked, key=lambda key: -ranked[key].value)
+    weights = np.exp(np.array([ranked[key].value for key in order]) - logsumexp([ranked[key].value for key in order]))
+    count = int(np.searchsorted(np.cumsum(weights), 1.0 - alpha)) + 1
+    return Verdict("effect" if count == 1 else "class", tuple(order[:count]), lead)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neuido.discrepancy.inference import evidence
+from neuido.discrepancy.inference import bootstrap
 from neuido.discrepancy.inference.contests import MANY, SMALL, better
 from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial, times_over, unphysical
 from neuido.discrepancy.inference.journal import place
@@ -237,7 +237,7 @@ class Judging(Refining):
         sizes = [sign * unit * STEP**k for sign in p.signs for k in range(STEPS)]
         return [{**start, p.name: size} for size in sizes if p.lower < size < p.upper]
 
-    def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: evidence.LinearModel, *, every: bool = False) -> Round:
+    def judge(self, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: bootstrap.LinearModel, *, every: bool = False) -> Round:
         """A round with the trials that fits make, and what is chosen of them; `every` as for `measured`."""
         errors = empty.errors
         trials = []
@@ -354,8 +354,8 @@ class Judging(Refining):
         if all(self.fitted) or not self.is_noise(t.errors[self.fitted], fitted=True) or len(t.candidate.parameters) > FEW:
             return False
         fitted = np.array(self.fitted)
-        leads = [evidence.ratio(o.errors, t.errors, fitted) for o in r.trials if o.candidate.name != t.candidate.name]
-        return min(leads, default=math.inf) > FIT_LEAD and evidence.ratio(r.errors, t.errors, fitted) > FIT_GAIN
+        leads = [bootstrap.ratio(o.errors, t.errors, fitted) for o in r.trials if o.candidate.name != t.candidate.name]
+        return min(leads, default=math.inf) > FIT_LEAD and bootstrap.ratio(r.errors, t.errors, fitted) > FIT_GAIN
 
     def above_noise(self, before: np.ndarray, t: Trial) -> float:
         """The gain, that of the fitted recordings by what is above the noise: near it nothing lowers the whole of an error by much.
@@ -366,7 +366,7 @@ class Judging(Refining):
             return t.gain
         above = [np.maximum(errors - self.noise_squares, SEEN * self.noise_squares) for errors in (before, t.errors)]
         fitted = np.array(self.fitted)
-        return max(t.gain, min(evidence.ratio(*above, fitted), self.foretold(before, t.errors)))
+        return max(t.gain, min(bootstrap.ratio(*above, fitted), self.foretold(before, t.errors)))
 
     def by_chance(self, r: Round) -> float:
         """Gain up to which an effect is not worth another look, be it alone or with a second one."""

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from neuido.discrepancy.inference import evidence
-from neuido.discrepancy.inference.evidence import NOISE_ALONE
+from neuido.discrepancy.inference import bootstrap
+from neuido.discrepancy.inference.bootstrap import NOISE_ALONE
 from neuido.discrepancy.inference.floors import Floor, Part, over_time, score, sealed, split
 from neuido.discrepancy.inference.journal import Journal
 from neuido.discrepancy.inference.least_squares import Fit, Request, levenberg_marquardt, residuals, run
@@ -312,13 +312,13 @@ class Laboratory:
         return hopeless or self.is_noise(errors)
 
     def gain(self, before: np.ndarray, after: np.ndarray) -> float:
-        """`evidence.gain` of mean squares of the parts."""
-        return evidence.gain(before, after, self.fitted, self.noise_squares)
+        """`bootstrap.gain` of mean squares of the parts."""
+        return bootstrap.gain(before, after, self.fitted, self.noise_squares)
 
     def foretold(self, before: np.ndarray, after: np.ndarray) -> float:
         """Logarithm of the ratio of errors of what is held out, or of all parts where nothing is; of mean squares of the parts."""
         fitted = np.array(self.fitted)
-        return evidence.ratio(before, after, fitted if fitted.all() else ~fitted)
+        return bootstrap.ratio(before, after, fitted if fitted.all() else ~fitted)
 
     def fitted_score(self, errors: np.ndarray) -> float:
         """Score of what is left of the fitted parts, of mean squares of all."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neuido.discrepancy.inference import evidence
+from neuido.discrepancy.inference import bootstrap
 from neuido.discrepancy.inference.contests import MANY, Contest, better
 from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, score, times_over
 from neuido.discrepancy.inference.journal import Journal
@@ -288,7 +288,7 @@ class Inference(Prospects):
         with self.quickly(at.fit.point, at.floor):
             return min(self.promising(at.fit, at.floor, [beside], most=MANY).promise.values(), default=1.0)
 
-    def _linear(self, point, floor, left, slopes, columns, chosen, candidates) -> evidence.LinearModel:
+    def _linear(self, point, floor, left, slopes, columns, chosen, candidates) -> bootstrap.LinearModel:
         """The linear model of the fits; `left` is what the discretisation leaves after a refit, mean squares of the parts.
 
         Of all candidates, or once the time for the search is over of those that got a fit.
@@ -313,8 +313,10 @@ class Inference(Prospects):
             scale = over_time * math.sqrt(square / max(float(np.mean(over_time**2)), 1e-300))
             smooth = scale[:, None] * self.problem.directions(n)[rows]
             settings = floor.differences[n][rows]
-            made.append(evidence.Columns(floor.weight[n][rows], floor.noise[n], slopes[n][rows], nuisances[n][rows], settings, smooth, own))
+            made.append(
+                bootstrap.Columns(floor.weight[n][rows], floor.noise[n], slopes[n][rows], nuisances[n][rows], settings, smooth, own)
+            )
         common = set.intersection(*(set(c.candidates) for c in made))
         made = [replace(c, candidates={k: v for k, v in c.candidates.items() if k in common}) for c in made]
-        return evidence.LinearModel([c for c, p in zip(made, self.parts, strict=True) if p.fitted],
+        return bootstrap.LinearModel([c for c, p in zip(made, self.parts, strict=True) if p.fitted],
                                     [c for c, p in zip(made, self.parts, strict=True) if not p.fitted], seed=self.seed)  # fmt: skip

@@ -1,0 +1,99 @@
+"""The likelihood of recordings under a fitted model: noise, nuisances, other settings, and what no setting shows.
+
+For the residual r of a recording where a fit ended,
+
+    r ~ N(0, sigma^2 I + N N^T + s^2 S S^T + D D^T + J P J^T),
+
+with N one prior standard deviation of each nuisance, S smooth patterns of one mean square together, D the differences of the other
+settings, and J the slopes by the free parameters, of prior variances P. The amounts of N and S are a recording's own, those of D and J are
+shared by all recordings. The scale s of the patterns is common and unknown: densities are computed for many scales at once, and averaged.
+
+A recording is rotated once into the principal patterns left by noise and nuisances; a density at any scale then costs a few products of
+small matrices (Woodbury's identity, and the determinant lemma beside it).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+from scipy.stats import invgamma
+
+from neuido.discrepancy.inference.statistics import PartStatistics
+
+FREEDOM = 2.0
+"""Degrees of freedom of the prior of s^2, an inverse gamma distribution about the square of its scale: with it what the patterns hold has
+the tails of a Student distribution, so that a solver which differs by several times as much as the settings do is no surprise."""
+SCALES = np.geomspace(0.2, 1000.0, 49)
+"""Scales of the patterns that densities are averaged over, in units of that scale: the prior has less than 1e-5 outside."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rotated:
+    """A recording in its principal patterns, whitened by noise and nuisances."""
+
+    constant: float
+    """Rows times log(2 pi), and the log-determinant of noise and nuisances."""
+    strength: np.ndarray
+    """(k,) variances of the principal patterns at scale one, over noise and nuisances."""
+    along: np.ndarray
+    """(k, q + 1) the shared directions and the residual along them."""
+    gram: np.ndarray
+    """(q + 1, q + 1) their inner products."""
+
+
+def rotated(parts: Sequence[PartStatistics], shared: Sequence[np.ndarray]) -> Rotated:
+    """Return parts of one recording as one.
+
+    Args:
+        parts: Of one recording, with one noise.
+        shared: Of each part the directions whose amounts all recordings share, (k, q).
+    """
+    noise, rows = parts[0].noise, sum(p.rows for p in parts)
+    smooth, nuisances, residual = (np.concatenate([getattr(p, name) for p in parts]) for name in ("smooth", "nuisances", "residual"))
+    columns = np.concatenate([np.concatenate(shared), residual[:, None]], axis=1) / noise
+    U, widths, _ = np.linalg.svd(nuisances / noise, full_matrices=False)
+    shrink = 1.0 - 1.0 / np.sqrt(1.0 + widths**2)
+
+    def whitened(M: np.ndarray) -> np.ndarray:
+        return M - U @ (shrink[:, None] * (U.T @ M))
+
+    columns = whitened(columns)
+    V, strength, _ = np.linalg.svd(whitened(smooth / noise), full_matrices=False)
+    constant = rows * math.log(2.0 * math.pi * noise**2) + float(np.sum(np.log1p(widths**2)))
+    return Rotated(constant, strength**2, V.T @ columns, columns.T @ columns)
+
+
+def log_densities(recordings: Sequence[Rotated], variances: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Return the log-density of the residuals of several recordings at each scale of the patterns, (len(scales),).
+
+    Args:
+        recordings: With the same shared directions.
+        variances: Prior variances of the shared amounts, (q,).
+        scales: Of the patterns, in the unit of the data.
+    """
+    q = len(variances)
+    gram = np.zeros((len(scales), q + 1, q + 1))
+    out = np.zeros(len(scales))
+    for r in recordings:
+        grown = scales[:, None] ** 2 * r.strength  # (g, k)
+        gram += r.gram - np.einsum("gk,ki,kj->gij", grown / (1.0 + grown), r.along, r.along)
+        out -= 0.5 * (r.constant + np.log1p(grown).sum(axis=1))
+    root = np.sqrt(variances)
+    B = np.eye(q) + root[:, None] * gram[:, :q, :q] * root
+    b = root * gram[:, :q, q]
+    taken = np.einsum("gi,gi->g", b, np.linalg.solve(B, b[..., None])[..., 0]) if q else 0.0
+    _, logdet = np.linalg.slogdet(B) if q else (1.0, 0.0)
+    return out - 0.5 * (logdet + gram[:, q, q] - taken)
+
+
+def log_prior(scales: np.ndarray, scale: float) -> np.ndarray:
+    """Return the log-weights of geometrically spaced scales under the prior about `scale`; they sum to one."""
+    weights = invgamma.logpdf(scales**2, 0.5 * FREEDOM, scale=0.5 * FREEDOM * scale**2) + 2.0 * np.log(scales)
+    return weights - logsumexp(weights)
+
+
+def log_mean(densities: np.ndarray, weights: np.ndarray) -> float:
+    """Return the logarithm of the mean density over scales, of log-densities and log-weights."""
+    return float(logsumexp(densities + weights))

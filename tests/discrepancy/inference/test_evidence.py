@@ -1,0 +1,216 @@
+"""Likelihood and evidence where both are known in closed form, their calibration, and what must not change them."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import logsumexp
+from scipy.stats import invgamma, multivariate_normal
+
+from neuido.discrepancy.inference.attribution import diagnose
+from neuido.discrepancy.inference.evidence import KINDS, LEAST, Evidence, at_the_prior_mean, densities, evidences, judged, price, unseen
+from neuido.discrepancy.inference.journal import FitRecord
+from neuido.discrepancy.inference.likelihood import FREEDOM, SCALES, log_densities, log_mean, log_prior, rotated
+from neuido.discrepancy.inference.statistics import PartStatistics, best_fits, read
+from tests.discrepancy.report.test_answer import Curve
+
+NOISE, ROWS, PHI = 0.3, 40, 0.1
+T = np.linspace(0.0, 1.0, ROWS)
+
+
+def part(rng, *, rows=ROWS, smooth=4, nuisances=2, settings=2, slopes=2):
+    """A part of random directions, and of a random residual."""
+    S = rng.normal(size=(rows, smooth))
+    S /= np.sqrt(np.mean(np.sum(S**2, axis=1))) if smooth else 1.0
+    N, D, J = (0.5 * rng.normal(size=(rows, k)) for k in (nuisances, settings, slopes))
+    return PartStatistics(rows, NOISE, S, N, D, J, rng.normal(size=rows))
+
+
+def reduced(p):
+    """The same part in a basis of its directions."""
+    names = ("smooth", "nuisances", "settings", "slopes")
+    whole = np.concatenate([getattr(p, n) for n in names] + [p.residual[:, None]], axis=1)
+    basis, _ = np.linalg.qr(whole)
+    return replace(p, residual=basis.T @ p.residual, **{n: basis.T @ getattr(p, n) for n in names})
+
+
+def covariance(parts, variances, scale):
+    """Of the residuals of recordings, each a part, one after another."""
+    shared = np.concatenate([np.concatenate([p.settings, p.slopes], axis=1) for p in parts])
+    out = shared @ np.diag(np.concatenate([np.ones(parts[0].settings.shape[1]), variances])) @ shared.T
+    at = 0
+    for p in parts:
+        own = slice(at, at := at + p.rows)
+        out[own, own] += NOISE**2 * np.eye(p.rows) + p.nuisances @ p.nuisances.T + scale**2 * p.smooth @ p.smooth.T
+    return out
+
+
+@pytest.mark.parametrize("basis", [lambda p: p, reduced])
+@pytest.mark.parametrize("sizes", [{}, {"settings": 0, "smooth": 0}, {"slopes": 0, "settings": 0}, {"nuisances": 0}])
+def test_a_density_is_that_of_the_whole_covariance(basis, sizes):
+    rng = np.random.default_rng(3)
+    parts, scales = [part(rng, **sizes), part(rng, rows=25, **sizes)], np.array([1e-6, 0.4, 30.0])
+    variances = np.array([2.0, 0.3])[: parts[0].slopes.shape[1]]
+    made = [rotated([p], [np.concatenate([p.settings, p.slopes], axis=1)]) for p in map(basis, parts)]
+    prior = np.concatenate([np.ones(parts[0].settings.shape[1]), variances])
+    r = np.concatenate([p.residual for p in parts])
+    whole = [multivariate_normal(np.zeros(len(r)), covariance(parts, variances, s)).logpdf(r) for s in scales]
+    np.testing.assert_allclose(log_densities(made, prior, scales), whole, rtol=1e-8)
+
+
+def test_what_is_held_out_is_foretold_by_the_conditional_density():
+    rng = np.random.default_rng(5)
+    parts, variances = [part(rng, smooth=0) for _ in range(2)], np.array([2.0, 0.3])
+    C = covariance(parts, variances, 0.0)
+    a, b = (p.residual for p in parts)
+    gain = C[ROWS:, :ROWS] @ np.linalg.inv(C[:ROWS, :ROWS])
+    known = multivariate_normal(gain @ a, C[ROWS:, ROWS:] - gain @ C[:ROWS, ROWS:]).logpdf(b)
+    assert densities(parts, [0, 1], [True, False], variances, 1.0)[0] == pytest.approx(known)
+
+
+def test_the_last_part_of_a_recording_shares_its_nuisances():
+    """A nuisance that the first part has told is known in the second one."""
+    rng = np.random.default_rng(6)
+    p = part(rng, smooth=0, settings=0, slopes=0, nuisances=1)
+    big = replace(p, nuisances=20.0 * np.ones((ROWS, 1)), residual=7.0 + NOISE * rng.normal(size=ROWS))
+    one, *_ = densities([big, big], [0, 0], [True, False], np.empty(0), 1.0)
+    two, *_ = densities([big, big], [0, 1], [True, False], np.empty(0), 1.0)
+    assert one > two + 2.0
+
+
+def test_the_scale_is_averaged_over_its_prior():
+    """One datum along one pattern: a Student distribution beside the noise."""
+    phi, e = 0.8, 5.0
+    p = PartStatistics(1, NOISE, np.ones((1, 1)), *(np.zeros((1, 0)) for _ in range(3)), np.array([e]))
+    found = log_mean(log_densities([rotated([p], [np.zeros((1, 0))])], np.empty(0), SCALES * phi), log_prior(SCALES * phi, phi))
+
+    def density(v):
+        gauss = math.exp(-0.5 * e**2 / (NOISE**2 + v)) / math.sqrt(2.0 * math.pi * (NOISE**2 + v))
+        return gauss * invgamma.pdf(v, FREEDOM / 2, scale=FREEDOM / 2 * phi**2)
+
+    known = quad(density, 0.0, 10.0)[0] + quad(density, 10.0, np.inf)[0]
+    assert found == pytest.approx(math.log(known), abs=2e-3)
+
+
+def test_what_a_setting_leaves_after_a_refit_is_the_scale():
+    J, off = np.sin(3 * T)[:, None], np.cos(9 * T)[:, None]
+    nothing = np.zeros((ROWS, 0))
+    p = PartStatistics(ROWS, NOISE, nothing, nothing, np.concatenate([2.0 * J, 0.0 * J], axis=1), J, T)
+    assert unseen([p]) == pytest.approx(LEAST * NOISE)  # slopes make it good; one that did not run counts for nothing
+    own = off - J @ np.linalg.lstsq(J, off, rcond=None)[0]
+    assert unseen([replace(p, settings=off)]) == pytest.approx(math.sqrt(np.mean(own**2)))
+
+
+@pytest.fixture(scope="module")
+def toys():
+    """Draws, patterns, and the slopes of the declared model and of one with each of six candidates, for two recordings."""
+    rng = np.random.default_rng(8)
+    smooth = np.stack([np.cos(math.pi * k * T) for k in range(5)], axis=1)
+    smooth /= np.sqrt(np.mean(np.sum(smooth**2, axis=1)))
+    base = T[:, None] - 0.5
+    slopes = {(): [base, base]}
+    for i in range(6):
+        slopes[f"c{i}",] = [np.concatenate([base, np.sin((4 + 3 * i) * T + rng.normal())[:, None]], axis=1) for _ in range(2)]
+    return rng, smooth, slopes
+
+
+def weighed(residuals, slopes, smooth, *, refit=True):
+    """The evidence of each model for residuals of two recordings; `refit`: they are taken where a fit of the first one ended."""
+    out = []
+    for effects, J in slopes.items():
+        q = np.linalg.lstsq(J[0], residuals[0], rcond=None)[0] if refit else np.zeros(J[0].shape[1])
+        own = [r - j @ q for r, j in zip(residuals, J, strict=True)]
+        nothing = np.zeros((ROWS, 0))
+        parts = [PartStatistics(ROWS, NOISE, smooth, nothing, nothing, j, r) for j, r in zip(J, own, strict=True)]
+        foretold, free, whole = densities(at_the_prior_mean(parts, -q), [0, 1], [True, False], np.full(len(q), 9.0), PHI)
+        value = foretold - price(len(effects), len(slopes) - 1)
+        out += [of(value, *effects)] + [of(value + free - whole, unknown=True)] * (not effects)
+    return out
+
+
+def of(value, *effects, unknown=False):
+    return Evidence(FitRecord(0, effects, {}, (), 0.0, True, 1, 0, (), ()), value, PHI, unknown)
+
+
+def drawn(rng, smooth, slopes, effect=0.0):
+    """Residuals under the declared model, whose patterns have a scale of the prior; `effect`: size of the first candidate beside it."""
+    s = math.sqrt(invgamma.rvs(FREEDOM / 2, scale=FREEDOM / 2 * PHI**2, random_state=rng))
+    q = np.array([3.0 * rng.normal(), effect])
+    return [slopes["c0",][n] @ q + s * smooth @ rng.normal(size=smooth.shape[1]) + NOISE * rng.normal(size=ROWS) for n in range(2)]
+
+
+def test_nothing_is_named_on_nulls(toys):
+    rng, smooth, slopes = toys
+    answers = [judged(weighed(drawn(rng, smooth, slopes), slopes, smooth)).answer for _ in range(100)]
+    assert sum(a != "none" for a in answers) <= 5  # Markov: 5 %
+
+
+def test_where_a_fit_ended_does_not_count_where_the_model_is_linear(toys):
+    rng, smooth, slopes = toys
+    residuals = drawn(rng, smooth, slopes, effect=2.0)
+    refitted, plain = (weighed(residuals, slopes, smooth, refit=refit) for refit in (True, False))
+    np.testing.assert_allclose([e.value for e in refitted], [e.value for e in plain], rtol=1e-8)
+
+
+def test_an_effect_is_named(toys):
+    rng, smooth, slopes = toys
+    verdicts = [judged(weighed(drawn(rng, smooth, slopes, effect=4.0), slopes, smooth)) for _ in range(20)]
+    assert sum(v.answer in ("effect", "class") and v.sets[0] == ("c0",) for v in verdicts) >= 19  # one solver in twenty is far off
+
+
+def test_what_no_effect_explains_is_unknown(toys):
+    rng, smooth, slopes = toys
+    answers = []
+    for _ in range(10):
+        residuals = [own + 40.0 * smooth @ rng.normal(size=smooth.shape[1]) for own in drawn(rng, smooth, slopes)]
+        answers.append(judged(weighed(residuals, slopes, smooth)).answer)
+    assert answers.count("unknown") == 10
+
+
+def test_a_class_holds_all_but_little_of_the_probability():
+    found = [of(0.0), of(1.0, unknown=True), of(20.0, "a"), of(19.0, "b"), of(10.0, "c"), of(15.0, "a")]
+    assert judged(found).sets == (("a",), ("b",)) and judged(found).lead == 20.0
+    assert judged([of(0.0), of(20.0, "b", "a"), of(10.0, "a")]).sets == (("a", "b"),)
+    just = math.log((KINDS - 1) / 0.05)
+    assert [judged([of(0.0), of(v, "a")]).answer for v in (just - 0.01, just + 0.01)] == ["none", "effect"]
+    with pytest.raises(ValueError, match="declared model"):
+        judged([of(1.0, "a")])
+
+
+def test_prior_weights_of_all_models_sum_to_one():
+    weights = [-price(m, 6) + math.log(math.comb(6, m)) for m in range(KINDS - 1)] + [-price(0, 6)]  # the last one: the unknown
+    assert logsumexp(weights) == pytest.approx(0.0)
+
+
+def test_units_and_the_order_of_recordings_change_nothing():
+    rng = np.random.default_rng(9)
+    parts, variances = [part(rng), part(rng, rows=30), part(rng, rows=25)], np.array([2.0, 0.3])
+    other = [replace(p, residual=p.residual - 0.7 * p.slopes[:, 0]) for p in parts]
+
+    def value(parts, scale=0.4, order=(0, 1, 2)):
+        return densities([parts[i] for i in order], list(order), [i < 2 for i in order], variances, scale)[0]
+
+    def in_millimetres(p):
+        own = {n: 1000.0 * getattr(p, n) for n in ("noise", "nuisances", "settings", "slopes", "residual")}
+        return replace(p, **own)  # the patterns have no unit, their scale has
+
+    assert value(parts, order=(1, 2, 0)) == pytest.approx(value(parts), rel=1e-9)
+    big, other_big = ([in_millimetres(p) for p in own] for own in (parts, other))
+    assert value(big, 400.0) - value(other_big, 400.0) == pytest.approx(value(parts) - value(other), rel=1e-6)
+    assert unseen(big) == pytest.approx(1000.0 * unseen(parts))
+
+
+@pytest.mark.parametrize(("truth", "answer"), [({"young": 1.5, "drag_linear.k": 0.8}, "effect"), ({"young": 1.5}, "none")])
+def test_stored_fits_have_an_evidence(truth, answer):
+    found = diagnose(Curve(truth), draws=39, statistics=True)
+    fits = read(found.statistics)
+    journal = SimpleNamespace(bases=found.case.bases, rounds=found.case.judged)
+    assert {f.record.digest for f in fits} == {f.digest for f in best_fits(journal)}
+    made = evidences(found.case, fits)
+    verdict = judged(made)
+    assert verdict.answer == answer
+    assert answer == "none" or verdict.sets == (("drag_linear",),)
+    assert sum(e.unknown for e in made) == 1 and all(np.isfinite(e.value) for e in made)
