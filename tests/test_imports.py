@@ -65,7 +65,13 @@ def test_direction(module):
             assert not wrong, f"{module} imports {sorted(wrong)}; {room} may import {allowed} alone"
 
 
-SPEAK_WANDB = ("neuido.commands.main", "neuido.commands.sweep", "neuido.commands.cli.sweep_file", "neuido.data.files.sweep_run")
+SPEAK_WANDB = (
+    "neuido.commands.main",
+    "neuido.commands.sweep",
+    "neuido.commands.cli.sweep_file",
+    "neuido.data.files.sweep_run",
+    "neuido.commands.cli.trainer",
+)
 """They speak the language of its files and its environment, and import nothing of it."""
 
 

@@ -1,6 +1,7 @@
 """A mistyped key, option or class and a value of a wrong type are one line: where it stands, what is wrong, what was meant."""
 
 import pytest
+import yaml
 
 import neuido
 from neuido.commands.cli.mistakes import check_configurations
@@ -204,3 +205,32 @@ def test_only_what_opens_a_message_is_placed(tmp_path):
 
 def test_nothing_close_is_no_suggestion():
     assert suggest("zzz", ["alpha", "beta"]) == ""
+
+
+@pytest.mark.parametrize("words", ["--trainer.logger TensorBoardLogger", "--trainer.logger=lightning.pytorch.loggers.TensorBoardLogger"])
+def test_tensorboard_names_its_extra(capsys, monkeypatch, words):
+    monkeypatch.setattr("neuido.commands.cli.mistakes.find_spec", lambda name: None)
+    one_line(capsys, ["fit", "--config", "quickstart", *words.split()], "pip install 'neuido[tensorboard]'")
+
+
+def test_tensorboard_in_a_configuration_names_its_extra(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr("neuido.commands.cli.mistakes.find_spec", lambda name: None)
+    (tmp_path / "own.yaml").write_text("base: quickstart\ntrainer:\n  logger:\n    class_path: TensorBoardLogger\n")
+    one_line(capsys, ["fit", "--config", tmp_path / "own.yaml"], "pip install 'neuido[tensorboard]'")
+
+
+def test_tensorboard_keeps_the_folder_of_the_log(capsys):
+    status, out, err = run(capsys, "fit", "--config", "quickstart", "--trainer.logger", "TensorBoardLogger", "--print_config")
+    assert (status, err) == (0, "")
+    logger = yaml.safe_load(out)["trainer"]["logger"]
+    assert logger["class_path"].endswith("TensorBoardLogger") and logger["init_args"]["save_dir"] == "runs"
+
+
+def test_wandb_without_an_account_is_one_line_with_the_way_out(capsys, monkeypatch):
+    from wandb.errors import UsageError
+
+    def refused(args):
+        raise UsageError("api_key not configured (no-tty). call wandb.login(key=[your_api_key])")
+
+    monkeypatch.setattr("neuido.commands.cli.trainer._run", refused)
+    one_line(capsys, ["fit", "--config", "quickstart"], "api_key not configured", "WANDB_MODE=offline")

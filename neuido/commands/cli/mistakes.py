@@ -5,6 +5,7 @@ The check reads source text (`signatures`), so that a mistake is answered before
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,6 +70,7 @@ def check_configurations(args: list[str], *, trust: bool = False) -> None:
     _check_words(args, everything, trust=trust)
     if not any(word.partition("=")[0] == "--print_config" for word in args):
         _check_needs(args, everything)
+        _check_loggers(args, everything)
 
 
 def _top(command: str) -> list[str]:
@@ -337,6 +339,16 @@ def _check_needs(args: list[str], content: Mapping[str, Any]) -> None:
     model, data = content.get("model"), content.get("data")
     if isinstance(model, Mapping) and isinstance(data, Mapping):
         _check_pair(str(model.get("class_path")), str(data.get("class_path")))
+
+
+def _check_loggers(args: list[str], content: Mapping[str, Any]) -> None:
+    """Refuse a logger whose package is not installed."""
+    given = (content.get("trainer") or {}).get("logger")
+    parts = given if isinstance(given, list) else [given]
+    names = [str(part.get("class_path") if isinstance(part, Mapping) else part) for part in parts]
+    names = [value or "" for name, value in given_options(args) if name in ("trainer.logger", "trainer.logger.class_path")] or names
+    if any(_short(name) == "TensorBoardLogger" for name in names) and not any(find_spec(p) for p in ("tensorboard", "tensorboardX")):
+        raise UserError("trainer.logger = TensorBoardLogger needs the extra `tensorboard`: pip install 'neuido[tensorboard]'")
 
 
 def _slots(content: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:

@@ -44,6 +44,13 @@ def run_lightning(args: list[str]) -> "LightningCLI":
         raise UserError(explained(condensed(error), args, type_in_configuration(args))) from error
     except UserError as error:
         raise UserError(placed(str(error), args)) from error
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] == "wandb":
+            raise UserError(
+                f"wandb: {str(error).splitlines()[0][:120]}; WANDB_MODE=offline needs no account (`wandb sync` sends the run later), "
+                "`wandb login` logs in"
+            ) from error
+        raise
 
 
 def _run(args: list[str]) -> "LightningCLI":
