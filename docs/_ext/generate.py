@@ -1,7 +1,7 @@
 """Pages made from the package itself, written to docs/generated before Sphinx reads its sources.
 
 The command line comes from its parsers, the library of effects from `LIBRARY`, the configuration keys from configs/, the reference of the
-public names from `neuido.__all__`, and the benchmarks from research/results.
+public names from `neuido.__all__`, the benchmarks from research/results, and the constants of a diagnosis from its sources.
 """
 
 import contextlib
@@ -13,6 +13,7 @@ from pathlib import Path
 
 from api_examples import EXAMPLES
 from benchmark_pages import benchmark_pages
+from decision_constants import constant_page
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "docs" / "generated"
@@ -234,6 +235,7 @@ def escape_docstring(app, what, name, obj, options, lines) -> None:
 def write_pages(app=None) -> None:
     """Write all generated pages; a page that is the same stays untouched, so that Sphinx need not read it again."""
     pages = {"commands.md": command_page(), "effects.md": effect_page(), "configs.md": config_page(), **api_pages(), **benchmark_pages()}
+    pages["decision_constants.md"] = constant_page()
     for name, text in pages.items():
         path = OUT / name
         path.parent.mkdir(parents=True, exist_ok=True)

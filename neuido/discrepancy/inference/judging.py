@@ -68,6 +68,7 @@ BROUGHT_BACK = 1.5
 (`LED_AWAY`) need gain no more than `LEAST_GAIN`, and `BACK_GAIN` above the floor. Of 344 blind cases, 119 nulls among them, the first
 changed one answer, to a right one. Well within the floor it needs what all need there: grids led one null's base fit 36-fold away."""
 BACK_GAIN = math.log(1.4)
+"""What such an effect must gain above the floor."""
 GAIN_TO_NOISE = math.log(2.0)
 """What it takes where noise alone is left, for a candidate can take the place of what the grid does; of one that `stands_alone`; and above
 the floor where the base fit is led away, as none of 40 nulls' was."""
