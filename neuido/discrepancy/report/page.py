@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuido.discrepancy.report import motion_player, plots, silhouette_pictures
+from neuido.discrepancy.report import motion_player, plots
 from neuido.discrepancy.report.reader_units import WRITTEN, Units, rounded
 from neuido.discrepancy.report.wording import FIGURES, Words, leading, listed, title, worded, words_of
 
@@ -157,6 +157,8 @@ def _section(c: Mapping[str, Any], motion: Motion, units: Units, figures: list[d
         add("Where on the body", [motion_player.residual_map(bodies, c, units)], form="map", note=_places(c, units))
         add("Which stage", plots.stage_plots(c), note=WEAK)
     elif any("masks" in arrays for arrays in motion.values()):
+        from neuido.discrepancy.report import silhouette_pictures  # loads torch, which no other page needs
+
         pictures = silhouette_pictures.pictures(motion, c)
     else:
         add("Data before and after", [p for name, arrays in others.items() for p in plots.data_plots(name, arrays, c, units, rows)])

@@ -7,6 +7,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from neuido.discrepancy.problems.silhouettes import distances
+
 BEFORE, AFTER = (192, 57, 43), (31, 119, 180)
 """Red and blue of the report, RGB."""
 FRAMES = 8
@@ -38,8 +40,6 @@ def pictures(motion: Mapping[str, Mapping[str, np.ndarray]], c: Mapping[str, Any
 
 def _overlay(own: Mapping[str, np.ndarray], t: int, v: int, inset: float) -> np.ndarray:
     """One image (H, W, 3) uint8."""
-    from neuido.discrepancy.silhouettes import distances
-
     mask = own["masks"][t, v] / 255.0
     size = (ENLARGED * mask.shape[1], ENLARGED * mask.shape[0])
     image = np.repeat((255 - 90 * cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR))[..., None], 3, axis=2).round().astype(np.uint8)

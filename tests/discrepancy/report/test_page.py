@@ -1,13 +1,15 @@
 """The page of a diagnosis: whole, self-contained, escaped, small, and useful without JavaScript."""
 
+import base64
 import json
 import re
 from html.parser import HTMLParser
 
+import cv2
 import numpy as np
 import pytest
 
-from neuido.discrepancy.report import motion_player, page, plots
+from neuido.discrepancy.report import motion_player, page, plots, silhouette_pictures
 from neuido.discrepancy.report.reader_units import Units
 from tests.discrepancy.report.report_content import HOSTILE, content, motion, stress_curve
 
@@ -110,6 +112,25 @@ def test_several_bodies_have_a_table_first():
     assert text.count("<details") == 2 and text.count("<details open>") == 1
 
 
+def test_silhouettes_are_outlined_over_their_masks():
+    y, x = np.mgrid[:24, :32]
+    disc = (255 * ((x - 16) ** 2 + (y - 12) ** 2 < 50)).astype(np.uint8)
+    masks = np.broadcast_to(disc, (3, 2, 24, 32)).copy()
+    scores = {"held_out": {"iou": 0.9, "outline_px": 0.4, "outline_mm": 1.2, "psnr": 20.0}}
+    shown = {"drop": {"role": "held_out", "inset": 0.0, "frame_times": [0.0, 0.1, 0.2]}}
+    c = content(recordings=shown, silhouettes={"drop": {"before": scores, "after": scores}}, stages={}, models=[])
+    arrays = {"masks": masks, "drawn_before": np.roll(masks, 3, axis=3), "drawn_after": masks}
+    text = page.page([c], [{"drop": arrays}])
+    said = read(text).text
+    assert text.count("data:image/png;base64,") == 1 and "drop at 0, 0.1, 0.2 s" in said and "overlap (IoU)" in said
+    ((_, url),) = silhouette_pictures.pictures({"drop": arrays}, c)
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(url.partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (2 * 2 * 24, 3 * 2 * 32, 3)
+    assert (picture == silhouette_pictures.BEFORE[::-1]).all(axis=2).any() and (picture == silhouette_pictures.AFTER[::-1]).all(
+        axis=2
+    ).any()
+
+
 def test_names_do_nothing():
     c, arrays = stress_curve(HOSTILE)
     effect = {
@@ -165,8 +186,6 @@ def test_player_holds_the_motion():
     made = motion_player.player(m, c, Units(lengths=[7e-4, 0.7]))
     assert made["unit"] == "mm"
     own = made["recordings"][0]
-    import base64
-
     sets = [np.frombuffer(base64.b64decode(s), "<i2").reshape(own["frames"], own["points"], 3) for s in own["sets"]]
     for key, packed in zip(motion_player.SETS, sets, strict=True):
         np.testing.assert_allclose(np.array(own["middle"]) + own["scale"] * packed, 1e3 * m["throw"][key], atol=0.1)
@@ -177,8 +196,6 @@ def test_player_draws_a_floor_that_is_near_and_hides_what_was_not_seen():
     c, m = content(), motion()
     m["throw"]["measured"][1, 0] = np.nan
     own = motion_player.player(m, c, Units())["recordings"][0]
-    import base64
-
     packed = np.frombuffer(base64.b64decode(own["sets"][0]), "<i2").reshape(own["frames"], own["points"], 3)
     assert (packed[1, 0] == motion_player.HIDDEN).all() and (packed[0] != motion_player.HIDDEN).all()
     c["recordings"]["throw"]["colliders"][0]["point"] = [0.0, float(m["throw"]["measured"][0, :, 1].min()) - 0.05, 0.0]
