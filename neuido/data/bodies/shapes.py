@@ -69,7 +69,7 @@ def box(
     lower, upper = _vector("lower", lower), _vector("upper", upper)
     if any(u <= l for l, u in zip(lower, upper)):
         raise UserError(f"a box needs lower < upper on each axis, got lower {list(lower)} and upper {list(upper)}")
-    centre = tuple((l + u) / 2 for l, u in zip(lower, upper))
+    centre = ((lower[0] + upper[0]) / 2, (lower[1] + upper[1]) / 2, (lower[2] + upper[2]) / 2)
     volume = math.prod(u - l for l, u in zip(lower, upper))
     x = _lattice(lower, upper, spacing, jitter, seed)
     return _body(x, volume, centre, velocity, angular_velocity)

@@ -100,7 +100,7 @@ def webm(path: Path, width: int) -> bytes | None:
     os.close(handle)
     try:
         with _silenced_stderr():
-            sink = cv2.VideoWriter(name, cv2.VideoWriter_fourcc(*"VP90"), source.get(cv2.CAP_PROP_FPS) or 20.0, smaller)
+            sink = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*"VP90"), source.get(cv2.CAP_PROP_FPS) or 20.0, smaller)
             if not sink.isOpened():
                 return None
             while (read := source.read())[0]:

@@ -209,7 +209,7 @@ def _one_point(points: Mapping[str, np.ndarray], point: str | None, path: Path) 
         return np.mean(list(points.values()), axis=0)
     if point is None and len(points) == 1:
         return next(iter(points.values()))
-    if point not in points:
+    if point is None or point not in points:
         raise UserError(
             f"{path.name} has the points {', '.join(list(points)[:12])}: select one with --point NAME, or give --point mean or --kind body"
         )
