@@ -51,6 +51,16 @@ def test_lines_of_a_fit_and_of_a_test(tmp_path, lines):
     assert len(lines) == 2 and lines[1].startswith("test: 6 of 6 batches")
 
 
+class Talking(Small):
+    def on_train_end(self):
+        self.print("the end of training")
+
+
+def test_a_module_prints_beside_the_lines(tmp_path, lines, capsys):
+    trainer(tmp_path, max_steps=1).fit(Talking(), torch.utils.data.DataLoader(torch.ones(2, 1)))
+    assert "the end of training" in capsys.readouterr().out
+
+
 def test_a_bar_that_the_user_chose_or_turned_off_stays_so(monkeypatch):
     assert needs_plain_lines({}) and not needs_plain_lines({"enable_progress_bar": False})
     assert not needs_plain_lines({"callbacks": [TQDMProgressBar()]})

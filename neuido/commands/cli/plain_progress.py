@@ -23,6 +23,7 @@ def plain_progress() -> "Callback":
 
     class PlainProgress(ProgressBar):
         work: Progress | None = None
+        is_enabled = False  # no bar that `LightningModule.print` would have to keep whole: it prints as it is
 
         def _begin(self, what: str, total: float | None, done: int = 0) -> None:
             self._end()
