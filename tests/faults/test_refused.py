@@ -11,6 +11,7 @@ from neuido.data.bodies.scene_files import scene_from_dict
 from neuido.data.files.results import logged_curves
 from neuido.discrepancy import workflow
 from neuido.errors import UserError
+from tests.command import run
 
 PLANE = {"type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 1.0, 0.0], "contact": "separate", "friction": 0.0}
 SCENE = {"domain": [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], "gravity": [0.0, -9.8, 0.0]}
@@ -36,6 +37,32 @@ def test_out_below_a_file_is_refused_before_work(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="is a file"):
         workflow.diagnose(tmp_path, out=tmp_path / "file" / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+WRITING = {  # command: its arguments but for --out
+    "simulate": ["nclaw-cube"],
+    "trajectories": [],
+    "scenes": ["--config", "six_small"],
+    "undeclared": ["--seed", "1"],
+    "replay": ["absent"],
+    "reconstruct": ["absent"],
+    "film": [],
+    "latents": [],
+    "sweep": ["sweeps/views"],
+    "report": ["absent"],
+    "import": ["absent.csv"],
+    "demo": [],
+}
+
+
+@pytest.mark.parametrize("command", WRITING)
+def test_every_command_tests_its_folder_before_work(command, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("kept")
+    status, out, err = run(capsys, command, *WRITING[command], "--out", "file/below/out.html")
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert "file is a file" in err and "out = file/below" in err.replace(f"{tmp_path}/", "")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"] and (tmp_path / "file").read_text() == "kept"
 
 
 def test_too_many_colliders_are_refused(monkeypatch):
