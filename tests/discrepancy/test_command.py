@@ -16,6 +16,10 @@ import yaml
 import neuido
 from neuido.commands.main import main
 from neuido.data.measured.experiment import read_experiment
+from neuido.discrepancy import diagnose
+from neuido.discrepancy.inference.decision import decide
+from neuido.discrepancy.inference.evidence import evidences, judged
+from neuido.discrepancy.inference.statistics import read_fits
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.problems.settings import SETTINGS
 from neuido.discrepancy.workflow import solved_by
@@ -282,6 +286,15 @@ def test_bodies_are_diagnosed_one_by_one(tmp_path, capsys):
     models = yaml.safe_load((tmp_path / "out" / "model_after.yaml").read_text())["bodies"]
     assert models["ball-0"]["effects"]
     assert models["ball-1"]["effects"] == {}
+
+
+@pytest.mark.slow
+def test_what_a_decision_rests_on_is_kept_and_decided_again(folders, tmp_path):
+    found = diagnose(folders["track"], out=tmp_path / "out", effects=["drag_linear", "drag_quadratic"], draws=39, statistics=True)
+    case, fits = read_fits(tmp_path / "out" / "fits" / "0.npz")
+    decision = decide(case)
+    assert (decision.answer, list(decision.effects)) == (found.answer, [e.name for e in found.effects])
+    assert ("drag_quadratic",) in judged(evidences(case, fits)).sets
 
 
 @pytest.mark.slow

@@ -6,12 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from neuido.commands.demo.closed_loop import record
 from neuido.discrepancy.inference.attribution import diagnose
 from neuido.discrepancy.inference.decision import decide
+from neuido.discrepancy.inference.evidence import evidences, judged
 from neuido.discrepancy.inference.journal import from_json, to_json
 from neuido.discrepancy.inference.statistics import read_fits, write_fits
+from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.problems.problem import Problem
+from neuido.discrepancy.workflow import restricted
 from neuido.errors import UserError
+from tests.discrepancy.inference.test_decisions import FLIES
 from tests.discrepancy.inference.test_rounds import Line, Mixed, T, clipped
 from tests.discrepancy.report.test_answer import Curve
 
@@ -79,6 +84,20 @@ def test_a_density_of_the_statistics_is_that_of_the_data(diagnosed, tmp_path):
             np.testing.assert_allclose(own.settings.T @ own.residual, D.T @ r, rtol=1e-4, atol=1e-5 * float(r @ r))
             np.testing.assert_allclose(own.settings.T @ own.settings, D.T @ D, rtol=1e-4, atol=1e-8)
             assert own.slopes.shape[1] == len(fit.record.names)
+
+
+@pytest.mark.slow
+def test_a_body_is_decided_again_and_its_fits_have_an_evidence(tmp_path):
+    problem = restricted(body_problem(record(tmp_path / "block", {"drag_linear.k": 3.0}, launches=FLIES, frames=13)), "drag_linear,gravity")
+    found = diagnose(problem, draws=39, most=1, statistics=True)
+    write_fits(tmp_path / "0.npz", found.case, found.statistics)
+    case, fits = read_fits(tmp_path / "0.npz")
+    decision = decide(case)
+    assert (decision.answer, decision.effects, decision.differs) == (found.answer, ("drag_linear",), ())
+    assert all(p.smooth.shape[1] == 72 and p.nuisances.shape[1] == 9 for fit in fits for p in fit.parts)
+    verdict = judged(evidences(case, fits))
+    assert verdict.answer == "effect" and verdict.sets == (("drag_linear",),)
+    assert (tmp_path / "0.npz").stat().st_size < 1e5
 
 
 def test_what_holds_no_fits_is_refused(tmp_path):

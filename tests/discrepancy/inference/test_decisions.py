@@ -27,7 +27,7 @@ from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.problem import Problem
 from neuido.discrepancy.problems.tracks import track_problems
 from neuido.discrepancy.report import answer, residual
-from neuido.discrepancy.report.answer import motions
+from neuido.discrepancy.report.answer_content import motions
 from neuido.discrepancy.store import CachedProblem
 from neuido.discrepancy.workflow import restricted
 from neuido.errors import UserError
