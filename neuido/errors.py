@@ -10,9 +10,15 @@ import pickle
 import re
 from collections.abc import Iterable
 
+LONGEST = 300
+"""Largest number of characters of an error's line; a longer line loses its middle."""
+
 
 class UserError(ValueError):
-    """Bad input. The command line prints the message as one line and exits with status 2."""
+    """Bad input. The message is one printable line of at most `LONGEST` characters; the command line prints it and exits with status 2."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(shortened(message))
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
@@ -29,9 +35,6 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, RuntimeError) and any(words in str(error) for words in ("out of memory", "Failed to allocate"))
 
 
-LONGEST = 300
-"""Largest number of characters in the line of an error; a longer line is shortened in the middle."""
-
 _NO_MEMORY = re.compile(r"can't allocate memory|bad_alloc|bad allocation|Unable to allocate|not enough memory", re.IGNORECASE)
 _NOT_WRITTEN = re.compile(r"No space left on device|os error 28|PytorchStreamWriter failed|file write failed|\d+ requested and \d+ written")
 
@@ -44,6 +47,8 @@ def one_line(error: BaseException) -> str | None:
 
 def shortened(text: str) -> str:
     """Return a text as one printable line without control characters, of at most `LONGEST` characters."""
+    if len(text) > 100 * LONGEST:  # a value that fills memory would be looked at letter by letter
+        text = text[: 50 * LONGEST] + text[-50 * LONGEST :]
     text = " ".join(text.split())
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 103]} ... {text[-98:]}"

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neuido.data.files.html_page import Best, escaped, figure, page, style_axes, svg, table, video
-from neuido.data.files.results import Entry, logged_curves, mean, open_runs, scenes_of
+from neuido.data.files.html_page import Best, escaped, figure, page, plain, style_axes, svg, table, video
+from neuido.data.files.results import Entry, figures, logged_curves, mean, open_runs, scenes_of
 from neuido.data.files.score_tables import read_rows
 from neuido.errors import UserError
 
@@ -222,7 +222,7 @@ def _spread(entries: list[Entry]) -> list[str]:
     for scene in scenes_of(seeds):
         values = [row["cd"] for e in seeds if isinstance((row := e.row_of(scene)).get("cd"), float)]
         if len(values) > 1:
-            middle, deviation = statistics.fmean(values), statistics.stdev(values)
+            middle, deviation = statistics.fmean(values) or math.nan, statistics.stdev(values)
             rows.append(
                 (scene, len(values), min(values), max(values), middle, deviation, deviation / middle, (max(values) - min(values)) / middle)
             )
@@ -253,10 +253,10 @@ def _by_frame(entries: list[Entry]) -> list[str]:
     colours = {e.label: f"C{i % 10}" for i, e in enumerate(entries)}
     for ax, (scene, own) in zip(axes, found.items()):
         for label, rows in own.items():
-            ax.plot([r["frame"] for r in rows], [r["cd"] for r in rows], color=colours[label], lw=1, label=label)
+            ax.plot(figures(rows, "frame"), figures(rows, "cd"), color=colours[label], lw=1, label=plain(label))
         rows = next(iter(own.values()))
-        ax.plot([r["frame"] for r in rows], [r["floor"] for r in rows], color="0.4", ls=":", lw=1, label=FLOOR)
-        ax.set(title=scene, yscale="log", xlabel="frame", ylabel="CD [1e-4]")
+        ax.plot(figures(rows, "frame"), figures(rows, "floor"), color="0.4", ls=":", lw=1, label=FLOOR)
+        ax.set(title=plain(scene), yscale="log", xlabel="frame", ylabel="CD [1e-4]")
         style_axes(ax)
     axes[0].legend(fontsize=6, frameon=False)
     return ["<h2>Chamfer distance over time</h2>", svg(made)]
@@ -276,10 +276,10 @@ def _logged(entries: list[Entry]) -> list[str]:
     made, axes = drawn
     for ax, name in zip(axes, order):
         for label, points in found[name].items():
-            ax.plot(*zip(*points), lw=1, label=label)
+            ax.plot(*zip(*points), lw=1, label=plain(label))
         if all(v > 0 for points in found[name].values() for _, v in points):
             ax.set_yscale("log")
-        ax.set(title=name, xlabel="step")
+        ax.set(title=plain(name), xlabel="step")
         style_axes(ax)
     axes[0].legend(fontsize=6, frameon=False)
     return ["<h2>Logged while training</h2>", svg(made)]

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, TensorDataset
 
 from neuido.data.files.parsing import read_arrays, read_json
+from neuido.data.files.values import file_name, list_of_mappings, mapping, number, require_key
 from neuido.errors import UserError
 
 FORMAT = "neuido-films/1"
@@ -58,11 +59,18 @@ def read_clip(path: Path) -> Clip:
         UserError: The file is missing, truncated or not a clip.
     """
     arrays = read_arrays(path, Clip._fields, what="clip of `neuido film`")
-    parts = {name: torch.from_numpy(arrays[name]) for name in Clip._fields if name != "frame_interval"}
-    if arrays["frame_interval"].size != 1:
+    flow, cell = arrays["flow"], arrays["cell"]
+    if arrays["frame_interval"].size != 1 or not arrays["frame_interval"].reshape(()) > 0:
         raise UserError(f"{path} is not a valid clip of `neuido film`: frame_interval must be one number")
-    interval = float(arrays["frame_interval"])
-    return Clip(**parts, frame_interval=interval)
+    if flow.ndim != 5 or flow.shape[2] != flow.shape[3] or flow.shape[4] != 2 or cell.shape != flow.shape[:1] or min(flow.shape) < 1:
+        raise UserError(f"{path} is not a valid clip of `neuido film`: flow and cell have the shapes {flow.shape} and {cell.shape}")
+    if any(arrays[name].shape != (len(arrays["trial"]), 3, 3) for name in ("trial", "corrected", "stress")):
+        raise UserError(f"{path} is not a valid clip of `neuido film`: trial, corrected and stress must be (n, 3, 3)")
+    for name, array in arrays.items():
+        if array.dtype.kind != "f" or array.dtype.itemsize > 8 or not np.isfinite(array).all():
+            raise UserError(f"{path} is not a valid clip of `neuido film`: {name} must hold finite floating-point numbers")
+    parts = {name: torch.from_numpy(arrays[name]) for name in Clip._fields if name != "frame_interval"}
+    return Clip(**parts, frame_interval=float(arrays["frame_interval"].reshape(())))
 
 
 class FlowWindows(Dataset):
@@ -132,6 +140,12 @@ class FilmDataModule(LightningDataModule):
             raise UserError(f"{path} must contain a mapping of keys to values")
         if content.get("format") != FORMAT:
             raise UserError(f"{path} has the format {content.get('format')!r}, not {FORMAT!r}")
+        for i, entry in enumerate(list_of_mappings(content.get("clips"), f"{path}: clips")):
+            where = f"{path}: clips[{i}]"
+            file_name(require_key(entry, "name", where), f"{where}.name")
+            file_name(require_key(entry, "family", where), f"{where}.family")
+            for key, value in mapping(require_key(entry, "parameters", where), f"{where}.parameters").items():
+                number(value, f"{where}.parameters.{key}")
         return content
 
     @property

@@ -3,10 +3,12 @@
 import contextlib
 import functools
 import hashlib
+import io
 import json
 import math
 import os
 import time
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +21,7 @@ import numpy as np
 import neuido
 from neuido.data.files.writing import atomic_write, make_real_folder, remove
 from neuido.discrepancy.problems.problem import Ask, Point, Problem, Recording, Rows
+from neuido.errors import shortened
 
 IN_MEMORY = 500_000_000
 """Bytes of the predictions that are kept; the one that was used longest ago goes first."""
@@ -234,8 +237,10 @@ class CachedProblem(Problem):
         stored = short if np.array_equal(short.astype(np.float64), values, equal_nan=True) else values  # the simulators work in float32
         if self.used + stored.nbytes > self.limit:
             return
-        with atomic_write(path) as hidden, hidden.open("wb") as stream:
-            np.save(stream, stored)
+        content = io.BytesIO()
+        np.save(content, stored)
+        with atomic_write(path) as hidden:
+            hidden.write_bytes(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
         self.used += stored.nbytes
 
 
@@ -248,10 +253,16 @@ def _load(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
     if not path.is_file():
         return None
     try:
-        values = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError):  # numpy's answers to a file that is cut short
+        content = path.read_bytes()
+        if hashlib.sha256(content[:-32]).digest() != content[-32:]:
+            raise ValueError("its digest does not agree")
+        values = np.load(io.BytesIO(content[:-32]), allow_pickle=False)
+        if values.shape != shape:
+            raise ValueError(f"it has the shape {values.shape}, not {shape}")
+    except Exception as error:  # numpy's answers to a file that is cut short or damaged are of several types
+        warnings.warn(f"{path} is left aside and computed again: {shortened(str(error))}", stacklevel=2)
         return None
-    return values.astype(np.float64) if values.shape == shape else None
+    return values.astype(np.float64)
 
 
 def plan_of(folder: str | os.PathLike, options: dict[str, Any], *, out: Path) -> str:

@@ -160,7 +160,7 @@ def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch, change, words):
 def test_file_that_is_none(tmp_path, capsys):
     path = tmp_path / "plan.yaml"
     path.write_text("!!python/object/apply:os.system ['touch evil']\n")
-    with pytest.raises(UserError, match="not YAML"):
+    with pytest.raises(UserError, match="not valid YAML"):
         sweep(str(path))
     with pytest.raises(UserError, match="shard = 2"):
         sweep(str(path), shard=2, shards=2)

@@ -10,7 +10,7 @@ from typing import Any
 from neuido.commands.cli.mistakes import given_options
 from neuido.commands.cli.trainer_help import LINKED, given_content
 from neuido.commands.cli.wrong_values import value_place
-from neuido.errors import UserError
+from neuido.errors import UserError, shortened
 
 
 def numbers_of(checkpoint: str, class_path: str) -> dict[str, Any]:
@@ -21,14 +21,19 @@ def numbers_of(checkpoint: str, class_path: str) -> dict[str, Any]:
     """
     import torch
 
-    found = torch.load(checkpoint, weights_only=True, map_location="cpu")
+    try:
+        found = torch.load(checkpoint, weights_only=True, map_location="cpu")
+    except Exception as error:  # torch names no one type for a file that is malformed or not safe
+        raise UserError(
+            f"ckpt_path = {checkpoint} is damaged, or holds objects that reading would execute: {shortened(str(error))[:120]}"
+        ) from error
     found = found.get("hyper_parameters") if isinstance(found, dict) else None
     if not isinstance(found, dict):
         return {}
     name = found.get("_class_path", class_path)
     if str(name).rpartition(".")[2] != class_path.rpartition(".")[2]:
         raise UserError(f"ckpt_path = {checkpoint} is a checkpoint of {str(name)[:80]!r}, and the model is {class_path}")
-    return {key: value for key, value in found.items() if isinstance(value, int | float) and key not in LINKED}
+    return {key: value for key, value in found.items() if isinstance(key, str) and isinstance(value, int | float) and key not in LINKED}
 
 
 def stated_options(args: list[str]) -> dict[str, str]:
@@ -64,5 +69,5 @@ def check_checkpoint(given: str | None) -> None:
         return
     if not Path(given).exists():
         raise UserError(f"ckpt_path = {given}: there is no such file")
-    if Path(given).is_file() and not zipfile.is_zipfile(given):
+    if not Path(given).is_dir() and not (Path(given).is_file() and zipfile.is_zipfile(given)):
         raise UserError(f"ckpt_path = {given} is not a checkpoint, or is cut short")

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neuido.data.files.yaml_files import located
+from neuido.data.files.yaml_files import checking
 from neuido.errors import UserError
 
 KEYS = ("program", "command", "method", "metric", "parameters", "name", "description", "project", "entity", "run_cap", "early_terminate")
@@ -83,17 +83,12 @@ def read_sweep(path: str | os.PathLike) -> SweepFile:
     Raises:
         UserError: What cannot be run without a server, an unknown key, or a value of the wrong kind.
     """
-    import yaml
+    from neuido.data.files.parsing import read_yaml
 
     path = Path(path)
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is not YAML: {error}") from error
-    try:
+    content = read_yaml(path, plain=True)
+    with checking(path):
         return _parse(content, path.stem)
-    except UserError as error:
-        raise located(path, error) from error
 
 
 def _parse(content: Any, name: str) -> SweepFile:

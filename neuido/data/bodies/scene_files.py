@@ -17,7 +17,7 @@ import torch
 from neuido.data.bodies import shapes
 from neuido.data.files.parsing import check_limit, read_arrays, read_yaml
 from neuido.data.files.values import check_keys, mapping, number, path_inside, vector
-from neuido.data.files.yaml_files import located
+from neuido.data.files.yaml_files import checking
 from neuido.errors import UserError, suggest
 from neuido.physics.laws.classical import material
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
@@ -77,7 +77,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         known = "" if path.parent != scenes_folder() else f"{suggest(str(name), scene_names())}; known scenes: {', '.join(scene_names())}"
         raise UserError(f"the scene file {path} is missing{known}")
     content = read_yaml(path)
-    try:
+    with checking(path):
         check_keys(content, "the file", KEYS, ("source", "on_inversion"))
         if content["format"] != FORMAT:
             raise UserError(f"format = {content['format']!r} must be {FORMAT!r}")
@@ -96,8 +96,6 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         outside = ((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any(dim=1)
         if outside.any():
             raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain: enlarge the domain or move the body")
-    except UserError as error:
-        raise located(path, error) from error
     info = {"name": content["name"], "source": content.get("source", ""), "steps": steps, "on_inversion": on_inversion, **model}
     return SceneSetup(scene, body, info)
 

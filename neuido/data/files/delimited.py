@@ -10,7 +10,7 @@ from neuido.errors import UserError
 
 DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","))
 """Separators and decimal signs, the most likely first; a blank means any white space."""
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")  # each digit is matched in one way: no time grows with the square
 _COMMA = re.compile(r"[+-]?(\d+|\d*,\d+)([eE][+-]?\d+)?")
 _GROUPED = {".": re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d+)?"), ",": re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d+)?")}
 _SAMPLE = 400
@@ -41,6 +41,8 @@ def read_delimited(path: Path) -> Delimited:
         UserError: The file is missing, too large or not text.
     """
     text, encoding = _decoded(path)
+    cells = max(text.count(separator) for separator in ",;\t ") + text.count("\n") + text.count("\r")
+    check_limit(cells, "NEUIDO_MAX_TABLE_CELLS", f"{path} has {cells} cells")
     numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
     separator, decimal = _dialect([line for _, line in numbered[-_SAMPLE:]])
     rows, lines = [], []

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from neuido.errors import shortened
+
 STYLE = """body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:1120px;margin:2em auto;padding:0 1em}
 h1{font-size:1.5em}h2{font-size:1.2em;margin-top:2em;border-bottom:1px solid #ddd}img,svg{max-width:100%;height:auto}
 table{border-collapse:collapse;margin:.6em 0}td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #eee;font-size:.93em}
@@ -90,7 +92,10 @@ def webm(path: Path, width: int) -> bytes | None:
     """Convert a video file to WebM (VP9), at most `width` pixels wide; return None if OpenCV cannot read or write it."""
     import cv2
 
-    source = cv2.VideoCapture(str(path))
+    if not path.is_file():
+        return None
+    with _silenced_stderr():
+        source = cv2.VideoCapture(str(path))
     size = [int(source.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
     if not source.isOpened() or min(size) < 2:
         return None
@@ -113,7 +118,7 @@ def webm(path: Path, width: int) -> bytes | None:
 
 
 class _silenced_stderr:
-    """Context that discards stderr, where FFmpeg warns about a codec tag that WebM does not use."""
+    """Context that discards stderr, where FFmpeg reports a damaged file and a codec tag that WebM does not use."""
 
     def __enter__(self) -> None:
         import sys
@@ -148,6 +153,11 @@ def svg(made: Any) -> str:
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "neuido"}):
         made.savefig(stream, format="svg", metadata={"Date": None})
     return stream.getvalue().partition("<svg")[1] + stream.getvalue().partition("<svg")[2]
+
+
+def plain(text: str) -> str:
+    """Return text that a figure shows as it is: no mathematics between dollar signs, which fails where it is malformed."""
+    return shortened(text).replace("$", r"\$")
 
 
 def style_axes(ax: Any) -> None:

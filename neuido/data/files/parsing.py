@@ -21,15 +21,17 @@ import yaml
 from neuido.errors import UserError
 
 LIMITS = {
-    "NEUIDO_MAX_TEXT_BYTES": 1 << 29,
+    "NEUIDO_MAX_TEXT_BYTES": 1 << 26,
+    "NEUIDO_MAX_YAML_BYTES": 1 << 22,
     "NEUIDO_MAX_YAML_NODES": 1_000_000,
-    "NEUIDO_MAX_ARRAY_ELEMENTS": 1 << 31,
+    "NEUIDO_MAX_TABLE_CELLS": 5_000_000,
+    "NEUIDO_MAX_ARRAY_ELEMENTS": 1 << 28,
     "NEUIDO_MAX_IMAGE_PIXELS": 1 << 27,
     "NEUIDO_MAX_PARTICLES": 20_000_000,
     "NEUIDO_MAX_COLLIDERS": 256,
 }
-"""Largest number of bytes of a text file, nodes of a YAML file, elements of an array, pixels of an image, particles of a body or a PLY
-file, and colliders of a scene."""
+"""Largest number of bytes of a text file and of a YAML file, nodes of a YAML file, cells of a table, elements of an array, pixels of an
+image, particles of a body or a PLY file, and colliders of a scene."""
 
 
 def limit(name: str) -> int:
@@ -70,6 +72,31 @@ def parser_errors(path: str | os.PathLike, what: str) -> Iterator[None]:
         raise
     except Exception as error:  # parsers raise undocumented exceptions: zlib.error, TokenError, RecursionError, ...
         raise UserError(f"{path} is not a valid {what}: {one_line(error)}") from error
+
+
+@contextlib.contextmanager
+def naming(path: str | os.PathLike, what: str = "") -> Iterator[None]:
+    """Put the name of a file before each `UserError`, and turn any other exception into one: the check of a content that failed.
+
+    Args:
+        path: The file, or the folder of several.
+        what: What the error says instead of "cannot be read" where a check failed that nobody foresaw.
+    """
+    path = Path(path)
+    try:
+        yield
+    except UserError as error:
+        if path.name in str(error):
+            raise
+        raise UserError(f"{path}: {error}") from error
+    except (KeyboardInterrupt, GeneratorExit):
+        raise
+    except MemoryError:
+        raise
+    except OSError as error:
+        raise UserError(f"{error.filename or path} cannot be read: {one_line(error)}") from error
+    except Exception as error:  # a value of a kind that no check foresaw, far too large, or nested without end
+        raise UserError(f"{path} {what or 'cannot be read'}: {type(error).__name__}: {one_line(error)}") from error
 
 
 def one_line(error: BaseException) -> str:
@@ -128,15 +155,20 @@ _Loader.add_implicit_resolver(
 )
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path, *, plain: bool = False) -> dict[str, Any]:
     """Read a YAML file that contains a mapping; 1e5 and 1.0e5 are numbers, as in YAML 1.2.
+
+    Args:
+        path: The file.
+        plain: Whether 1e5 stays text, as YAML 1.1 has it.
 
     Raises:
         UserError: The file is missing, not valid YAML, not a mapping, or its aliases expand to too many values.
     """
     text = read_text(path, "is not valid YAML")
+    check_limit(len(text), "NEUIDO_MAX_YAML_BYTES", f"{path} has {len(text)} characters")
     try:
-        loader = _Loader(text)
+        loader = (yaml.SafeLoader if plain else _Loader)(text)
         try:
             root = loader.get_single_node()
             check_limit(_expanded(root, {}), "NEUIDO_MAX_YAML_NODES", f"{path}: its aliases expand to too many values")
@@ -185,13 +217,13 @@ def read_table(path: Path) -> list[list[str]]:
 
 
 def read_arrays(
-    path: str | os.PathLike, needed: Iterable[str], optional: Iterable[str] = (), *, what: str = "", others: bool = True
+    path: str | os.PathLike, needed: Iterable[str] | None, optional: Iterable[str] = (), *, what: str = "", others: bool = True
 ) -> dict[str, np.ndarray]:
     """Read arrays of a NumPy archive (.npz); pickled objects are refused.
 
     Args:
         path: The file.
-        needed: Names of the required arrays.
+        needed: Names of the required arrays; None: all arrays of the file are read, at most a thousand.
         optional: Names of arrays that may be absent.
         what: What the file should be, for error messages; by default "archive of <needed>".
         others: True: ignore arrays of other names. False: refuse them.
@@ -199,12 +231,13 @@ def read_arrays(
     Raises:
         UserError: The file is missing, damaged or too large, or lacks an array.
     """
-    path, needed, optional = Path(path), tuple(needed), tuple(optional)
-    what = what or f"archive of {', '.join(needed)}"
+    path, every, needed, optional = Path(path), needed is None, tuple(needed or ()), tuple(optional)
+    what = what or f"archive of {', '.join(needed) or 'arrays'}"
     if not path.is_file():
         raise UserError(f"{path} is missing")
     with parser_errors(path, what), zipfile.ZipFile(path) as archive:
         members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+        needed = tuple(members)[:1000] if every else needed
         if not others and (unknown := sorted(set(members) - {*needed, *optional})):
             raise UserError(f"{path}: unknown array {unknown[0]!r}; it takes {', '.join((*needed, *optional))}")
         if missing := [name for name in needed if name not in members]:

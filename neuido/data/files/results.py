@@ -1,6 +1,5 @@
 """Read the results of runs for tables and figures: scores, scores by time step, logged curves and videos."""
 
-import csv
 import math
 import re
 from collections.abc import Sequence
@@ -90,7 +89,14 @@ def _entries(folder: Path, label: str, parameters: dict[str, Any]) -> list[Entry
 def tables(folder: Path) -> dict[Path, list[dict[str, Any]]]:
     """Read scores.csv and test.csv below a folder; return the rows by folder. test.csv has the scores of a later `neuido test`."""
     paths = sorted({*folder.rglob("scores.csv"), *folder.rglob("test.csv")}, key=lambda path: (path.parent, path.name))
-    return {place: [row for path in paths if path.parent == place for row in read_rows(path)] for place in {p.parent: 0 for p in paths}}
+    return {place: [row for path in paths if path.parent == place for row in _scenes(path)] for place in {p.parent: 0 for p in paths}}
+
+
+def _scenes(path: Path) -> list[dict[str, Any]]:
+    rows = read_rows(path)
+    if any("scene" not in row for row in rows):
+        raise UserError(f"{path}: a row has no scene; `neuido fit` and `neuido test` write such tables")
+    return rows
 
 
 def _name(folder: Path) -> str:
@@ -122,13 +128,23 @@ def logged_curves(root: Path) -> dict[str, list[tuple[float, float]]]:
     out: dict[str, list[tuple[float, float]]] = {}
     for path in logs(root):
         own: dict[str, list[tuple[float, float]]] = {}
-        with path.open(newline="") as file:
-            for row in csv.DictReader(file):
-                for name, text in row.items():
-                    if name not in ("step", "epoch", None) and text and row.get("step"):
-                        own.setdefault(name, []).append((float(row["step"]), float(text)))
+        for row in read_rows(path):
+            step = row.get("step")
+            for name, value in row.items():
+                if name not in ("step", "epoch") and _drawn(step) and _drawn(value):
+                    own.setdefault(name, []).append((step, value))
         out |= own
     return out
+
+
+def _drawn(value: Any) -> bool:
+    """Whether a cell is a number that an axis can show."""
+    return isinstance(value, float) and abs(value) < 1e100
+
+
+def figures(rows: Sequence[dict[str, Any]], name: str) -> list[float]:
+    """Return a column of a table as numbers, NaN where a cell holds none that an axis can show."""
+    return [value if _drawn(value := row.get(name)) else math.nan for row in rows]
 
 
 def scenes_of(entries: Sequence[Entry]) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from neuido.data.files.parsing import check_limit, limit, read_text
 from neuido.errors import UserError
 
 
@@ -30,10 +31,15 @@ def read_rows(path: str | os.PathLike) -> list[dict[str, Any]]:
     Raises:
         UserError: The file is missing or not text.
     """
+    text = read_text(path, "cannot be read as a table")
+    cells = text.count(",") + text.count("\n")
+    check_limit(cells, "NEUIDO_MAX_TABLE_CELLS", f"{path} has {cells} cells")
     try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            return [{k: number(v) for k, v in row.items() if k is not None and v} for row in csv.DictReader(file)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = csv.DictReader(io.StringIO(text, newline=""))
+        if rows.fieldnames is not None and len(rows.fieldnames) * (text.count("\n") + 1) > 10 * limit("NEUIDO_MAX_TABLE_CELLS"):
+            raise UserError(f"{path} has {len(rows.fieldnames)} columns and too many rows to fill: NEUIDO_MAX_TABLE_CELLS raises the limit")
+        return [{k: number(v) for k, v in row.items() if k is not None and v} for row in rows]
+    except csv.Error as error:
         raise UserError(f"{path} cannot be read as a table: {error}") from error
 
 

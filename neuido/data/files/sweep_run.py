@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from neuido.errors import UserError
+
 FORMAT = "neuido-run/1"
 FOLDER = "NEUIDO_RUN"
 """Environment variable with the folder that receives all files of a run."""
@@ -12,11 +14,14 @@ FOLDER = "NEUIDO_RUN"
 
 def read_status(folder: Path) -> dict[str, Any]:
     """Read `run.json` of a run; return an empty dictionary if it is missing or malformed."""
+    from neuido.data.files.parsing import read_json
+
     try:
-        content = json.loads((folder / "run.json").read_text())
-    except (OSError, ValueError):
+        content = read_json(folder / "run.json")
+    except UserError:
         return {}
-    return content if isinstance(content, dict) and content.get("format") == FORMAT else {}
+    whole = isinstance(content, dict) and content.get("format") == FORMAT and isinstance(content.get("parameters", {}), dict)
+    return content if whole else {}
 
 
 def write_status(folder: Path, state: Mapping[str, Any]) -> None:

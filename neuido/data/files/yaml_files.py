@@ -1,5 +1,6 @@
 """YAML files that build on others (`base: FILE` takes what another file says, and the keys beside it win), and the line of each key."""
 
+import contextlib
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -9,7 +10,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from neuido import configs_root
-from neuido.data.files.parsing import read_text, read_yaml
+from neuido.data.files.parsing import naming, read_text, read_yaml
 from neuido.errors import UserError
 
 Keys = tuple[str | int, ...]
@@ -63,6 +64,16 @@ def located(path: str | os.PathLike, error: Exception) -> UserError:
         return UserError(message)
     line = line_of(message, key_lines(path))
     return UserError(f"{path}:{line}: {message}" if line else f"{path}: {message}")
+
+
+@contextlib.contextmanager
+def checking(path: str | os.PathLike) -> Iterator[None]:
+    """Name the file and the line in each error about the content of a YAML file, whatever its type."""
+    with naming(path, "holds a value that cannot be used"):
+        try:
+            yield
+        except UserError as error:
+            raise located(path, error) from error
 
 
 def line_of(message: str, lines: dict[Keys, int]) -> int | None:

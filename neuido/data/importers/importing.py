@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from neuido.data.files.parsing import naming
 from neuido.data.importers.checked_folder import write_checked
 from neuido.data.importers.testing_machine import Specimen, read_machine
 from neuido.data.importers.titled_tables import read_cells
@@ -81,14 +82,16 @@ def import_file(
     roles = {name: "held_out" if name in held else "fit" for name in names}
     columns, units = dict(columns or {}), dict(units or {})
     summary: list[str] = []
-    chosen = _kind(paths[0], columns) if kind == "auto" else kind
+    with naming(paths[0]):
+        chosen = _kind(paths[0], columns) if kind == "auto" else kind
     if chosen == "material":
         tables, tests, secants = {}, [], []
         for path, name in zip(paths, names):
-            measured = read_machine(path, specimen or Specimen(), mode, columns, units, compression)
+            with naming(path):
+                measured = read_machine(path, specimen or Specimen(), mode, columns, units, compression)
+                secants.append(_modulus(measured.columns))
             summary += [f"{path.name}: {note}" for note in measured.summary]
             tables[f"{name}.csv"] = measured.columns
-            secants.append(_modulus(measured.columns))
             quantities = {key: key for key in measured.columns}
             tests.append({"name": name, "file": f"{name}.csv", "mode": mode, "columns": quantities, "role": roles[name]})
         guess = young or float(f"{np.median(secants):.2g}")
@@ -105,9 +108,10 @@ def import_file(
     elif chosen == "track":
         tables, recordings = {}, []
         for path, name in zip(paths, names):
-            t, points, notes = _motion(path, read_motion(path, columns), scale, y_down, up, frame_rate, units)
+            with naming(path):
+                t, points, notes = _motion(path, read_motion(path, columns), scale, y_down, up, frame_rate, units)
+                x = _one_point(points, point, path)
             summary += [f"{path.name}: {note}" for note in notes]
-            x = _one_point(points, point, path)
             seen = np.isfinite(x).all(axis=1)
             if seen.sum() < 3:
                 raise UserError(f"{path.name}: the point is seen in {seen.sum()} frames; at least 3 are needed")
@@ -128,10 +132,14 @@ def import_file(
 
         takes = {}
         for path, name in zip(paths, names):
-            t, points, notes = _motion(path, read_motion(path, columns), scale, y_down, up, frame_rate, units)
+            with naming(path):
+                t, points, notes = _motion(path, read_motion(path, columns), scale, y_down, up, frame_rate, units)
             summary += [f"{path.name}: {note}" for note in notes]
             takes[name] = (t, points)
-        summary += write_deforming_body(takes, out, roles=roles, density=density, young=young, poisson=poisson, volume=volume, floor=floor)
+        with naming(paths[0]):
+            summary += write_deforming_body(
+                takes, out, roles=roles, density=density, young=young, poisson=poisson, volume=volume, floor=floor
+            )
     if out is not None:
         summary.append(f"next: neuido check {out}; neuido diagnose {out} --out {out}-answer")
     return summary

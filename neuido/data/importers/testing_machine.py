@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuido.data.files.delimited import is_number
-from neuido.data.importers.titled_tables import Table, read_titled
+from neuido.data.importers.titled_tables import LONGEST_TITLE, Table, read_titled
 from neuido.data.importers.titles import find_columns
 from neuido.data.importers.units import conversion_factor, parse_quantity
 from neuido.errors import UserError
@@ -122,8 +122,9 @@ def _sizes(table: Table, specimen: Specimen) -> dict[str, float]:
     sizes: dict[str, Any] = {}
     for row in table.preamble:
         cells = [cell for cell in row if cell]
-        label = re.sub(r"\s*[\(\[].*?[\)\]]|:", "", cells[0]).strip().lower()
-        unit = re.search(r"[\(\[](.+?)[\)\]]", cells[0])
+        title = cells[0][:LONGEST_TITLE]
+        label = re.sub(r"\s*[\(\[].*?[\)\]]|:", "", title).strip().lower()
+        unit = re.search(r"[\(\[](.+?)[\)\]]", title)
         if len(cells) > 1 and is_number(cells[1]) and (len(cells) > 2 or unit):
             for name, pattern in _SIZES.items():
                 if re.fullmatch(pattern, label):
@@ -141,7 +142,7 @@ def _clean_rows(columns: dict[str, np.ndarray], summary: list[str]) -> dict[str,
             summary.append(f"{repeated.sum()} rows whose time does not increase are left out")
         valid &= ~repeated
     rows = np.flatnonzero(valid)
-    every = -(-len(rows) // MAX_ROWS)
+    every = max(1, -(-len(rows) // MAX_ROWS))
     if every > 1:
         summary.append(f"every {every}th of {len(rows)} rows is used")
     if len(rows[::every]) < 3:

@@ -11,6 +11,9 @@ from neuido.data.files.parsing import parser_errors
 from neuido.data.importers.units import import_extra, is_unit
 from neuido.errors import UserError
 
+LONGEST_TITLE = 200
+"""Characters of a title that are looked at."""
+
 
 class Table(NamedTuple):
     """A table of C columns and n rows."""
@@ -59,7 +62,7 @@ def read_titled(path: Path) -> Table:
         units = [cell.strip("()[] ") for cell in above] + [""] * (width - len(above))
         above, head = rows[first - 2], first - 2
         notes.append("a row of units")
-    titles = [" ".join(cell.split()) for cell in above] + [""] * (width - len(above))
+    titles = [" ".join(cell[:LONGEST_TITLE].split()) for cell in above] + [""] * (width - len(above))
     for i, title in enumerate(titles[:width]):
         found = re.search(r"[\(\[]([^()\[\]]*)[\)\]]\s*$|\s(?:in\s)?(%|k?N|[kMG]?Pa|mm|ms|s)$", title)
         if found and not units[i] and is_unit(found[1] or found[2] or ""):

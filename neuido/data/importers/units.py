@@ -1,16 +1,21 @@
 """Unit conversion of columns and options, with pint."""
 
 import re
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 from neuido.errors import UserError
+from neuido.physics.runtime.once import cached
 
 _SPELLED = {
     "°c": "degC", "sec": "s", "seconds": "s", "msec": "ms", "n/mm²": "N/mm^2", "n/mm2": "N/mm^2", "mm/mm": "", "-": "", "%": "percent",
     "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "kn": "kN", "newton": "N", "px": "pixel",
     "meters": "m", "millimeters": "mm", "centimeters": "cm",
 }  # fmt: skip
+
+
+_TOWER = re.compile(r"(\^|\*\*)\s*[+-]?\s*\d{2}|\^.*\^|\*\*.*\*\*|\d{5}")
+"""Powers above 9, and powers of powers: numbers without end, in a file that is not trusted."""
 
 
 def import_extra(module: str, what: str) -> Any:
@@ -31,7 +36,7 @@ def import_extra(module: str, what: str) -> Any:
         raise UserError(f"{what} needs {module}: pip install 'neuido[import]'") from error
 
 
-@cache
+@cached
 def _registry() -> Any:
     return import_extra("pint", "a unit").UnitRegistry(non_int_type=float)
 
@@ -47,13 +52,21 @@ def conversion_factor(unit: str, to: str, where: str) -> float:
     Raises:
         UserError: `unit` is not a unit, or it has another dimension than `to`.
     """
-    own = _spelled(unit)
+    found = _ratio(_spelled(unit), to)
+    if found is None:
+        raise UserError(f"{where}: the unit {unit[:40]!r} cannot be converted to {to or 'a ratio'}")
+    return found
+
+
+@lru_cache(512)
+def _ratio(own: str, to: str) -> float | None:
+    """Return the ratio of two units; None where the first is no unit, or one of another kind."""
+    if not re.fullmatch(r"[\w\s/*^.µ%·-]{0,30}", own) or _TOWER.search(own):
+        return None
     try:
-        if not re.fullmatch(r"[\w\s/*^.µ%·-]{0,30}", own):
-            raise ValueError("not a unit")
         return float(_registry().Quantity(1.0, own or "dimensionless").to(to or "dimensionless").magnitude)
-    except Exception as error:  # pint raises errors of several kinds
-        raise UserError(f"{where}: the unit {unit[:40]!r} cannot be converted to {to or 'a ratio'}") from error
+    except Exception:  # pint raises errors of several kinds
+        return None
 
 
 def parse_quantity(text: str, to: str, option: str) -> float:
@@ -76,11 +89,17 @@ def is_unit(text: str) -> bool:
     text = text.strip().strip("()[]")
     if not text or _spelled(text) == "":
         return True
+    return re.fullmatch(r"[\w/^%µ°²·* -]{1,12}", text) is not None and _names_unit(_spelled(text))
+
+
+@lru_cache(512)
+def _names_unit(spelled: str) -> bool:
+    if _TOWER.search(spelled):
+        return False
     try:
-        factor_of = _registry().parse_units(_spelled(text))
+        return _registry().parse_units(spelled) is not None
     except Exception:  # pint raises errors of several kinds
         return False
-    return factor_of is not None and re.fullmatch(r"[\w/^%µ°²·* -]{1,12}", text) is not None
 
 
 def _spelled(unit: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from neuido.data.files.delimited import is_number, read_delimited
 from neuido.data.files.parsing import read_yaml
 from neuido.data.files.values import check_keys, mapping, number, path_inside
-from neuido.data.files.yaml_files import located
+from neuido.data.files.yaml_files import checking
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY, Effects
 
@@ -44,12 +44,11 @@ def read_header(folder: Path, name: str, form: str) -> tuple[Path, dict[str, Any
 @contextlib.contextmanager
 def errors_of(file: Path) -> Iterator[None]:
     """Add the path of the file to errors about its content."""
-    try:
-        yield
-    except UserError as error:
-        raise located(file, error) from error
-    except OverflowError as error:
-        raise UserError(f"{file}: a number is too large: {error}") from error
+    with checking(file):
+        try:
+            yield
+        except OverflowError as error:
+            raise UserError(f"{file}: a number is too large: {error}") from error
 
 
 def read_entries(given: Any, key: str, what: str, read: Callable[[Any, str], Entry]) -> tuple[Entry, ...]:

@@ -33,7 +33,7 @@ from neuido.data.bodies import scene_files as scenes
 from neuido.data.files.parsing import read_arrays, read_yaml
 from neuido.data.files.values import check_keys, mapping, number, vector
 from neuido.data.files.writing import write_text
-from neuido.data.files.yaml_files import located
+from neuido.data.files.yaml_files import checking
 from neuido.data.measured.experiment import read_experiment, scene_to_dict
 from neuido.data.scenes.multiview import UP, SceneViews
 from neuido.data.scenes.readers import read
@@ -218,7 +218,7 @@ def read_setting(path: Path, *, recording: str | None = None) -> SceneSetting:
     if not path.is_file():
         raise UserError(f"{path} is missing")
     content = read_yaml(path)
-    try:
+    with checking(path):
         check_keys(content, "the file", ("format", "name", "scene", "discretisation", "model", "placing"))
         if content["format"] != FORMAT:
             raise UserError(f"format = {content['format']!r} must be {FORMAT!r}")
@@ -230,8 +230,6 @@ def read_setting(path: Path, *, recording: str | None = None) -> SceneSetting:
             raise UserError(f"placing.up = {given['up']!r} is unknown: choose from {', '.join(UP)}")
         scale = number(given["scale"], "placing.scale", above=0.0)
         placing = Placement(scale, vector(given["shift"], "placing.shift"), given["up"])
-    except UserError as error:
-        raise located(path, error) from error
     return SceneSetting(str(content["name"]), scene, model["density"], model, placing)
 
 
@@ -254,13 +252,11 @@ def read_motion(folder: Path) -> Motion | None:
     if not path.is_file():
         return None
     content = read_yaml(path)
-    try:
+    with checking(path):
         check_keys(content, "the file", ("format", "velocity", "angular_velocity", "centre"), ("angular_velocity", "centre"))
         if content["format"] != MOTION:
             raise UserError(f"format = {content['format']!r} must be {MOTION!r}")
         vectors = {key: vector(value, key) for key, value in content.items() if key != "format"}
-    except UserError as error:
-        raise located(path, error) from error
     return Motion(**vectors)
 
 
@@ -302,10 +298,8 @@ def read_truth(folder: Path, *, frame_step: int = 1, frames: int | None = None) 
     if len({arrays["x"].shape[1], len(arrays["x0"]), len(arrays["volume"])}) != 1 or len(arrays["x"]) != len(arrays["times"]):
         raise UserError(f"{path}: the shapes of x, x0, volume and times do not match")
     content = read_yaml(folder / "truth.yaml")
-    try:
+    with checking(folder / "truth.yaml"):
         law = scenes.model_from_dict(content.get("law", {}))
-    except UserError as error:
-        raise UserError(f"{folder / 'truth.yaml'}: {error}") from error
     x, times = torch.from_numpy(arrays["x"])[::frame_step][:frames].float(), torch.from_numpy(arrays["times"])[::frame_step][:frames]
     if frames is not None and len(times) < frames:
         raise UserError(f"{path} has {len(times)} frames, but the recording has {frames}: it is the truth of another motion")

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from neuido.data.files.parsing import naming
 from neuido.data.formats import colmap, nerfstudio, neuma, pacnerf, springgaus
 from neuido.data.formats.layout import MultiView
 from neuido.data.measured import experiment_video
@@ -52,7 +53,8 @@ def read(path: str | os.PathLike, format: str = "auto", *, recording: str | None
         raise UserError(f"format = {format!r} is unknown: choose from auto, {', '.join(FORMATS)}")
     if frame_interval is not None and not frame_interval > 0:
         raise UserError(f"frame_interval must be positive, got {frame_interval}")
-    return READERS[format](folder, recording=recording, frame_interval=frame_interval)
+    with naming(folder, "holds a value that cannot be used"):
+        return READERS[format](folder, recording=recording, frame_interval=frame_interval)
 
 
 def detect(folder: Path) -> str:

@@ -25,7 +25,7 @@ def is_complete(path: Path, shape: tuple[int, ...]) -> bool:
         return False
     try:
         array = np.load(path, mmap_mode="r")
-    except (ValueError, EOFError, OSError):  # raised by numpy for a truncated file
+    except Exception:  # raised by numpy for a truncated or damaged file: ValueError, EOFError, TokenError, MemoryError, ...
         return False
     return array.shape == shape and array.dtype == np.float32
 

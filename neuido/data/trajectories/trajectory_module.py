@@ -10,8 +10,8 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
-from neuido.data.files.parsing import read_json
-from neuido.data.files.values import file_name, list_of_mappings, require_key
+from neuido.data.files.parsing import naming, read_json
+from neuido.data.files.values import file_name, list_of_mappings, mapping, number, require_key
 from neuido.data.sampling import FixedBatches, SampleOrder, Step, TrainingSteps
 from neuido.data.trajectories.options import Throw, make_trajectories
 from neuido.data.trajectories.trajectory_files import COLUMNS, FORMAT, TrajectoryFiles, is_complete, to_batch
@@ -106,10 +106,21 @@ class TrajectoryDataModule(LightningDataModule):
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             content = content if isinstance(content, dict) else {}
             raise UserError(f"{path} has the format {content.get('format')!r}, not {FORMAT!r}: generate it again with `{command}`")
+        with naming(path, "holds a value that cannot be used"):
+            setup = mapping(require_key(content, "setup", "the file"), "setup")
+            for key in ("steps", "record_every", "particles_per_side"):
+                if not isinstance(setup.get(key), int) or not 0 < setup[key] < 1 << 31:
+                    raise UserError(f"setup.{key} must be a positive whole number, got {setup.get(key)!r}")
         for i, entry in enumerate(list_of_mappings(require_key(content, "trajectories", str(path)), f"{path}: trajectories")):
             for key in ("name", "family", "split", "parameters", "stress_rms", "residual_rms"):
                 require_key(entry, key, f"{path}: trajectories[{i}]")
-            file_name(entry["name"], f"{path}: trajectories[{i}].name")
+            where = f"{path}: trajectories[{i}]"
+            file_name(entry["name"], f"{where}.name")
+            file_name(entry["family"], f"{where}.family")
+            for key in ("stress_rms", "residual_rms"):
+                number(entry[key], f"{where}.{key}", least=0.0)
+            for key, value in mapping(entry["parameters"], f"{where}.parameters").items():
+                number(value, f"{where}.parameters.{key}")
             if not is_complete(self.root / f"{entry['name']}.npy", self._shape(content)):
                 raise UserError(f"{self.root / entry['name']}.npy is missing or truncated: generate it again with `{command}`")
         return content

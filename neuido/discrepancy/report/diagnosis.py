@@ -11,6 +11,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from neuido.data.files.html_page import plain
+from neuido.data.files.parsing import read_arrays
+from neuido.data.files.values import file_name
 from neuido.discrepancy.report import diagnosis_format
 from neuido.discrepancy.report.reader_units import Units, axis_of
 from neuido.discrepancy.report.wording import LEADING, MORE, Words, words_of
@@ -233,17 +236,11 @@ class Diagnosis:
 
     def motion(self) -> "dict[str, dict[str, np.ndarray]]":
         """Return the arrays of each recording that is stored: what was measured, what is predicted before and after, over what."""
-        import numpy as np
-
         out = {}
         for name in self._content["recordings"] or self._content["error"]["after"]["by_recording"]:
             path = self._motion(name)
             if path is not None:
-                try:
-                    with np.load(path, allow_pickle=False) as archive:
-                        out[name] = dict(archive)
-                except (ValueError, OSError) as error:
-                    raise UserError(f"{path} cannot be read: {error}") from error
+                out[name] = read_arrays(path, None, what="file of predictions")
         return out
 
     def plot(self) -> "Figure":
@@ -260,14 +257,14 @@ class Diagnosis:
                 _curves(ax, arrays, own.error, units)
             else:
                 _data(ax, arrays, own._content, name, units)
-            ax.set_title(name, fontsize=9)
+            ax.set_title(plain(name), fontsize=9)
         if shown:
             figure.axes[0].legend(fontsize=7, frameon=False)
-        figure.suptitle(textwrap.fill(self.line.splitlines()[0], 52 * max(len(shown), 1)), fontsize=9)
+        figure.suptitle(textwrap.fill(self.line.splitlines()[0].replace("$", r"\$"), 52 * max(len(shown), 1)), fontsize=9)
         return figure
 
     def _motion(self, name: str) -> Path | None:
-        path = self.folder / "predicted" / f"{name}.npz"
+        path = self.folder / "predicted" / f"{file_name(name, 'the name of a recording')}.npz"
         return path if path.name == f"{name}.npz" and path.is_file() else None  # a name is no path
 
     def report(self, path: str | os.PathLike | None = None) -> Path:

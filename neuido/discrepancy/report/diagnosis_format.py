@@ -1,11 +1,11 @@
 """The format of diagnosis.json: its JSON Schema, which checks a file and stands in the documentation, and what older files lack."""
 
 import copy
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from neuido.data.files.parsing import naming, read_json
 from neuido.errors import UserError
 
 FORMAT = "neuido-diagnosis/2"
@@ -149,18 +149,13 @@ def read(path: Path) -> dict[str, Any]:
     Raises:
         UserError: No valid JSON, another format, or content that is not as the format says.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise UserError(f"{path} is no valid JSON: {error}") from error
+    content = read_json(path)
     found = content.get("format") if isinstance(content, dict) else None
     if found not in (FORMAT, OLDER):
         raise UserError(f"{path}: format = {found!r} must be {FORMAT} or {OLDER}; run `neuido diagnose` again")
-    try:
+    with naming(path, f"is not as {found} says"):
         content = upgraded(content) if found == OLDER else content
-    except (KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} is not as {OLDER} says: {error!r}") from error
-    check(content, path)
+        check(content, path)
     return content
 
 

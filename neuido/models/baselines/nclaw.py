@@ -4,11 +4,11 @@ import math
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from neuido.data.bodies.scene_files import data_root
+from neuido.data.files.parsing import read_arrays
 from neuido.errors import UserError
 from neuido.models.fewshot.method import Method, require_positive
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
@@ -45,11 +45,7 @@ def read_nclaw_weights(path: str | Path) -> tuple[list[Tensor], list[Tensor]]:
     path = Path(path)
     if not path.is_file():
         raise UserError(f"NCLaw's weights {path} are missing: give the path of an nclaw-*.npz file")
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            weights = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-    except (ValueError, OSError, EOFError) as error:
-        raise UserError(f"NCLaw's weights {path} are not an npz file: {error}") from error
+    weights = {name: torch.from_numpy(array) for name, array in read_arrays(path, None, what="file of NCLaw's weights").items()}
     return tuple([_layer(weights, f"{part}.{name}", shape, path) for name, shape in LAYERS] for part in PARTS)  # type: ignore[return-value]
 
 

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from neuido.data.files.parsing import read_json
 from neuido.data.files.writing import atomic_write, write_text
+from neuido.data.weight_files import read_safetensors
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import rollout_laws
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
@@ -165,9 +166,9 @@ class Method(nn.Module):
         """
         path = folder / CARD
         try:
-            content = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise UserError(f"model.adapter: {path} is missing or not JSON: {error}") from error
+            content = read_json(path)
+        except UserError as error:
+            raise UserError(f"model.adapter: {error}") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("method") != type(self).__name__:
             found = content.get("method") if isinstance(content, dict) else None
             raise UserError(f"model.adapter: {path} is of the method {found!r}, but model.method is {type(self).__name__}")
@@ -186,12 +187,10 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     Raises:
         UserError: The file is missing or damaged.
     """
-    if not path.is_file():
-        raise UserError(f"model.adapter: {path} is missing")
     try:
-        return load_file(path)
-    except SafetensorError as error:
-        raise UserError(f"model.adapter: {path} is not a safetensors file: {error}") from error
+        return read_safetensors(path)[0]
+    except UserError as error:
+        raise UserError(f"model.adapter: {error}") from error
 
 
 def scalars(found: dict[str, Any]) -> dict[str, Any]:

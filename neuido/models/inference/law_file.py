@@ -1,7 +1,6 @@
 """Law files: the effective networks of one material as safetensors, with its description beside it as JSON."""
 
 import json
-import math
 import os
 from collections.abc import Mapping
 from datetime import date
@@ -11,6 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuido.data.files.parsing import naming
+from neuido.data.files.values import number
+from neuido.data.files.writing import write_text
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import LAWS, IntrinsicDynamicsOperator
 from neuido.models.video.flow_vae import read_weights, write_weights
@@ -41,7 +43,7 @@ def save_law(path: str | os.PathLike, operator: IntrinsicDynamicsOperator, z: Te
     card = {"date": date.today().isoformat(), "modulus": modulus, **(card or {})}
     write_weights(path, FORMAT, config, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, card)
     text = json.dumps({"format": FORMAT, **config, "unit": "Kirchhoff stress in Pa", **card}, indent=1)
-    Path(path).with_suffix(".json").write_text(text + "\n")
+    write_text(Path(path).with_suffix(".json"), text + "\n")
 
 
 def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
@@ -58,10 +60,14 @@ def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
         parts = [[tensors[f"{kind}.{name}"] for name in WEIGHTS] for kind in ("elastic", "plastic")]
     except KeyError as error:
         raise UserError(f"law: {path} lacks the tensor {error}") from error
-    laws = elastic(*parts[0], scale=config["elastic_scale"]), plastic(*parts[1], scale=config["plastic_scale"])
-    if (limit := card.get("strain_limit")) is not None:
-        if isinstance(limit, bool) or not isinstance(limit, int | float) or not 0 < limit < math.inf:
-            raise UserError(f"law: {path} has the strain_limit {limit!r}; it must be a positive number")
-        for law in laws:
-            law.strain_limit = float(limit)
+    with naming(path, "is no whole law file"):
+        scales = [number(config.get(f"{kind}_scale"), f"{kind}_scale", above=0.0) for kind in ("elastic", "plastic")]
+        for kind, part in zip(("elastic", "plastic"), parts):
+            if not all(t.is_floating_point() and bool(torch.isfinite(t).all()) for t in part):
+                raise UserError(f"the tensors of {kind} must be finite numbers")
+        laws = elastic(*parts[0], scale=scales[0]), plastic(*parts[1], scale=scales[1])
+        if card.get("strain_limit") is not None:
+            limit = number(card["strain_limit"], "strain_limit", above=0.0)
+            for law in laws:
+                law.strain_limit = limit
     return laws

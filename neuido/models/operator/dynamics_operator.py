@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
 from neuido.data.files.missing_weights import weights_hint
 from neuido.data.files.writing import atomic_write
+from neuido.data.weight_files import build, parse_metadata, read_safetensors
 from neuido.errors import UserError
 from neuido.physics.laws.neural import networks, readouts
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
@@ -240,18 +240,24 @@ class IntrinsicDynamicsOperator(nn.Module):
             remedy = "make them: neuido fit --config configs/stage1.yaml, then `save_to`" if named else weights_hint(path)
             raise UserError(f"init_from: the weights {path} are missing: {remedy}")
         try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}
-        except SafetensorError as error:
-            raise UserError(f"init_from: {path} is not a safetensors file: {error}") from error
+            tensors, metadata = read_safetensors(path)
+        except UserError as error:
+            raise UserError(f"init_from: {error}") from error
         if metadata.get("format") != FORMAT:
             raise UserError(f"init_from: {path} has format {metadata.get('format')!r}, not {FORMAT!r}")
-        operator = cls(**json.loads(metadata["config"]))
-        latents = json.loads(metadata["latents"])
-        operator.set_latents(tensors.pop("latents"), latents["names"], latents["families"])
-        operator.load_state_dict(tensors)
-        operator.card = json.loads(metadata["card"])
+        config, latents, card = (parse_metadata(metadata, key, path) for key in ("config", "latents", "card"))
+        points = tensors.pop("latents", None)
+        operator = build(cls, config, tensors, path)
+        names, families = latents.get("names"), latents.get("families")
+        if points is None or not all(
+            isinstance(given, list) and len(given) == len(points) and all(isinstance(name, str) for name in given)
+            for given in (names, families)
+        ):
+            raise UserError(f"init_from: {path} must have a name and a family for each of its latents")
+        if points.shape != (len(points), operator.latent_dim) or not bool(torch.isfinite(points).all()):
+            raise UserError(f"init_from: {path}: latents must be finite and of the shape (M, {operator.latent_dim})")
+        operator.set_latents(points, names, families)
+        operator.card = card
         return operator
 
 

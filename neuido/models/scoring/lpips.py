@@ -5,7 +5,7 @@ safetensors. Without one LPIPS is not computed, and `open_lpips` returns the rea
 """
 
 import os
-import pickle
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from neuido.data.files.parsing import one_line
 from neuido.errors import UserError
 from neuido.physics.runtime.device import as_device
 
@@ -87,17 +88,20 @@ class LPIPS(nn.Module):
                 weights = load_file(path)
             else:
                 weights = torch.load(path, map_location="cpu", weights_only=True)
-        except (OSError, RuntimeError, pickle.UnpicklingError) as error:
-            raise UserError(f"lpips_backbone = {path} cannot be read: {error}") from error
+        except Exception as error:  # torch and safetensors name no one type for a file that is malformed or not safe
+            raise UserError(f"lpips_backbone = {path} cannot be read: {one_line(error)}") from error
+        if not isinstance(weights, dict) or not all(isinstance(name, str) and isinstance(t, Tensor) for name, t in weights.items()):
+            raise UserError(f"lpips_backbone = {path} holds no tensors by name")
         convolutions = [layer for group in self.groups for layer in group if isinstance(layer, nn.Conv2d)]
-        names = sorted({int(name.split(".")[1]) for name in weights if name.startswith("features.")})
+        names = sorted({int(found[1]) for name in weights if (found := re.match(r"features\.([0-9]{1,4})\.", name))})
         if len(names) != len(convolutions):
             raise UserError(f"lpips_backbone = {path} has {len(names)} layers of features; {self.net} has {len(convolutions)}")
         for number, layer in zip(names, convolutions):
             for part in ("weight", "bias"):
-                own, given = getattr(layer, part), weights[f"features.{number}.{part}"]
-                if own.shape != given.shape:
-                    raise UserError(f"lpips_backbone = {path}: features.{number}.{part} is {tuple(given.shape)}, not {tuple(own.shape)}")
+                own, given = getattr(layer, part), weights.get(f"features.{number}.{part}")
+                if given is None or own.shape != given.shape:
+                    found = "missing" if given is None else tuple(given.shape)
+                    raise UserError(f"lpips_backbone = {path}: features.{number}.{part} is {found}, not {tuple(own.shape)}")
                 own.data.copy_(given)
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:

@@ -7,18 +7,20 @@ from a video.
 
 import hashlib
 import json
+import warnings
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
 from lightning.pytorch import LightningModule
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
 from neuido.data.bodies.families import laws
 from neuido.data.clips import Clip, FilmDataModule
 from neuido.data.files.writing import atomic_write
 from neuido.data.progress import Progress
+from neuido.data.weight_files import read_safetensors
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus
@@ -152,8 +154,13 @@ class WarmupModule(LightningModule):
     def _embed(self, clip: Clip, kept: Path | None) -> tuple[Tensor, Tensor]:
         """Return flow latents (1, or 2 with the mirrored clip, V, channels, T', h, w) and conditions (V, 2)."""
         if kept is not None and kept.is_file():
-            found = load_file(kept)
-            return found["volume"], found["conditions"]
+            try:
+                found, metadata = read_safetensors(kept)
+                if metadata.get("digest") == _digest(found["volume"], found["conditions"]):
+                    return found["volume"], found["conditions"]
+            except (UserError, KeyError, TypeError):  # numpy has no type for every one of torch's
+                pass
+            warnings.warn(f"{kept} is damaged or of another version, and is computed again", stacklevel=2)
         seen = [clip.flow.float()]
         if self.hparams.mirror:
             seen.append(seen[0].flip(3) * seen[0].new_tensor([-1.0, 1.0]))
@@ -161,7 +168,7 @@ class WarmupModule(LightningModule):
         volume, conditions = torch.stack([volume for volume, _ in pairs]).cpu(), pairs[0][1].cpu()
         if kept is not None:
             with atomic_write(kept) as hidden:
-                save_file({"volume": volume, "conditions": conditions}, hidden)
+                save_file({"volume": volume, "conditions": conditions}, hidden, metadata={"digest": _digest(volume, conditions)})
         return volume, conditions
 
     def training_step(self, numbers: Tensor, batch_idx: int) -> Tensor:
@@ -209,3 +216,8 @@ def _spearman(a: Tensor, b: Tensor) -> Tensor:
         return a.new_tensor(float("nan"))
     ranks = torch.stack([v.argsort().argsort().to(torch.float32) for v in (a, b)])
     return torch.corrcoef(ranks)[0, 1]
+
+
+def _digest(*tensors: Tensor) -> str:
+    """Return the SHA-256 of tensors, as hexadecimal digits."""
+    return hashlib.sha256(b"".join(t.contiguous().numpy().tobytes() for t in tensors)).hexdigest()

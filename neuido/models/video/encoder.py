@@ -15,10 +15,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from neuido.data.files.parsing import naming
+from neuido.data.files.values import mapping
+from neuido.data.weight_files import build
 from neuido.errors import UserError
 from neuido.models.video.flow import ENCODINGS, Velocities, encode_flow, measure_velocities
 from neuido.models.video.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, load_state, read_weights, write_weights
-from neuido.models.video.video_vae import CogVideoXVAE, open_vae
+from neuido.models.video.video_vae import PREFIX, CogVideoXVAE, open_vae
 from neuido.types import MultiViewBatch
 
 PRETRAINED = {
@@ -257,12 +260,19 @@ class DynamicsEncoder(nn.Module):
         """
         file = PRETRAINED.get(str(path)) or Path(path)
         config, tensors, card = read_weights(file, (ENCODER_FORMAT,), "encoder")
-        vae = config["source"] or FlowVAE(**config["vae"])
-        sizes = {key: config["projector"][key] for key in ("latent_dim", "width", "heads", "conditions")}
-        encoder = cls(vae, **config["flow"], **sizes)
-        for part in ("projector", "vae"):
-            own = {name.removeprefix(f"{part}."): t for name, t in tensors.items() if name.startswith(f"{part}.")}
-            if own or part == "projector":
-                load_state(getattr(encoder, part), own, file)
+        source = config.get("source")
+        if source is not None and not (isinstance(source, str) and source.startswith(PREFIX)):
+            raise UserError(f"encoder: {file}: source must begin with {PREFIX}, got {source!r}")
+        flow, projector = (mapping(config.get(key), f"encoder: {file}: {key}") for key in ("flow", "projector"))
+        own = {
+            part: {name.removeprefix(f"{part}."): t for name, t in tensors.items() if name.startswith(f"{part}.")}
+            for part in ("projector", "vae")
+        }
+        vae = source or build(FlowVAE, mapping(config.get("vae"), f"encoder: {file}: vae"), own["vae"], file)
+        fitted = build(Projector, projector, own["projector"], file)
+        with naming(file, "is no whole file of an encoder"):
+            sizes = {key: fitted.config[key] for key in ("latent_dim", "width", "heads", "conditions")}
+            encoder = cls(vae, **flow, **sizes)
+            load_state(encoder.projector, own["projector"], file)
         encoder.card = card
         return encoder

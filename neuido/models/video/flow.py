@@ -7,7 +7,7 @@ stiffness. The colour wheel of Tora, which is normalised frame by frame and lose
 import hashlib
 import math
 import os
-import zipfile
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.data.files.parsing import read_arrays
 from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
 from neuido.types import Cameras
@@ -168,10 +169,13 @@ def _read_cache(path: Path | None) -> tuple[Tensor, Tensor] | None:
     if path is None or not path.is_file():
         return None
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return torch.from_numpy(arrays["flow"]), torch.from_numpy(arrays["side"])
-    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile):
-        path.unlink()  # truncated; it is computed again
+        arrays = read_arrays(path, ("flow", "side"))
+        if arrays["flow"].ndim != 5 or arrays["side"].shape != arrays["flow"].shape[:1] or not np.isfinite(arrays["flow"]).all():
+            raise UserError(f"{path} holds no flow")
+        return torch.from_numpy(arrays["flow"]), torch.from_numpy(arrays["side"])
+    except UserError as error:
+        warnings.warn(f"the cached flow is computed again: {error}", stacklevel=3)
+        path.unlink(missing_ok=True)
         return None
 
 

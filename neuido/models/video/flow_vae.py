@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
 from neuido.data.files.missing_weights import weights_hint
+from neuido.data.files.values import mapping
 from neuido.data.files.writing import atomic_write
+from neuido.data.weight_files import build, parse_metadata, read_safetensors
 from neuido.errors import UserError
 
 FORMAT = "neuido-flow-vae/1"
@@ -166,12 +167,11 @@ class FlowVAE(nn.Module):
         """
         config, tensors, card = read_weights(path, (FORMAT, ENCODER_FORMAT), "vae")
         if "projector" in config:
-            if config["vae"] is None:
-                raise UserError(f"vae: {path} holds no VAE: its encoder uses {config['source']}")
-            config, card = config["vae"], {}
+            if config.get("vae") is None:
+                raise UserError(f"vae: {path} holds no VAE: its encoder uses {config.get('source')!r}")
+            config, card = mapping(config["vae"], f"{path}: vae"), {}
             tensors = {name.removeprefix("vae."): t for name, t in tensors.items() if name.startswith("vae.")}
-        vae = cls(**config)
-        load_state(vae, tensors, path)
+        vae = build(cls, config, tensors, path)
         vae.card = card
         return vae
 
@@ -204,14 +204,12 @@ def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -
     if not path.is_file():
         raise UserError(f"{option}: the weights {path} are missing: {weights_hint(path, option)}")
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
-        if metadata.get("format") not in kinds:
-            raise UserError(f"{option}: {path} has format {metadata.get('format')!r}, not {' or '.join(map(repr, kinds))}")
-        return json.loads(metadata["config"]), tensors, json.loads(metadata["card"])
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
-        raise UserError(f"{option}: {path} is not a weights file of neuido: {error}") from error
+        tensors, metadata = read_safetensors(path)
+    except UserError as error:
+        raise UserError(f"{option}: {error}") from error
+    if metadata.get("format") not in kinds:
+        raise UserError(f"{option}: {path} has format {metadata.get('format')!r}, not {' or '.join(map(repr, kinds))}")
+    return parse_metadata(metadata, "config", path), tensors, parse_metadata(metadata, "card", path)
 
 
 def load_state(module: nn.Module, tensors: dict[str, Tensor], path: str | os.PathLike) -> None:
