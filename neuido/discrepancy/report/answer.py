@@ -18,6 +18,8 @@ from neuido.discrepancy.problems.declared_model import beside
 from neuido.discrepancy.report import page
 from neuido.discrepancy.report.answer_content import describe, plain
 from neuido.discrepancy.report.diagnosis_format import FORMAT
+from neuido.discrepancy.report.reader_units import Units
+from neuido.discrepancy.report.wording import words_of
 
 Found = Sequence[tuple[Diagnosis, float]]
 
@@ -64,6 +66,9 @@ def write(
     traces = [trace(d) for d, _ in found]
     write_json(out / "trace.json", {"bodies": traces} if len(found) > 1 else traces[0])
     contents = [content for content, _ in made]
+    units = Units.of(contents)
+    for content in contents:
+        content["words"] = list(words_of(content, units).paragraphs)
     name = found[0][0].problem.name.rpartition(": ")[0] if len(found) > 1 else contents[0]["experiment"]
     whole: dict[str, Any] = {"format": FORMAT, "experiment": name, "kind": kind}
     whole |= {"bodies": contents} if len(found) > 1 else contents[0]

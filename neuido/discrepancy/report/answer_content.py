@@ -14,6 +14,7 @@ from neuido.discrepancy.inference.judging import ALPHA
 from neuido.discrepancy.problems.problem import Problem
 from neuido.discrepancy.problems.settings import CONTACT_HEIGHT
 from neuido.discrepancy.report import ceiling, next_experiment, residual
+from neuido.discrepancy.report.reader_units import reach
 from neuido.discrepancy.report.wording import title, words_of
 from neuido.errors import UserError
 
@@ -84,6 +85,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         for name, own in drawn.items():
             motion[name] |= {key: np.round(255 * own[key]).astype(np.uint8) for key in ("masks", "drawn_before", "drawn_after")}
             content["recordings"][name] |= {"inset": float(own["inset"]), "frame_times": [float(t) for t in own["times"]]}
+    content["reach"] = reach(motion, d.problem.unit)
     content = plain(content)
     content["words"] = list(words_of(content).paragraphs)
     return content, motion

@@ -103,6 +103,7 @@ class Diagnosis:
 
     def __init__(self, folder: Path, content: Mapping[str, Any], keep: Any = None) -> None:
         self.folder, self._content, self._keep = folder, content, keep
+        self._units: Units | None = None  # of a page that several bodies share
 
     @classmethod
     def read(cls, folder: str | os.PathLike, *, keep: Any = None) -> "Diagnosis":
@@ -126,7 +127,10 @@ class Diagnosis:
         """The diagnosis of each body of a track folder; of other data one, by the name of what was measured."""
         if "bodies" not in self._content:
             return {self._content.get("body", self.name): self}
-        return {own["body"]: Diagnosis(self.folder, own, self._keep) for own in self._content["bodies"]}
+        out = {own["body"]: Diagnosis(self.folder, own, self._keep) for own in self._content["bodies"]}
+        for own in out.values():
+            own._units = Units.of(self._content["bodies"])
+        return out
 
     @property
     def answer(self) -> str:
@@ -214,7 +218,7 @@ class Diagnosis:
         """The answer in plain words: finding, error, how sure, what is not excluded, what to measure next. Of one body alone."""
         if "bodies" in self._content:
             raise UserError(f"{self.name} has several bodies: take the words of one of `bodies`")
-        return words_of(self._content, Units.of([self._content]))
+        return words_of(self._content, self._units or Units.of([self._content]))
 
     def summary(self) -> str:
         """Return the answer in plain words, as the command prints it and the page opens with it; of several bodies a paragraph each."""

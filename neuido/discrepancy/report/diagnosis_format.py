@@ -136,7 +136,14 @@ def schema() -> Schema:
             "device": TEXT,
             "version": TEXT,
         },
-        {"body": TEXT, "experiment": TEXT, "solver": TEXT, "not_predicted": mapping(ANY_TEXT), "silhouettes": {"type": "object"}},
+        {
+            "body": TEXT,
+            "experiment": TEXT,
+            "solver": TEXT,
+            "reach": NUMBER,
+            "not_predicted": mapping(ANY_TEXT),
+            "silhouettes": {"type": "object"},
+        },
     )
     head = {"format": {"const": FORMAT}, "experiment": TEXT, "kind": {"enum": list(KINDS)}}
     several = record({"bodies": listing({"allOf": [part, {"required": ["body"]}]}, minItems=1)})

@@ -1,7 +1,7 @@
 """The motion before and after in space, packed for the page's player, and a map of what is left on the body."""
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -117,15 +117,3 @@ def residual_map(motion: Mapping[str, Mapping[str, np.ndarray]], c: Mapping[str,
         top = {when: float(np.quantile(values, 0.98)) for when, values in sizes.items()}
         recordings.append({"name": name, "place": [numbers(factor * place[:, k]) for k in range(3)], **own, "top": top})
     return {"unit": unit, "shown": [when for when, _ in predictions(c)], "recordings": recordings}
-
-
-def reach(motions: Sequence[Mapping[str, Mapping[str, np.ndarray]]]) -> float:
-    """Return the largest extent of any motion [m]; 0 where nothing moves in space."""
-    out = 0.0
-    for motion in motions:
-        for arrays in motion.values():
-            if "positions" in arrays:
-                x = arrays["measured"].reshape(-1, 3)
-                x = x[np.isfinite(x).all(axis=1)]
-                out = max(out, float(np.ptp(x, axis=0).max())) if len(x) else out
-    return out

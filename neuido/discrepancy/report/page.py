@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuido.discrepancy.report import motion_player, plots
-from neuido.discrepancy.report.reader_units import WRITTEN, Units, rounded
+from neuido.discrepancy.report.reader_units import WRITTEN, Units, reach, rounded
 from neuido.discrepancy.report.wording import FIGURES, Words, leading, listed, title, worded, words_of
 
 LIMIT = 6_000_000
@@ -80,7 +80,7 @@ def page(contents: Sequence[Mapping[str, Any]], motions: Sequence[Motion], *, ki
 
 
 def _page(contents: Sequence[Mapping[str, Any]], motions: Sequence[Motion], kind: str, name: str, share: float) -> str:
-    units = Units.of(contents, reach=motion_player.reach(motions))
+    units = Units.of(contents, reach=max(reach(m, c["error"]["unit"]) for c, m in zip(contents, motions)))
     figures: list[dict[str, Any]] = []
     count = max(sum(len(m) for m in motions), 1)
     rows = max(int(share * min(plots.MOST_ROWS, CURVE_POINTS // count)), 40)

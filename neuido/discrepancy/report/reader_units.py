@@ -33,9 +33,9 @@ class Units:
 
         Args:
             contents: Parts of diagnosis.json, one a body.
-            reach: Largest coordinate or length that is drawn [m].
+            reach: Largest coordinate or length that is drawn [m], where the parts do not tell it.
         """
-        found: dict[str, list[float]] = {"m": [reach], "Pa": []}
+        found: dict[str, list[float]] = {"m": [reach, *(c.get("reach", 0.0) for c in contents)], "Pa": []}
         for c in contents:
             error = c["error"]
             found.setdefault(error["unit"], []).extend(v for v in (error["noise_floor"], error["discretisation_floor"]) if v)
@@ -79,6 +79,27 @@ class Units:
         decimals = -first + (half / 10.0**first < 2)
         shown, *ends = (fixed(v, decimals) for v in (value * factor, low, high))
         return shown, f"{ends[0]} to {ends[1]}" if low < 0 else "–".join(ends)
+
+
+def reach(motion: Mapping[str, Mapping[str, Any]], unit: str) -> float:
+    """Return the largest length that plots of motions show [m]: an extent in space, or a coordinate of a track; 0 of other data.
+
+    Args:
+        motion: Arrays of each recording.
+        unit: Of the errors.
+    """
+    import numpy as np
+
+    out = 0.0
+    for arrays in motion.values():
+        x = np.asarray(arrays["measured"]) if "measured" in arrays else np.empty(0)
+        if "positions" in arrays:
+            x = x.reshape(-1, 3)
+            x = x[np.isfinite(x).all(axis=1)]
+            out = max(out, float(np.ptp(x, axis=0).max())) if len(x) else out
+        elif unit == "m" and np.isfinite(x).any():
+            out = max(out, float(np.nanmax(np.abs(x))))
+    return out
 
 
 def axis_of(arrays: Mapping[str, Any], told: Mapping[str, Any], units: Units) -> tuple[Any, str]:

@@ -11,6 +11,7 @@ import pytest
 
 from neuido.discrepancy.report import motion_player, page, plots, silhouette_pictures
 from neuido.discrepancy.report.reader_units import Units
+from neuido.discrepancy.report.wording import words_of
 from tests.discrepancy.report.report_content import HOSTILE, content, motion, stress_curve
 
 VOID = ("meta", "input", "br", "img", "link", "hr")
@@ -213,6 +214,16 @@ def test_player_begins_where_the_motions_lie_furthest_apart():
     x[6] = np.nan
     moved[4] += 1.0
     assert motion_player.most_telling(x, moved) == 4
+
+
+def test_a_far_flight_stands_in_metres_everywhere():
+    c = content(error=content()["error"], reach=47.6)
+    assert words_of(c).error.startswith("Held-out error 0.0398 m before")
+    arrays = {"times": np.linspace(0, 3, 9), "groups": np.zeros(9, int), **{key: np.linspace(47.6, 12, 9) for key in motion_player.SETS}}
+    c.pop("reach")
+    text = page.page([c], [{"throw": arrays}])
+    assert "Held-out error 0.0398 m before" in text and "mm" not in read(text).text
+    assert figures(text)[0]["layout"]["yaxis"]["title"]["text"] == "measured [m]" and figures(text)[0]["data"][0]["y"][0] == 47.6
 
 
 def test_without_an_effect_there_is_one_prediction():
