@@ -107,9 +107,10 @@ def _configurations(args: list[str]) -> list[tuple[int, str, dict[str, Any]]]:
         prefix = "" if before in ("-c", "--config") else "--config="
         if prefix and not word.startswith(prefix):
             continue
+        given = word.removeprefix(prefix)
         try:
-            content = read_configuration(word.removeprefix(prefix))
-        except (UserError, OSError):
+            content = yaml.safe_load(given) if given.lstrip().startswith("{") else read_configuration(given)
+        except (UserError, OSError, yaml.YAMLError):
             continue
         if isinstance(content, dict):
             found.append((i, prefix, content))
