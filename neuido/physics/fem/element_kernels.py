@@ -55,6 +55,7 @@ def build(real: type) -> SimpleNamespace:
         C: wp.array(dtype=mat33),
         F: wp.array(dtype=mat33),
         step: int,
+        volume: wp.array(dtype=real),
         lowest: wp.array(dtype=real),
         since: wp.array(dtype=wp.int32),
     ):
@@ -63,7 +64,8 @@ def build(real: type) -> SimpleNamespace:
         C is the gradient of the new velocity at the old positions, so that F is (I + dt C) times the last F. F is not accumulated from
         C: its error stays bounded where an element is nearly inverted and G is large for a moment.
 
-        An element whose det F is below `COLLAPSED` leaves the smallest one in `lowest` and the first such step in `since`.
+        An element whose det F, or whose volume over the initial `volume`, is below `COLLAPSED` leaves the smallest one in `lowest` and the
+        first such step in `since`: where it flows its elastic F is sound while its shape is not.
         """
         i = wp.tid()
         e = elements[i]
@@ -72,7 +74,7 @@ def build(real: type) -> SimpleNamespace:
             C[i] = edges(e, v) * gradients[i]
         f = D * shape[i]
         F[i] = f
-        J = wp.determinant(f)
+        J = wp.min(wp.determinant(f), wp.determinant(D) / (real(6.0) * volume[i]))
         if J < wp.static(real(COLLAPSED)):
             lowest[i] = wp.min(lowest[i], J)
             if since[i] < 0:

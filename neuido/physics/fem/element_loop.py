@@ -207,7 +207,7 @@ class Loop:
         self._launch(k.move, len(self.x), a.first, a.corner, a.node_scene, a.held, f.mass, f.dt, pull, f.force, self.plane, self.kind,
                      f.friction, self.force, self.x, self.v, self.rest)  # fmt: skip
         self._launch(k.kinematics, len(self.F), a.elements, self.x, self.v, self.shape, rates, self.gradients, self.C,
-                     self.trial if self.changes else self.F, n, self.lowest, self.since)  # fmt: skip
+                     self.trial if self.changes else self.F, n, a.volume, self.lowest, self.since)  # fmt: skip
 
     def _update_history(self, growth: Tensor | None) -> None:
         """Advance the history by a step, and correct the trial F if a plastic effect is present."""
