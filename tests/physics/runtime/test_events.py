@@ -8,8 +8,9 @@ import torch
 
 from neuido.data.bodies.shapes import cube
 from neuido.errors import UserError
+from neuido.physics.effects import Effects
 from neuido.physics.fem import FiniteElements
-from neuido.physics.laws import AutogradElastic, FixedCorotated, NeoHookean
+from neuido.physics.laws import AutogradElastic, FixedCorotated, NeoHookean, VonMises
 from neuido.physics.laws.neural.symbolic import SymbolicElastic
 from neuido.physics.mpm import Simulator
 from neuido.physics.runtime.events import COLLAPSED, determinant, marks_of_frames
@@ -115,3 +116,15 @@ def test_a_law_that_is_asked_beyond_its_training_is_told(stretch):
     assert sim.rollout(1, law).events == ()
     free = AutogradElastic(lambda F: 0 * F, modulus=1e4)
     assert sim.rollout(1, free, state=sim.state._replace(F=F.contiguous())).events == ()
+
+
+def test_what_collapses_is_the_fixed_corotated_law_and_not_its_hardening():
+    """Hardening lies between perfect plasticity and the elastic body; that of the fixed-corotated law is crushed, others are not."""
+    effects = Effects.of({"kinematic_hardening.h": 1e6})
+    sim = Simulator(SCENE, BODY, device="cpu")
+    for law, collapses in ((FixedCorotated, True), (NeoHookean, False)):
+        for plasticity, added in ((None, None), (VonMises(300.0, 1e4, 0.3), effects)):
+            events = sim.rollout(150, law(1e4, 0.3), plasticity, effects=added, every=150).events
+            assert [event.kind for event in events] == ["collapsed"] * collapses
+    energy = 0.5 * float(FixedCorotated(1e4, 0.3).modulus())  # of a body crushed to nothing along one axis, a volume
+    assert energy < 0.5 * 1000.0 * 4.0**2
