@@ -497,7 +497,7 @@ GROUPS = {
         Reader("diagnosis", _diagnosis, "diagnosis.json", _read_diagnosis),
         Reader("operator", _operator, "*.safetensors", _read_operator),
         Reader("law", _law, "*.safetensors", _read_law),
-        Reader("encoder", _encoder, "*.safetensors", _read_encoder),
+        Reader("encoder", _encoder, "*.safetensors", _read_encoder, 2_000, 20),
         Reader("fit", _fit, "*.safetensors", _read_fit),
         Reader("checkpoint", _checkpoint, "*.ckpt", _read_checkpoint),
         Reader("nclaw", _nclaw, "*.npz", _read_nclaw),

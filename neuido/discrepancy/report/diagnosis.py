@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neuido.data.files.html_page import plain
 from neuido.data.files.parsing import read_arrays
-from neuido.data.files.values import file_name
 from neuido.discrepancy.report import diagnosis_format
 from neuido.discrepancy.report.reader_units import Units, axis_of
 from neuido.discrepancy.report.wording import LEADING, MORE, Words, words_of
@@ -268,7 +267,7 @@ class Diagnosis:
         return figure
 
     def _motion(self, name: str) -> Path | None:
-        path = self.folder / "predicted" / f"{file_name(name, 'the name of a recording')}.npz"
+        path = self.folder / "predicted" / f"{name}.npz"
         return path if path.name == f"{name}.npz" and path.is_file() else None  # a name is no path
 
     def report(self, path: str | os.PathLike | None = None) -> Path:

@@ -53,7 +53,7 @@ def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
         UserError: There is no such file, or it is not a law file.
     """
     config, tensors, card = read_weights(path, (FORMAT,), "law")
-    if config.get("trunk") not in LAWS:
+    if not isinstance(config.get("trunk"), str) or config["trunk"] not in LAWS:
         raise UserError(f"law: {path} has the trunk {config.get('trunk')!r}; one of {', '.join(LAWS)}")
     elastic, plastic = LAWS[config["trunk"]]
     try:
