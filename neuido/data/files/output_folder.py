@@ -15,13 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from neuido.data.files.lock import OwnedLock
+from neuido.data.files.sweep_run import RUN_FILES
 from neuido.data.files.writing import check_writable, write_text
 from neuido.errors import UserError
 
 PLAN = "plan.json"
 LOCK = ".lock-out"
-OF_A_SWEEP = ("run.json", "log.txt", "wandb")
-"""What a run of a sweep has in its folder before its command writes there."""
 
 
 @contextlib.contextmanager
@@ -112,7 +111,7 @@ def _check_use(path: Path, text: str, held: str, file: str, compared: str | None
         wanted = json.loads(text)
         if found != wanted:
             raise UserError(f"{path} holds {held}{_difference(found, wanted, compared)}: give another {option}, or remove the folder")
-    elif used := [name for name in _content(path) if name not in (*keeps, *OF_A_SWEEP)]:
+    elif used := [name for name in _content(path) if name not in (*keeps, *RUN_FILES)]:
         raise UserError(f"{option} = {path} is in use for something else, it holds {_listed(used)}: give another {option}")
 
 

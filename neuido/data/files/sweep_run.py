@@ -10,6 +10,8 @@ from neuido.errors import UserError
 FORMAT = "neuido-run/1"
 FOLDER = "NEUIDO_RUN"
 """Environment variable with the folder that receives all files of a run."""
+RUN_FILES = ("run.json", "log.txt", "wandb")
+"""What a run has in its folder before its command writes there: status, output, and the logger's files."""
 
 
 def read_status(folder: Path) -> dict[str, Any]:
