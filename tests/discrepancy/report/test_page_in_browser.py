@@ -21,7 +21,7 @@ def browser():
     program = which("chromium") or which("chromium-browser") or which("google-chrome")
     if program is None:
         pytest.skip("no Chromium on this machine")
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install neuido[browser]")
     with playwright.sync_playwright() as driver:
         made = driver.chromium.launch(executable_path=program, args=list(ARGUMENTS))
         yield made
