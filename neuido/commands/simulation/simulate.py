@@ -9,6 +9,7 @@ from neuido.data.files.output_folder import check_unused
 from neuido.data.files.writing import new_folder
 from neuido.data.progress import Progress
 from neuido.errors import UserError
+from neuido.physics.runtime.limits import check_limit
 
 FRAMES = 100
 """Frames that are written at most where `every` is not given."""
@@ -59,6 +60,7 @@ def simulate(
     count = setup.info["steps"] if steps is None else steps
     if count < 1:
         raise UserError(f"steps is {count}; it must be a positive whole number")
+    check_limit(count, "NEUIDO_MAX_STEPS", f"steps is {count}")
     spacing = next(k for k in range(-(-count // FRAMES), count + 1) if count % k == 0) if every is None else every
     laws = material(setup.info["elasticity"], setup.info["plasticity"]) if law is None else load_law(law)
     asked = on_inversion or setup.info["on_inversion"]

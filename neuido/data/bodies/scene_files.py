@@ -15,11 +15,12 @@ import numpy as np
 import torch
 
 from neuido.data.bodies import shapes
-from neuido.data.files.parsing import check_limit, read_arrays, read_yaml
+from neuido.data.files.parsing import read_arrays, read_yaml
 from neuido.data.files.values import check_keys, mapping, number, path_inside, vector
 from neuido.data.files.yaml_files import checking
 from neuido.errors import UserError, suggest
 from neuido.physics.laws.classical import material
+from neuido.physics.runtime.limits import check_limit
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
 
 FORMAT = "neuido-scene/1"

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neuido.data.files.parsing import limit
 from neuido.errors import UserError
+from neuido.physics.runtime.limits import limit
 from neuido.types import Body, Vector
 
 

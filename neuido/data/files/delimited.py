@@ -5,8 +5,9 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from neuido.data.files.parsing import check_limit, one_line
+from neuido.data.files.parsing import one_line
 from neuido.errors import UserError
+from neuido.physics.runtime.limits import check_limit
 
 DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","))
 """Separators and decimal signs, the most likely first; a blank means any white space."""

@@ -1,7 +1,7 @@
 """Readers of untrusted files: JSON, YAML, CSV, NumPy archives and images.
 
 Each reader converts every failure of its parser into a `UserError` that names the file, and checks sizes before it allocates memory.
-`LIMITS` has the largest sizes; an environment variable of the same name changes one.
+`physics/runtime/limits.py` has the largest sizes.
 """
 
 import contextlib
@@ -19,48 +19,7 @@ import numpy as np
 import yaml
 
 from neuido.errors import UserError
-
-LIMITS = {
-    "NEUIDO_MAX_TEXT_BYTES": 1 << 26,
-    "NEUIDO_MAX_YAML_BYTES": 1 << 22,
-    "NEUIDO_MAX_YAML_NODES": 1_000_000,
-    "NEUIDO_MAX_TABLE_CELLS": 5_000_000,
-    "NEUIDO_MAX_ARRAY_ELEMENTS": 1 << 28,
-    "NEUIDO_MAX_IMAGE_PIXELS": 1 << 27,
-    "NEUIDO_MAX_PARTICLES": 20_000_000,
-    "NEUIDO_MAX_COLLIDERS": 256,
-}
-"""Largest number of bytes of a text file and of a YAML file, nodes of a YAML file, cells of a table, elements of an array, pixels of an
-image, particles of a body or a PLY file, and colliders of a scene."""
-
-
-def limit(name: str) -> int:
-    """Return a limit of `LIMITS`, or the environment variable of the same name if it is set.
-
-    Raises:
-        UserError: The variable is not a positive whole number.
-    """
-    given = os.environ.get(name, "").strip()
-    if not given:
-        return LIMITS[name]
-    if not re.fullmatch(r"[0-9]{1,18}", given) or int(given) < 1:
-        raise UserError(f"the environment variable {name} must be a positive whole number, got {given!r}")
-    return int(given)
-
-
-def check_limit(count: int, name: str, what: str) -> None:
-    """Check that a size does not exceed a limit of `LIMITS`.
-
-    Args:
-        count: The size.
-        name: Key of `LIMITS`.
-        what: Beginning of the error message, such as "a.yaml has 12 bytes".
-
-    Raises:
-        UserError: The size exceeds the limit; the message names the environment variable that raises it.
-    """
-    if count > limit(name):
-        raise UserError(f"{what}, more than the limit of {limit(name)}: raise it with the environment variable {name}")
+from neuido.physics.runtime.limits import check_limit, limit
 
 
 @contextlib.contextmanager

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from neuido.data.files.parsing import check_limit, limit, read_text
+from neuido.data.files.parsing import read_text
 from neuido.errors import UserError
+from neuido.physics.runtime.limits import check_limit, limit
 
 
 def write_rows(path: str | os.PathLike, rows: Sequence[dict[str, Any]]) -> None:

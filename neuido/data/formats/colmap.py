@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from neuido.data import cameras as convert
-from neuido.data.files.parsing import check_limit, one_line, read_text
+from neuido.data.files.parsing import one_line, read_text
 from neuido.data.files.values import path_inside
 from neuido.data.formats.layout import MultiView, Shot, assemble, natural_key
 from neuido.errors import UserError
+from neuido.physics.runtime.limits import check_limit
 
 NAMES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
          "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE")  # fmt: skip

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from neuido.data.files.parsing import check_limit, parser_errors
+from neuido.data.files.parsing import parser_errors
 from neuido.errors import UserError
+from neuido.physics.runtime.limits import check_limit
 
 REST_COUNTS = (0, 9, 24, 45)
 """Number of `f_rest` columns for spherical harmonics of degree 0, 1, 2 and 3."""

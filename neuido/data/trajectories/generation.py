@@ -25,9 +25,12 @@ from neuido.errors import UserError
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.device import choose_device
+from neuido.physics.runtime.limits import check_limit, check_memory
 from neuido.types import Body, ParticleState, Scene, Vector, Walls
 
 SEGMENT = 100  # substeps held in memory at a time
+SAMPLE_BYTES = 800
+"""Memory of a particle in a substep that is held [bytes]: its state twice, and what is recorded, partly in float64."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,12 @@ class Setup:
         for name, lowest in (("instances", 1), ("held_out", 0), ("seed", 0), ("cells", 4), ("steps", 1), ("record_every", 1)):
             if getattr(self, name) < lowest:
                 raise UserError(f"{name} must be at least {lowest}, got {getattr(self, name)}")
+        check_limit(
+            self.particles_per_side**3, "NEUIDO_MAX_PARTICLES", f"particles_per_side = {self.particles_per_side}: too many particles"
+        )
+        check_limit(self.steps, "NEUIDO_MAX_STEPS", f"steps is {self.steps}")
+        count = (self.instances + self.held_out) * len(self.families)
+        check_limit(count, "NEUIDO_MAX_TRAJECTORIES", f"instances and held_out of {len(self.families)} families are {count} trajectories")
         for name in ("density", "dt"):
             if not 0 < getattr(self, name) < math.inf:
                 raise UserError(f"{name} must be positive, got {getattr(self, name)}")
@@ -115,13 +124,17 @@ def generate(
 
     Raises:
         UserError: `shard`, `batch` or `device` is invalid, `out` cannot be written or holds trajectories of other options, or the
-            simulation fails (a substep above the stability limit, a NaN).
+            simulation fails (a substep above the stability limit, a NaN); or the options exceed a limit of `physics/runtime/limits.py`.
     """
     if not 0 <= shard < shards:
         raise UserError(f"shard must lie in 0..{shards - 1} (shards = {shards}), got {shard}")
     if batch < 0:
         raise UserError(f"batch must be 0 (automatic) or positive, got {batch}")
     chosen = choose_device(device)
+    size = batch or (10 if chosen.type == "cuda" else 1)
+    particles = size * setup.shape[1]
+    what = f"a batch of {size} trajectories of {setup.shape[1]} particles, {_segment(setup)} substeps at a time,"
+    check_memory(SAMPLE_BYTES * particles * _segment(setup), chosen, what, "lower batch, particles_per_side or record_every")
     instances = plan(setup)
     _check_steps(setup, instances)
     folder = Path(out)
@@ -132,7 +145,6 @@ def generate(
 
         in_shard = [instance for i, instance in enumerate(instances) if i % shards == shard]
         missing = [instance for instance in in_shard if not is_complete(files[instance.name], setup.shape)]
-        size = batch or (10 if chosen.type == "cuda" else 1)
         with Progress("trajectories", len(in_shard), done=len(in_shard) - len(missing), shown=progress) as work:
             for family in PARAMETERS:
                 in_family = [instance for instance in missing if instance.family == family]
@@ -165,13 +177,18 @@ def _check_steps(setup: Setup, instances: list[Instance]) -> None:
             raise UserError(f"{instance.name}: {error}") from error
 
 
+def _segment(setup: Setup) -> int:
+    """Return how many substeps are in memory at a time, a multiple of `record_every`."""
+    return max(setup.record_every, SEGMENT // setup.record_every * setup.record_every)
+
+
 def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: torch.device) -> None:
     """Simulate instances of one family in one launch; write their files one segment of substeps at a time."""
     frames, count, _ = setup.shape
     body = _body(setup)
     elastic, plastic = laws(group[0].family, [instance.parameters for instance in group])
     exact = [laws(instance.family, [instance.parameters]) for instance in group]
-    segment = max(setup.record_every, SEGMENT // setup.record_every * setup.record_every)
+    segment = _segment(setup)
     names = group[0].name if len(group) == 1 else f"{group[0].name} .. {group[-1].name}"
     header = {"descr": "<f4", "fortran_order": False, "shape": setup.shape}
     try:

@@ -1,6 +1,7 @@
 """Write a case with an undeclared effect: a folder for `neuido diagnose` and a sealed key."""
 
 import hashlib
+import math
 import re
 from dataclasses import asdict
 from pathlib import Path
@@ -19,9 +20,12 @@ from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, Redraw
 from neuido.errors import UserError
 from neuido.physics.runtime.device import choose_device
+from neuido.physics.runtime.limits import check_limit
 
 TRIES = 12
 """Largest number of random draws for a seed."""
+SHORTEST_STEP = 6.25e-5
+"""The shortest step that a body may be simulated with [s]: grains, half the step for slow losses and for a finer solver."""
 
 
 def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, progress: bool) -> Path:
@@ -84,8 +88,11 @@ def _check(case: Case) -> None:
         raise UserError(
             f"separation = {case.separation}; it must lie in {MIN_SEPARATION:g} to {MAX_SEPARATION:g} standard deviations of the noise"
         )
-    if case.particles < 0 or (0 < case.particles < 100) or case.seconds < 0 or (0 < case.seconds < 0.05):
+    if case.particles < 0 or (0 < case.particles < 100) or not (case.seconds == 0 or 0.05 <= case.seconds < math.inf):
         raise UserError(f"particles = {case.particles} must be 0 or at least 100, seconds = {case.seconds} 0 or at least 0.05 s")
+    check_limit(case.particles, "NEUIDO_MAX_PARTICLES", f"particles is {case.particles}")
+    steps = round(case.seconds / SHORTEST_STEP)
+    check_limit(steps, "NEUIDO_MAX_STEPS", f"seconds is {case.seconds:g}, which may take {steps} steps")
 
 
 def _plan_of(key: Path) -> dict[str, Any]:

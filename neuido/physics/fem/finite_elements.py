@@ -26,6 +26,7 @@ from neuido.physics.runtime.device import real_of
 from neuido.physics.runtime.events import MarkRecorder, Marks, OnInversion, checked_option, raise_inversions
 from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
+from neuido.physics.runtime.limits import check_memory
 from neuido.physics.runtime.threads import one_thread_each, scene_pool
 from neuido.types import Body, ParticleState, Scene
 
@@ -274,6 +275,9 @@ class FiniteElements:
         inner_factor: int,
         nan_on_failure: bool,
     ) -> Frames:
+        needed = (steps // every + 1) * sum(t.numel() for t in given.state) * self.dtype.itemsize
+        what = f"a rollout of {len(self.mass)} particles and {steps // every + 1} frames"
+        check_memory(needed, self.device, what, "raise `every`, lower `steps`")
         state, effects, tables, viscosity, stiffness = given.state, given.effects, given.tables, given.viscosity, given.stiffness
         refused: list[int] = []
         if inner is None:

@@ -10,6 +10,7 @@ from torch import Tensor
 from neuido.physics.mpm.graphs import RolloutCache
 from neuido.physics.mpm.plan import FIXED, KINDS, STATES, Plan
 from neuido.physics.mpm.rollout import check
+from neuido.physics.runtime.limits import UNCHECKED, check_memory
 from neuido.physics.runtime.threads import one_thread_each
 
 T = TypeVar("T")
@@ -33,9 +34,10 @@ def run(
         pool: Threads, one scene each; None: all scenes share their launches.
 
     Raises:
-        UserError: As `rollout.check`.
+        UserError: As `rollout.check`, or more memory than there is.
     """
     differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    _check_memory(plan, inputs, segment, differentiable, cache)
     captured = plan.setup.device.type == "cuda"  # a graph of many thousand substeps is large and slow to capture
     if (differentiable or captured) and segment is not None and segment < plan.steps:
         return _Segments.apply(plan, segment, cache, *inputs)
@@ -44,6 +46,20 @@ def run(
     if differentiable:
         return _Rollout.apply(plan, cache, *inputs)
     return _frames(plan, cache, tuple(t.detach() for t in inputs))
+
+
+def _check_memory(plan: Plan, inputs: Sequence[Tensor], segment: int | None, differentiable: bool, cache: RolloutCache) -> None:
+    """Raise UserError where the frames and the tape of a rollout need more memory than there is; arguments as for `run`."""
+    setup, state = plan.setup, sum(t.numel() for t in inputs[:STATES])
+    frames = plan.steps // plan.every + 1
+    taped = min(segment or plan.steps, plan.steps) if differentiable else 0
+    numbers = state * (2 * frames + taped)  # as computed and in the order of the bodies
+    if setup.keep_grid:
+        numbers += taped * (9 * len(setup.mass) * (2 if plan.corrects else 1) + 8 * setup.node_count)
+    what = f"a rollout of {len(setup.mass)} particles, {plan.steps} steps and {frames} frames{' with gradients' if differentiable else ''}"
+    change = f"raise `every`, lower `steps`{', give `segment`' if taped == plan.steps else ''}"
+    needed = numbers * setup.dtype.itemsize
+    check_memory(needed, setup.device, what, change, own=cache.held_bytes() if needed > UNCHECKED else 0)
 
 
 def _frames(plan: Plan, cache: RolloutCache, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

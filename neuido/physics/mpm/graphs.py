@@ -146,6 +146,13 @@ class RolloutCache:
         """Return the cache for the rollouts of scene s alone."""
         return self._single.setdefault(s, RolloutCache(self.graphs))
 
+    def held_bytes(self) -> int:
+        """Return the memory of the tapes [bytes], which later rollouts use again."""
+        with self.lock:
+            tapes = [rollout.tape for rollout in self._rollouts.values()]
+            own = sum(t.numel() * t.element_size() for tape in tapes for t in tape if isinstance(t, Tensor))
+            return own + sum(cache.held_bytes() for cache in self._single.values())
+
     def find(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> CachedRollout:
         """Return the cached rollout for a plan and inputs of these shapes, or make one; captured if graphs are on and the laws allow it."""
         own = plan.key(inputs) if self.graphs else None

@@ -11,6 +11,7 @@ from neuido.physics.effects import coefficients
 from neuido.physics.effects.coefficients import Tables
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.runtime.limits import check_limit
 from neuido.types import Particles, ParticleState
 
 
@@ -75,7 +76,8 @@ class RolloutInputs(NamedTuple):
 
 
 def check_frames(steps: int, every: int) -> None:
-    """Raise UserError unless `steps` is a positive multiple of `every`."""
+    """Raise UserError unless `steps` is a positive multiple of `every` and within `NEUIDO_MAX_STEPS`."""
+    check_limit(steps, "NEUIDO_MAX_STEPS", f"steps is {steps}")
     if steps < 1 or every < 1 or steps % every:
         raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
 

@@ -12,7 +12,13 @@ from neuido.errors import UserError
 from neuido.physics.colliders.tables import clamp_table, collider_table, inside_box
 from neuido.physics.mpm import transfers as kernels
 from neuido.physics.runtime.device import real_of
+from neuido.physics.runtime.limits import check_memory
 from neuido.types import Body, Particles, ParticleState, Scene
+
+NODE_BYTES = 16
+"""Memory of a grid node beside its mass, momentum and velocity [bytes]: the index."""
+PARTICLE_BYTES = 400
+"""Memory of a particle beside its state [bytes]: the body in float64, its order, mass and volume."""
 
 
 def affine_velocity(x: Tensor, v: Tensor, neighbours: int = 32, chunk: int = 2048) -> Tensor:
@@ -103,11 +109,12 @@ class Setup:
         self.scenes, self.device, self.dtype = tuple(scenes), device, dtype
         self.kernels = kernels.build(real_of(dtype))
         self._load_scenes()
-        self._load_bodies(bodies, densities)
         nodes = [max(scene.nodes[a] for scene in self.scenes) + 2 * kernels.PAD for a in range(3)]
-        self.nodes = wp.vec3i(*nodes)
         self.grid_shape = (len(self.scenes), *nodes)
         self.node_count = math.prod(self.grid_shape)
+        self._check_memory(bodies)
+        self.nodes = wp.vec3i(*nodes)
+        self._load_bodies(bodies, densities)
         self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes per thread: on the CPU, calling a thread costs as much as a node
         scene, *axes = (torch.arange(n, dtype=torch.int32) for n in self.grid_shape)
         s, i, j, k = torch.meshgrid(scene, *axes, indexing="ij")
@@ -135,6 +142,14 @@ class Setup:
         self.gravity = column([list(s.gravity) for s in self.scenes])
         self.colliders = collider_table(self.scenes, self.dtype, self.device)
         self.clamp_lower, self.clamp_upper = clamp_table(self.scenes, self.dtype, self.device)
+
+    def _check_memory(self, bodies: Sequence[Body]) -> None:
+        """Raise UserError where grid and particles need more memory than there is."""
+        count = sum(torch.as_tensor(body.x).shape[:1].numel() for body in bodies)
+        needed = self.node_count * (NODE_BYTES + 8 * self.dtype.itemsize) + count * (PARTICLE_BYTES + 24 * self.dtype.itemsize)
+        nodes = " x ".join(str(n) for n in self.grid_shape[1:])
+        what = f"a simulator of {len(self.scenes)} scene{'s' * (len(self.scenes) > 1)}, {count} particles and {nodes} grid nodes a scene"
+        check_memory(needed, self.device, what, "lower `cells` or the number of particles or scenes")
 
     def _load_bodies(self, bodies: Sequence[Body], densities: Sequence[float]) -> None:
         x, v, C, F, mass, volume, held, scene_index = [], [], [], [], [], [], [], []

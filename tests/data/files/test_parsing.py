@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from neuido.data.files.parsing import image_size, limit, read_arrays, read_image, read_json, read_table, read_yaml
+from neuido.data.files.parsing import image_size, read_arrays, read_image, read_json, read_table, read_yaml
 from neuido.errors import UserError
+from neuido.physics.runtime.limits import limit
 
 
 def refused(call, path, match):
