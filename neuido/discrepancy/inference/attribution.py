@@ -277,8 +277,8 @@ def diagnose(
         fit, found = narrow(inference, fit, floor, found, rounds)
         at = inference.finished(Stand(fit, floor, inference.mean_squares([fit.point], floor)[0]))
     made = conclude(inference, start, at, found, rounds)
-    if statistics:
-        made.statistics = statistics_of(tried, [s.floor for s in starts], journal)
+    if statistics and made.case is not None:
+        made.statistics = statistics_of(tried, [s.floor for s in starts], journal, (made.case.before, made.case.after))
     return made
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from neuido.discrepancy.inference.journal import CaseRecord, FitRecord
-from neuido.discrepancy.inference.likelihood import SCALES, log_densities, log_mean, log_prior, rotated
+from neuido.discrepancy.inference.likelihood import SCALES, log_densities, log_mean, log_prior, rotated, share
 from neuido.discrepancy.inference.statistics import FitStatistics, PartStatistics
 from neuido.discrepancy.problems.problem import Parameter
 
@@ -84,12 +84,19 @@ def prior_of(case: CaseRecord, fit: FitRecord) -> tuple[np.ndarray, np.ndarray]:
     return np.array(away), np.array(variances)
 
 
-def unseen(parts: Sequence[PartStatistics]) -> float:
+def unseen(parts: Sequence[PartStatistics], declared: Sequence[bool] | None = None) -> float:
     """Return what the settings leave of one another, root mean square: each fitted by the slopes and by the other differences.
 
     That is the scale of what another solver does that none of the settings shows, where the fit ended.
+
+    Args:
+        parts: Of the fitted recordings.
+        declared: Which slopes are by parameters of the declared model; all by default. Those of effects take no part: the more a set
+            has, the smaller its scale would be, and it would lead by that alone.
     """
     slopes, settings = (np.concatenate([getattr(p, name) for p in parts]) for name in ("slopes", "settings"))
+    if declared is not None:
+        slopes = slopes[:, np.array(declared, bool)]
     rows, noise = sum(p.rows for p in parts), min(p.noise for p in parts)
     able = [j for j in range(settings.shape[1]) if settings[:, j].any()]
     left = []
@@ -120,25 +127,28 @@ def densities(
         recordings: The recording of each part.
         fitted: Which parts were fitted.
         variances: Prior variances of the coordinates of the free parameters.
-        scale: About which the patterns' scale is taken; a free one is any of `SCALES` times it.
+        scale: About which the patterns' scale is taken; a free one is any above it.
     """
     shared = [np.concatenate([p.settings, p.slopes], axis=1) for p in parts]
     prior = np.concatenate([np.ones(parts[0].settings.shape[1]), variances])
     scales = SCALES * scale
     weights = log_prior(scales, scale)
 
+    counted = {n: share([p for p, own in zip(parts, recordings, strict=True) if own == n]) for n in recordings}
+
     def by_scale(chosen: Sequence[int]) -> np.ndarray:
         by_recording: dict[int, list[int]] = {}
         for i in chosen:
             by_recording.setdefault(recordings[i], []).append(i)
-        made = [rotated([parts[i] for i in own], [shared[i] for i in own]) for own in by_recording.values()]
+        made = [rotated([parts[i] for i in own], [shared[i] for i in own], counted[n]) for n, own in by_recording.items()]
         return log_densities(made, prior, scales)
 
     early = [i for i, f in enumerate(fitted) if f]
     everything = by_scale(range(len(parts)))
     whole = log_mean(everything, weights)
     foretold = whole - log_mean(by_scale(early), weights) if len(early) < len(parts) else whole
-    return foretold, log_mean(everything, np.full(len(scales), -math.log(len(scales)))), whole
+    above = everything[scales >= scale]  # what is unknown is more than the settings show, never less
+    return foretold, log_mean(above, np.full(len(above), -math.log(len(above)))), whole
 
 
 def evidences(case: CaseRecord, fits: Sequence[FitStatistics]) -> list[Evidence]:
@@ -147,10 +157,11 @@ def evidences(case: CaseRecord, fits: Sequence[FitStatistics]) -> list[Evidence]
     What is unknown is told by the scale that all recordings show, for a scale that the fitted ones have shown foretells the others.
     """
     recordings, fitted = [n for n, *_ in case.parts], [f for _, f, *_ in case.parts]
+    declared = {p["name"] for p in case.declared}
     out = []
     for fit in fits:
         own = fit.record
-        scale = unseen([p for p, f in zip(fit.parts, fitted, strict=True) if f])
+        scale = unseen([p for p, f in zip(fit.parts, fitted, strict=True) if f], [name in declared for name in own.names])
         away, variances = prior_of(case, own)
         foretold, free, whole = densities(at_the_prior_mean(fit.parts, away), recordings, fitted, variances, scale)
         value = foretold - price(len(own.effects), len(case.candidates))

@@ -51,30 +51,40 @@ class FitStatistics:
     parts: tuple[PartStatistics, ...]
 
 
-def best_fits(journal: Journal, most: int = MOST) -> list[FitRecord]:
-    """Return the declared model's fits, and the best fit of each set of effects by each method, at most so many."""
+def best_fits(journal: Journal, ends: Sequence[FitRecord] = (), most: int = MOST) -> list[FitRecord]:
+    """Return the declared model's fits, and the best fit of each set of effects by each method, at most so many.
+
+    Args:
+        journal: What was judged.
+        ends: Fits of the answer, which go on from judged ones and are kept first.
+        most: Fits in all.
+    """
     best: dict[tuple, FitRecord] = {}
-    for r in journal.rounds:
-        for fit in r.fits:
-            last = fit.finished or fit
-            if np.isfinite(last.errors).all():
-                key = last.method, tuple(sorted(last.effects))
-                if key not in best or score(np.array(last.errors)) < score(np.array(best[key].errors)):
-                    best[key] = last
-    ranked = sorted(best.values(), key=lambda fit: score(np.array(fit.errors)))
-    return [*journal.bases, *ranked[: max(most - len(journal.bases), 0)]]
+    judged = [fit.finished or fit for r in journal.rounds for fit in r.fits]
+    for last in (*ends, *judged):
+        if last.effects and np.isfinite(last.errors).all():
+            key = last.method, tuple(sorted(last.effects))
+            if key not in best or score(np.array(last.errors)) < score(np.array(best[key].errors)):
+                best[key] = last
+    declared = {fit.digest: fit for fit in (*journal.bases, *(fit for fit in ends if not fit.effects))}
+    first = {end.method: tuple(sorted(end.effects)) for end in ends}
+    ranked = sorted(best.items(), key=lambda item: (first.get(item[0][0]) != item[0][1], score(np.array(item[1].errors))))
+    return [*declared.values(), *(fit for _, fit in ranked[: max(most - len(declared), 0)])]
 
 
-def statistics_of(laboratories: Sequence[BaseFits], floors: Sequence[Floor], journal: Journal) -> dict[str, np.ndarray]:
+def statistics_of(
+    laboratories: Sequence[BaseFits], floors: Sequence[Floor], journal: Journal, ends: Sequence[FitRecord] = ()
+) -> dict[str, np.ndarray]:
     """Return the arrays to keep.
 
     Args:
         laboratories: The methods.
         floors: The floor of each where its declared model ended: its nuisances serve for all fits.
         journal: What was fitted.
+        ends: Fits of the answer.
     """
     arrays: dict[str, np.ndarray] = {}
-    listed, chosen = [], best_fits(journal)
+    listed, chosen = [], best_fits(journal, ends)
     for laboratory, floor in zip(laboratories, floors, strict=True):
         own = [fit for fit in chosen if fit.method == laboratory.own]
         with laboratory.under(laboratory.own):

@@ -13,7 +13,7 @@ from scipy.stats import invgamma, multivariate_normal
 from neuido.discrepancy.inference.attribution import diagnose
 from neuido.discrepancy.inference.evidence import KINDS, LEAST, Evidence, at_the_prior_mean, densities, evidences, judged, price, unseen
 from neuido.discrepancy.inference.journal import FitRecord
-from neuido.discrepancy.inference.likelihood import FREEDOM, SCALES, log_densities, log_mean, log_prior, rotated
+from neuido.discrepancy.inference.likelihood import FREEDOM, SCALES, log_densities, log_mean, log_prior, rotated, share
 from neuido.discrepancy.inference.statistics import PartStatistics, best_fits, read
 from tests.discrepancy.report.test_answer import Curve
 
@@ -102,6 +102,9 @@ def test_what_a_setting_leaves_after_a_refit_is_the_scale():
     assert unseen([p]) == pytest.approx(LEAST * NOISE)  # slopes make it good; one that did not run counts for nothing
     own = off - J @ np.linalg.lstsq(J, off, rcond=None)[0]
     assert unseen([replace(p, settings=off)]) == pytest.approx(math.sqrt(np.mean(own**2)))
+    wide = replace(p, settings=off, slopes=np.concatenate([J, off], axis=1))  # an effect that could imitate the setting
+    assert unseen([wide], [True, False]) == pytest.approx(math.sqrt(np.mean(own**2)))
+    assert unseen([wide]) == pytest.approx(LEAST * NOISE)
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +173,33 @@ def test_what_no_effect_explains_is_unknown(toys):
     assert answers.count("unknown") == 10
 
 
+def test_a_solver_that_differs_by_less_than_the_settings_is_not_unknown():
+    """With the suggested solver itself no pattern is left, however much the settings differ by."""
+    rng = np.random.default_rng(10)
+    exact = [replace(part(rng, rows=400, slopes=0, settings=0, nuisances=0), residual=NOISE * rng.normal(size=400)) for _ in range(2)]
+    foretold, free, whole = densities(exact, [0, 1], [True, False], np.empty(0), 20.0 * NOISE)
+    assert free < whole
+    declared, unknown = of(foretold - price(0, 6)), of(foretold - price(0, 6) + free - whole, unknown=True)
+    assert judged([declared, unknown]).answer == "none"
+
+
+@pytest.mark.parametrize("rows", [400, 40_000])
+def test_more_points_outside_the_patterns_do_not_say_more(rows):
+    """A difference of solvers that is finer than the patterns, of 0.3 of the noise, of which an effect happens to take a tenth."""
+    rng = np.random.default_rng(11)
+    t, nothing = np.linspace(0.0, 1.0, rows), np.zeros((rows, 0))
+    smooth = np.stack([np.cos(math.pi * k * t) for k in range(5)], axis=1)
+    fine = 0.3 * NOISE * math.sqrt(2.0) * np.cos(40.0 * math.pi * t)
+    noise = NOISE * rng.normal(size=(2, rows))
+
+    def value(left):
+        parts = [PartStatistics(rows, NOISE, smooth, nothing, nothing, nothing, left * fine + own) for own in noise]
+        return densities([reduced(p) for p in parts], [0, 1], [True, False], np.empty(0), PHI)[0]
+
+    assert share([PartStatistics(rows, NOISE, smooth, nothing, nothing, nothing, fine)]) == pytest.approx(5 / (rows - 5))
+    assert 0.0 < value(0.9) - value(1.0) < 0.1
+
+
 def test_a_class_holds_all_but_little_of_the_probability():
     found = [of(0.0), of(1.0, unknown=True), of(20.0, "a"), of(19.0, "b"), of(10.0, "c"), of(15.0, "a")]
     assert judged(found).sets == (("a",), ("b",)) and judged(found).lead == 20.0
@@ -208,9 +238,26 @@ def test_stored_fits_have_an_evidence(truth, answer):
     found = diagnose(Curve(truth), draws=39, statistics=True)
     fits = read(found.statistics)
     journal = SimpleNamespace(bases=found.case.bases, rounds=found.case.judged)
-    assert {f.record.digest for f in fits} == {f.digest for f in best_fits(journal)}
+    assert {f.record.digest for f in fits} == {f.digest for f in best_fits(journal, (found.case.before, found.case.after))}
+    assert found.case.after.digest in {f.record.digest for f in fits}
     made = evidences(found.case, fits)
     verdict = judged(made)
     assert verdict.answer == answer
     assert answer == "none" or verdict.sets == (("drag_linear",),)
     assert sum(e.unknown for e in made) == 1 and all(np.isfinite(e.value) for e in made)
+
+
+def test_the_fits_of_the_answer_are_kept_first():
+    """The answer is fitted to its end after it was judged; a judged fit of the same effects may have stopped far from there."""
+
+    def fit(error, *effects, at=0.0, finished=None):
+        return FitRecord(0, effects, {"young": at}, (), 0.0, True, 1, 0, (error, error), (), finished=finished)
+
+    before, far, end = fit(9.0, at=1.0), fit(4.0, "a"), fit(1.0, "a", at=1.0)
+    others = [fit(0.5 + 0.01 * i, "b", f"c{i}") for i in range(40)]
+    journal = SimpleNamespace(bases=[fit(10.0)], rounds=[SimpleNamespace(fits=[far, *others])])
+    kept = best_fits(journal, (before, end))
+    assert len(kept) == 24 and kept[:3] == [journal.bases[0], before, end]
+    assert far not in kept and kept[3:] == others[:21]
+    cut = fit(math.nan, "a", at=2.0)
+    assert cut not in best_fits(journal, (before, cut))
