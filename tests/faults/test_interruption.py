@@ -77,6 +77,7 @@ def interrupted(folder: Path, number: signal.Signals, *args: str) -> Path:
     return state
 
 
+@pytest.mark.slow
 def test_a_fit_ends_after_its_step_with_its_state(made, tmp_path):
     state = interrupted(tmp_path, signal.SIGTERM, *fit(made))
     assert torch.load(state, weights_only=True)["global_step"] >= 2

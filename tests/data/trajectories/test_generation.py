@@ -127,6 +127,7 @@ def test_record_every(folder, tmp_path, monkeypatch):
         assert np.array_equal(np.load(tmp_path / f"{name}.npy"), np.load(folder / f"{name}.npy")[3::4])
 
 
+@pytest.mark.slow
 def test_killed_run_leaves_no_broken_file(tmp_path):
     """SIGKILL in the middle: every file that has its name is whole."""
     options = TINY | {"steps": 400, "velocity": (1.0, -1.5, -2.0)}

@@ -743,6 +743,7 @@ def test_a_size_of_the_other_sign_is_found_from_elsewhere(monkeypatch):
     assert not diagnose(problem).effects
 
 
+@pytest.mark.slow
 def test_what_an_effect_leaves_within_the_floor_is_searched_only_where_another_one_promises_much(monkeypatch):
     def searches(y):
         lines = []
@@ -1092,6 +1093,7 @@ def test_what_another_method_names_with_as_much_left_is_in_the_class(unnamed):
     assert widened(1.0, inference.noise_squares) == ["low"], "nothing is left to be told"
 
 
+@pytest.mark.slow
 def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
     monkeypatch.setattr(Inference, "growing_pairs", lambda *_: [])  # they would find them before
     real = choosing.first_rounds

@@ -148,6 +148,7 @@ def test_nothing_is_found_where_nothing_is_missing(folders):
     assert d.effects == []
 
 
+@pytest.mark.slow
 def test_a_body_is_made_of_silhouettes_where_none_is_given(folders):
     experiment = read_experiment(folders["hull"])
     assert experiment.recordings[0].body is None

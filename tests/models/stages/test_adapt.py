@@ -95,6 +95,7 @@ def test_curriculum_and_frames_of_the_fit(tmp_path):
     assert scored["later_cd"] == pytest.approx(sum(float(row["cd"]) for row in late) / len(late), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_silhouettes_alone(tmp_path):
     """Colours that say nothing do not matter where they have no weight."""
     scene = tiny_scene(tmp_path, young=2e5)
@@ -219,6 +220,7 @@ def test_start_is_a_rigid_motion(tmp_path):
     assert torch.allclose(state.C[0] @ arm[0].float(), (v[0] - v.mean(0)).float(), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_early_stop_keeps_the_best(tmp_path, monkeypatch):
     values = itertools.chain([1.0, 0.5, 0.7, 0.6], itertools.repeat(0.9))
     model = module(tmp_path, stop_on="view", check_every=2, patience=4, steps=20)
@@ -236,6 +238,7 @@ def test_early_stop_keeps_the_best(tmp_path, monkeypatch):
     assert len(rows_of(tmp_path / "out" / "scores.csv")) == 4
 
 
+@pytest.mark.slow
 def test_a_step_into_a_law_that_cannot_run_is_undone(tmp_path, capsys):
     model = module(tmp_path, steps=4, start="jelly")
     step = model.optimizer_step

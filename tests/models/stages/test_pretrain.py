@@ -54,6 +54,7 @@ def synthetic(materials=16, samples=32):
     return TrajectoryBatch(*flat, torch.arange(materials).repeat_interleave(samples)), 0.01 * rms[0], 0.01 * rms[1] + 1e-5
 
 
+@pytest.mark.slow
 def test_training_learns_and_an_unseen_material_needs_only_its_latent():
     batch, stress_epsilon, residual_epsilon = synthetic()
     torch.manual_seed(0)

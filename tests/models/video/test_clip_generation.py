@@ -83,6 +83,7 @@ def test_it_resumes_and_repeats(folder, tmp_path, monkeypatch):
         _ = FilmDataModule(str(tmp_path / "b")).index
 
 
+@pytest.mark.slow
 def test_vae_training_learns(folder, tmp_path):
     seed_everything(0)
     data = FilmDataModule(str(folder), batch_size=4, frames=8, windows=2, held_out=0.2)

@@ -29,6 +29,7 @@ def test_it_sees_no_future():
     assert (a[:, :, 3:] - b[:, :, 3:]).abs().max() > 1e-4
 
 
+@pytest.mark.slow
 def test_it_learns():
     torch.manual_seed(0)
     vae = FlowVAE(16)
