@@ -57,6 +57,7 @@ def test_cells_are_well_formed(path):
             compile(body, "cell", "exec")
 
 
+@pytest.mark.slow
 def test_closed_loop_on_rubber(data_root, tmp_path):
     """The real case: stiffening, and a much better extrapolation."""
     execute("closed_loop", tmp_path / "out", NEUIDO_DATA=str(data_root))
@@ -66,6 +67,7 @@ def test_closed_loop_on_rubber(data_root, tmp_path):
     assert matplotlib.image.imread(tmp_path / "out" / "rubber.png").std() > 0.05
 
 
+@pytest.mark.slow
 def test_latent_space(tmp_path):
     pytest.importorskip("sklearn")
     printed = execute("latent_space", tmp_path / "out")
@@ -75,6 +77,7 @@ def test_latent_space(tmp_path):
         assert matplotlib.image.imread(tmp_path / "out" / f"{name}.png").std() > 0.05
 
 
+@pytest.mark.slow
 def test_interpolation(tmp_path):
     printed = execute("interpolation", tmp_path / "out")
     for name in ("small-strain modulus [Pa]", "greatest compression", "contact time [s]"):

@@ -31,6 +31,8 @@ FIT = {
     },
 }
 
+BEGUN: list[subprocess.Popen] = []
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
@@ -44,8 +46,23 @@ def made(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def no_process_stays():
+    """Kill what a failed test leaves running."""
+    yield
+    while BEGUN:
+        process = BEGUN.pop()
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
 def begin(folder: Path, *args: str) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, "-m", "neuido", *args], cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "neuido", *args]
+    pipe = subprocess.PIPE
+    heeds = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731 (a shell's background jobs ignore it)
+    BEGUN.append(subprocess.Popen(command, cwd=folder, stderr=pipe, stdout=pipe, text=True, preexec_fn=heeds))
+    return BEGUN[-1]
 
 
 def wait_for(condition, process: subprocess.Popen, seconds: float = 400.0) -> None:
