@@ -20,12 +20,15 @@ from neuido.data.files.values import check_keys, mapping, number, path_inside, v
 from neuido.data.files.yaml_files import checking
 from neuido.errors import UserError, suggest
 from neuido.physics.laws.classical import material
+from neuido.physics.linalg.extent import box_axes, without_volume
 from neuido.physics.runtime.limits import check_limit
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
 
 FORMAT = "neuido-scene/1"
 KEYS = ("format", "name", "source", "scene", "model", "body", "discretisation", "steps", "on_inversion")
 VARIABLE = "NEUIDO_DATA"
+FEW = 4000
+"""Number of particles below which the smallest box around them bounds the estimate of their volume."""
 CONTACTS = ("sticky", "slip", "separate")
 
 
@@ -158,8 +161,16 @@ def body_volume(x: np.ndarray) -> float:
     empty. The volume V and the voxel width are found together by iteration. A voxel beside an empty one counts 2/3, because the surface
     cuts it. The result is the mean over eight positions of the voxel grid; its error is below 10 % for 5,000 particles. The motion of
     a body hardly depends on the volume, because a uniform volume scales masses and forces alike.
+
+    Fewer particles have an error of up to 40 %; without a bound it would have no limit. Below `FEW` of them the volume of the smallest box
+    around them is the bound.
+
+    Raises:
+        UserError: The particles span no volume: they are in one place, on a line or in a plane.
     """
     x = np.asarray(x, dtype=np.float64)
+    if flat := without_volume(x):
+        raise UserError(f"the {len(x)} particles {flat} and span no volume: give particles in several layers")
     lower, extent = x.min(axis=0), np.ptp(x, axis=0)
     volume = float(np.prod(np.maximum(extent, 1e-3 * extent.max())))
     for _ in range(30):
@@ -168,7 +179,17 @@ def body_volume(x: np.ndarray) -> float:
         before, volume = volume, voxel**3 * float(np.mean(counts))
         if abs(volume - before) < 1e-3 * before:
             break
-    return volume
+    return min(volume, _box_volume(x)) if len(x) < FEW else volume
+
+
+def _box_volume(x: np.ndarray) -> float:
+    """Return the volume [m^3] of the smallest box around particles, with its faces half a spacing s outside the outermost.
+
+    Were the box full, its volume would be P s^3, which gives s.
+    """
+    a, b, c = np.ptp(x @ box_axes(x).T, axis=0)
+    s = np.roots([len(x) - 1.0, -(a + b + c), -(a * b + b * c + c * a), -a * b * c]).real.max()
+    return len(x) * float(s) ** 3
 
 
 def _occupied(x: np.ndarray) -> float:
@@ -252,11 +273,12 @@ def _particles(relative: str, root: Path) -> Body:
         raise UserError(f"body.particles: {path} has x of shape {x.shape} and v of shape {v.shape}; both must be (P, 3)")
     if not (np.isfinite(x).all() and np.isfinite(v).all()):
         raise UserError(f"body.particles: {path} contains a NaN or an infinity")
-    if len(x) < 2 or not np.ptp(x, axis=0).any():
-        raise UserError(
-            f"body.particles: {path} has {len(x)} particles in one place, which fill no volume; give two or more in different places"
-        )
-    volume = body_volume(x) / len(x)
+    if not len(x):
+        raise UserError(f"body.particles: {path} has no particles")
+    try:
+        volume = body_volume(x) / len(x)
+    except UserError as error:
+        raise UserError(f"body.particles: {path}: {error}") from error
     return Body(torch.from_numpy(x).float(), torch.from_numpy(v).float(), torch.full((len(x),), volume))
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.linalg.extent import box_axes, without_volume
 from neuido.physics.runtime.limits import check_memory
 
 PER_PARTICLE = 1.0
@@ -162,7 +163,8 @@ def mesh_body(x: Tensor, volume: Tensor, *, elements: int | None = None, kind: i
         kind: Tetrahedra per cell, 5 or 6.
 
     Raises:
-        UserError: No particles, too few elements or more than fit into memory, or particles that fill no cell.
+        UserError: No particles, too few elements or more than fit into memory, or particles that span no
+            volume or fill no cell.
     """
     points, weight = x.double().cpu().numpy(), volume.double().cpu().numpy()
     if not len(points):
@@ -171,6 +173,8 @@ def mesh_body(x: Tensor, volume: Tensor, *, elements: int | None = None, kind: i
     if apart < kind:
         raise UserError(f"a body of {apart} particle{'s' if apart > 1 else ''} in different places has no mesh, which needs {kind}: "
                         "give more particles or a mesh, or use material points")  # fmt: skip
+    if flat := without_volume(points):
+        raise UserError(f"the {len(points)} particles of a body {flat}, which has no mesh: give layers or a mesh, or use material points")
     wanted = PER_PARTICLE * len(points) if elements is None else float(elements)
     if not kind <= wanted < np.inf:
         raise UserError(f"elements is {elements}; give at least {kind}, the tetrahedra of one cell")
@@ -282,41 +286,6 @@ def lattice_of(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | Non
         return None
     index = index.astype(np.int64)
     return origin + index.min(axis=0) @ basis, basis, index - index.min(axis=0)
-
-
-def box_axes(x: np.ndarray) -> np.ndarray:
-    """Find the axes of the smallest box around points, by rotations about one axis at a time from several starts.
-
-    Args:
-        x: Points [m], (P, 3).
-
-    Returns:
-        The axes as orthonormal rows, (3, 3).
-    """
-    generator = np.random.default_rng(0)
-    d = x - x.mean(axis=0)
-    starts = [np.eye(3), np.linalg.svd(d.T @ d)[2], *(np.linalg.qr(generator.standard_normal((3, 3)))[0] for _ in range(6))]
-    if len(d) > 4000:  # the box depends on the outermost points alone
-        directions = generator.standard_normal((2000, 3))
-        d = d[np.unique(np.argmax(d @ directions.T, axis=0))]
-    best, smallest = np.eye(3), np.inf
-    for axes in starts:
-        width = np.pi / 4
-        for _ in range(24):
-            for a in range(3):
-                i, j = (a + 1) % 3, (a + 2) % 3
-                angle = np.linspace(-width, width, 61)
-                u, v = d @ axes[i], d @ axes[j]
-                area = np.ptp(np.outer(np.cos(angle), u) + np.outer(np.sin(angle), v), axis=1)
-                area = area * np.ptp(np.outer(np.cos(angle), v) - np.outer(np.sin(angle), u), axis=1)
-                t = angle[np.argmin(area)]
-                axes = axes.copy()
-                axes[[i, j]] = np.cos(t) * axes[i] + np.sin(t) * axes[j], np.cos(t) * axes[j] - np.sin(t) * axes[i]
-            width = max(0.7 * width, 1e-4)
-        size = np.prod(np.ptp(d @ axes.T, axis=0))
-        if size < smallest * (1 - 1e-6):
-            best, smallest = axes, size
-    return best
 
 
 def _faces(q: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

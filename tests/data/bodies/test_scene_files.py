@@ -214,3 +214,43 @@ def test_body_volume(jitter):
         shapes.box(lower=(0.1, 0.1, 0.1), upper=(0.4, 0.3, 0.35), spacing=spacing, jitter=jitter),
     ):
         assert scenes.body_volume(body.x.numpy()) == pytest.approx(float(body.volume.double().sum()), rel=0.1)
+
+
+@pytest.mark.parametrize("side", [2, 3, 4, 5])
+@pytest.mark.parametrize("turned", [False, True])
+def test_body_volume_of_few_particles(side, turned):
+    x = 0.1 * np.stack(np.meshgrid(np.arange(side), np.arange(side), np.arange(4.0)), axis=-1).reshape(-1, 3)
+    if turned:
+        x = x @ np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
+    found = scenes.body_volume(x)
+    assert 0.65e-3 * len(x) < found < 1.01e-3 * len(x)
+    assert scenes.body_volume(8.0 * x) == pytest.approx(512.0 * found, rel=0.15)  # in other units; on a lattice the iteration goes on
+    four = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    assert 1 / 6 < scenes.body_volume(four) < 25.0  # without the bound: 35,000
+
+
+@pytest.mark.parametrize(
+    ("x", "words"),
+    [
+        ([[0.5, 0.5, 0.5]], "1 particles are all in one place"),
+        ([[0.5, 0.5, 0.5]] * 4, "4 particles are all in one place"),
+        ([[0.4, 0.5, 0.5], [0.6, 0.5, 0.4]], "2 particles lie on a line"),
+        ([[0.1 * k, 0.05 * k, 0.3] for k in range(5)], "5 particles lie on a line"),
+        ([[0.1 * i, 0.1 * j + 0.02 * i, 0.3 + 0.07 * i] for i in range(6) for j in range(6)], "36 particles lie in a plane"),
+    ],
+)
+def test_particles_without_volume(x, words, tmp_path):
+    x = np.asarray(x, dtype=np.float32)
+    with pytest.raises(UserError, match=f"{words} and span no volume"):
+        scenes.body_volume(x)
+    np.savez(tmp_path / "flat.npz", x=x, v=np.zeros_like(x))
+    with pytest.raises(UserError, match=rf"^body.particles: .*flat.npz: the {words} and span no volume") as error:
+        scenes.body_from_dict({"particles": "flat.npz"}, tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_particles_in_two_layers(tmp_path):
+    x = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0), np.arange(2.0)), axis=-1).reshape(-1, 3).astype(np.float32) * 0.05 + 0.2
+    np.savez(tmp_path / "thin.npz", x=x, v=np.zeros_like(x))
+    body = scenes.body_from_dict({"particles": "thin.npz"}, tmp_path)
+    assert float(body.volume.sum()) == pytest.approx(0.05**3 * 128, rel=0.2)

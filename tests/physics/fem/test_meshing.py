@@ -9,7 +9,6 @@ import torch
 from neuido.errors import UserError
 from neuido.physics.fem.meshing import (
     Mesh,
-    box_axes,
     lattice_of,
     mesh_body,
     mesh_of_cells,
@@ -17,6 +16,7 @@ from neuido.physics.fem.meshing import (
     tetrahedra_of,
 )
 from neuido.physics.fem.particle_weights import interpolation_weights, locate
+from neuido.physics.linalg.extent import box_axes
 from tests.physics.bodies import block
 
 
@@ -165,3 +165,18 @@ def test_bad_meshes_are_refused():
         mesh_body(nodes, torch.ones(5), elements=2)
     with pytest.raises(UserError, match="without particles"):
         mesh_body(nodes[:0], torch.ones(0))
+
+
+@pytest.mark.parametrize(("shape", "words"), [((6, 6, 1), "36 particles of a body lie in a plane"), ((9, 1, 1), "9 .* lie on a line")])
+def test_flat_bodies_are_refused(shape, words):
+    axes = [torch.arange(n, dtype=torch.float32) for n in shape]
+    x = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3) * 0.02
+    for turn in (torch.eye(3), rotation(3).float()):
+        with pytest.raises(UserError, match=f"{words}, which has no mesh"):
+            mesh_body(x @ turn.T + 0.4, torch.full((len(x),), 8e-6))
+
+
+def test_a_thin_body_has_a_mesh():
+    x = torch.stack(torch.meshgrid(*(torch.arange(n) for n in (6, 6, 2)), indexing="ij"), dim=-1).reshape(-1, 3) * 0.02
+    mesh = mesh_body(x.double(), torch.full((len(x),), 8e-6, dtype=torch.float64), elements=5 * len(x))
+    assert float(mesh.volume.sum()) == pytest.approx(72 * 8e-6)
