@@ -65,6 +65,7 @@ def neuido(*arguments: str) -> None:
     assert ended.value.code == 0
 
 
+@pytest.mark.slow
 def test_from_images_to_a_law_in_three_commands(video, tmp_path, monkeypatch):
     video, truth = video
     monkeypatch.chdir(tmp_path)

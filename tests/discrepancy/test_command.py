@@ -144,7 +144,7 @@ WRONG = {  # kind, what is done to it, words of the line
     "t-file": ("track", remove("ball-0-0.csv"), "ball-0-0.csv"),
     "t-path": ("track", change(T, "recordings", 0, "file", "../../secret.csv"), "file"),
     "t-nan": ("track", text("ball-0-0.csv", "t,x,y\n0,1,1\n0.1,nan,2\n0.2,2,2\n0.3,2,2\n"), "finite"),
-    "t-rise": ("track", text("ball-0-0.csv", "t,x,y\n0,1,1\n0.2,1,2\n0.1,2,2\n0.3,2,2\n"), "rise"),
+    "t-rise": ("track", text("ball-0-0.csv", "t,x,y\n0,1,1\n0.2,1,2\n0.1,2,2\n0.3,2,2\n"), "must increase"),
     "t-effect": ("track", change(T, "model", "effects", {"viscosity_shear.eta": 1.0}), "viscosity_shear"),
     "m-mode": ("test", change(M, "tests", 0, "mode", "torsion"), "torsion"),
     "m-stretch": ("test", text("uniaxial.csv", "stretch,stress\n1,1\n-1.1,2\n1.2,3\n1.3,4\n"), "positive"),

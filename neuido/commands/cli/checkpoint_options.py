@@ -10,7 +10,7 @@ from typing import Any
 from neuido.commands.cli.mistakes import given_options
 from neuido.commands.cli.trainer_help import LINKED, given_content
 from neuido.commands.cli.wrong_values import value_place
-from neuido.errors import UserError, shortened
+from neuido.errors import UserError
 
 
 def numbers_of(checkpoint: str, class_path: str) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def numbers_of(checkpoint: str, class_path: str) -> dict[str, Any]:
         found = torch.load(checkpoint, weights_only=True, map_location="cpu")
     except Exception as error:  # torch names no one type for a file that is malformed or not safe
         raise UserError(
-            f"ckpt_path = {checkpoint} is damaged, or holds objects that reading would execute: {shortened(str(error))[:120]}"
+            f"ckpt_path = {checkpoint} cannot be read weights-only: it is damaged, or holds objects that reading would execute"
         ) from error
     found = found.get("hyper_parameters") if isinstance(found, dict) else None
     if not isinstance(found, dict):

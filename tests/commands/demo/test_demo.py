@@ -69,6 +69,7 @@ def test_unknown_parts(parts, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_loop(tmp_path, monkeypatch):
     """The demonstration's loop with few candidates: the drag is named, the error falls to its floor, the second pass finds nothing."""
     whole = demo_loop.demo_loop

@@ -216,7 +216,7 @@ def test_other_formats_say_what_is_missing(tmp_path):
     with pytest.raises(UserError, match="camera 2 lacks frame 3"):
         read(tmp_path / "pacnerf")
     edit(tmp_path / "pacnerf" / "all_data.json", lambda c: c[3].update(file_path="data/frame.png"))
-    with pytest.raises(UserError, match="not of the form"):
+    with pytest.raises(UserError, match="must have the form"):
         read(tmp_path / "pacnerf")
 
     made(tmp_path, "neuma-real")
@@ -398,5 +398,5 @@ def test_a_broken_image(tmp_path):
     with pytest.raises(UserError, match=r"1_002.png is not an image"):
         SceneViews(found).load([1])
     cv2.imwrite(str(tmp_path / "nerfstudio" / "images" / "1_002.png"), np.zeros((10, 10, 3), np.uint8))
-    with pytest.raises(UserError, match="10 x 10 pixels, its camera 24 x 16"):
+    with pytest.raises(UserError, match="10 x 10 pixels, but its camera has 24 x 16"):
         SceneViews(found).load([1])

@@ -137,6 +137,7 @@ def excess(d: Diagnosis, case: Case) -> tuple[float, float]:
     return own.excess(own.before), own.excess(own.after)
 
 
+@pytest.mark.slow
 def test_nothing_is_missing(tmp_path, monkeypatch):
     experiment = record(tmp_path / "block", {}, launches=FLIES, frames=13)
     sound, smallest = both(body_problem(experiment), "drag_linear,gravity,viscosity_shear", tmp_path / "runs", monkeypatch, 1)
