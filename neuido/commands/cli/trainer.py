@@ -3,11 +3,12 @@
 YAML gives `class_path` and `init_args` of the model and the data module.
 """
 
+import contextlib
 import functools
 import importlib
 import os
 from argparse import ArgumentError
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -22,13 +23,18 @@ from neuido.commands.cli.plain_progress import needs_plain_lines, plain_progress
 from neuido.commands.cli.signatures import MODULES
 from neuido.commands.cli.trainer_help import HEAVY
 from neuido.commands.cli.wrong_values import explained, placed, type_in_configuration
+from neuido.data.files.output_folder import held_folder
 from neuido.data.files.renamed_options import rename_in_arguments, rename_in_configuration
 from neuido.data.files.sweep_run import own_folder, redirect
+from neuido.data.files.writing import check_writable
 from neuido.errors import UserError, condensed
 
 if TYPE_CHECKING:
     from lightning.pytorch import Trainer
     from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+
+METRICS = 8
+"""Number of metrics that a command shows in the end."""
 
 
 def run_lightning(args: list[str]) -> "LightningCLI":
@@ -137,6 +143,12 @@ def _cli_class() -> type["LightningCLI"]:
                     raise
                 raise UserError(f"trainer: {' '.join(str(error).split())}") from error
 
+        def _run_subcommand(self, subcommand: str) -> None:
+            with _held_results(self, subcommand):
+                super()._run_subcommand(subcommand)
+            if self.trainer.is_global_zero and interruption.received() is None and subcommand != "predict":  # which names each scene's
+                print("\n".join(_summary(self, subcommand)))
+
         def before_instantiate_classes(self) -> None:
             # Lightning loads a remote checkpoint with pickle unless told otherwise; here that takes an explicit `--weights_only false`.
             options = self.config[self.subcommand]
@@ -153,6 +165,51 @@ def _cli_class() -> type["LightningCLI"]:
                 self.trainer_defaults["callbacks"].append(plain_progress())
 
     return NeuidoCLI
+
+
+def _results_folder(cli: "LightningCLI", command: str) -> Path | None:
+    """Return the folder `out` of the model, if this command writes there."""
+    return Path(cli.model.hparams["out"]) if command in getattr(cli.model, "commands_with_results", ()) else None
+
+
+@contextlib.contextmanager
+def _held_results(cli: "LightningCLI", command: str) -> Iterator[None]:
+    """Hold the folder of the results while a command writes there, by the first process of several that train together."""
+    folder = _results_folder(cli, command)
+    if folder is None or not cli.trainer.is_global_zero:
+        yield
+        return
+    check_writable(folder, "model.out")
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with held_folder(folder, option="model.out"):
+            yield
+    finally:
+        for each in made:
+            with contextlib.suppress(OSError):  # it holds results
+                each.rmdir()
+
+
+def _summary(cli: "LightningCLI", command: str) -> list[str]:
+    """Return the last metrics of a command, and where its results, log and checkpoint are."""
+    trainer = cli.trainer
+    metrics = [f"{name} {float(value):.4g}" for name, value in trainer.callback_metrics.items() if name.count("/") < 2]  # not of a scene
+    more = f" and {len(metrics) - METRICS} more" if len(metrics) > METRICS else ""
+    lines = [f"last metrics: {', '.join(metrics[:METRICS])}{more}"] if metrics else []
+    saved = getattr(trainer.checkpoint_callback, "best_model_path", "") or getattr(trainer.checkpoint_callback, "last_model_path", "")
+    weights = cli.model.hparams.get("save_to")
+    places = {
+        "tables and fits": _results_folder(cli, command),
+        "weights": weights if command == "fit" and weights and Path(weights).exists() else None,
+        "log": trainer.log_dir if trainer.loggers and trainer.log_dir and Path(trainer.log_dir).exists() else None,
+        "checkpoint": saved if command == "fit" and saved else None,
+    }
+    found = [(what, place) for what, place in places.items() if place]
+    if not found:
+        return [*lines, "no results are written: neither a logger nor a checkpoint is on"]
+    (what, first), *others = found
+    return [*lines, f"results in {first} ({what})" + "".join(f"; {what} in {place}" for what, place in others)]
 
 
 @functools.cache  # once a process

@@ -76,6 +76,9 @@ class AdaptModule(ImageModule):
         condition_files: For predict: files of conditions (`inference.transfer`) to simulate with the fitted laws.
     """
 
+    commands_with_results = ("fit", "test", "predict")
+    """Commands that write into the folder `out`."""
+
     def __init__(
         self,
         method: Method,

@@ -68,6 +68,9 @@ class AlignModule(ImageModule):
         condition_files: For predict: files of conditions (`inference.transfer`) to simulate with the inferred laws.
     """
 
+    commands_with_results = ("test", "predict")
+    """Commands that write into the folder `out`."""
+
     def __init__(
         self,
         operator: str = "pretrained",
