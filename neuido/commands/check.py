@@ -32,16 +32,22 @@ def contents(folder: str) -> list[str]:
     given = Path(folder).expanduser()
     here = given.name if given.is_file() else next((name for name in KINDS if (given / name).is_file()), "")
     if here == "experiment.yaml":
-        from neuido.data.measured.experiment import read_experiment as read
+        from neuido.data.measured.experiment import read_experiment
+
+        found = read_experiment(given)
+        kind, entries = "experiment", found.recordings
     elif here == "test.yaml":
-        from neuido.data.measured.material_test import read_material_tests as read
+        from neuido.data.measured.material_test import read_material_tests
+
+        found = read_material_tests(given)
+        kind, entries = "material test", found.tests
     elif here == "track.yaml":
-        from neuido.data.measured.track import read_tracks as read
+        from neuido.data.measured.track import read_tracks
+
+        found = read_tracks(given)
+        kind, entries = "track", found.recordings
     else:
         raise UserError(f"{folder} has none of {', '.join(KINDS)}: `neuido import` makes such a folder")
-    found = read(given)
-    entries = found.tests if here == "test.yaml" else found.recordings
-    kind = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}[here]
     count = f"{len(entries)} recording{'s' * (len(entries) > 1)}"
     return [f"{kind} {found.name}, {count}", *(f"  {entry.name}: {ROLES[entry.role]}" for entry in entries)]
 

@@ -49,9 +49,7 @@ def _add(parser: argparse.ArgumentParser, options: Iterator[Option]) -> None:
         if option.name in seen:
             continue
         seen.add(option.name)
-        action = parser.add_argument(
-            f"--{option.name}", help=_plain(option.text), **({"choices": option.choices} if option.choices else {})
-        )
+        action = parser.add_argument(f"--{option.name}", help=_plain(option.text), choices=option.choices or None)
         last = option.name.rpartition(".")[2]
         if not option.choices and (last in FILES or last.endswith(("_from", "_file"))):
             action.complete = shtab.FILE  # type: ignore[attr-defined]

@@ -62,7 +62,7 @@ def film(
 
     plan = ClipPlan(
         count=count,
-        families={family: {name: tuple(bounds) for name, bounds in ranges.items()} for family, ranges in families.items()},
+        families={family: {name: (low, high) for name, (low, high) in ranges.items()} for family, ranges in families.items()},
         views=views,
         frames=frames,
         frame_steps=frame_steps,

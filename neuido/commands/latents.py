@@ -121,6 +121,7 @@ def draw_embedding(points: list[dict[str, Any]], path: Path) -> None:
     """Draw t-SNE by family; the darker, the stiffer within its family."""
     import math
 
+    from matplotlib.colors import to_rgba
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.2, 4.2), layout="constrained")
@@ -128,8 +129,8 @@ def draw_embedding(points: list[dict[str, Any]], path: Path) -> None:
     for colour, family in zip(COLOURS, dict.fromkeys(p["family"] for p in points), strict=False):
         own = [p for p in points if p["family"] == family]
         logs = [math.log(max(p["modulus"], 1.0)) for p in own]
-        shade = [0.3 + 0.7 * (v - min(logs)) / (max(logs) - min(logs) or 1.0) for v in logs]
-        axes.scatter([p["x"] for p in own], [p["y"] for p in own], s=22, color=colour, alpha=shade, linewidths=0, label=family)
+        shades = [to_rgba(colour, 0.3 + 0.7 * (v - min(logs)) / (max(logs) - min(logs) or 1.0)) for v in logs]
+        axes.scatter([p["x"] for p in own], [p["y"] for p in own], s=22, color=shades, linewidths=0, label=family)
     axes.set(xticks=[], yticks=[], title="t-SNE of the latents of Stage I (darker: stiffer)")
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=150)
@@ -141,7 +142,7 @@ def draw_interpolation(found: "Interpolation", path: Path) -> None:
 
     count = len(found.rows)
     figure = Figure(figsize=(1.5 * count, 4.2), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.3))
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.0, 1.3))[:, 0]
     heights = found.motion[..., 1]
     when = (heights.amax(2) - heights.amin(2)).argmin(0).tolist()
     for i, (axes, frame) in enumerate(zip(above.subplots(1, count, squeeze=False)[0], when, strict=True)):

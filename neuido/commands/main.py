@@ -133,7 +133,7 @@ def _help() -> str:
     commands = "\n".join(f"  {name:<14}{text}" for name, text in table.items())
     return (
         "usage: neuido [--help] [--version] [--print_completion SHELL] COMMAND [--config FILE] [OPTIONS]\n\n"
-        f"{neuido.__doc__.splitlines()[0]}\n\n"
+        f"{(neuido.__doc__ or 'neuido').splitlines()[0]}\n\n"
         f"commands:\n{commands}\n\n`neuido COMMAND --help` lists the options of a command; `--print_config` writes them as YAML."
     )
 

@@ -2,7 +2,7 @@
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from neuido.errors import UserError
 
@@ -147,7 +147,8 @@ def _setting(source: Path, file: str | None, recording: str | None, scale: float
 
     if up not in UP or not scale > 0:
         raise UserError(f"up = {up!r} must be one of {', '.join(UP)}, and scale = {scale} positive")
-    placing = Placement(scale, tuple(shift), up)
+    x, y, z = shift
+    placing = Placement(scale, (x, y, z), up)
     if (source / "experiment.yaml").is_file() and file is None:
         if placing != Placement():
             raise UserError("scale, shift and up are not for experiments: their files are in metres")
@@ -248,9 +249,9 @@ def _velocity(x: "Tensor", source: Path, options: dict[str, Any]) -> "Tensor":
         motion = Motion(options["velocity"] or still, options["angular_velocity"] or still)
     known = None if motion is not None else read(source, recording=options["recording"]).body
     if known is not None:
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
-        return known.v[torch.from_numpy(cKDTree(known.x.numpy()).query(x.numpy())[1])]
+        return known.v[torch.from_numpy(KDTree(known.x.numpy()).query(x.numpy())[1])]
     if motion is None:
         print("the velocity at t = 0 is not known: taken as zero; give --velocity")
         motion = Motion()
@@ -274,7 +275,8 @@ def _score(module: "ReconstructModule", batch: "MultiViewBatch") -> dict[str, fl
         figures[f"psnr_{name}"] = float(-10 * square.mean().log10())
         figures[f"psnr_{name}_object"] = float(-10 * square[near.expand_as(square)].mean().log10())
         both = (images.permute(0, 3, 1, 2), part.images[:, 0].permute(0, 3, 1, 2))
-        figures[f"ssim_{name}"] = float(structural_similarity_index_measure(*both, data_range=1.0))
+        similarity = cast("Tensor", structural_similarity_index_measure(*both, data_range=1.0))  # a pair only with an image of it
+        figures[f"ssim_{name}"] = float(similarity)
     return figures
 
 

@@ -188,11 +188,11 @@ def _costs(entries: list[Entry]) -> list[str]:
     """Means over the scenes of all further figures: steps, seconds, memory."""
     known = ("scene", "failed", "unseen", "floor", "stage", "found_", "later_", *MEASURES)  # of beginnings
     columns = list(dict.fromkeys(c for e in entries for row in e.rows for c in row if not c.startswith(known)))
-    rows = [(e.label, *(mean([row[c] for row in e.rows if isinstance(row.get(c), float)]) for c in columns)) for e in entries if e.rows]
-    told = [i for i in range(len(columns)) if any(math.isfinite(row[i + 1]) for row in rows)]
+    rows = [(e.label, [mean([row[c] for row in e.rows if isinstance(row.get(c), float)]) for c in columns]) for e in entries if e.rows]
+    told = [i for i in range(len(columns)) if any(math.isfinite(means[i]) for _, means in rows)]
     if not told:
         return []
-    shown = [[row[0], *(row[i + 1] for i in told)] for row in rows]
+    shown = [[label, *(means[i] for i in told)] for label, means in rows]
     return ["<h2>Cost and further figures, means over the scenes</h2>", table(["", *(columns[i] for i in told)], shown)]
 
 

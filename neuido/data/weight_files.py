@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import safe_open
@@ -45,7 +45,10 @@ def parse_metadata(metadata: Mapping[str, str], key: str, path: str | os.PathLik
     return content
 
 
-def build(make: Callable[..., nn.Module], config: Mapping[str, Any], tensors: Mapping[str, Tensor], path: str | os.PathLike) -> nn.Module:
+AnyModule = TypeVar("AnyModule", bound=nn.Module)
+
+
+def build(make: Callable[..., AnyModule], config: Mapping[str, Any], tensors: Mapping[str, Tensor], path: str | os.PathLike) -> AnyModule:
     """Return a module that holds the tensors of a file. Their shapes are compared first, so that no size in the file takes memory.
 
     Args:

@@ -90,7 +90,8 @@ def stop_at_step(path: Path | None = None) -> "Callback":
             if _received:
                 self._stop(trainer, save=False)
 
-        on_predict_batch_end = on_test_batch_end
+        def on_predict_batch_end(self, trainer: Trainer, *_: Any) -> None:
+            self.on_test_batch_end(trainer)
 
         def _stop(self, trainer: Trainer, *, save: bool) -> None:
             if save:

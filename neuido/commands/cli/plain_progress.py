@@ -69,7 +69,8 @@ def plain_progress() -> "Callback":
             if self.work is not None:
                 self.work.update()
 
-        on_predict_batch_end = on_test_batch_end
+        def on_predict_batch_end(self, trainer: "Trainer", *_: Any) -> None:
+            self.on_test_batch_end(trainer)
 
         def on_validation_batch_end(self, trainer: "Trainer", *_: Any) -> None:
             if self.work is not None and trainer.state.fn == "validate":

@@ -8,7 +8,7 @@ import functools
 import importlib
 import os
 from argparse import ArgumentError
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -62,7 +62,8 @@ def run_lightning(args: list[str]) -> "LightningCLI":
 def _run(args: list[str]) -> "LightningCLI":
     words = rename_in_arguments(expanded(args), "model.method", MODULES)
     try:
-        return _cli_class()(args=words, stated=stated_options(args), **_settings())
+        make: Callable[..., LightningCLI] = _cli_class()
+        return make(args=words, stated=stated_options(args), **_settings())
     except RuntimeError as error:
         if str(error).startswith("Error(s) in loading state_dict"):
             raise does_not_fit(error, args) from error
@@ -151,7 +152,7 @@ def _cli_class() -> type["LightningCLI"]:
 
         def before_instantiate_classes(self) -> None:
             # Lightning loads a remote checkpoint with pickle unless told otherwise; here that takes an explicit `--weights_only false`.
-            options = self.config[self.subcommand]
+            options = self.config[self.config.subcommand]
             if options.get("weights_only") is None:
                 options["weights_only"] = True
             folder = own_folder(os.environ)

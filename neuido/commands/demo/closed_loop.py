@@ -249,7 +249,7 @@ def draw(diagnosis: Path, path: Path) -> None:
     found = " and ".join(" or ".join(e["class"]) for e in content["effects"])
     figure = Figure(figsize=(12.5, 3.1 * len(names) + 0.4), layout="constrained")
     figure.suptitle(f"{content['answer']}{': ' if found else ''}{found}", fontsize=11)
-    left, right = figure.subfigures(1, 2, width_ratios=(2.6, 1.0))
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(2.6, 1.0))[0]
     panels = left.subplots(len(names), 3, squeeze=False)
     longest = max(float(np.nanmax(np.abs(m["measured"][-1] - m["before"][-1]))) for m in motions.values())
     times = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n * longest < 0.15), default=1)

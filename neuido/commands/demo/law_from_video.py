@@ -2,10 +2,10 @@
 
 import csv
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 TRAINING, UNSEEN = ("elastic-0", "elastic-4"), ("elastic-9",)
-RECONSTRUCTION = {"steps": 120, "start": 1000, "gaussians": 1500, "particles": 700, "resolution": 32}
+RECONSTRUCTION: dict[str, Any] = {"steps": 120, "start": 1000, "gaussians": 1500, "particles": 700, "resolution": 32}
 
 
 class SceneResult(NamedTuple):
@@ -72,7 +72,7 @@ def demo_video(
     settings = yaml.safe_load(Path(find_config("scenes/ten_small")).read_text())
     chosen = [scene for scene in settings["scenes"] if scene["name"] in (*TRAINING, *UNSEEN)]
     print("[video 1/5] filming three small bodies", flush=True)
-    film = {key: tuple(value) if isinstance(value, list) else value for key, value in settings["film"].items()}
+    film: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in settings["film"].items()}
     make_scenes(chosen, Film(**film), folder / "scenes", draw=rasterize, device="cpu")
     print("[video 2/5] reconstructing them from their first frame", flush=True)
     for name in (*TRAINING, *UNSEEN):
@@ -86,6 +86,7 @@ def demo_video(
     start = ["--model.init_from", init_from or "null", "--model.save_to", str(encoder)]
     length = ["--trainer.max_epochs", str(epochs), "--trainer.limit_val_batches", "0"]
     fitted = run_lightning(["fit", *common, *start, *length])
+    assert fitted.trainer.log_dir is not None  # the configuration has a logger that writes CSV
     with (Path(fitted.trainer.log_dir) / "metrics.csv").open() as file:
         steps = [row for row in csv.DictReader(file) if row.get("train/loss")]
     most = max((float(row["train/frames"]) for row in steps), default=0.0)  # the curriculum begins with fewer
@@ -114,10 +115,10 @@ def _adapt(folder: Path, encoder: Path, steps: int) -> Adapted:
     run_lightning(["predict", *common, "--model.adapter", str(results)])
     with (results / "scores.csv").open() as file:
         before, after = csv.DictReader(file)
-    figures = [_scores(row) for row in (before, after)]
+    first, last = _scores(before), _scores(after)
     picture = results / after["scene"] / "prediction.png"
-    print(f"{after['scene']}: held-out PSNR {figures[0]['psnr']:.2f} dB before, {figures[1]['psnr']:.2f} dB after {after['steps']} steps")
-    return Adapted(after["scene"], *figures, int(after["steps"]), float(after["seconds"]), picture)
+    print(f"{after['scene']}: held-out PSNR {first['psnr']:.2f} dB before, {last['psnr']:.2f} dB after {after['steps']} steps")
+    return Adapted(after["scene"], first, last, int(after["steps"]), float(after["seconds"]), picture)
 
 
 def _listed(names: tuple[str, ...]) -> str:

@@ -65,11 +65,11 @@ def demo_laws(out: str = "runs/demo", *, settings: str = "quickstart") -> LawsRe
         chosen.setdefault(family, (name, values))  # the first of each family: NCLaw's published material
     compared = [_compare(trained.model.operator, name, family, values) for family, (name, values) in chosen.items()]
     figures = {key: float(value) for key, value in trained.trainer.callback_metrics.items()}
+    stress, plastic = ([figures.get(f"val/{kind}_error/{family}", float("nan")) for family in chosen] for kind in ("stress", "plastic"))
     rows = tuple(
-        (each.name, *(figures.get(f"val/{kind}_error/{family}", float("nan")) for kind in ("stress", "plastic")),
-         each.rmse, each.rmse / each.path)
-        for family, each in zip(chosen, compared, strict=True)
-    )  # fmt: skip
+        (each.name, of_stress, of_flow, each.rmse, each.rmse / each.path)
+        for each, of_stress, of_flow in zip(compared, stress, plastic, strict=True)
+    )
     _print_table(rows)
     picture = folder / "demo.png"
     _draw(compared, picture)

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 from neuido.data.files.score_tables import folder_of, read_rows
 from neuido.data.files.sweep_run import read_status
@@ -137,14 +137,14 @@ def logged_curves(root: Path) -> dict[str, list[tuple[float, float]]]:
     return out
 
 
-def _drawn(value: Any) -> bool:
+def _drawn(value: Any) -> TypeGuard[float]:
     """Whether a cell is a number that an axis can show."""
     return isinstance(value, float) and abs(value) < 1e100
 
 
 def figures(rows: Sequence[dict[str, Any]], name: str) -> list[float]:
     """Return a column of a table as numbers, NaN where a cell holds none that an axis can show."""
-    return [value if _drawn(value := row.get(name)) else math.nan for row in rows]
+    return [value if _drawn(value) else math.nan for value in (row.get(name) for row in rows)]
 
 
 def scenes_of(entries: Sequence[Entry]) -> list[str]:

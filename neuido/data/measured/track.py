@@ -1,5 +1,6 @@
 """Tracks: measured motion of bodies as points, in the folder format `neuido-track/1`."""
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -146,7 +147,7 @@ def _recording(entry: Any, where: str, bodies: Mapping[str, Any], folder: Path) 
     scale = mapping(entry.get("scale", {}), f"{where}.scale")
     check_keys(scale, f"{where}.scale", ("t", *AXES), ("t", *AXES))
     for key, factor in scale.items():
-        if not number(factor, f"{where}.scale.{key}", **({"above": 0.0} if key == "t" else {})):
+        if not number(factor, f"{where}.scale.{key}", above=0.0 if key == "t" else -math.inf):
             raise UserError(f"{where}.scale.{key} must not be zero")
     data, _ = read_columns(folder, entry, where, scale=scale)
     return Track(

@@ -87,7 +87,7 @@ def make_trajectories(
     chosen = replace(setup, **throw) if isinstance(setup, Throw) else Throw(**{**setup, **throw})
     vectors = {name: tuple(getattr(chosen, name)) for name in ("velocity", "angular_velocity", "gravity")}
     plan = Setup(
-        families={family: {name: tuple(bounds) for name, bounds in ranges.items()} for family, ranges in families.items()},
+        families={family: {name: (low, high) for name, (low, high) in ranges.items()} for family, ranges in families.items()},
         instances=instances,
         held_out=held_out,
         seed=seed,

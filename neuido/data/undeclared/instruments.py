@@ -1,6 +1,7 @@
 """Simulated measurement of a motion: marked points, seen with errors of clock, ruler and launch."""
 
 from collections.abc import Mapping, Sequence
+from typing import TypedDict
 
 import numpy as np
 import torch
@@ -16,6 +17,13 @@ WRONG_NUISANCES = (  # name, unit, standard deviation relative to: frame interva
     ("velocity", "m/s", 0.005),
     ("spin", "rad/s", 0.01),
 )
+
+
+class Attachment(TypedDict, total=False):
+    """How the points of a `Recording` follow the body: one of its fields, by name."""
+
+    track: torch.Tensor
+    anchor: torch.Tensor
 
 
 class Markers:
@@ -44,7 +52,7 @@ class Markers:
         index, weight = self.maps[recording]
         return np.einsum("nk,tnkc->tnc", weight, x[:, index])
 
-    def named(self, recording: int) -> dict[str, torch.Tensor]:
+    def named(self, recording: int) -> Attachment:
         """Return the field `track` or `anchor` of a `Recording`, which says how its points follow the body."""
         if self.glued:
             return {"anchor": torch.from_numpy(self.places[recording]).float()}

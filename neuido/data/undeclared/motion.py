@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neuido.physics.effects.parameters import Effects, linear_gradient
 from neuido.physics.fem.finite_elements import FiniteElements
+from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical import material
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, ParticleState, Scene
@@ -163,7 +164,13 @@ def _moving_floor_force(lift: Mapping[str, float], steps: int, dt: float) -> dic
 
 
 def _rollout_with_kicks(
-    simulator: Simulator, elasticity, plasticity, effects: Effects, own: dict[str, dict[str, float]], frames: int, every: int
+    simulator: Simulator | FiniteElements,
+    elasticity: ElasticLaw,
+    plasticity: PlasticLaw,
+    effects: Effects,
+    own: dict[str, dict[str, float]],
+    frames: int,
+    every: int,
 ) -> ParticleState:
     """Alternate rollouts and velocity updates (Strang splitting).
 

@@ -304,7 +304,7 @@ class Contests(BaseFits):
             if remains is not None and score(remains) > beyond:
                 unfitted = {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave}
                 return Contest(*self.closely(free, best, None, floor, until), unfitted)
-            if puts_off and remains is not None and not self.may_be_noise(remains):
+            if puts_off and leading is not None and remains is not None and not self.may_be_noise(remains):
                 waiting = tuple(start for wave in waves[i:] for start in wave)
                 unfitted = {c.key: NO_TIME for c, *_ in waiting}
                 return Contest({**best, leading[0].key: leading}, None, unfitted, PutOff(tuple(ended), waiting))

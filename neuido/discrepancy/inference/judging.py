@@ -231,7 +231,7 @@ class Judging(Refining):
 
     def scanned(self, c: Candidate, start: Point) -> list[Point]:
         """A start of a candidate of one size with sizes of either sign from the one that it is screened at up."""
-        if len(c.size_parameters) > 1 or not c.linear:
+        if len(c.size_parameters) != 1 or not c.linear:
             return []
         p = c.size_parameters[0]
         unit = abs(c.starts[0][p.name])

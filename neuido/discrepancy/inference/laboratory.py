@@ -360,8 +360,12 @@ class Laboratory:
         """Directions of the nuisances of each recording, of one prior standard deviation, as a quick motion has them where it runs."""
         asks = {}
         for n in recordings:
-            own = [p for p in self.problem.nuisances if p.prior is not None and p.name.endswith(f":{self.problem.recordings[n].name}")]
-            asks[n] = [point, *(point | {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + p.prior)} for p in own)]
+            own = [
+                (p, p.prior)
+                for p in self.problem.nuisances
+                if p.prior is not None and p.name.endswith(f":{self.problem.recordings[n].name}")
+            ]
+            asks[n] = [point, *({**point, p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + prior)} for p, prior in own)]
         quick, predicted = self.problem.quick(self.own), {}
         for setting in dict.fromkeys((quick, self.own) if self.bears(point, quick) else (self.own,)):
             wanted = [n for n in recordings if n not in predicted or not np.isfinite(predicted[n][0]).all()]

@@ -17,6 +17,7 @@ What lies outside the patterns and the nuisances is counted as few data, not row
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
@@ -110,9 +111,14 @@ def log_densities(recordings: Sequence[Rotated], variances: np.ndarray, scales: 
 def log_prior(scales: np.ndarray, scale: float) -> np.ndarray:
     """Return the log-weights of geometrically spaced scales under the prior about `scale`; they sum to one."""
     weights = invgamma.logpdf(scales**2, 0.5 * FREEDOM, scale=0.5 * FREEDOM * scale**2) + 2.0 * np.log(scales)
-    return weights - logsumexp(weights)
+    return weights - _log_sum(weights)
 
 
 def log_mean(densities: np.ndarray, weights: np.ndarray) -> float:
     """Return the logarithm of the mean density over scales, of log-densities and log-weights."""
-    return float(logsumexp(densities + weights))
+    return _log_sum(densities + weights)
+
+
+def _log_sum(values: np.ndarray) -> float:
+    total: Any = logsumexp(values)  # a pair only where signs are asked for
+    return float(total)

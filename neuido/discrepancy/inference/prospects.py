@@ -143,7 +143,7 @@ class Prospects(Judging):
             small = len(c.parameters) <= MANY if c.key not in finite else c.linear and len(c.parameters) <= SMALL
             if c.key not in chosen and ((first and small) or c.key in leaders):
                 chosen[c.key] = 0
-                starts.append((c, self.at_declared(base.point) | dict(c.starts[0]), None))
+                starts.append((c, {**self.at_declared(base.point), **c.starts[0]}, None))
         for c in (c for c in candidates if first and not hurried and c.far and c.key in chosen):
             places = [c.starts[i] for _, other, i, _ in ranked if other is c][:PLACES]
             starts += [(c, begin, None) for begin in self.strong(c, places, base.point, floor)]

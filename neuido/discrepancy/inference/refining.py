@@ -297,7 +297,7 @@ class Refining(Contests):
         """Fits of one size once more, from the declared values and a larger size: the slope at zero may have led into a side valley."""
         begins: list[tuple[Candidate, Point]] = []
         for key, (c, fit) in best.items():
-            if not c.linear or len(c.size_parameters) > 1 or len(c.parameters) > SMALL:
+            if not c.linear or len(c.size_parameters) != 1 or len(c.parameters) > SMALL:
                 continue
             p = c.size_parameters[0]
             for sign in p.signs:

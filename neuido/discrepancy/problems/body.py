@@ -250,6 +250,7 @@ class BodyProblem(BodyRollouts):
             if r.anchor is not None:
                 places, known = r.anchor.double(), torch.full((len(r.anchor),), -1)
             else:
+                assert r.track is not None  # points without an anchor follow particles
                 places, known = _first_seen(r), r.track
             index, weight = interpolation_weights(x, places, near=NEIGHBOURS, falloff=2.0)
             for n in torch.nonzero(known >= 0)[:, 0].tolist():

@@ -49,7 +49,7 @@ def scales(experiment: Experiment) -> Scales:
     speed = max(_speed(r.x.numpy(), r.t.numpy()) for r in fits)
     wave = length * math.sqrt(2.6 * rho / young)
     gravity = max(math.hypot(*experiment.scene.gravity), 1e-3)
-    return Scales(young, wave, max(float(r.t[-1]) for r in fits), speed, length, gravity, experiment.scene.dt)
+    return Scales(young, wave, max(float(r.t[-1]) for r in fits if r.t is not None), speed, length, gravity, experiment.scene.dt)
 
 
 def _speed(x: np.ndarray, t: np.ndarray) -> float:

@@ -67,8 +67,8 @@ class Released:
 
     def off_prior(self, values: np.ndarray) -> np.ndarray:
         """How far parameters (P, k) are from where their priors have them, in standard deviations, one column for each that has one."""
-        owned = [(i, p) for i, p in enumerate(self.parameters) if p.prior is not None]
-        return np.stack([(values[:, i] - p.value) / (p.scale * p.prior) for i, p in owned], axis=1)
+        owned = [(i, p, p.prior) for i, p in enumerate(self.parameters) if p.prior is not None]
+        return np.stack([(values[:, i] - p.value) / (p.scale * prior) for i, p, prior in owned], axis=1)
 
     @property
     def variance(self) -> float:
@@ -99,7 +99,7 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
     whiten = start.whitener(t)
     scale, centre, low, high = (np.array([getattr(p, key) for p in parameters]) for key in ("scale", "value", "lower", "upper"))
     release = [i for i, p in enumerate(parameters) if p.name.startswith("release_time")]
-    begun = [centre, centre + np.array([p.prior * p.scale if i in release else 0.0 for i, p in enumerate(parameters)])]
+    begun = [centre, centre + np.array([(p.prior or 0.0) * p.scale if i in release else 0.0 for i, p in enumerate(parameters)])]
     begun = begun if release else begun[:1]
     values = np.repeat(np.clip(begun, low, high), count, axis=0)
     rows, k = values.shape
@@ -125,7 +125,7 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
         Jc, rc = np.where(usable[:, None, None], J, 0.0), np.where(usable[:, None], r, 0.0)
         A, g = np.einsum("pmi,pmj->pij", Jc, Jc), np.einsum("pmi,pm->pi", Jc, rc)
         # a parameter at its bound that wants to go on is held there
-        held = ((values <= low) & (g > 0)) | ((values >= high) & (g < 0))
+        held = np.asarray(((values <= low) & (g > 0)) | ((values >= high) & (g < 0)))
         free = ~held
         A = A * free[:, :, None] * free[:, None, :]
         A = A + np.eye(k) * (held[:, :, None] + damping[:, None, None] * np.einsum("pii->pi", A)[:, :, None] + 1e-12)

@@ -109,7 +109,7 @@ class BodyRollouts(Problem):
     @property
     def duration(self) -> float:
         """Over which the knots of a force in time spread, in every recording [s]: the longest one that is fitted."""
-        return max(float(r.t[-1]) for r in self.measured if r.role == "fit")
+        return max(float(r.t[-1]) for r in self.measured if r.role == "fit" and r.t is not None)
 
     def _moved(self, point: Point, recording: int, setting: int = 0) -> ParticleState:
         """The frames of one motion, (T, 1, P, ...)."""

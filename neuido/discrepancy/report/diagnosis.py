@@ -161,7 +161,10 @@ class Diagnosis:
         """The error before and after: of held-out recordings where there are any. Of several bodies: their root mean square."""
         if "bodies" in self._content:
             own = [body.error for body in self.bodies.values()]
-            before, after, floor = (math.sqrt(sum(row[i] ** 2 for row in own) / len(own)) for i in (0, 1, 3))
+            before, after, floor = (
+                math.sqrt(sum(value**2 for value in column) / len(own))
+                for column in zip(*((row.before, row.after, row.floor) for row in own))
+            )
             return ErrorChange(before, after, own[0].unit, floor, all(row.held_out for row in own))
         e = self._content["error"]
         key = "held_out" if "held_out" in e["after"] and e["after"]["held_out"] is not None else "fit"

@@ -113,9 +113,9 @@ def _slopes(d: Diagnosis, problem: Problem, rival: Rival, setting: int) -> np.nd
     asked, here = [], dict(rival.point)
     for name in rival.names:
         p = d.problem.parameter(name)
-        low, high = d.intervals.get(name, (None, None))
+        low, high = d.intervals.get(name, (0.0, 0.0))
         q = p.coordinate(here.get(name, p.value))
-        sd = (p.coordinate(high) - p.coordinate(low)) / 3.29 if low is not None and low < high else 1.0
+        sd = (p.coordinate(high) - p.coordinate(low)) / 3.29 if low < high else 1.0
         asked.append(here | {name: p.physical(q + sd)})
     rows = problem.predict([here, *asked], 0, setting)
     change = (rows[1:] - rows[0]).T
@@ -172,8 +172,9 @@ def changes(r: Measured, density: float) -> Iterator[tuple[str, Measured]]:
     if any(p.contact == "separate" and p.friction < 0.3 for p in r.scene.colliders):
         planes = tuple(replace(p, friction=0.6) if p.contact == "separate" else p for p in r.scene.colliders)
         yield "give the floor a friction of 0.6", replace(r, scene=replace(r.scene, colliders=planes))
-    longer = r.t * 1.8
-    yield f"record for {float(longer[-1]):.2g} s", replace(r, t=longer, frame_interval=1.8 * r.frame_interval)
+    if r.t is not None:
+        longer = r.t * 1.8
+        yield f"record for {float(longer[-1]):.2g} s", replace(r, t=longer, frame_interval=1.8 * r.frame_interval)
 
 
 def _moved(r: Measured, velocity: torch.Tensor) -> Measured:

@@ -59,6 +59,8 @@ def _layer(weights: dict[str, Tensor], name: str, shape: tuple[int, int], path: 
 class LoRAWeight(nn.Module):
     """Weight W + alpha / r B A with frozen W (m, n), A (r, n) initialised by Kaiming and B (m, r) by zero (NeuMA, `loralib`)."""
 
+    weight: Tensor
+
     def __init__(self, weight: Tensor, rank: int, alpha: float, generator: torch.Generator):
         super().__init__()
         self.scale = alpha / rank
@@ -160,7 +162,7 @@ class NeuMA(NCLaw):
         self.lora = nn.ModuleDict(lora)
 
     def _layers(self, part: str) -> list[Tensor]:
-        return [layer()[None] for layer in self.lora[part]]
+        return [layer()[None] for layer in self.lora[part].children()]
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         usual = self.RATES[self.chosen][0]

@@ -102,6 +102,11 @@ class SparseLaw(Method):
         self.level = nn.Parameter(torch.tensor(math.log10((lam + 2 * mu / 3) / STRESS_SCALE)))
         self.shape = nn.Parameter(shape)
         self.surface = nn.Parameter(torch.tensor(radii if yields else [UNREACHABLE, ZERO_RADIUS, UNREACHABLE]))
+        self.gain: Tensor
+        self.active: Tensor
+        self.runs: Tensor
+        self.keep: Tensor
+        self.becomes: Tensor
         self.register_buffer("gain", (1 / (LINEAR * STRAIN)) ** torch.tensor(DEGREE))
         self.register_buffer("active", torch.ones(4, 7))
         self.register_buffer("runs", torch.zeros((), dtype=torch.int64))

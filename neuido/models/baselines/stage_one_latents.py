@@ -20,6 +20,8 @@ class LatentMethod(Method):
         operator: File of the operator, or `pretrained`.
     """
 
+    z: torch.Tensor
+
     def __init__(self, operator: str = "pretrained"):
         super().__init__()
         self.operator = IntrinsicDynamicsOperator.load(operator).eval().requires_grad_(False)

@@ -9,7 +9,7 @@ import hashlib
 import os
 import uuid
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,9 @@ from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import Moduli, implausibility, p_wave_modulus, small_strain_moduli
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import read_weights
+
+if TYPE_CHECKING:
+    from peft import PeftModel
 
 TARGETS = r"(elastic|plastic)_trunk\.(fc1|fc2|out)"
 LATENT, LAW = "latent.safetensors", "law.safetensors"
@@ -113,6 +116,7 @@ class LowRankAdaptation(Method):
         else:
             z = self._named_start()
         self.z = nn.Parameter(z.detach().clone().to(device))
+        self.origin: Tensor
         self.register_buffer("origin", self.z.detach().clone())
         if self.rank:
             from peft import LoraConfig, get_peft_model
@@ -200,11 +204,11 @@ class LowRankAdaptation(Method):
         self.rank = 0
         self.tuned = plain
         if (folder / PEFT_FILES[0]).exists() or content.get("found", {}).get("rank"):
-            self.tuned = load_adapter(plain, folder).to(device)
-            self.rank = int(self.tuned.peft_config["default"].r)
+            adapted = load_adapter(plain, folder).to(device)
+            self.tuned, self.rank = adapted, int(adapted.peft_config["default"].r)
 
 
-def load_adapter(operator: IntrinsicDynamicsOperator, folder: Path) -> nn.Module:
+def load_adapter(operator: IntrinsicDynamicsOperator, folder: Path) -> "PeftModel":
     """Wrap the operator with an adapter in PEFT's format.
 
     Raises:

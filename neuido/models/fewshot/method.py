@@ -46,6 +46,7 @@ class Method(nn.Module):
     steps: int = 100
     lr: float = 1e-3
     encoder: DynamicsEncoder | None = None
+    _start: list[Tensor]
 
     def for_scene(self, scene: PreparedScene) -> Self:
         """Return a copy with parameters for one scene, on the device of the scene; the encoder is shared."""

@@ -127,9 +127,9 @@ def carry_points(rest: Tensor, points: Tensor, x: Tensor, nearest: int = 8) -> T
     Returns:
         Positions of the points [m], (K, N, 3).
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    distance, index = cKDTree(rest.detach().cpu().numpy()).query(points.detach().cpu().numpy(), k=min(nearest, len(rest)))
+    distance, index = KDTree(rest.detach().cpu().numpy()).query(points.detach().cpu().numpy(), k=min(nearest, len(rest)))
     d = torch.as_tensor(distance, dtype=torch.float64).reshape(len(points), -1)
     weight = 1 / (d.square() + 1e-12)
     weight = (weight / weight.sum(1, keepdim=True)).to(x)

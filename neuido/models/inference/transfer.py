@@ -192,10 +192,10 @@ def _place(body: BodyCondition, prepared: PreparedScene) -> tuple[Body, Gaussian
 
 def _apart(bodies: list[Body], dx: float) -> None:
     """Check that bodies are at least half a cell apart; otherwise they would start as one body."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     for i in range(len(bodies)):
         for j in range(i):
-            nearest = float(cKDTree(bodies[i].x.numpy()).query(bodies[j].x.numpy())[0].min())
+            nearest = float(KDTree(bodies[i].x.numpy()).query(bodies[j].x.numpy())[0].min())
             if nearest < 0.5 * dx:
                 raise UserError(f"bodies {j} and {i} start {nearest:.3g} m apart, less than half a cell of {dx:.3g} m; change their shift")

@@ -241,7 +241,7 @@ def _poisson(volume: Volume, edge: float, level: float, generator: np.random.Gen
 
     All candidates that precede their neighbours are accepted at once, which gives the same result as one at a time.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     inside = torch.nn.functional.max_pool3d((volume.values > 0)[None, None].float(), 3, 1, 1)[0, 0] > 0
     cells = inside.nonzero().cpu().numpy()
@@ -255,7 +255,7 @@ def _poisson(volume: Volume, edge: float, level: float, generator: np.random.Gen
     x = x[(volume.at(torch.from_numpy(x).float().to(volume.lower.device)) > level).cpu().numpy()]
     generator.shuffle(x)
     distance = 0.825 * edge  # so that about one particle falls on edge^3
-    pairs = cKDTree(x).query_pairs(distance, output_type="ndarray") if len(x) else np.empty((0, 2), int)
+    pairs = KDTree(x).query_pairs(distance, output_type="ndarray") if len(x) else np.empty((0, 2), int)
     first, second = pairs.min(1), pairs.max(1)  # the index is the order of the visits
     open_, taken = np.ones(len(x), bool), np.zeros(len(x), bool)
     while open_.any():

@@ -5,7 +5,7 @@ Colours are independent of the viewing direction (spherical harmonics of degree 
 """
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning.pytorch import LightningModule
@@ -76,8 +76,16 @@ class ReconstructModule(LightningModule):
             raise UserError(f"max_gaussians = {max_gaussians} is less than initial_gaussians = {initial_gaussians}")
         self.save_hyperparameters()
         shapes = {"means": (0, 3), "log_scales": (0, 3), "quaternions": (0, 4), "logits": (0,), "harmonics": (0, 1, 3)}
+        self.means: nn.Parameter
+        self.log_scales: nn.Parameter
+        self.quaternions: nn.Parameter
+        self.logits: nn.Parameter
+        self.harmonics: nn.Parameter
         for name in PARTS:
             setattr(self, name, nn.Parameter(torch.empty(shapes[name])))
+        self.gradient: Tensor
+        self.count: Tensor
+        self.size: Tensor
         self.register_buffer("gradient", torch.zeros(0))
         self.register_buffer("count", torch.zeros(()))
         self.register_buffer("size", torch.ones(()))
@@ -157,7 +165,7 @@ class ReconstructModule(LightningModule):
         images, alphas = self.render(chosen, self.batch.background)
         one, other = images.permute(0, 3, 1, 2), truth.permute(0, 3, 1, 2)
         difference, outline = (images - truth).abs().mean(), (alphas - masks).abs().mean()
-        similarity = structural_similarity_index_measure(one, other, data_range=1.0)
+        similarity = cast(Tensor, structural_similarity_index_measure(one, other, data_range=1.0))  # a pair only with an image of it
         loss = (1 - self.hparams.ssim) * difference + self.hparams.ssim * (1 - similarity) + self.hparams.silhouette * outline
         if here % self.trainer.log_every_n_steps == 0:
             square = (images.detach() - truth).square().mean()
@@ -186,6 +194,7 @@ class ReconstructModule(LightningModule):
         cameras = self.batch.cameras
         depth = (self.means @ cameras.viewmats[:, 2, :3].T + cameras.viewmats[:, 2, 3]).mean(1).abs()
         scale = 0.5 * cameras.width / float(cameras.Ks[:, 0, 0].mean())
+        assert self.means.grad is not None  # a step came before
         self.gradient += self.means.grad.norm(dim=1) * depth * scale
         self.count += 1
 

@@ -121,12 +121,12 @@ def bind(gaussians: Gaussians, x: Tensor, *, nearest: int = 10, reach: float = R
         nearest: Maximum number of particles of a Gaussian.
         reach: Maximum squared Mahalanobis distance [-].
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     means, covariances = gaussians.means.detach().double().cpu(), gaussians.covariances.detach().double().cpu()
     points = x.detach().double().cpu()
     many = min(4 * nearest, len(points))
-    _, index = cKDTree(points.numpy()).query(means.numpy(), k=many)
+    _, index = KDTree(points.numpy()).query(means.numpy(), k=many)
     index = torch.as_tensor(np.asarray(index).reshape(len(means), many))
     d = points[index] - means[:, None]
     small = 1e-12 * covariances.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=1e-30)
@@ -208,7 +208,7 @@ def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
     columns = [gaussians.means, torch.zeros_like(gaussians.means), base, rest, *shape]
     table = torch.cat([c.detach().double().cpu() for c in columns], 1).numpy().astype(np.float32)
     vertices = np.empty(len(table), [(name, "f4") for name in column_names(rest.shape[1])])
-    for name, column in zip(vertices.dtype.names, table.T, strict=True):
+    for name, column in zip(vertices.dtype.names or (), table.T, strict=True):
         vertices[name] = column
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
 
@@ -225,7 +225,7 @@ def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device
         UserError: The file is missing, is not a PLY file, or its vertices lack properties of a Gaussian.
     """
     vertices = read_gaussian_vertices(Path(path))
-    rest = sum(name.startswith("f_rest_") for name in vertices.dtype.names)
+    rest = sum(name.startswith("f_rest_") for name in vertices.dtype.names or ())
 
     def columns(*names: str) -> Tensor:
         return torch.from_numpy(np.stack([vertices[name].astype(np.float64) for name in names], 1))

@@ -60,6 +60,8 @@ class LPIPS(nn.Module):
             groups.append(nn.Sequential(*layers))
         self.groups = nn.ModuleList(groups)
         self.heads = nn.ModuleList([nn.Conv2d(c, 1, 1, bias=False) for c in self.channels])
+        self.shift: Tensor
+        self.spread: Tensor
         self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1))
         self.register_buffer("spread", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1))
         self._load_heads()
@@ -92,7 +94,7 @@ class LPIPS(nn.Module):
             raise UserError(f"lpips_backbone = {path} cannot be read: {one_line(error)}") from error
         if not isinstance(weights, dict) or not all(isinstance(name, str) and isinstance(t, Tensor) for name, t in weights.items()):
             raise UserError(f"lpips_backbone = {path} holds no tensors by name")
-        convolutions = [layer for group in self.groups for layer in group if isinstance(layer, nn.Conv2d)]
+        convolutions = [layer for group in self.groups for layer in group.children() if isinstance(layer, nn.Conv2d)]
         names = sorted({int(found[1]) for name in weights if (found := re.match(r"features\.([0-9]{1,4})\.", name))})
         if len(names) != len(convolutions):
             raise UserError(f"lpips_backbone = {path} has {len(names)} layers of features; {self.net} has {len(convolutions)}")

@@ -126,6 +126,8 @@ class MatchedRMSE(Metric):
 
     full_state_update = False
     higher_is_better = False
+    total: Tensor
+    points: Tensor
 
     def __init__(self, **kwargs: Any):
         super().__init__(**kwargs)

@@ -19,15 +19,21 @@ CD_SCALE = 1e4
 """Factor on Chamfer distances in unit-cube coordinates, as in the paper's tables."""
 
 
+def _true_positions(prepared: PreparedScene) -> Tensor:
+    truth = prepared.source.truth
+    assert truth is not None  # callers score against a known truth only
+    return truth.x
+
+
 def chamfer_per_frame(prepared: PreparedScene, motion: ParticleState) -> Tensor:
     """Return the Chamfer distance to the true particles in each frame after the first, times 1e4, (K - 1,); the truth must be known."""
-    target = prepared.source.truth.x[1 : len(motion.x)].to(motion.x)
+    target = _true_positions(prepared)[1 : len(motion.x)].to(motion.x)
     return CD_SCALE * chamfer_distance(motion.x[1 : len(target) + 1], target)
 
 
 def floor_per_frame(prepared: PreparedScene) -> Tensor:
     """Return the `resampling_floor` of the truth in each frame after the first, times 1e4, (T - 1,), whatever the prediction."""
-    return CD_SCALE * resampling_floor(prepared.source.truth.x[1:].to(prepared.simulator.state.x))
+    return CD_SCALE * resampling_floor(_true_positions(prepared)[1:].to(prepared.simulator.state.x))
 
 
 def score_motion(prepared: PreparedScene, motion: ParticleState, floor: Tensor | None = None) -> list[dict[str, float]]:

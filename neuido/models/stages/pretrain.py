@@ -95,7 +95,6 @@ class PretrainModule(LightningModule):
         self.register_buffer("stress_epsilon", torch.ones(trajectory_count))
         self.register_buffer("residual_epsilon", torch.full((trajectory_count,), RESIDUAL_FLOOR))
         self.register_buffer("family_mean", torch.eye(trajectory_count), persistent=False)
-        self.metrics: ConstitutiveMetrics | None = None
         self.families: list[str] = []
 
     def _start_from(self, init_from: str) -> None:

@@ -103,6 +103,7 @@ class Projector(nn.Module):
             spread: Initial standard deviation of z relative to that of the latents.
         """
         last = self.head[-1]
+        assert isinstance(last, nn.Linear)
         centred = latents - latents.mean(0)
         mix = torch.randn(len(latents), last.in_features, dtype=latents.dtype) / last.in_features**0.5
         last.weight.copy_(spread * centred.T @ mix / max(1, len(latents) - 1) ** 0.5)

@@ -89,6 +89,7 @@ class FlowVAE(nn.Module):
             raise UserError(f"width = {width} must be a multiple of 8, and latent_channels = {latent_channels} at least 1")
         self.config = {"width": width, "latent_channels": latent_channels, "last_norm": last_norm}
         self.channels = latent_channels
+        last = CausalConv3d(2 * width, 2 * latent_channels)
         self.encoder = nn.Sequential(
             CausalConv3d(12, width),
             Residual(width),
@@ -97,7 +98,7 @@ class FlowVAE(nn.Module):
             CausalConv3d(2 * width, 2 * width, stride=(2, 2, 2)),
             Residual(2 * width),
             *([Activation(2 * width)] if last_norm else []),
-            CausalConv3d(2 * width, 2 * latent_channels),
+            last,
         )
         self.decoder = nn.ModuleList(
             [
@@ -112,8 +113,9 @@ class FlowVAE(nn.Module):
             ]
         )
         with torch.no_grad():  # little noise at first; otherwise the decoder learns to ignore the latent
-            self.encoder[-1].conv.bias[latent_channels:] = -6.0
-            self.encoder[-1].conv.weight[latent_channels:] *= 0.1
+            last.conv.bias[latent_channels:] = -6.0
+            last.conv.weight[latent_channels:] *= 0.1
+        self.scale: Tensor
         self.register_buffer("scale", torch.ones(()))
         self.card: dict[str, Any] = {}
 
