@@ -11,7 +11,7 @@ from argparse import ArgumentError
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import neuido
 from neuido.commands.cli import interruption
@@ -62,7 +62,7 @@ def run_lightning(args: list[str]) -> "LightningCLI":
 def _run(args: list[str]) -> "LightningCLI":
     words = rename_in_arguments(expanded(args), "model.method", MODULES)
     try:
-        make: Callable[..., LightningCLI] = _cli_class()
+        make = cast("Callable[..., LightningCLI]", _cli_class())  # it takes `stated` as well
         return make(args=words, stated=stated_options(args), **_settings())
     except RuntimeError as error:
         if str(error).startswith("Error(s) in loading state_dict"):

@@ -121,11 +121,11 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
     r, J = evaluate(values)
     cost, damping = cost_of(r), np.full(rows, 1e-4)
     for _ in range(ITERATIONS):
-        usable = np.isfinite(J).all((1, 2)) & np.isfinite(r).all(1)
+        usable = np.asarray(np.isfinite(J).all((1, 2)) & np.isfinite(r).all(1))
         Jc, rc = np.where(usable[:, None, None], J, 0.0), np.where(usable[:, None], r, 0.0)
         A, g = np.einsum("pmi,pmj->pij", Jc, Jc), np.einsum("pmi,pm->pi", Jc, rc)
         # a parameter at its bound that wants to go on is held there
-        held = np.asarray(((values <= low) & (g > 0)) | ((values >= high) & (g < 0)))
+        held = ((values <= low) & (g > 0)) | ((values >= high) & (g < 0))
         free = ~held
         A = A * free[:, :, None] * free[:, None, :]
         A = A + np.eye(k) * (held[:, :, None] + damping[:, None, None] * np.einsum("pii->pi", A)[:, :, None] + 1e-12)

@@ -115,7 +115,7 @@ def simulate_condition(condition: Condition, known: list[tuple[PreparedScene, La
         placed = [_place(body, prepared) for body, (prepared, _) in zip(condition.bodies, chosen)]
         _apart([body for body, _ in placed], first.source.scene.dx)
         joined = Body(*(torch.cat([getattr(body, name) for body, _ in placed]) for name in ("x", "v", "volume")))
-        device = first.volume.device
+        device = first.images.device
         density = first.source.density
         if any(prepared.source.density != density for prepared, _ in chosen):
             raise UserError("the bodies have different densities; a scene has one density")

@@ -112,6 +112,7 @@ class FlowVAE(nn.Module):
                 CausalConv3d(width, 12),
             ]
         )
+        assert last.conv.bias is not None  # as is usual of a convolution
         with torch.no_grad():  # little noise at first; otherwise the decoder learns to ignore the latent
             last.conv.bias[latent_channels:] = -6.0
             last.conv.weight[latent_channels:] *= 0.1
