@@ -208,19 +208,6 @@ def _body(folder: Path) -> None:
     exports.write(folder / "particles.csv", ["t,id,x,y,z", *lines])
 
 
-def _c3d(folder: Path) -> None:
-    import ezc3d
-
-    made = ezc3d.c3d()
-    made["parameters"]["POINT"]["RATE"]["value"] = [30.0]
-    made["parameters"]["POINT"]["LABELS"]["value"] = ("ball",)
-    made["parameters"]["POINT"]["UNITS"]["value"] = ("m",)
-    points = np.ones((4, 1, 31))
-    points[:3, 0] = exports.FLIGHT.T
-    made["data"]["points"] = points
-    made.write(str(folder / "ball.c3d"))
-
-
 def _trajectories(folder: Path) -> None:
     from neuido.data.trajectories.trajectory_files import FORMAT
 
@@ -484,7 +471,7 @@ GROUPS = {
         _importer("vicon", exports.vicon, "vicon.csv"),
         _importer("trc", exports.trc, "ball.trc"),
         _importer("deeplabcut", _deeplabcut, "dlc.csv", scale=0.005, y_down=True, frame_rate=30.0),
-        _importer("c3d", _c3d, "ball.c3d"),
+        _importer("c3d", exports.c3d, "ball.c3d"),
         _importer("body", _body, "particles.csv", density=1000.0, young=5e4, floor=0.0),
     ),
     "results": (

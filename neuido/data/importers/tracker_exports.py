@@ -1,6 +1,7 @@
 """Reader of tracker and motion-capture exports: OptiTrack, Vicon, TRC, DeepLabCut, C3D and plain tables."""
 
 import re
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -122,14 +123,23 @@ def _deeplabcut(path: Path, rows: list[list[str]]) -> Motion:
 
 
 def _c3d(path: Path) -> Motion:
-    ezc3d = import_extra("ezc3d", path.name)
-    with parser_errors(path, "C3D file"):
-        content = ezc3d.c3d(str(path))
-        given = content["parameters"]["POINT"]
-        x = np.asarray(content["data"]["points"], dtype=float)[:3]
-        rate, labels, unit = float(given["RATE"]["value"][0]), list(given["LABELS"]["value"]), (given["UNITS"]["value"] or ["mm"])[0]
-    points = {str(name): x[:, i].T.copy() for i, name in enumerate(labels[: x.shape[1]])}
-    return Motion(np.arange(x.shape[2]) / rate, points, unit, False, [f"C3D, {len(points)} markers, {rate:g} Hz"])
+    c3d = import_extra("c3d", path.name)
+    with parser_errors(path, "C3D file"), path.open("rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        reader = c3d.Reader(file)
+        labels = [label.strip() for label in reader.point_labels]
+        rate, given = float(reader.point_rate), reader.get("POINT:UNITS")
+        unit = given.string_value.strip("\0 ") if given is not None else ""
+        frames = [points[:, :4].copy() for _, points, _ in reader.read_frames(copy=False)]
+        declared = reader.last_frame - reader.first_frame + 1
+    if len(frames) < declared or not frames:
+        raise UserError(f"{path} is truncated: it states {declared} frames and has {len(frames)}")
+    if not rate > 0.0:
+        raise UserError(f"{path}: the rate of the points is {rate:g} Hz and must be positive")
+    data = np.asarray(frames, dtype=float)
+    x = np.where(data[..., 3:] < 0.0, np.nan, data[..., :3])  # a negative residual marks a point that was not seen
+    points = {name: x[:, i].copy() for i, name in enumerate(labels[: x.shape[1]]) if name}
+    return Motion(np.arange(len(x)) / rate, points, unit or "mm", False, [f"C3D, {len(points)} markers, {rate:g} Hz"])
 
 
 def _plain(path: Path, columns: dict[str, str]) -> Motion:

@@ -137,12 +137,30 @@ def trc(path):
     return write(path / "ball.trc", [*head, *(f"{i + 1}\t{row}" for i, row in enumerate(table(T, *(1e3 * FLIGHT.T), separator="\t")))])
 
 
-@pytest.mark.parametrize("make", [tracker, millimetres, epoch, optitrack, vicon, trc])
+def c3d(path):
+    made = pytest.importorskip("c3d").Writer(point_rate=30.0, point_units="mm", point_scale=-1.0)
+    made.set_point_labels(["ball"])
+    points = np.zeros((len(FLIGHT), 1, 5), np.float32)
+    points[:, 0, :3] = 1e3 * FLIGHT
+    made.add_frames([(frame, np.zeros((0, 0))) for frame in points])
+    with (path / "ball.c3d").open("wb") as file:
+        made.write(file)
+    return path / "ball.c3d"
+
+
+@pytest.mark.parametrize("make", [tracker, millimetres, epoch, optitrack, vicon, trc, c3d])
 def test_tracks(tmp_path, make):
     neuido.import_file(make(tmp_path), tmp_path / "out", mass=0.06, diameter=0.07)
     (track,) = neuido.read_tracks(tmp_path / "out").recordings
     np.testing.assert_allclose(track.t, T, atol=2e-6)
     np.testing.assert_allclose(track.x, FLIGHT, atol=2e-6)
+
+
+def test_a_truncated_c3d_file_is_refused(tmp_path):
+    path = c3d(tmp_path)
+    path.write_bytes(path.read_bytes()[:-1024])
+    with pytest.raises(UserError, match=r"ball\.c3d is truncated: it states 31 frames"):
+        neuido.import_file(path, tmp_path / "out")
 
 
 def test_pixels_of_deeplabcut(tmp_path):
