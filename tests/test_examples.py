@@ -22,11 +22,11 @@ ANSWERS = {  # what each must print
     "04": r"-0\.\d+ m for each 1/s of drag",
     "05": r"d height / d modulus",
     "06": r"the methods end \d\.\d mm apart",
-    "07": r"lacks strain_stiffening",
-    "08": r"drag_quadratic",
+    "07": r"lacks strain stiffening",
+    "08": r"lacks quadratic air drag",
     "09": r"torch\.Size\(\[6, 2, 96, 96, 3\]\)",
     "10": r"Young's modulus read from the video: \d+ kPa, Poisson's ratio 0\.\d+",
-    "11": r"lacks drag_linear",
+    "11": r"lacks linear air drag",
     "12": "",
 }
 

@@ -110,7 +110,7 @@ from neuido import laws
 
 young = torch.tensor([1e5], requires_grad=True)  # Pa
 elastic = laws.FixedCorotated(young, 0.3)
-plastic = laws.VonMises(young, 0.3, yield_stress=2e3)
+plastic = laws.VonMises(2e3, young, 0.3)
 """,
     "load_scene": """
 from pathlib import Path

@@ -170,7 +170,7 @@ def test_command_writes_all(tmp_path, monkeypatch):
     assert stop.value.code == 0
     assert {path.name for path in tmp_path.iterdir()} == {
         "directions.csv", "embedding.csv", "embedding.png", "interpolation.csv", "interpolation.npz", "interpolation.png",
-        "monotonicity.csv", "pairs.csv", "silhouettes.csv"}  # fmt: skip
+        "monotonicity.csv", "pairs.csv", "setup.json", "silhouettes.csv"}  # fmt: skip
     assert len(read_rows(tmp_path / "embedding.csv")) == 90
     assert [row["space"] for row in read_rows(tmp_path / "silhouettes.csv")] == list(latents.SPACES)
     assert [row["share"] for row in read_rows(tmp_path / "interpolation.csv")] == [0.0, 0.5, 1.0]
