@@ -267,6 +267,7 @@ def test_killed_run_goes_on_to_the_same_answer(folders, track_answer, tmp_path):
     assert (out / "model_after.yaml").read_text() == (track_answer / "model_after.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_track_with_its_drag_declared_lacks_nothing(folders, track_answer, tmp_path, capsys):
     status, out, _ = run(capsys, folders["track"], "--out", tmp_path / "out", "--model", track_answer / "model_after.yaml")
     assert status == 0

@@ -112,7 +112,9 @@ def test_an_interrupted_fit_goes_on_to_the_same_bits(made, tmp_path):
     assert resumed.keys() == whole.keys() and all(torch.equal(resumed[name], whole[name]) for name in whole)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)]
+)
 def test_a_light_command_ends_with_the_signal_and_leaves_nothing_half_written(tmp_path, number):
     args = ["trajectories", "--out", "out", "--instances=1", "--held_out=0", "--setup.steps=200000", "--device=cpu", "--progress=false"]
     process = begin(tmp_path, *args)

@@ -187,6 +187,7 @@ PAIR = {"a": 0.83, "chirp.c": -18.6, "jerk.c": -17.2}
 """Two effects of which neither, alone, comes near to what they do together."""
 
 
+@pytest.mark.slow
 def test_two_effects_grow_together_where_neither_is_named_alone(monkeypatch):
     problem = Swing(PAIR, together=True, jerk=True)
     found = diagnose(problem, draws=39)

@@ -940,6 +940,7 @@ def test_a_neighbour_takes_the_place_of_an_effect_once_the_other_one_was_found(m
     assert names(diagnose(problem, most=2)) == ["high", "mix"]
 
 
+@pytest.mark.slow
 def test_what_fits_beside_the_wrong_effect_is_tried_beside_the_others(monkeypatch):
     """`mix` leads alone, and `high` fits beside it but foretells nothing: it belongs beside `low`."""
     monkeypatch.setattr(Inference, "growing_pairs", lambda *_: [])  # they would find them before

@@ -131,6 +131,7 @@ def test_a_held_out_half_of_a_test_starts_where_the_first_ends(tmp_path):
     assert MaterialProblem(tmp_path).predict([{}], 1)[0][0] > then[0]  # a virgin specimen, stretched to 1.7 %
 
 
+@pytest.mark.slow
 def test_kinematic_hardening_of_steel_is_told_from_isotropic(tmp_path):
     strain = np.concatenate([np.linspace(0, 0.015, 16), np.linspace(0.013, -0.015, 15), np.linspace(-0.013, 0.015, 15)])
     steel = {"elasticity": {"law": "sigma", "young": 2e11, "poisson": 0.3}, "plasticity": {"law": "von_mises", "yield_stress": 3e8},

@@ -142,6 +142,7 @@ def test_drag_is_found_from_video_alone(folders):
         assert after["outline_mm"] == pytest.approx(after["outline_px"] * problem_of(folders["drag"]).footage[0].millimetres, rel=0.05)
 
 
+@pytest.mark.slow
 def test_nothing_is_found_where_nothing_is_missing(folders):
     d = diagnose(problem_of(folders["null"], "drag_linear", "viscosity_shear", "uniform_acceleration"), draws=39)
     assert d.answer == "none"

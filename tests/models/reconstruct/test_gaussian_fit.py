@@ -52,6 +52,7 @@ def report(folder) -> dict:
     return json.loads((folder / "report.json").read_text())
 
 
+@pytest.mark.slow
 def test_figures(box):
     figures = report(box / "reconstruction")
     assert figures["psnr_held_out"] > 27 and figures["psnr_train"] > figures["psnr_held_out"]

@@ -42,6 +42,7 @@ def frames(count, many, seed):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.slow
 def test_all_pairs_equal_the_tree(dtype):
     """The GPU's kernel, here on the CPU; a distance of 1e-6 between points near 1 must survive, which |a|^2 + |b|^2 - 2 a.b loses."""
     a, b = frames(3, 400, 20).to(dtype), frames(3, 330, 30).to(dtype)

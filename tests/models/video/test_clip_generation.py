@@ -97,6 +97,7 @@ def test_vae_training_learns(folder, tmp_path):
     assert vae.card["figures"]["val/error"] == pytest.approx(after["val/error"], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_warm_up_learns_and_touches_the_projector_alone(folder, tmp_path):
     seed_everything(0)
     torch.manual_seed(0)

@@ -57,6 +57,7 @@ def processes(count: int) -> None:
         assert done.returncode == 0 and done.stdout.strip() == "whole", (done.returncode, done.stderr[-600:])
 
 
+@pytest.mark.slow
 def test_eight_threads_of_fresh_processes_build_the_kernels_at_once():
     processes(2)
 
