@@ -4,6 +4,7 @@ import pytest
 import yaml
 
 import neuido
+from neuido.commands.cli.config_files import find_config
 from neuido.commands.cli.mistakes import check_configurations
 from neuido.commands.cli.wrong_values import placed
 from neuido.errors import UserError, suggest
@@ -234,3 +235,14 @@ def test_wandb_without_an_account_is_one_line_with_the_way_out(capsys, monkeypat
 
     monkeypatch.setattr("neuido.commands.cli.trainer._run", refused)
     one_line(capsys, ["fit", "--config", "quickstart"], "api_key not configured", "WANDB_MODE=offline")
+
+
+@pytest.mark.parametrize(
+    ("config", "option"),
+    [("predict", "--model.init_from"), ("predict", "--model.init_args.init_from"), ("adapt_small", "--model.method.init_args.init_from")],
+)
+def test_a_file_that_an_option_takes_is_no_configuration(tmp_path, config, option):
+    (weights := tmp_path / "encoder.safetensors").write_bytes(b"\x90\x01class_path: os.system")
+    check_configurations(["predict", "--config", find_config(config), option, str(weights)])
+    with pytest.raises(UserError, match=r"encoder\.safetensors"):
+        check_configurations(["predict", "--config", find_config(config), option.partition(".init_")[0], str(weights)])

@@ -251,12 +251,26 @@ def _check_words(args: list[str], content: Mapping[str, Any], *, trust: bool) ->
         if value is None and first not in ("h", "help", "print_config"):
             raise UserError(f"--{name} needs a value")
         if first in ("trainer", "model", "data") and value and not trust and Path(value).is_file():
-            check_trust(Path(value), read_yaml(Path(value)))
+            if not _takes_text(rest, first, content.get(first)):
+                check_trust(Path(value), read_yaml(Path(value)))
         if first == "trainer" and rest and rest[0] in NAMED and value and rest[1:] in ([], ["class_path"]):
             if re.fullmatch(r"[A-Za-z_][\w.]*", value) and value not in ("true", "false", "null"):
                 resolve(rest[0], value, f"--{name}", "")
         if first in BASES:
             _check_word(name, rest, first, content.get(first), value or "")
+
+
+def _takes_text(rest: list[str], key: str, given: Any) -> bool:
+    """Return whether `--model.method.init_from` and the like is text or a path: a file named there is no configuration."""
+    rest = rest[1:] if rest[:1] == ["init_args"] else rest
+    given = {"class_path": given} if isinstance(given, str) else given
+    class_path = str(given.get("class_path")) if isinstance(given, Mapping) else ""
+    found = signature(TRAINER if key == "trainer" else class_named(key, class_path) or class_path)
+    if not rest or found is None:
+        return False
+    if rest[0] in BASES:
+        return _takes_text(rest[1:], rest[0], (given.get("init_args") or {}).get(rest[0]))
+    return len(rest) == 1 and rest[0] in found.options and found.options[rest[0]].type.removesuffix(" or null") in ("text", "path")
 
 
 def given_options(args: list[str]) -> Iterator[tuple[str, str | None]]:
