@@ -132,7 +132,12 @@ def test_missing_configuration(capsys, command):
     assert_one_line(capsys, [command, "--config", "nowhere.yaml"], "nowhere.yaml", "--config")
 
 
-def test_missing_configuration_of_the_demo(capsys):
+def test_missing_configuration_of_the_demo(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert_one_line(capsys, ["demo", "--settings", "nowhere"], "nowhere", "--settings")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "runs" / "demo").mkdir(parents=True)  # a demonstration that was made hides the mistake no more
+    (tmp_path / "runs" / "demo" / "demo.json").write_text('{"settings": "quickstart"}')
     assert_one_line(capsys, ["demo", "--settings", "nowhere"], "nowhere", "--settings")
 
 

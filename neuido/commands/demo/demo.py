@@ -41,8 +41,10 @@ def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "
     if not chosen:
         raise UserError(f"parts = {parts!r} names none: choose from {', '.join(PARTS)}")
 
+    from neuido.commands.cli.config_files import find_config
     from neuido.physics.runtime.threads import one_thread_each
 
+    find_config(settings, "--settings")
     folder, sections = Path(out), []
     with claimed_folder(folder, {"settings": settings}, "a demonstration with other settings", file="demo.json", keeps=MADE):
         with one_thread_each():
