@@ -80,14 +80,42 @@ class Marks(NamedTuple):
             return []
         out = []
         for kind, seen in ((INVERTED, found & (self.lowest < -FLAT)), (CRUSHED, found & (self.lowest >= -FLAT))):
-            for s in torch.unique(self.scene[seen]).tolist():
-                own = ((self.scene == s) & seen).nonzero()[:, 0]
-                steps = self.since[own]
-                at = int(steps.argmin())
-                step = int(steps[at]) + 1
-                out.append(Event(kind, s, len(own), int((self.scene == s).sum()), int(own[at]), step, step * self.dt[s],
-                                 math.ceil(step / self.every[s]), float(self.lowest[own].min()), self.what))  # fmt: skip
+            out += _scene_events(kind, seen, self.since + 1, self.lowest, self.scene, self.dt, self.every, self.what)
         return out
+
+
+def _scene_events(
+    kind: str,
+    seen: Tensor,
+    step: Tensor,
+    extreme: Tensor,
+    scene: Tensor,
+    dt: Sequence[float],
+    every: Sequence[int],
+    what: str = "particles",
+) -> list[Event]:
+    """Return an event of one kind for each scene with an affected particle or element.
+
+    Args:
+        kind: `Event.kind`.
+        seen: Which particles or elements are affected, (N,) bool.
+        step: `Event.step` of each, (N,).
+        extreme: Smallest det F or largest logarithmic stretch of each [-], (N,).
+        scene: The scene of each, (N,).
+        dt: Step of each scene [s].
+        every: Steps between two frames of each scene.
+        what: `Event.what`.
+    """
+    out = []
+    for s in torch.unique(scene[seen]).tolist():
+        inside = scene == s
+        own = (inside & seen).nonzero()[:, 0]
+        at = int(step[own].argmin())
+        first = int(step[own[at]])
+        worst = extreme[own].max() if kind == OUTSIDE else extreme[own].min()
+        out.append(Event(kind, s, len(own), int(inside.sum()), int(own[at]), first, first * dt[s],
+                         math.ceil(first / every[s]), float(worst), what))  # fmt: skip
+    return out
 
 
 def checked_option(value: str) -> str:
@@ -194,10 +222,4 @@ def strain_events(F: Tensor, limit: float, scene: Tensor, dt: Sequence[float]) -
             beyond = part[stretch > limit]
             since[beyond] = torch.where(since[beyond] < 0, k, since[beyond])
             largest[part] = torch.maximum(largest[part], stretch)
-    out = []
-    for s in torch.unique(scene[since >= 0]).tolist():
-        own = ((scene == s) & (since >= 0)).nonzero()[:, 0]
-        at = int(since[own].argmin())
-        k = int(since[own][at])
-        out.append(Event(OUTSIDE, s, len(own), int((scene == s).sum()), int(own[at]), k, k * dt[s], k, float(largest[own].max())))
-    return out
+    return _scene_events(OUTSIDE, since >= 0, since, largest, scene, dt, (1,) * len(dt))
