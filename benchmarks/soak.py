@@ -26,6 +26,7 @@ from neuido.physics.effects import LIBRARY, Effects, ball_inclusion, linear_grad
 from neuido.physics.fem.finite_elements import FiniteElements
 from neuido.physics.laws import ElasticLaw, PlasticLaw, material
 from neuido.physics.laws.neural.symbolic import SymbolicElastic
+from neuido.physics.laws.parametric import lame
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.points.material_point import MODES, Specimen, stress_along
 from neuido.physics.springs.mass_spring import MassSpring, connect
@@ -149,7 +150,7 @@ def laws_of(c: Case) -> tuple[ElasticLaw, PlasticLaw | None, dict[str, float]]:
     classical = "sigma" if c.law == "symbolic" else c.law
     elasticity, plasticity = material({"law": classical, **moduli}, plastic)
     if c.law == "symbolic":  # Hencky's law as the neural laws write it
-        mu, lam = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+        mu, lam = lame(young, poisson)
         W = torch.zeros(1, 4, 7, dtype=torch.float64)
         W[0, 0, 0], W[0, 1, 0] = (lam + 2 / 3 * mu) / 1e5, 2 * mu / 1e5
         elasticity = SymbolicElastic(W)
@@ -183,8 +184,7 @@ def effects_of(c: Case, x: Tensor, moduli: dict[str, float]) -> tuple[Effects | 
 
 def stored(law: str, F: Tensor, moduli: dict[str, float]) -> Tensor:
     """Return the elastic energy per volume of a classical law [Pa], (...)."""
-    young, poisson = moduli["young"], moduli["poisson"]
-    mu, lam = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    mu, lam = lame(**moduli)
     sigma, J = torch.linalg.svdvals(F.double()), torch.linalg.det(F.double())
     e = sigma.clamp(min=1e-12).log()
     if law == "fixed_corotated":
