@@ -20,7 +20,7 @@ from neuido.data.files.values import mapping
 from neuido.data.weight_files import build
 from neuido.errors import UserError
 from neuido.models.video.flow import ENCODINGS, Velocities, encode_flow, measure_velocities
-from neuido.models.video.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, load_state, read_weights, write_weights
+from neuido.models.video.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, read_weights, write_weights
 from neuido.models.video.video_vae import PREFIX, CogVideoXVAE, open_vae
 from neuido.types import MultiViewBatch
 
@@ -274,6 +274,7 @@ class DynamicsEncoder(nn.Module):
         with naming(file, "is no whole file of an encoder"):
             sizes = {key: fitted.config[key] for key in ("latent_dim", "width", "heads", "conditions")}
             encoder = cls(vae, **flow, **sizes)
-            load_state(encoder.projector, own["projector"], file)
-        encoder.card = card
+        if encoder.projector.config != fitted.config:
+            raise UserError(f"encoder: {file}: its projector takes {fitted.config['channels']} channels, its VAE {encoder.vae.channels}")
+        encoder.projector, encoder.card = fitted, card
         return encoder

@@ -213,15 +213,3 @@ def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -
     if metadata.get("format") not in kinds:
         raise UserError(f"{option}: {path} has format {metadata.get('format')!r}, not {' or '.join(map(repr, kinds))}")
     return parse_metadata(metadata, "config", path), tensors, parse_metadata(metadata, "card", path)
-
-
-def load_state(module: nn.Module, tensors: dict[str, Tensor], path: str | os.PathLike) -> None:
-    """Load a state dict.
-
-    Raises:
-        UserError: The tensors do not fit the module.
-    """
-    try:
-        module.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise UserError(f"{path} does not hold the tensors that its configuration names: {error}") from error
