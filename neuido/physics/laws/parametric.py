@@ -179,8 +179,8 @@ class _SingleScene(ParametricLaw):
 
     identity = False
 
-    def __init__(self, law: type[ParametricLaw], correct: bool):
-        self._law, self._plastic = law, correct
+    def __init__(self, law: type[ParametricLaw], plastic: bool):
+        self._law, self._plastic = law, plastic
 
     def scene_laws(self) -> tuple[type[ParametricLaw], ...]:
         return (self._law,)

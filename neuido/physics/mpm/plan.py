@@ -93,11 +93,10 @@ class Plan:
         return (*elastic, *(() if self.plasticity is None else self.plasticity.tensors()))
 
     def key(self, inputs: Sequence[Tensor]) -> tuple | None:
-        """Return the part of the cache key of the launches that shapes do not give; None if they must not be captured."""
+        """Return what the laws and effects add to the cache key of the launches; None if they must not be captured."""
         elastic = self.elasticity.key(inputs[FIXED : self.split])
         plastic = "none" if self.plasticity is None else self.plasticity.key(inputs[self.split :])
-        own = (self.steps, self.every, self.layout, self.spectral, self.flow_kinds, self.compensated)
-        return None if elastic is None or plastic is None else (*own, elastic, plastic)
+        return None if elastic is None or plastic is None else (self.layout, self.spectral, self.flow_kinds, elastic, plastic)
 
     def shortened(self, steps: int) -> "Plan":
         """Return a copy of the plan with another number of substeps."""
