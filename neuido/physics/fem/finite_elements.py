@@ -26,7 +26,7 @@ from neuido.physics.runtime.device import real_of
 from neuido.physics.runtime.events import MarkRecorder, Marks, OnInversion, checked_option, raise_inversions
 from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
-from neuido.physics.runtime.limits import check_memory
+from neuido.physics.runtime.limits import check_frames, check_memory
 from neuido.physics.runtime.threads import one_thread_each, scene_pool
 from neuido.types import Body, ParticleState, Scene
 
@@ -257,7 +257,7 @@ class FiniteElements:
         """
         inner_factor = renamed_option("inner_factor", inner_factor, "finer", finer)
         nan_on_failure = renamed_option("nan_on_failure", nan_on_failure, "lenient", lenient)
-        inputs.check_frames(steps, every)
+        check_frames(steps, every)
         with torch.no_grad():
             given = inputs.prepare(
                 self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass

@@ -11,7 +11,6 @@ from neuido.physics.effects import coefficients
 from neuido.physics.effects.coefficients import Tables
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
-from neuido.physics.runtime.limits import check_limit
 from neuido.types import Particles, ParticleState
 
 
@@ -73,13 +72,6 @@ class RolloutInputs(NamedTuple):
         if self.growth is not None:
             factor = factor * self.growth.detach().double().amax(dim=0)
         return added, factor
-
-
-def check_frames(steps: int, every: int) -> None:
-    """Raise UserError unless `steps` is a positive multiple of `every` and within `NEUIDO_MAX_STEPS`."""
-    check_limit(steps, "NEUIDO_MAX_STEPS", f"steps is {steps}")
-    if steps < 1 or every < 1 or steps % every:
-        raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
 
 
 def prepare(

@@ -26,6 +26,7 @@ from neuido.physics.runtime.events import Marks, OnInversion, checked_option, ra
 from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.threads import scene_pool
+from neuido.physics.runtime.limits import check_frames
 from neuido.types import Body, ParticleState, Scene
 
 COURANT_LIMIT = 1.0
@@ -258,7 +259,7 @@ class Simulator:
             UserError: Before the start, an unstable step; afterwards, a particle that left the domain, is too fast, or is not finite.
         """
         nan_on_failure = renamed_option("nan_on_failure", nan_on_failure, "lenient", lenient)
-        inputs.check_frames(steps, every)
+        check_frames(steps, every)
         if segment is not None and (segment < 1 or steps % segment or segment % every):
             raise UserError(f"segment is {segment}; it must divide steps ({steps}) and be a multiple of every ({every})")
         given = inputs.prepare(

@@ -60,6 +60,13 @@ def check_limit(count: int, name: str, what: str) -> None:
         raise UserError(f"{what}, more than the limit of {limit(name)}: raise it with the environment variable {name}")
 
 
+def check_frames(steps: int, every: int) -> None:
+    """Raise UserError unless `steps` is a positive multiple of `every` and within `NEUIDO_MAX_STEPS`."""
+    check_limit(steps, "NEUIDO_MAX_STEPS", f"steps is {steps}")
+    if steps < 1 or every < 1 or steps % every:
+        raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
+
+
 def check_memory(needed: int, device: "torch.device | str", what: str, change: str, *, own: int = 0) -> None:
     """Check that memory which is about to be allocated is there.
 

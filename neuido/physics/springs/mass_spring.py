@@ -13,7 +13,7 @@ from neuido.errors import UserError
 from neuido.physics.colliders.contact import SLIP, STICKY
 from neuido.physics.colliders.tables import collider_table
 from neuido.physics.runtime.device import real_of, repeated, torch_stream
-from neuido.physics.runtime.limits import check_limit, check_memory
+from neuido.physics.runtime.limits import check_frames, check_memory
 from neuido.physics.springs import spring_kernels
 from neuido.types import Scene, brief_fields
 
@@ -148,9 +148,7 @@ class MassSpring:
         Raises:
             UserError: A motion that is not finite, or steps that are not a multiple of `every`.
         """
-        check_limit(steps, "NEUIDO_MAX_STEPS", f"steps is {steps}")
-        if steps < 1 or every < 1 or steps % every:
-            raise UserError(f"steps is {steps} and every is {every}; steps must be a positive multiple of every")
+        check_frames(steps, every)
         needed = 3 * (steps + 1) * x.numel() * x.element_size()  # positions, velocities, velocities before contact
         check_memory(needed, x.device, f"a rollout of {len(x)} masses over {steps} steps", "lower `steps`")
         start = [t.to(self.mass).contiguous() for t in (x, v, stiffness, damping, grip.reshape(1))]
