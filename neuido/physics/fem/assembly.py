@@ -65,8 +65,8 @@ class BodyMesh(NamedTuple):
     """Particles and weights, (N, k) each, that interpolate a field to the nodes; exact for affine fields."""
     to_elements: tuple[Tensor, Tensor]
     """Particles and positive weights, (E, k) each, for the mean over the particles near an element."""
-    stiffness_bound: Tensor
-    """`meshing.stiffness_bound` of each element [1/m^2], (E,) float64."""
+    stiffness_bound: float
+    """Largest `meshing.stiffness_bound` of an element [1/m^2]."""
 
 
 def body_mesh(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype: torch.dtype) -> BodyMesh:
@@ -96,7 +96,7 @@ def body_mesh(mesh: Mesh, x: Tensor, volume: Tensor, device: torch.device, dtype
         real(weights),
         (to_nodes[0].to(device), real(to_nodes[1])),
         (to_elements[0].to(device), real(to_elements[1])),
-        stiffness_bound(mesh).to(device),
+        float(stiffness_bound(mesh).max()),
     )
 
 

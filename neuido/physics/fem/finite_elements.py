@@ -179,15 +179,16 @@ class FiniteElements:
     ) -> list[float]:
         """Return the ratio of the step to the stable inner step of each scene; arguments as for `inner_steps`."""
         bounds = inputs.waves(self, elasticity, mass, stiffening)
+        viscosities = None if viscosity is None else viscosity.detach().double().tolist()
         out = []
         for assembly in self.assemblies:
             for s in range(assembly.a, assembly.b):
                 modulus, density = bounds[s]
-                bound = float(assembly.meshes[s - assembly.a].stiffness_bound.max())
+                bound = assembly.meshes[s - assembly.a].stiffness_bound
                 omega = 2.0 * math.sqrt(modulus / density * bound)
                 damping = 0.0
-                if viscosity is not None:
-                    eta, zeta = viscosity.detach()[s].double().tolist()
+                if viscosities is not None:
+                    eta, zeta = viscosities[s]
                     damping = 4.0 * bound * (4.0 / 3.0 * eta + zeta) / density
                 # the root of (omega dt)^2 + 2 damping dt = 4
                 step = 4.0 / (damping + math.sqrt(damping**2 + 4.0 * omega**2)) if omega + damping > 0 else math.inf

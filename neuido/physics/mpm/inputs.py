@@ -1,5 +1,6 @@
 """Inputs of a rollout other than the laws, converted to the solver's dtype and device and validated; shared by MPM and FEM."""
 
+from itertools import pairwise
 from typing import NamedTuple, Protocol
 
 import torch
@@ -67,7 +68,7 @@ class RolloutInputs(NamedTuple):
         factor = torch.ones(len(self.gravity), dtype=torch.float64, device=self.mass.device)
         if self.stiffness is not None:
             rho = self.mass.detach().double() / solver.volume.double()
-            parts = zip(solver.particles.offsets[:-1], solver.particles.offsets[1:])
+            parts = pairwise(solver.particles.offsets)
             factor = torch.stack([(self.stiffness[i:j].detach() / rho[i:j]).max() * rho[i:j].min() for i, j in parts])
         if self.growth is not None:
             factor = factor * self.growth.detach().double().amax(dim=0)
@@ -145,10 +146,10 @@ def waves(
     if stiffening is not None:
         modulus = (modulus + stiffening[0]) * stiffening[1]
     rho = (solver.mass if mass is None else mass.detach()).double() / solver.volume.double()
+    least = torch.stack([rho[i:j].min() for i, j in pairwise(solver.particles.offsets)])
     out = []
-    for s, (i, j) in enumerate(zip(solver.particles.offsets[:-1], solver.particles.offsets[1:])):
-        value = float(modulus[s])
+    for s, (value, density) in enumerate(torch.stack([modulus, least], dim=1).tolist()):  # one transfer for all scenes
         if not value >= 0.0:
             raise UserError(f"the law of scene {s} has a P-wave modulus of {value:g} Pa at rest; it must not be negative")
-        out.append((value, float(rho[i:j].min())))
+        out.append((value, density))
     return out

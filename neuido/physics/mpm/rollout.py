@@ -341,7 +341,7 @@ def check(plan: Plan, tape: Tape) -> None:
     setup, found = plan.setup, tape.status.view(-1, 3)
     plan.recorder.add(tape.lowest, tape.since, setup.first_particle, plan.offset)
     finite = torch.isfinite(tape.F[-1]).all(dim=(1, 2))
-    if bool(finite.all()) and not bool(found.any()):
+    if bool(finite.all() & ~found.any()):  # one transfer
         return
     if plan.nan_on_failure:
         invalidate(tape.states[:4], ~finite | (found[:, 0] != 0)[setup.particles.scene.long()], setup.particles.scene)

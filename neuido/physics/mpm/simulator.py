@@ -7,6 +7,7 @@ Method"): P2G with tau(F), grid update, G2P, F_tr = (I + dt C) F, F = F_hat(F_tr
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import torch
@@ -25,8 +26,8 @@ from neuido.physics.runtime.device import as_device
 from neuido.physics.runtime.events import Marks, OnInversion, checked_option, raise_inversions
 from neuido.physics.runtime.frames import Frames
 from neuido.physics.runtime.invalidation import invalidate
-from neuido.physics.runtime.threads import scene_pool
 from neuido.physics.runtime.limits import check_frames
+from neuido.physics.runtime.threads import scene_pool
 from neuido.types import Body, ParticleState, Scene
 
 COURANT_LIMIT = 1.0
@@ -132,10 +133,11 @@ class Simulator:
             UserError: A negative modulus.
         """
         out = []
+        viscosities = None if viscosity is None else viscosity.detach().double().tolist()
         for s, (modulus, density) in enumerate(inputs.waves(self, elasticity, mass, stiffening)):
             dx, viscous = self.scenes[s].dx, math.inf
-            if viscosity is not None:
-                eta, zeta = viscosity.detach()[s].double().tolist()
+            if viscosities is not None:
+                eta, zeta = viscosities[s]
                 viscous = COURANT_LIMIT * dx**2 * density / max(2.0 * (4.0 / 3.0 * eta + zeta), 1e-30)
             out.append(StepLimit(COURANT_LIMIT * dx / max((modulus / density) ** 0.5, 1e-30), viscous))
         return out
@@ -150,12 +152,13 @@ class Simulator:
         """
         given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
         limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
-        crossing = [scene.dx / max(self._speed(s), 1e-30) for s, scene in enumerate(self.scenes)]
+        crossing = [scene.dx / max(speed, 1e-30) for speed, scene in zip(self._speeds(), self.scenes)]
         return min(min(*limit, own) / scene.dt for limit, own, scene in zip(limits, crossing, self.scenes))
 
-    def _speed(self, s: int) -> float:
-        """Return the largest initial speed of the body of scene s [m/s]."""
-        return float(self.state.v[self.particles.offsets[s] : self.particles.offsets[s + 1]].norm(dim=1).max())
+    def _speeds(self) -> list[float]:
+        """Return the largest initial speed of the body of each scene [m/s]."""
+        speed = self.state.v.norm(dim=1)
+        return torch.stack([speed[i:j].max() for i, j in pairwise(self.particles.offsets)]).tolist()
 
     def _rounds_off(self, state: ParticleState, pull: Tensor, steps: int) -> bool:
         """Return whether a step at the largest likely speed is so short that float32 would lose a part of the motion (`RESOLUTION`)."""
@@ -194,9 +197,9 @@ class Simulator:
     ) -> list[str]:
         """Return for each scene why its step is too long, as `check_step` reports it; an empty string where the step is stable."""
         out = []
-        for s, limit in enumerate(self.step_limits(elasticity, viscosity, mass, stiffening)):
+        limits, speeds = self.step_limits(elasticity, viscosity, mass, stiffening), self._speeds()
+        for s, (scene, limit, speed) in enumerate(zip(self.scenes, limits, speeds)):
             why = ""
-            scene = self.scenes[s]
             if scene.dt > limit.of_waves:
                 wave = COURANT_LIMIT * scene.dx / limit.of_waves
                 why = (f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_waves:.3g} s of a wave of {wave:.4g} m/s on "
@@ -206,7 +209,7 @@ class Simulator:
                 eta = float(viscosity[s, 0].detach())
                 why = (f"dt is {scene.dt:g} s in scene {s}, above the limit {limit.of_viscosity:.3g} s of a shear viscosity of "
                        f"{eta:.3g} and a bulk viscosity of {bulk:.3g} Pa s; lower `dt` or the viscosity")  # fmt: skip
-            elif (speed := self._speed(s)) * scene.dt >= scene.dx:
+            elif speed * scene.dt >= scene.dx:
                 why = (f"the body of scene {s} starts with {speed:.4g} m/s and crosses a cell of {scene.dx:.4g} m in a step of "
                        f"{scene.dt:g} s; lower `dt`")  # fmt: skip
             out.append(why)
