@@ -15,7 +15,7 @@ from neuido.errors import UserError
 
 COLLAPSED = 1e-3
 """det F below which matter counts as collapsed [-]."""
-FLAT = 1e-6
+SIGN_TOLERANCE = 1e-6
 """Absolute value of a negative det F above which matter counts as inverted; up to it the sign may be a rounding error."""
 INVERTED, CRUSHED, OUTSIDE = "inverted", "collapsed", "outside training"
 OnInversion = Literal["report", "error"]
@@ -79,7 +79,7 @@ class Marks(NamedTuple):
         if not bool(found.any()):
             return []
         out = []
-        for kind, seen in ((INVERTED, found & (self.lowest < -FLAT)), (CRUSHED, found & (self.lowest >= -FLAT))):
+        for kind, seen in ((INVERTED, found & (self.lowest < -SIGN_TOLERANCE)), (CRUSHED, found & (self.lowest >= -SIGN_TOLERANCE))):
             out += _scene_events(kind, seen, self.since + 1, self.lowest, self.scene, self.dt, self.every, self.what)
         return out
 
