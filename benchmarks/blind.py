@@ -111,7 +111,7 @@ def free_memory(device: str) -> None:
 def diagnose_one(folder: str, out: str, ablation: str, device: str, minutes: float = 0.0, statistics: bool = False) -> str:
     """Diagnose a folder into `out` within a time limit [min] (0: none); return an empty string, or the reason of the failure."""
     from neuido.discrepancy import workflow
-    from neuido.discrepancy.inference import attribution
+    from neuido.discrepancy.inference.search import attribution
     from neuido.discrepancy.report import answer
 
     target = Path(out)
@@ -240,8 +240,8 @@ def score_all(folders: list[Path], out: Path, ablations: list[str]) -> str:
 
 def replay_all(folders: list[Path], out: Path) -> str:
     """Decide all cases again from their kept fits, write replay.csv, and return the table of search recall and decision accuracy."""
-    from neuido.discrepancy.inference.decision import decide
     from neuido.discrepancy.inference.evidence import evidences, judged
+    from neuido.discrepancy.inference.search.decision import decide
     from neuido.discrepancy.inference.statistics import read_fits
 
     rows = []

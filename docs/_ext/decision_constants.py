@@ -70,7 +70,7 @@ SEARCHES = {  # constants of the same files that steer the search, or only what 
 
 def constants(module: str) -> dict[str, tuple[str, str]]:
     """Return the value and the docstring of each constant of a module."""
-    out, body = {}, ast.parse((PACKAGE / f"{module}.py").read_text()).body
+    out, body = {}, ast.parse(next(PACKAGE.rglob(f"{module}.py")).read_text()).body
     for node, after in zip(reversed(body), [None, *reversed(body)][: len(body)], strict=True):
         if not isinstance(node, ast.Assign):
             continue

@@ -102,7 +102,7 @@ def diagnose(
         check_writable(Path(out).expanduser())
 
     from neuido.discrepancy import store
-    from neuido.discrepancy.inference.attribution import diagnose as infer
+    from neuido.discrepancy.inference.search.attribution import diagnose as infer
     from neuido.discrepancy.inference.statistics import write_fits
     from neuido.discrepancy.own_effects import with_own_effects
     from neuido.discrepancy.report import answer

@@ -17,8 +17,8 @@ import neuido
 from neuido.commands.main import main
 from neuido.data.measured.experiment import read_experiment
 from neuido.discrepancy import diagnose
-from neuido.discrepancy.inference.decision import decide
 from neuido.discrepancy.inference.evidence import evidences, judged
+from neuido.discrepancy.inference.search.decision import decide
 from neuido.discrepancy.inference.statistics import read_fits
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.problems.settings import SETTINGS

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuido.discrepancy.inference import attribution
-from neuido.discrepancy.inference.attribution import diagnose
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference.search import attribution
+from neuido.discrepancy.inference.search.attribution import diagnose
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.report import next_experiment
 from neuido.discrepancy.store import AFTER, LEAST_SEARCH, SEARCH, Deadline

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 
-from neuido.discrepancy.inference.attribution import diagnose
+from neuido.discrepancy.inference.search.attribution import diagnose
 from neuido.discrepancy.workflow import Log
 from tests.discrepancy.report.test_answer import Curve
 

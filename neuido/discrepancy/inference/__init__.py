@@ -1,1 +1,1 @@
-"""From a residual to a name: fits, floors, rounds and what is said of them."""
+"""What inference stands on: fits and their floors, what noise and chance do, the records kept of them, and their evidence."""

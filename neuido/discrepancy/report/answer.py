@@ -11,9 +11,9 @@ import yaml
 
 from neuido.data.files.values import file_name
 from neuido.data.files.writing import atomic_write, make_real_folder, remove, write_text
-from neuido.discrepancy.inference.attribution import Diagnosis
 from neuido.discrepancy.inference.floors import Round, Trial
-from neuido.discrepancy.inference.judging import ALPHA
+from neuido.discrepancy.inference.search.attribution import Diagnosis
+from neuido.discrepancy.inference.search.judging import ALPHA
 from neuido.discrepancy.problems.declared_model import beside
 from neuido.discrepancy.report import page
 from neuido.discrepancy.report.answer_content import describe, plain

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 import neuido
-from neuido.discrepancy.inference.attribution import Diagnosis
 from neuido.discrepancy.inference.floors import Part, Round, Trial
-from neuido.discrepancy.inference.intervals import would_help
-from neuido.discrepancy.inference.judging import ALPHA
+from neuido.discrepancy.inference.search.attribution import Diagnosis
+from neuido.discrepancy.inference.search.intervals import would_help
+from neuido.discrepancy.inference.search.judging import ALPHA
 from neuido.discrepancy.problems.problem import Problem
 from neuido.discrepancy.problems.settings import CONTACT_HEIGHT
 from neuido.discrepancy.report import ceiling, next_experiment, residual

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuido.discrepancy.inference.attribution import Diagnosis
 from neuido.discrepancy.inference.floors import Part
+from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.physics.runtime.threads import one_thread_each
 
 WIDTH = 32

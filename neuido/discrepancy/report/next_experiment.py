@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from neuido.data.measured.experiment import Recording as Measured
-from neuido.discrepancy.inference.attribution import Diagnosis
+from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.discrepancy.problems.problem import Point, Problem
 from neuido.errors import UserError
 from neuido.types import AttachedMass, Body, Box

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from neuido.commands.demo.closed_loop import record
-from neuido.discrepancy.inference.attribution import diagnose
-from neuido.discrepancy.inference.decision import decide
 from neuido.discrepancy.inference.evidence import evidences, judged
 from neuido.discrepancy.inference.journal import from_json, to_json
+from neuido.discrepancy.inference.search.attribution import diagnose
+from neuido.discrepancy.inference.search.decision import decide
 from neuido.discrepancy.inference.statistics import read_fits, write_fits
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.problems.problem import Problem

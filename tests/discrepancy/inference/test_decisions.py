@@ -19,9 +19,9 @@ from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.motion import Solver, simulate_motion
-from neuido.discrepancy.inference import attribution
-from neuido.discrepancy.inference.attribution import Diagnosis
-from neuido.discrepancy.inference.rounds import Inference, Round
+from neuido.discrepancy.inference.search import attribution
+from neuido.discrepancy.inference.search.attribution import Diagnosis
+from neuido.discrepancy.inference.search.rounds import Inference, Round
 from neuido.discrepancy.problems.body import BodyProblem, body_problem
 from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.problem import Problem

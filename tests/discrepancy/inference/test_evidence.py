@@ -10,10 +10,10 @@ from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import invgamma, multivariate_normal
 
-from neuido.discrepancy.inference.attribution import diagnose
 from neuido.discrepancy.inference.evidence import KINDS, LEAST, Evidence, at_the_prior_mean, densities, evidences, judged, price, unseen
 from neuido.discrepancy.inference.journal import FitRecord
 from neuido.discrepancy.inference.likelihood import FREEDOM, SCALES, log_densities, log_mean, log_prior, rotated, share
+from neuido.discrepancy.inference.search.attribution import diagnose
 from neuido.discrepancy.inference.statistics import PartStatistics, best_fits, read
 from tests.discrepancy.report.test_answer import Curve
 

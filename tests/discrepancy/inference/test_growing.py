@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from neuido.discrepancy.inference import attribution, base_fits, contests, pairs, refining, rounds
-from neuido.discrepancy.inference.attribution import diagnose
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference import base_fits
+from neuido.discrepancy.inference.search import attribution, contests, pairs, refining, rounds
+from neuido.discrepancy.inference.search.attribution import diagnose
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 
 T = np.linspace(0.01, 1.0, 300)

@@ -12,11 +12,11 @@ import yaml
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.discrepancy import store
-from neuido.discrepancy.inference.attribution import diagnose
-from neuido.discrepancy.inference.intervals import findings
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import levenberg_marquardt, run
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference.search.attribution import diagnose
+from neuido.discrepancy.inference.search.intervals import findings
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.noise import correlation, surface
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from neuido.discrepancy.inference import attribution, choosing, contests, judging, pairs, prospects, refining, rounds
-from neuido.discrepancy.inference.attribution import UNEXPLAINED, WITHIN, diagnose, drop
 from neuido.discrepancy.inference.floors import Round, Stand, Trial, unphysical
-from neuido.discrepancy.inference.intervals import intervals
-from neuido.discrepancy.inference.judging import BACK_GAIN, FORETELLS, GAIN_AT_FLOOR, GAIN_IN_FLOOR, GAIN_TO_NOISE
 from neuido.discrepancy.inference.laboratory import LEAST_GAIN
 from neuido.discrepancy.inference.least_squares import Fit, Race, levenberg_marquardt, run
-from neuido.discrepancy.inference.rounds import Inference, Look, Promising
+from neuido.discrepancy.inference.search import attribution, choosing, contests, judging, pairs, prospects, refining, rounds
+from neuido.discrepancy.inference.search.attribution import UNEXPLAINED, WITHIN, diagnose, drop
+from neuido.discrepancy.inference.search.intervals import intervals
+from neuido.discrepancy.inference.search.judging import BACK_GAIN, FORETELLS, GAIN_AT_FLOOR, GAIN_IN_FLOOR, GAIN_TO_NOISE
+from neuido.discrepancy.inference.search.rounds import Inference, Look, Promising
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.report.answer import trace
 from neuido.discrepancy.report.answer_content import rejected
@@ -759,7 +759,7 @@ def test_what_an_effect_leaves_within_the_floor_is_searched_only_where_another_o
     monkeypatch.setattr(Inference, "floors", lambda self, point, free, floor: np.full(2, 0.15**2))
     assert searches(lambda t: low(t) + 0.25 * np.sin(90 * t)) == (["low"], 1)
     assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t)) == (["high", "low"], 2)  # unless one promises much
-    monkeypatch.setattr("neuido.discrepancy.inference.attribution.FURTHER", 0.0)
+    monkeypatch.setattr("neuido.discrepancy.inference.search.attribution.FURTHER", 0.0)
     assert searches(lambda t: low(t) + 0.25 * np.sin(90 * t))[1] == 2
 
 

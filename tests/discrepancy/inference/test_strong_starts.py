@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuido.discrepancy.inference.attribution import diagnose
-from neuido.discrepancy.inference.contests import LED_FAR
 from neuido.discrepancy.inference.least_squares import Fit
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference.search.attribution import diagnose
+from neuido.discrepancy.inference.search.contests import LED_FAR
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 
 S = np.linspace(-1.0, 1.0, 200)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.discrepancy.inference.attribution import Inference, diagnose
+from neuido.discrepancy.inference.search.attribution import Inference, diagnose
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.problems.settings import CONTACT_HEIGHT, SETTINGS
 from neuido.discrepancy.report import answer_content

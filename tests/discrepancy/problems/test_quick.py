@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuido.discrepancy.inference import attribution, choosing
-from neuido.discrepancy.inference.attribution import diagnose
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference.search import attribution, choosing
+from neuido.discrepancy.inference.search.attribution import diagnose
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.body import BodyProblem, body_problem
 from neuido.discrepancy.problems.settings import EVERY, SETTINGS, SOLVERS
 from neuido.discrepancy.store import CachedProblem

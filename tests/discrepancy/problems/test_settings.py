@@ -8,10 +8,10 @@ import pytest
 from neuido.commands.demo.closed_loop import ELASTIC, record
 from neuido.data.undeclared.motion import Solver, simulate_motion
 from neuido.discrepancy.inference import laboratory
-from neuido.discrepancy.inference.attribution import diagnose
 from neuido.discrepancy.inference.bootstrap import gain
 from neuido.discrepancy.inference.floors import REACH, Floor, Part
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference.search.attribution import diagnose
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.workflow import restricted
 from tests.discrepancy.inference.test_decisions import FALLS, over

@@ -13,7 +13,7 @@ import yaml
 
 from neuido.data.measured.experiment import read_experiment
 from neuido.data.scenes.synthetic import surround_with_gaussians
-from neuido.discrepancy.inference.attribution import diagnose
+from neuido.discrepancy.inference.search.attribution import diagnose
 from neuido.discrepancy.problems import silhouettes
 from neuido.discrepancy.problems.filmed import Splats, looks, read_film
 from neuido.discrepancy.problems.silhouettes import View
@@ -291,7 +291,7 @@ WRONG = {  # folder, what is done to it, words of the line
 
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_video_is_one_line(name, folders, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("neuido.discrepancy.inference.attribution.diagnose", None)  # nobody gets as far
+    monkeypatch.setattr("neuido.discrepancy.inference.search.attribution.diagnose", None)  # nobody gets as far
     kind, spoil, word = WRONG[name]
     folder = tmp_path / "folder"
     shutil.copytree(folders[kind], folder)

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from neuido.discrepancy import store
-from neuido.discrepancy.inference.attribution import diagnose
+from neuido.discrepancy.inference.search.attribution import diagnose
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.report import answer, answer_content, diagnosis_format
 

@@ -9,9 +9,9 @@ import torch
 from neuido.data.measured.experiment import read_experiment
 from neuido.data.measured.track import read_tracks
 from neuido.discrepancy.inference import floors
-from neuido.discrepancy.inference.attribution import Diagnosis
 from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial
 from neuido.discrepancy.inference.least_squares import Fit
+from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.problems.tracks import TrackProblem
 from neuido.discrepancy.report import next_experiment

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from neuido.discrepancy.inference import bootstrap
-from neuido.discrepancy.inference.contests import MANY, SMALL, better
 from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial, times_over, unphysical
 from neuido.discrepancy.inference.journal import place
 from neuido.discrepancy.inference.laboratory import LEAST_GAIN
 from neuido.discrepancy.inference.least_squares import Fit, Race
-from neuido.discrepancy.inference.refining import SOME_GAIN, Refining
+from neuido.discrepancy.inference.search.contests import MANY, SMALL, better
+from neuido.discrepancy.inference.search.refining import SOME_GAIN, Refining
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 from neuido.physics.effects.library import LIMITS
 

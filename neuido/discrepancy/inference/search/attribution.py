@@ -6,16 +6,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from neuido.discrepancy.inference.choosing import first_rounds, told_exactly
-from neuido.discrepancy.inference.decision import case_of, decided
 from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, score, split, times_over
-from neuido.discrepancy.inference.intervals import Hidden, blind_to_settings, findings, hidden, intervals, unable
 from neuido.discrepancy.inference.journal import CaseRecord, Journal
-from neuido.discrepancy.inference.judging import ALPHA, CLASS_RATIO, WITHIN
 from neuido.discrepancy.inference.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.inference.least_squares import Fit, NotFinite
-from neuido.discrepancy.inference.pairs import by_growing, neighbours, simpler, two_effects
-from neuido.discrepancy.inference.rounds import UNEXPLAINED, Inference
+from neuido.discrepancy.inference.search.choosing import first_rounds, told_exactly
+from neuido.discrepancy.inference.search.decision import case_of, decided
+from neuido.discrepancy.inference.search.intervals import Hidden, blind_to_settings, findings, hidden, intervals, unable
+from neuido.discrepancy.inference.search.judging import ALPHA, CLASS_RATIO, WITHIN
+from neuido.discrepancy.inference.search.pairs import by_growing, neighbours, simpler, two_effects
+from neuido.discrepancy.inference.search.rounds import UNEXPLAINED, Inference
 from neuido.discrepancy.inference.statistics import statistics_of
 from neuido.discrepancy.problems.problem import Point, Problem
 from neuido.discrepancy.store import Deadline, Memo, Work

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from neuido.discrepancy.inference.floors import Round, Stand, score
-from neuido.discrepancy.inference.judging import WITHIN
 from neuido.discrepancy.inference.laboratory import LEAST_GAIN
-from neuido.discrepancy.inference.pairs import WORSE, look_ahead
-from neuido.discrepancy.inference.refining import BEYOND
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference.search.judging import WITHIN
+from neuido.discrepancy.inference.search.pairs import WORSE, look_ahead
+from neuido.discrepancy.inference.search.refining import BEYOND
+from neuido.discrepancy.inference.search.rounds import Inference
 
 CLEARLY = 1.5
 """Times the error of another method's first fits at which those of the suggested one are refined first all the same."""

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.discrepancy.inference.base_fits import ELSEWHERE, HORIZONS
-from neuido.discrepancy.inference.contests import FAR, IN_REACH, MANY, SMALL, Contests, better
 from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial, score
 from neuido.discrepancy.inference.least_squares import Fit, Race
+from neuido.discrepancy.inference.search.contests import FAR, IN_REACH, MANY, SMALL, Contests, better
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 
 ABOVE = 2.5

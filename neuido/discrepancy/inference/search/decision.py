@@ -8,9 +8,9 @@ import numpy as np
 
 from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, times_over
 from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, RoundRecord, as_candidate, described, place
-from neuido.discrepancy.inference.judging import STANDS_OUT
 from neuido.discrepancy.inference.least_squares import Fit
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference.search.judging import STANDS_OUT
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 
 

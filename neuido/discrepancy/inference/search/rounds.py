@@ -14,14 +14,14 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.discrepancy.inference import bootstrap
-from neuido.discrepancy.inference.contests import MANY, Contest, better
 from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, score, times_over
 from neuido.discrepancy.inference.journal import Journal
-from neuido.discrepancy.inference.judging import LED_AWAY, WITHIN
 from neuido.discrepancy.inference.laboratory import Tell
 from neuido.discrepancy.inference.least_squares import Fit
-from neuido.discrepancy.inference.prospects import LED_BY, Promising, Prospects
-from neuido.discrepancy.inference.refining import MEASURED, NEAR
+from neuido.discrepancy.inference.search.contests import MANY, Contest, better
+from neuido.discrepancy.inference.search.judging import LED_AWAY, WITHIN
+from neuido.discrepancy.inference.search.prospects import LED_BY, Promising, Prospects
+from neuido.discrepancy.inference.search.refining import MEASURED, NEAR
 from neuido.discrepancy.problems.problem import Candidate, Problem
 from neuido.discrepancy.store import Deadline, Memo
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from neuido.discrepancy.inference.contests import MANY
 from neuido.discrepancy.inference.floors import Round, Stand, Trial, score, times_over, unphysical
 from neuido.discrepancy.inference.laboratory import LEAST_GAIN
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference.search.contests import MANY
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.problem import Candidate, Point
 from neuido.physics.effects.library import LIMITS
 

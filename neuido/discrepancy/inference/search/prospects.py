@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neuido.discrepancy.inference.contests import LEADERS, MANY, SMALL, Start
 from neuido.discrepancy.inference.floors import Floor, Led, Trial
-from neuido.discrepancy.inference.judging import Judging
 from neuido.discrepancy.inference.least_squares import Fit
+from neuido.discrepancy.inference.search.contests import LEADERS, MANY, SMALL, Start
+from neuido.discrepancy.inference.search.judging import Judging
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 
 VAIN = 0.98

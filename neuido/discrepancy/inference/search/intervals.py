@@ -10,9 +10,9 @@ from scipy.stats import t as student
 
 from neuido.discrepancy.inference.base_fits import BaseFits
 from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial
-from neuido.discrepancy.inference.judging import IMPLAUSIBLE
 from neuido.discrepancy.inference.least_squares import Fit
-from neuido.discrepancy.inference.rounds import Inference
+from neuido.discrepancy.inference.search.judging import IMPLAUSIBLE
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.problem import Parameter
 
 QUANTILE = 0.95
