@@ -68,9 +68,14 @@ SEARCHES = {  # constants of the same files that steer the search, or only what 
 }  # fmt: skip
 
 
+def file_of(module: str) -> Path:
+    """Return the file of a module, in whichever of the rooms of inference it is."""
+    return next(PACKAGE.rglob(f"{module}.py"))
+
+
 def constants(module: str) -> dict[str, tuple[str, str]]:
     """Return the value and the docstring of each constant of a module."""
-    out, body = {}, ast.parse(next(PACKAGE.rglob(f"{module}.py")).read_text()).body
+    out, body = {}, ast.parse(file_of(module).read_text()).body
     for node, after in zip(reversed(body), [None, *reversed(body)][: len(body)], strict=True):
         if not isinstance(node, ast.Assign):
             continue

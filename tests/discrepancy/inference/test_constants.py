@@ -23,7 +23,7 @@ def test_each_constant_is_said_to_decide_or_not(module):
 
 def test_unnamed_figures_stand_where_they_are_said_to():
     for module, function, *_ in listed.UNNAMED:
-        assert f"def {function}(" in (listed.PACKAGE / f"{module}.py").read_text()
+        assert f"def {function}(" in listed.file_of(module).read_text()
 
 
 def test_no_figure_is_added():
