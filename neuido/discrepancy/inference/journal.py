@@ -201,11 +201,6 @@ def place(method: int, stand: Stand) -> tuple:
     return method, tuple(sorted(stand.fit.point.items())), tuple(stand.errors.tolist())
 
 
-def parameter_of(p: Parameter) -> dict[str, Any]:
-    """Return a parameter as plain values."""
-    return asdict(p)
-
-
 def candidate_of(c: Candidate) -> dict[str, Any]:
     """Return a candidate as plain values."""
     own = {f.name: getattr(c, f.name) for f in fields(c) if f.name not in ("parameters", "starts", "beside")}
@@ -222,7 +217,7 @@ def as_candidate(content: Mapping[str, Any]) -> Candidate:
 
 def described(problem: Problem) -> tuple[tuple[dict[str, Any], ...], tuple[dict[str, Any], ...]]:
     """Return the declared parameters and the candidates of a problem as plain values."""
-    return tuple(map(parameter_of, problem.declared)), tuple(map(candidate_of, problem.candidates))
+    return tuple(map(asdict, problem.declared)), tuple(map(candidate_of, problem.candidates))
 
 
 def to_json(case: CaseRecord) -> str:
@@ -236,19 +231,20 @@ def from_json(text: str) -> CaseRecord:
     if content.pop("format") != FORMAT:
         raise ValueError(f"not a file of {FORMAT}")
     content["judged"] = tuple(
-        RoundRecord(**{**_tuples(r), "fits": tuple(map(_fit_of, r["fits"])), "members": tuple(r["members"])}) for r in content["judged"]
+        RoundRecord(**{**_tuples(r), "fits": tuple(map(fit_of, r["fits"])), "members": tuple(r["members"])}) for r in content["judged"]
     )
     content["steps"] = tuple(StepRecord(**_tuples(s)) for s in content["steps"])
-    content["bases"] = tuple(map(_fit_of, content["bases"]))
-    content |= {when: _fit_of(content[when]) for when in ("before", "after")}
+    content["bases"] = tuple(map(fit_of, content["bases"]))
+    content |= {when: fit_of(content[when]) for when in ("before", "after")}
     content |= {key: tuple(map(tuple, content[key])) for key in ("parts", "recordings")}
     content |= {key: tuple(content[key]) for key in ("declared", "candidates", "effects", "why")}
     return CaseRecord(**content)
 
 
-def _fit_of(content: Mapping[str, Any]) -> FitRecord:
+def fit_of(content: Mapping[str, Any]) -> FitRecord:
+    """Return the record of plain values."""
     inner = content["finished"]
-    return FitRecord(**{**_tuples(content), "finished": None if inner is None else _fit_of(inner)})
+    return FitRecord(**{**_tuples(content), "finished": None if inner is None else fit_of(inner)})
 
 
 def _tuples(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ single precision, the part of S and N once for all fits of a method.
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from neuido.data.files.writing import atomic_write
 from neuido.discrepancy.inference.base_fits import BaseFits
 from neuido.discrepancy.inference.floors import Floor, score
-from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, Journal, from_json, to_json
+from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, Journal, fit_of, from_json, to_json
 from neuido.errors import UserError
 
 MOST = 24
@@ -99,7 +99,7 @@ def statistics_of(
                 if columns is None:
                     continue
                 k = len(listed)
-                listed.append(json.dumps(_plain(fit)))
+                listed.append(json.dumps(asdict(replace(fit, finished=None, alone=None))))
                 for i, (part, (basis, *_)) in enumerate(zip(laboratory.parts, common, strict=True)):
                     own_columns = columns[part.recording][part.rows]
                     inside = basis.T @ own_columns
@@ -113,9 +113,7 @@ def read(arrays: Mapping[str, np.ndarray]) -> list[FitStatistics]:
     """Return the fits of kept arrays."""
     out = []
     for k, text in enumerate(arrays["fits"]):
-        content = json.loads(str(text))
-        tuples = {key: tuple(content[key]) for key in ("effects", "names", "errors", "spread")}
-        record = FitRecord(**{**content, **tuples})
+        record = fit_of(json.loads(str(text)))
         parts = []
         for i, noise in enumerate(arrays["noise"]):
             common = arrays[f"common-{record.method}-{i}"].astype(float)
@@ -159,11 +157,6 @@ def read_fits(path: Path) -> tuple[CaseRecord, list[FitStatistics]]:
             return case, read(arrays) if "fits" in arrays else []
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise UserError(f"{path} holds no stored fits: {error}") from error
-
-
-def _plain(fit: FitRecord) -> dict:
-    own = {**fit.__dict__, "finished": None, "alone": None}
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in own.items()}
 
 
 def _common(laboratory: BaseFits, floor: Floor) -> list[tuple[np.ndarray, np.ndarray, tuple[int, int]]]:
