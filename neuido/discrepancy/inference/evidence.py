@@ -12,12 +12,13 @@ This is computed beside the present decision, from stored fits, and decides noth
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.special import logsumexp
 
 from neuido.discrepancy.inference.journal import CaseRecord, FitRecord
-from neuido.discrepancy.inference.likelihood import SCALES, log_densities, log_mean, log_prior, rotated, share
+from neuido.discrepancy.inference.likelihood import SCALES, Rotated, log_densities, log_mean, log_prior, rotated, share
 from neuido.discrepancy.inference.statistics import FitStatistics, PartStatistics
 from neuido.discrepancy.problems.problem import Parameter
 
@@ -133,15 +134,17 @@ def densities(
     prior = np.concatenate([np.ones(parts[0].settings.shape[1]), variances])
     scales = SCALES * scale
     weights = log_prior(scales, scale)
-
     counted = {n: share([p for p, own in zip(parts, recordings, strict=True) if own == n]) for n in recordings}
+
+    @cache  # a recording that is fitted as a whole is asked for twice
+    def turned(own: tuple[int, ...]) -> Rotated:
+        return rotated([parts[i] for i in own], [shared[i] for i in own], counted[recordings[own[0]]])
 
     def by_scale(chosen: Sequence[int]) -> np.ndarray:
         by_recording: dict[int, list[int]] = {}
         for i in chosen:
             by_recording.setdefault(recordings[i], []).append(i)
-        made = [rotated([parts[i] for i in own], [shared[i] for i in own], counted[n]) for n, own in by_recording.items()]
-        return log_densities(made, prior, scales)
+        return log_densities([turned(tuple(own)) for own in by_recording.values()], prior, scales)
 
     early = [i for i, f in enumerate(fitted) if f]
     everything = by_scale(range(len(parts)))
