@@ -30,7 +30,7 @@ DECIDES = {  # of the present decision: module -> constant -> what is behind it
     "attribution": {"MOST": CHOSEN},
 }  # fmt: skip
 UNNAMED = [  # figures of the present decision that stand in its code: module, function, value, what it does
-    ("judging", "least_gain", "log(1.5)", "how far above its floor a residual is where the least gain is enough"),
+    ("judging", "gain_over_floor", "log(1.5)", "how far above its floor a residual is where the least gain is enough"),
     ("judging", "as_good", "3 and -0.1", "further parameters with which a rival must be better, and by how much in its score"),
     ("judging", "is_rival", "0.4", "share of the best gain that a member of a class needs"),
     ("choosing", "first_rounds", "log(1.2)", "what another method must do better by, to take the place of the suggested one"),

@@ -100,6 +100,12 @@ def stands_alone(r: Round, t: Trial) -> bool:
     return bool(others) and len(t.candidate.size_parameters) <= SMALL and t.gain - max(others) > LEAST_GAIN
 
 
+def gain_over_floor(over: float) -> float:
+    """Return the gain that an effect must bring by how far the residual is above its floor, a ratio of errors."""
+    steps = [math.log(WITHIN), 0.0, math.log(1.5)]
+    return float(np.interp(math.log(over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
+
+
 class Judging(Refining):
     """Candidates in the place of the leading one, and the decisions of a step."""
 
@@ -334,8 +340,7 @@ class Judging(Refining):
         away = self.moved(r.base) > LED_AWAY
         if away and r.over > WITHIN and self.moved(t.fit.point) < BROUGHT_BACK:
             return BACK_GAIN if r.over > 1.0 else LEAST_GAIN
-        steps = [math.log(WITHIN), 0.0, math.log(1.5)]
-        at_least = float(np.interp(math.log(r.over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
+        at_least = gain_over_floor(r.over)
         return min(at_least, GAIN_TO_NOISE) if (away and r.over > 1.0) or stands_alone(r, t) else at_least
 
     def usual_gain(self, r: Round) -> float:
@@ -344,8 +349,7 @@ class Judging(Refining):
             return max(LEAST_GAIN_EXACT, r.by_chance(ALPHA))
         if self.is_noise(r.errors):
             return GAIN_TO_NOISE
-        steps = [math.log(WITHIN), 0.0, math.log(1.5)]
-        return float(np.interp(math.log(r.over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
+        return gain_over_floor(r.over)
 
     def is_told_by_fit(self, r: Round, t: Trial) -> bool:
         """Whether an effect of few parameters, and no other one by far, brings the fitted recordings from far above the noise down to it.
