@@ -51,7 +51,7 @@ def write(
         begun = time.monotonic()
         content, motion = describe(diagnosis, device=device, seed=seed, tell=tell)
         content["seconds"] = round(spent + time.monotonic() - begun, 1) if seconds is None else seconds
-        made.append((plain(content), motion))
+        made.append((content, motion))
     tell("writing")
     predicted = make_real_folder(out / "predicted", "the folder")
     motions = {f"{file_name(name, 'the name of a recording')}.npz": arrays for _, motion in made for name, arrays in motion.items()}

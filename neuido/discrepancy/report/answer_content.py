@@ -15,7 +15,7 @@ from neuido.discrepancy.problems.problem import Problem
 from neuido.discrepancy.problems.settings import CONTACT_HEIGHT
 from neuido.discrepancy.report import ceiling, next_experiment, residual
 from neuido.discrepancy.report.reader_units import reach
-from neuido.discrepancy.report.wording import title, words_of
+from neuido.discrepancy.report.wording import title
 from neuido.errors import UserError
 
 VERSION = neuido.__version__
@@ -28,7 +28,10 @@ Motion = dict[str, dict[str, np.ndarray]]
 
 
 def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], None] | None = None) -> tuple[dict[str, Any], Motion]:
-    """Return the content of diagnosis.json, and the arrays of each recording: measured, before, after, and what they are over."""
+    """Return the content of diagnosis.json without its words, and the arrays of each recording: measured, before, after, over what.
+
+    The words are in the units of all bodies that are diagnosed together.
+    """
     tell = tell or (lambda line: None)
     tell("motion before and after")
     motion, failed = motions(d)
@@ -86,9 +89,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
             motion[name] |= {key: np.round(255 * own[key]).astype(np.uint8) for key in ("masks", "drawn_before", "drawn_after")}
             content["recordings"][name] |= {"inset": float(own["inset"]), "frame_times": [float(t) for t in own["times"]]}
     content["reach"] = reach(motion, d.problem.unit)
-    content = plain(content)
-    content["words"] = list(words_of(content).paragraphs)
-    return content, motion
+    return plain(content), motion
 
 
 def inner(problem: Problem) -> Any:
