@@ -127,8 +127,9 @@ class Diagnosis:
         if "bodies" not in self._content:
             return {self._content.get("body", self.name): self}
         out = {own["body"]: Diagnosis(self.folder, own, self._keep) for own in self._content["bodies"]}
+        units = Units.of(self._content["bodies"])
         for own in out.values():
-            own._units = Units.of(self._content["bodies"])
+            own._units = units
         return out
 
     @property

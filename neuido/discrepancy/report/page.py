@@ -71,16 +71,16 @@ def page(contents: Sequence[Mapping[str, Any]], motions: Sequence[Motion], *, ki
         kind: `experiment`, `material test` or `track`.
         name: Of what was measured; of the first part where absent.
     """
+    units = Units.of(contents, reach=max(reach(m, c["error"]["unit"]) for c, m in zip(contents, motions)))
     share = 1.0
     while True:
-        made = _page(contents, motions, kind, name or contents[0]["experiment"], share)
+        made = _page(contents, motions, kind, name or contents[0]["experiment"], units, share)
         if len(made.encode()) <= LIMIT or share < 0.05:
             return made
         share *= 0.6
 
 
-def _page(contents: Sequence[Mapping[str, Any]], motions: Sequence[Motion], kind: str, name: str, share: float) -> str:
-    units = Units.of(contents, reach=max(reach(m, c["error"]["unit"]) for c, m in zip(contents, motions)))
+def _page(contents: Sequence[Mapping[str, Any]], motions: Sequence[Motion], kind: str, name: str, units: Units, share: float) -> str:
     figures: list[dict[str, Any]] = []
     count = max(sum(len(m) for m in motions), 1)
     rows = max(int(share * min(plots.MOST_ROWS, CURVE_POINTS // count)), 40)
