@@ -15,7 +15,7 @@ from neuido.data.files.html_page import plain
 from neuido.data.files.parsing import read_arrays
 from neuido.discrepancy.report import diagnosis_format
 from neuido.discrepancy.report.reader_units import Units, axis_of
-from neuido.discrepancy.report.wording import LEADING, MORE, Words, words_of
+from neuido.discrepancy.report.wording import LEADING, MORE, Words, scored_by, words_of
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ class Diagnosis:
             )
             return ErrorChange(before, after, own[0].unit, floor, all(row.held_out for row in own))
         e = self._content["error"]
-        key = "held_out" if "held_out" in e["after"] and e["after"]["held_out"] is not None else "fit"
+        key = scored_by(e["after"])
         before, after = (math.nan if e[when][key] is None else e[when][key] for when in ("before", "after"))
         floor = math.hypot(*(e[name] or 0.0 for name in ("noise_floor", "discretisation_floor")))
         return ErrorChange(before, after, e["unit"], floor, key == "held_out")

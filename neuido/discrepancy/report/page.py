@@ -12,7 +12,7 @@ import numpy as np
 
 from neuido.discrepancy.report import motion_player, plots
 from neuido.discrepancy.report.reader_units import WRITTEN, Units, reach, rounded
-from neuido.discrepancy.report.wording import FIGURES, Words, leading, listed, title, worded, words_of
+from neuido.discrepancy.report.wording import FIGURES, Words, leading, listed, scored_by, title, worded, words_of
 
 LIMIT = 6_000_000
 """Most bytes of a page."""
@@ -262,7 +262,7 @@ def _settings(e: Mapping[str, Any], units: Units) -> list[str]:
     if amounts:
         held = "The predictions hold the differences of other settings, in the amounts that the fitted recordings ask for: "
         out.append(f"{held}{'; '.join(amounts)}.")
-    scored = "held_out" if e["one_setting"]["after"]["held_out"] is not None else "fit"
+    scored = scored_by(e["one_setting"]["after"])
     before, after = (units.said(e["one_setting"][when][scored], e["unit"]) for when in ("before", "after"))
     alone = f"One simulation without them leaves {before} before and {after} after."
     if height := e.get("contact_height"):
@@ -354,7 +354,7 @@ def _summary(contents: Sequence[Mapping[str, Any]], units: Units) -> list[tuple[
             keys = leading(effect["parameters"])
             value = ", ".join(_summary_figure(key, effect["parameters"][key], units) for key in keys)
             said.append(f"{listed([title(name) for name in effect['class']], 'or')}{f': {value}' if value else ''}")
-        scored = "held_out" if e["after"].get("held_out") is not None else "fit"
+        scored = scored_by(e["after"])
         before, after = (units.said(e[when][scored], e["unit"]) for when in ("before", "after"))
         noise = "" if e["noise_floor"] is None else units.said(e["noise_floor"], e["unit"])
         rows.append((c.get("body", c["experiment"]), ANSWERS[c["answer"]], "; ".join(said), before, after, noise))

@@ -172,9 +172,14 @@ def _missing(effects: Sequence[Content], units: Units, *, name: str) -> str:
     )
 
 
+def scored_by(scores: Content) -> str:
+    """Return which error of some scores counts: `held_out` where anything is, else `fit`."""
+    return "held_out" if scores.get("held_out") is not None else "fit"
+
+
 def _error(c: Content, units: Units) -> str:
     e = c["error"]
-    key = "held_out" if e["after"].get("held_out") is not None else "fit"
+    key = scored_by(e["after"])
     before, after = (units.said(e[when].get(key), e["unit"]) for when in ("before", "after"))
     named = "Held-out error" if key == "held_out" else "Error of the fit"
     change = f"{before} before, {after} after" if c["effects"] else after
