@@ -309,13 +309,12 @@ def _figure(q: Quantity) -> str:
 
 def _curves(ax: Any, arrays: Mapping[str, Any], error: ErrorChange, units: Units) -> None:
     """Draw the root mean square distance of the points over time."""
-    import numpy as np
+    from neuido.discrepancy.report.plots import distance_over_time
 
     factor, unit = units.scaled("m")
     for when, colour in (("before", BEFORE), ("after", AFTER)):
-        square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
-        seen = np.isfinite(square).any(axis=1)
-        ax.plot(arrays["t"][seen], factor * np.sqrt(np.nanmean(square[seen], axis=1)), color=colour, label=when, lw=1.2)
+        times, distance = distance_over_time(arrays, when)
+        ax.plot(times, factor * distance, color=colour, label=when, lw=1.2)
     ax.axhline(factor * error.floor, color=INK, ls=":", lw=1, label="floor")
     ax.set(xlabel="time [s]", ylabel=f"RMS distance [{unit}]")
     ax.set_ylim(bottom=0.0)

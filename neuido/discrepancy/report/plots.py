@@ -59,16 +59,21 @@ def thinned(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
+def distance_over_time(arrays: Arrays, when: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times at which any point is seen, and the root mean square distance of its points from a prediction then [m]."""
+    square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
+    seen = np.isfinite(square).any(axis=1)
+    return arrays["t"][seen], np.sqrt(np.nanmean(square[seen], axis=1))
+
+
 def error_over_time(name: str, arrays: Arrays, c: Mapping[str, Any], units: Units, most: int = MOST_ROWS) -> Plot:
     """Return the root mean square distance of a recording's points over time, before and after, with the floors."""
     factor, unit = units.scaled("m")
     times, traces = arrays["t"], []
     for when, called in predictions(c):
-        square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
-        seen = np.isfinite(square).any(axis=1)
-        curve = factor * np.sqrt(np.nanmean(square[seen], axis=1))
-        rows = thinned(len(curve), most)
-        traces.append(line(called, times[seen][rows], curve[rows], when))
+        seen, distance = distance_over_time(arrays, when)
+        rows = thinned(len(distance), most)
+        traces.append(line(called, seen[rows], factor * distance[rows], when))
     ends = [float(times[0]), float(times[-1])]
     noise, grid = (c["error"].get(key) or 0.0 for key in ("noise_floor", "discretisation_floor"))
     traces.append(line("noise", ends, [factor * noise] * 2, "muted", width=1, dash="dot"))
