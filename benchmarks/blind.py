@@ -40,7 +40,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import blind_scores
 
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.writing import write_text
+from neuido.data.files.writing import atomic_write, write_text
 from neuido.data.undeclared import Case, make_undeclared
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.errors import UserError
@@ -187,6 +187,13 @@ def record(path: Path, row: dict[str, Any]) -> None:
         writer.writerow(row)
 
 
+def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write rows as a CSV file with all digits, which appears when it is whole."""
+    with atomic_write(path) as hidden:
+        for row in rows:
+            record(hidden, row)
+
+
 def key_of(folder: Path) -> dict[str, Any]:
     """Return the key of a case after checking its digest against the README of the case; without a key, the truth.yaml of the folder."""
     path = folder.parent / "keys" / f"{folder.name}.yaml"
@@ -230,11 +237,7 @@ def score_all(folders: list[Path], out: Path, ablations: list[str]) -> str:
             everything += rows
     if not everything:
         return "nothing is diagnosed yet"
-    hidden = out / ".scores.csv.tmp"
-    hidden.unlink(missing_ok=True)
-    for row in everything:
-        record(hidden, row)
-    os.replace(hidden, out / "scores.csv")
+    write_table(out / "scores.csv", everything)
     return blind_scores.table(columns)
 
 
@@ -254,13 +257,10 @@ def replay_all(folders: list[Path], out: Path) -> str:
                 row = {"case": folder.name} | blind_scores.replayed(key, diagnosis, case, decide(case))
                 verdict = judged(evidences(case, fits)) if any(not fit.record.effects for fit in fits) else None
                 rows.append(row | blind_scores.by_evidence(key, diagnosis, verdict))
-    hidden = out / ".replay.csv.tmp"
-    hidden.unlink(missing_ok=True)
-    for row in rows:
-        record(hidden, row)
-    if rows:
-        os.replace(hidden, out / "replay.csv")
-    return blind_scores.table({"replayed": blind_scores.recall(rows)}) if rows else "no case has kept fits: diagnose with --statistics"
+    if not rows:
+        return "no case has kept fits: diagnose with --statistics"
+    write_table(out / "replay.csv", rows)
+    return blind_scores.table({"replayed": blind_scores.recall(rows)})
 
 
 def main() -> None:

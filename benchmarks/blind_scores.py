@@ -27,8 +27,7 @@ def score(key: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any
     outside = any(one.get("outside_library") for one in true)
     effects = diagnosis.get("effects") or []
     answer = diagnosis["answer"]
-    named = [e["name"] for e in effects] if answer in NAMED else []
-    classes = [{e["name"], *e.get("class", ())} for e in effects] if answer in NAMED else []
+    named, classes = _named(diagnosis)
     wanted = [set(one["diagnosis_names"]) for one in true if not one.get("outside_library")]
     pairs = _pairs(wanted, classes)
     exact = [i for i, j in pairs if named[j] in wanted[i]]
@@ -79,6 +78,12 @@ def score(key: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any
     }
 
 
+def _named(diagnosis: Mapping[str, Any]) -> tuple[list[str], list[set[str]]]:
+    """Return the effects that a diagnosis names, and the class of each."""
+    effects = (diagnosis.get("effects") or []) if diagnosis["answer"] in NAMED else []
+    return [e["name"] for e in effects], [{e["name"], *e.get("class", ())} for e in effects]
+
+
 NEAR = 0.25
 """Relative distance from the true sizes up to which a fit of the true effects counts as near its optimum; noise alone is another sign."""
 AT_NOISE = 1.1
@@ -107,8 +112,7 @@ def replayed(key: Mapping[str, Any], diagnosis: Mapping[str, Any], case: Any, de
     effects = [{"name": name.partition(":")[0], "class": list(c), "parameters": {}}
                for name, c in zip(decision.effects, decision.classes, strict=True)]  # fmt: skip
     now = score(key, {**diagnosis, "answer": decision.answer, "effects": effects})
-    live = [e["name"] for e in diagnosis.get("effects") or []] if diagnosis["answer"] in NAMED else []
-    classes = [set(e.get("class", ())) | {e["name"]} for e in diagnosis.get("effects") or []] if diagnosis["answer"] in NAMED else []
+    live, classes = _named(diagnosis)
     same = diagnosis["answer"] == decision.answer and live == [e["name"] for e in effects] and classes == [set(c) for c in decision.classes]
     return {
         "group": group_of(key),
