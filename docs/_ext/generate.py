@@ -205,7 +205,7 @@ def api_pages() -> dict[str, str]:
         else:
             body = directive(value, f"neuido.{name}")
         example = f"## Example\n\n```python\n{EXAMPLES[name].strip()}\n```\n\n## Reference\n\n" if name in EXAMPLES else ""
-        pages[f"api/{name}.md"] = f"# {'' if False else 'neuido.'}{name}\n\n{example}{body}\n"
+        pages[f"api/{name}.md"] = f"# neuido.{name}\n\n{example}{body}\n"
         line = (inspect.getdoc(value) or "").split("\n")[0]
         rows.append([f"[neuido.{name}](api/{name}.md)", line.replace("<", "&lt;")])
     toc = "```{toctree}\n:hidden:\n\n" + "\n".join(f"api/{name}" for name in names) + "\n```\n"

@@ -178,7 +178,7 @@ def _content(given: str | os.PathLike | Mapping[str, Any] | None) -> str | None:
         return None
     if isinstance(given, Mapping):
         return hashlib.sha256(json.dumps(given, sort_keys=True, default=str).encode()).hexdigest()
-    return Path(given).expanduser().read_bytes().hex()
+    return hashlib.sha256(Path(given).expanduser().read_bytes()).hexdigest()
 
 
 def kind_of(folder: str) -> tuple[str, Path]:
