@@ -9,21 +9,18 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from neuido.discrepancy.inference import bootstrap
 from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, score, times_over
-from neuido.discrepancy.inference.journal import Journal
-from neuido.discrepancy.inference.laboratory import Tell
 from neuido.discrepancy.inference.least_squares import Fit
 from neuido.discrepancy.inference.search.contests import MANY, Contest, better
 from neuido.discrepancy.inference.search.judging import LED_AWAY, WITHIN
 from neuido.discrepancy.inference.search.prospects import LED_BY, Promising, Prospects
 from neuido.discrepancy.inference.search.refining import MEASURED, NEAR
 from neuido.discrepancy.problems.problem import Candidate, Problem
-from neuido.discrepancy.store import Deadline, Memo
 
 CONFIRMED = 0.8
 """Share of the time for the search at which the first fits of a method end that is asked after another one named an effect: what is left is
@@ -64,30 +61,14 @@ class Inference(Prospects):
 
     Args:
         problem: What to diagnose.
-        setting: Setting of the discretisation that predicts; the others tell its error.
         keep: Candidates that get a full fit by their place in the screening, at the least; in the first round all small ones do beside.
         draws: Of the bootstrap.
         seed: Of the draws.
-        tell: Called with a line of progress.
-        memo: Predictions that are shared with the inferences of other settings.
-        deadline: When the search ends.
-        journal: What was judged, shared with the inferences of other settings.
+        options: Of `Laboratory`: the setting, and what is shared with the inferences of other settings.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        *,
-        setting: int = 0,
-        keep: int = 7,
-        draws: int = 199,
-        seed: int = 0,
-        tell: Tell | None = None,
-        memo: Memo | None = None,
-        deadline: Deadline | None = None,
-        journal: Journal | None = None,
-    ) -> None:
-        super().__init__(problem, setting=setting, tell=tell, memo=memo, deadline=deadline, journal=journal)
+    def __init__(self, problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0, **options: Any) -> None:
+        super().__init__(problem, **options)
         self.keep, self.draws, self.seed = keep, draws, seed
         self.seen: Look | None = None
         """The last look for a first effect."""
