@@ -11,10 +11,10 @@ from neuido.discrepancy.inference.floors import Round, Stand, Trial, unphysical
 from neuido.discrepancy.inference.laboratory import LEAST_GAIN
 from neuido.discrepancy.inference.least_squares import Fit, Race, levenberg_marquardt, run
 from neuido.discrepancy.inference.search import attribution, choosing, contests, judging, pairs, prospects, refining, rounds
-from neuido.discrepancy.inference.search.attribution import UNEXPLAINED, WITHIN, diagnose, drop
+from neuido.discrepancy.inference.search.attribution import diagnose, drop
 from neuido.discrepancy.inference.search.intervals import intervals
-from neuido.discrepancy.inference.search.judging import BACK_GAIN, FORETELLS, GAIN_AT_FLOOR, GAIN_IN_FLOOR, GAIN_TO_NOISE
-from neuido.discrepancy.inference.search.rounds import Inference, Look, Promising
+from neuido.discrepancy.inference.search.judging import BACK_GAIN, FORETELLS, GAIN_AT_FLOOR, GAIN_IN_FLOOR, GAIN_TO_NOISE, WITHIN
+from neuido.discrepancy.inference.search.rounds import UNEXPLAINED, Inference, Look, Promising
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.report.answer import trace
 from neuido.discrepancy.report.answer_content import rejected

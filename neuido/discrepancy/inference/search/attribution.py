@@ -6,20 +6,25 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, score, split, times_over
+from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, score, times_over
 from neuido.discrepancy.inference.journal import CaseRecord, Journal
 from neuido.discrepancy.inference.laboratory import LEAST_GAIN, Tell
 from neuido.discrepancy.inference.least_squares import Fit, NotFinite
 from neuido.discrepancy.inference.search.choosing import first_rounds, told_exactly
 from neuido.discrepancy.inference.search.decision import case_of, decided
 from neuido.discrepancy.inference.search.intervals import Hidden, blind_to_settings, findings, hidden, intervals, unable
-from neuido.discrepancy.inference.search.judging import ALPHA, CLASS_RATIO, WITHIN
+from neuido.discrepancy.inference.search.judging import CLASS_RATIO
 from neuido.discrepancy.inference.search.pairs import by_growing, neighbours, simpler, two_effects
-from neuido.discrepancy.inference.search.rounds import UNEXPLAINED, Inference
+from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.inference.statistics import statistics_of
 from neuido.discrepancy.problems.problem import Point, Problem
 from neuido.discrepancy.store import Deadline, Memo, Work
 from neuido.errors import UserError
+
+MOST = 3
+"""Effects that a growth may add."""
+FURTHER = 1.5
+"""Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 
 
 def widen(inference: Inference, r: Round, at: Stand, others: Iterable[Round]) -> None:
@@ -93,28 +98,6 @@ def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> t
             break
         base, found = fits[least], rests[least]
     return base, found
-
-
-__all__ = [
-    "ALPHA",
-    "MOST",
-    "UNEXPLAINED",
-    "WITHIN",
-    "Diagnosis",
-    "Floor",
-    "Inference",
-    "Part",
-    "Round",
-    "Stand",
-    "Trial",
-    "diagnose",
-    "split",
-]
-
-MOST = 3
-"""Effects that a growth may add."""
-FURTHER = 1.5
-"""Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 
 
 @dataclass(eq=False)
