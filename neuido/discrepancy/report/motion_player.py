@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.discrepancy.report.plots import heading, numbers, predictions
+from neuido.discrepancy.report.plots import heading, numbers, predictions, thinned
 from neuido.discrepancy.report.reader_units import Units
 
 MOST_POINTS, MOST_FRAMES = 400, 60
@@ -73,8 +73,7 @@ def _budget(frames: int, points: int, most: float) -> tuple[np.ndarray, np.ndarr
             count = max(LEAST_POINTS, int(0.8 * count))
         else:
             times = max(LEAST_FRAMES, int(0.8 * times))
-    rows = np.unique(np.linspace(0, frames - 1, min(frames, times)).round().astype(int))
-    return rows, np.unique(np.linspace(0, points - 1, min(points, count)).round().astype(int))
+    return thinned(frames, times), thinned(points, count)
 
 
 def most_telling(measured: np.ndarray, before: np.ndarray) -> int:
