@@ -11,8 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from lightning.pytorch import Callback, LightningModule, Trainer
 from safetensors.torch import load_file
+from torch.utils.data import DataLoader, TensorDataset
 
+from neuido.commands.cli.interruption import received, stop_at_step, watched
 from neuido.commands.main import main
 from neuido.commands.sweep import sweep
 
@@ -112,6 +115,61 @@ def test_an_interrupted_fit_goes_on_to_the_same_bits(made, tmp_path):
     assert resumed.keys() == whole.keys() and all(torch.equal(resumed[name], whole[name]) for name in whole)
 
 
+class Line(LightningModule):
+    """A line through points, in two batches an epoch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.layer = torch.nn.Linear(2, 1)
+
+    def training_step(self, batch, _):
+        return (self.layer(batch[0]) - 1.0).square().mean()
+
+    def validation_step(self, batch, _):
+        self.layer(batch[0])
+
+    def configure_optimizers(self):
+        return torch.optim.Adam(self.parameters(), lr=0.1)
+
+    def train_dataloader(self):
+        return DataLoader(TensorDataset(torch.linspace(0.0, 1.0, 8).reshape(4, 2)), batch_size=2)
+
+    val_dataloader = train_dataloader
+
+
+class Terminates(Callback):
+    """Send SIGTERM to this process by a hook of the second epoch, after the hook that ends a fit."""
+
+    def __init__(self, hook: str) -> None:
+        setattr(self, hook, self.send)
+
+    def send(self, trainer: Trainer, *_) -> None:
+        if trainer.current_epoch == 1 and not received():
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def fitted(state: Path, *callbacks: Callback, ckpt_path: Path | None = None) -> list[float]:
+    module = Line()
+    trainer = Trainer(
+        max_epochs=4, accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False, num_sanity_val_steps=0,
+        enable_checkpointing=False, callbacks=[stop_at_step(state), *callbacks],
+    )  # fmt: skip
+    trainer.fit(module, ckpt_path=ckpt_path, weights_only=True)
+    return torch.cat([part.detach().flatten() for part in module.parameters()]).tolist()
+
+
+@pytest.mark.parametrize("hook", ["on_train_batch_start", "on_train_batch_end", "on_train_epoch_end", "on_validation_batch_end"])
+def test_sigterm_leaves_the_state_wherever_it_comes(tmp_path, hook):
+    """Lightning has a handler of its own for SIGTERM, which ends a fit between two hooks."""
+    state = tmp_path / "interrupted.ckpt"
+    with watched(), pytest.raises(SystemExit):
+        fitted(state, Terminates(hook))
+    assert state.is_file()
+    with watched():
+        assert fitted(state, ckpt_path=state) == fitted(tmp_path / "none.ckpt")
+
+
 @pytest.mark.parametrize(
     "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)]
 )
@@ -180,8 +238,6 @@ def test_a_run_that_a_signal_ended_is_not_done_and_starts_again(tmp_path, monkey
 
 
 def test_a_worker_that_was_forked_dies_of_its_signal():
-    from neuido.commands.cli.interruption import watched
-
     with watched():
         child = os.fork()
         if child == 0:

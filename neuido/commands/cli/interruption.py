@@ -67,6 +67,7 @@ def stop_at_step(path: Path | None = None) -> "Callback":
         path: The file; `interrupted.ckpt` beside the trainer's other checkpoints where absent.
     """
     from lightning.pytorch import Callback, LightningModule, Trainer
+    from lightning.pytorch.utilities.exceptions import SIGTERMException
 
     class StopAtStep(Callback):
         def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -77,28 +78,31 @@ def stop_at_step(path: Path | None = None) -> "Callback":
 
         def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
             _patient.clear()
+            if isinstance(exception, SIGTERMException):  # Lightning ends a fit by itself where SIGTERM comes between two of these hooks
+                self._save(trainer)
 
         def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
-            if _received:
-                self._stop(trainer, save=True)
+            self._stop(trainer)
 
         def on_validation_end(self, trainer: Trainer, *_: Any) -> None:
-            if _received:
-                self._stop(trainer, save=trainer.state.fn == "fit" and not trainer.sanity_checking)
+            self._stop(trainer)
 
         def on_test_batch_end(self, trainer: Trainer, *_: Any) -> None:
-            if _received:
-                self._stop(trainer, save=False)
+            self._stop(trainer)
 
         def on_predict_batch_end(self, trainer: Trainer, *_: Any) -> None:
-            self.on_test_batch_end(trainer)
+            self._stop(trainer)
 
-        def _stop(self, trainer: Trainer, *, save: bool) -> None:
-            if save:
+        def _stop(self, trainer: Trainer) -> None:
+            if _received:
+                self._save(trainer)
+                raise Interrupted(signal.Signals(_received[0]).name)
+
+        def _save(self, trainer: Trainer) -> None:
+            if trainer.state.fn == "fit" and not trainer.sanity_checking:
                 file = path or _place(trainer) / STATE
                 trainer.save_checkpoint(file)
                 print(f"neuido: the state after step {trainer.global_step} is in {file}: --ckpt_path goes on from it", file=sys.stderr)
-            raise Interrupted(signal.Signals(_received[0]).name)
 
     return StopAtStep()
 
