@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from neuido.commands.cli.config_files import given_configs
-from neuido.commands.cli.signatures import BASES, TRAINER, Signature, class_named, classes, names_of, signature
+from neuido.commands.cli.signatures import BASES, TRAINER, Signature, as_class, classes, names_of, signature, signature_of
 from neuido.commands.cli.trainer_help import BY_COMMAND, COMMON, LINKED, given_content
 from neuido.data.files.yaml_files import BASE, Keys, chain, dotted, key_lines, merged, read_yaml, shown
 from neuido.errors import UserError, suggest
@@ -116,11 +116,10 @@ def _check_trainer(file: _File, given: Any) -> None:
 def _check_class(file: _File, keys: Keys, key: str, given: Any, context: Any) -> None:
     """Check what a file says of a key that takes a class."""
     where = dotted(keys)
-    if isinstance(given, str):
-        given = {"class_path": given}
+    given = as_class(given)
     if not isinstance(given, Mapping):
         raise UserError(f"{file.place(keys)}: {where} = {given!r} must be a class: class_path with its name, and init_args")
-    context = {"class_path": context} if isinstance(context, str) else context if isinstance(context, Mapping) else {}
+    context = as_class(context) if isinstance(context, str | Mapping) else {}
     if "class_path" in given or "class_path" in context:
         for part in given:
             if part not in INNER:
@@ -178,7 +177,7 @@ def _is_import(key: str, value: str) -> bool:
 
 
 def _check_name(path: Path, key: str, name: str, keys: Keys) -> None:
-    found = signature(class_named(key, name) or name)
+    found = signature_of(key, name)
     inside = "." not in name or any(name.startswith(f"{package}.") for package in TRUSTED)
     if not inside or (found is not None and not any(found.path.startswith(f"{package}.") for package in (*TRUSTED, "torch"))):
         lines = key_lines(path)
@@ -310,11 +309,11 @@ def _check_word(name: str, rest: list[str], key: str, given: Any, value: str) ->
             resolve(key, value, f"--{name}", "")
         return
     rest = rest[1:] if rest[0] == "init_args" else rest
-    given = {"class_path": given} if isinstance(given, str) else given
+    given = as_class(given)
     if not rest or rest[0] == "dict_kwargs" or not isinstance(given, Mapping) or "class_path" not in given:
         return
     class_path = str(given["class_path"])
-    found = signature(class_named(key, class_path) or class_path)
+    found = signature_of(key, class_path)
     if found is None:
         return
     if rest[0] not in found.options and rest[0] not in found.former and not found.open:
@@ -336,7 +335,7 @@ def _check_needs(args: list[str], content: Mapping[str, Any]) -> None:
         raise UserError(f"neuido {args[0]} needs a {what}: give --config FILE, such as quickstart, or {given}")
     for keys, key, given in _slots(content):
         class_path = str(given.get("class_path"))
-        found = signature(class_named(key, class_path) or class_path)
+        found = signature_of(key, class_path)
         options = given.get("init_args") or {}
         for option in found.options.values() if found is not None and not found.open else ():
             dotted_name = f"{keys}.{option.name}"
@@ -367,8 +366,7 @@ def _check_loggers(args: list[str], content: Mapping[str, Any]) -> None:
 
 def _slots(content: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
     for key in ("model", "data"):
-        given = content.get(key)
-        given = {"class_path": given} if isinstance(given, str) else given
+        given = as_class(content.get(key))
         if isinstance(given, Mapping) and "class_path" in given:
             yield key, key, given
             options = given.get("init_args") or {}
@@ -379,7 +377,7 @@ def _slots(content: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, 
 
 def _check_pair(model: str, data: str) -> None:
     """Refuse a model of Stage I without a data module that counts its trajectories."""
-    wanted, given = (signature(class_named(key, name) or name) for key, name in (("model", model), ("data", data)))
+    wanted, given = (signature_of(key, name) for key, name in (("model", model), ("data", data)))
     if wanted is None or given is None or not set(LINKED) & set(wanted.options) or given.open:
         return
     if not given.path.startswith("neuido.") or given.path == classes("data").get("TrajectoryDataModule"):

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Iterator
 from importlib.machinery import PathFinder
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 MODULES = (  # so that their class names resolve without a path
     *(f"neuido.models.stages.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt")),
@@ -120,11 +120,15 @@ def classes(key: str) -> dict[str, str]:
     return found
 
 
-def class_named(key: str, given: str) -> str | None:
-    """Return the import path of a class that a key takes by its name alone or its path; None where neuido has none of that name."""
-    if "." not in given:
-        return classes(key).get(given) if key in BASES else None
-    return given
+def signature_of(key: str, name: str) -> Signature | None:
+    """Return what a class takes that a key names by its name alone or its import path; None where its source is not found."""
+    path = name if "." in name else classes(key).get(name) if key in BASES else None
+    return signature(path) if path else None
+
+
+def as_class(given: Any) -> Any:
+    """Return what a configuration gives for a class, of which it may give the name alone, as a mapping with `class_path`."""
+    return {"class_path": given} if isinstance(given, str) else given
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from neuido.commands.cli.config_files import given_configs
-from neuido.commands.cli.signatures import TRAINER, Option, Signature, class_named, classes, signature, yaml_word
+from neuido.commands.cli.signatures import TRAINER, Option, Signature, as_class, classes, signature, signature_of, yaml_word
 from neuido.data.files.yaml_files import merged, read_configuration
 from neuido.errors import UserError, suggest
 
@@ -130,15 +130,13 @@ def _group(key: str, given: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Return the lines of a class that a configuration names: its options, with the values of the configuration."""
     name = str(given["class_path"])
     options = f"{prefix}.{key}" if prefix else key
-    found = _signature(key, name)
+    found = signature_of(key, name)
     if found is None:
         return [f"{options}: {name}, a class that is not part of neuido; its options are known when it is imported", ""]
     values = given.get("init_args") or {}
     lines = [f"{options}: {found.path.rpartition('.')[2]}. {found.summary}", *_options(found, f"--{options}", values, key), ""]
     for slot in SLOTS.get(key, ()) if not prefix else ():
-        below = values.get(slot)
-        if isinstance(below, str):
-            below = {"class_path": below}
+        below = as_class(values.get(slot))
         if isinstance(below, Mapping) and "class_path" in below:
             lines += _group(slot, below, options)
     return lines
@@ -148,15 +146,10 @@ def _help_of_class(key: str, name: str, command: str) -> str:
     where = f"model.{key}" if key in SLOTS["model"] else key
     if not name:
         return "\n".join([f"classes that --{where} takes (--{where}.help CLASS shows the options of one):", *_classes(key)])
-    found = _signature(key, name)
+    found = signature_of(key, name)
     if found is None:
         raise UserError(f"--{where}.help {name}: no such class{suggest(name, classes(key)) or ';'} there are {', '.join(classes(key))}")
     return "\n".join([f"{found.path}", "", found.summary, "", f"options of `neuido {command}`:", *_options(found, f"--{where}", {}, key)])
-
-
-def _signature(key: str, name: str) -> Signature | None:
-    path = class_named(key, name)
-    return signature(path) if path else None
 
 
 LINKED = ("trajectory_count",)

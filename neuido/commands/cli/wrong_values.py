@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from neuido.commands.cli.config_files import given_configs
-from neuido.commands.cli.signatures import TRAINER, class_named, signature
+from neuido.commands.cli.signatures import TRAINER, as_class, signature, signature_of
 from neuido.commands.cli.trainer_help import given_content
 from neuido.data.files.yaml_files import Keys, places
 
@@ -48,9 +48,9 @@ def type_in_configuration(args: list[str]) -> Callable[[str], tuple[str, Keys]]:
         keys: list[str | int] = [first]
         key, given, text = first, content.get(first), ""
         for part in (part for part in rest if part != "init_args"):
-            given = {"class_path": given} if isinstance(given, str) else given
+            given = as_class(given)
             class_path = str(given.get("class_path", "")) if isinstance(given, Mapping) else ""
-            found = signature(class_named(key, class_path) or class_path) if class_path else None
+            found = signature_of(key, class_path)
             option = found.options.get(part) if found else None
             text = option.type if option else ""
             keys += ["init_args", part]
