@@ -21,10 +21,17 @@ class UserError(ValueError):
         super().__init__(shortened(message))
 
 
-def suggest(word: str, known: Iterable[str]) -> str:
-    """Return `, did you mean '…'?` for the known word closest to one that is not known, or nothing where none is close."""
+def suggest(word: str, known: Iterable[str], *, before: str = "", after: str = "") -> str:
+    """Return `, did you mean '…'?` for the known word closest to one that is not known, or nothing where none is close.
+
+    Args:
+        word: The word that is not known.
+        known: Those that are.
+        before: What stands before the word where it is given, such as `--trainer.`.
+        after: What stands after it.
+    """
     close = difflib.get_close_matches(word, [str(each) for each in known], n=1, cutoff=0.6)
-    return f", did you mean '{close[0]}'?" if close else ""
+    return f", did you mean '{before}{close[0]}{after}'?" if close else ""
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -75,7 +75,7 @@ def _check(command: str, component: Callable[..., Any], args: list[str]) -> None
 
 
 def _unknown(given: str, word: str, known: Iterable[str], command: str, prefix: str = "") -> UserError:
-    close = suggest(str(word), known).replace("'", f"'{prefix}", 1)
+    close = suggest(str(word), known, before=prefix)
     return UserError(f"{given} is no option of neuido {command}{close or ':'} `neuido {command} --help` lists them")
 
 

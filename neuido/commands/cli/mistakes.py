@@ -297,9 +297,7 @@ def given_options(args: list[str]) -> Iterator[tuple[str, str | None]]:
 
 
 def _meant(word: str, rest: list[str], known: Iterable[str], prefix: str = "--") -> str:
-    close = suggest(word, known)
-    found = re.search(r"'(.*)'", close)
-    return f", did you mean '{prefix}{'.'.join([found[1], *rest])}'?" if found else ";"
+    return suggest(word, known, before=prefix, after="".join(f".{part}" for part in rest)) or ";"
 
 
 def _check_word(name: str, rest: list[str], key: str, given: Any, value: str) -> None:
