@@ -12,7 +12,7 @@ OPTIONS = ("-c", "--config")
 
 def find_config(name: str, option: str = "--config") -> str:
     """Return the path of a configuration: a file given by path, or one that comes with neuido, given by name."""
-    if name.lstrip().startswith("{") or Path(name).is_file():  # jsonargparse accepts the content itself too
+    if is_content(name) or Path(name).is_file():
         return name
     own = shipped(name)
     if own is None:
@@ -24,8 +24,7 @@ def find_configs(args: list[str]) -> list[str]:
     """Return the arguments with each `--config` resolved by `find_config`."""
     found = list(args)
     for i, given in given_configs(args):
-        file = find_config(given)
-        found[i] = f"--config={file}" if args[i].startswith("--config=") else file
+        found[i] = in_place(args[i], find_config(given))
     return found
 
 
@@ -40,13 +39,27 @@ def given_configs(args: list[str]) -> list[tuple[int, str]]:
     return found
 
 
+def config_paths(args: list[str]) -> list[str]:
+    """Return the files that the `--config` of a command line name."""
+    return [given for _, given in given_configs(args) if not is_content(given)]
+
+
+def is_content(given: str) -> bool:
+    """Return whether a word is the content of a configuration, which jsonargparse accepts in the place of a file."""
+    return given.lstrip().startswith("{")
+
+
+def in_place(argument: str, given: str) -> str:
+    """Return an argument that holds a configuration (`--config=FILE`, or the word after `--config`) with another one in its place."""
+    return f"--config={given}" if argument.startswith("--config=") else given
+
+
 def expanded(args: list[str]) -> list[str]:
     """Replace each `--config` file that has a key `base` by its merged content; return the arguments."""
     found = list(args)
     for i, given in given_configs(args):
-        if not given.lstrip().startswith("{") and _is_yaml(given) and len(chain(given)) > 1:
-            content = inline(read_configuration(given))
-            found[i] = f"--config={content}" if args[i].startswith("--config=") else content
+        if not is_content(given) and _is_yaml(given) and len(chain(given)) > 1:
+            found[i] = in_place(args[i], inline(read_configuration(given)))
     return found
 
 

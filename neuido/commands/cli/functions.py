@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, get_origin
 
-from neuido.commands.cli.config_files import expanded, given_configs
+from neuido.commands.cli.config_files import config_paths, expanded
 from neuido.commands.cli.signatures import signature
 from neuido.commands.cli.wrong_values import explained, placed
 from neuido.data.files.yaml_files import Keys, places, read_configuration
@@ -53,8 +53,8 @@ def options_of(component: Callable[..., Any]) -> dict[str, dict[str, Any]]:
 def _check(command: str, component: Callable[..., Any], args: list[str]) -> None:
     """Refuse a key or an option that a command does not have, with what was meant."""
     known = options_of(component)
-    for _, given in given_configs(args):
-        if given.lstrip().startswith("{") or not Path(given).is_file():
+    for given in config_paths(args):
+        if not Path(given).is_file():
             continue
         for key, value in read_configuration(given).items():
             if key not in known:

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neuido.commands.cli.config_files import given_configs
+from neuido.commands.cli.config_files import config_paths, is_content
 from neuido.commands.cli.signatures import BASES, TRAINER, Signature, as_class, classes, names_of, signature, signature_of
 from neuido.commands.cli.trainer_help import BY_COMMAND, COMMON, LINKED, given_content
 from neuido.data.files.yaml_files import BASE, Keys, chain, dotted, key_lines, merged, read_yaml, shown
@@ -57,9 +57,7 @@ def check_configurations(args: list[str], *, trust: bool = False) -> None:
         UserError: The first mistake, in one line.
     """
     command, everything = args[0], given_content(args)
-    for _, given in given_configs(args):
-        if given.lstrip().startswith("{"):
-            continue
+    for given in config_paths(args):
         context: dict[str, Any] = {}
         for file in chain(given):
             own = {key: value for key, value in read_yaml(file).items() if key != BASE}
@@ -303,7 +301,7 @@ def _meant(word: str, rest: list[str], known: Iterable[str], prefix: str = "--")
 def _check_word(name: str, rest: list[str], key: str, given: Any, value: str) -> None:
     """Check `--model.method.rank`, whose class the configurations or the command line give."""
     if not rest or rest == ["class_path"]:
-        if value and not value.lstrip().startswith("{") and not Path(value).is_file() and value != "null":
+        if value and not is_content(value) and not Path(value).is_file() and value != "null":
             resolve(key, value, f"--{name}", "")
         return
     rest = rest[1:] if rest[0] == "init_args" else rest

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from neuido.commands.cli.config_files import given_configs
+from neuido.commands.cli.config_files import given_configs, is_content
 from neuido.commands.cli.signatures import TRAINER, Option, Signature, as_class, classes, signature, signature_of, yaml_word
 from neuido.data.files.yaml_files import merged, read_configuration
 from neuido.errors import UserError, suggest
@@ -91,13 +91,13 @@ def given_content(args: list[str]) -> dict[str, Any]:
     """Return what the configurations and the classes of a command line say together."""
     content: dict[str, Any] = {}
     for _, given in given_configs(args):
-        own = _inline(given) if given.lstrip().startswith("{") else read_configuration(given)
+        own = _inline(given) if is_content(given) else read_configuration(given)
         content = merged(content, own)
     for i, word in enumerate(args):
         name, equals, value = word.partition("=")
         value = value if equals else args[i + 1] if i + 1 < len(args) else ""
         path = {"--model": ("model",), "--data": ("data",), "--model.method": ("model", "method")}.get(name.removesuffix(".class_path"))
-        if path is None or value.lstrip().startswith("{") or "/" in value:
+        if path is None or is_content(value) or "/" in value:
             continue
         own = {"class_path": value}
         content = merged(content, {"model": {"init_args": {"method": own}}} if len(path) == 2 else {path[0]: own})

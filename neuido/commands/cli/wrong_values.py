@@ -2,9 +2,8 @@
 
 import re
 from collections.abc import Callable, Mapping
-from typing import Any
 
-from neuido.commands.cli.config_files import given_configs
+from neuido.commands.cli.config_files import config_paths
 from neuido.commands.cli.signatures import TRAINER, as_class, signature, signature_of
 from neuido.commands.cli.trainer_help import given_content
 from neuido.data.files.yaml_files import Keys, places
@@ -67,8 +66,8 @@ def value_place(keys: Keys, args: list[str]) -> str:
     for word in args:
         if word.startswith("--") and word[2:].partition("=")[0].replace(".init_args", "") == plain:
             return ""
-    for _, given in reversed(given_configs(args)):
-        found: dict[Keys, Any] = {} if given.lstrip().startswith("{") else dict(places(given))
+    for given in reversed(config_paths(args)):
+        found = places(given)
         if keys in found:
             return f"{found[keys]}: "
     return ""
@@ -80,8 +79,8 @@ def placed(message: str, args: list[str]) -> str:
     if opening is None:
         return message
     plain = tuple(part for part in opening[1].split(".") if part != "init_args")
-    for _, given in reversed(given_configs(args)):
-        for keys in places(given) if not given.lstrip().startswith("{") else ():
+    for given in reversed(config_paths(args)):
+        for keys in places(given):
             if tuple(key for key in keys if key != "init_args") == plain:
                 return f"{value_place(keys, args)}{message}"
     return message

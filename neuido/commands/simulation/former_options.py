@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from neuido import configs_root
+from neuido.commands.cli.config_files import given_configs, in_place, inline, is_content
 from neuido.data.trajectories.options import Throw, make_trajectories
 from neuido.data.undeclared import Case
 from neuido.errors import UserError
@@ -93,27 +94,23 @@ def _job(given: set[str]) -> str:
 def _given(args: list[str]) -> set[str]:
     """Return the names of options on a command line and in its configurations; an empty key of a configuration is none."""
     names = {word[2:].partition("=")[0] for word in args if word.startswith("--")}
-    for _, _, content in _configurations(args):
+    for _, content in _configurations(args):
         names |= {str(key) for key, value in content.items() if value is not None}
     return names
 
 
-def _configurations(args: list[str]) -> list[tuple[int, str, dict[str, Any]]]:
-    """Return place, prefix and content of each configuration on a command line; one that cannot be read is left to its parser."""
+def _configurations(args: list[str]) -> list[tuple[int, dict[str, Any]]]:
+    """Return place and content of each configuration on a command line; one that cannot be read is left to its parser."""
     from neuido.data.files.yaml_files import read_configuration
 
     found = []
-    for i, (before, word) in enumerate(zip(["", *args], args, strict=False)):
-        prefix = "" if before in ("-c", "--config") else "--config="
-        if prefix and not word.startswith(prefix):
-            continue
-        given = word.removeprefix(prefix)
+    for i, given in given_configs(args):
         try:
-            content = yaml.safe_load(given) if given.lstrip().startswith("{") else read_configuration(given)
+            content = yaml.safe_load(given) if is_content(given) else read_configuration(given)
         except (UserError, OSError, yaml.YAMLError):
             continue
         if isinstance(content, dict):
-            found.append((i, prefix, content))
+            found.append((i, content))
     return found
 
 
@@ -121,7 +118,7 @@ def _renamed(args: list[str], command: str) -> list[str]:
     """Return arguments under the names of today; of a configuration only what is for the command."""
     out = [_word(word, RENAMED[command]) for word in args]
     others = {option for options in KNOWN.values() for option in options} - set(KNOWN[command])
-    for i, prefix, content in _configurations(args):
+    for i, content in _configurations(args):
         own: dict[str, Any] = {}
         for key, value in content.items():
             if value is None or (key in others and _unused(key, value)):
@@ -134,7 +131,7 @@ def _renamed(args: list[str], command: str) -> list[str]:
                 own["setup"] = own.get("setup", {}) | value
             else:
                 own[RENAMED[command](str(key))] = value
-        out[i] = prefix + yaml.safe_dump(own, default_flow_style=True, width=10**9, sort_keys=False)
+        out[i] = in_place(args[i], inline(own))
     return out
 
 
