@@ -8,9 +8,8 @@ import functools
 import importlib
 import os
 from argparse import ArgumentError
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 import neuido
@@ -62,8 +61,8 @@ def run_lightning(args: list[str]) -> "LightningCLI":
 def _run(args: list[str]) -> "LightningCLI":
     words = rename_in_arguments(expanded(args), "model.method", MODULES)
     try:
-        make = cast("Callable[..., LightningCLI]", _cli_class())  # it takes `stated` as well
-        return make(args=words, stated=stated_options(args), **_settings())
+        make = cast("Callable[..., LightningCLI]", _cli_class())  # it takes `given` as well
+        return make(args=words, given=args, **_settings())
     except RuntimeError as error:
         if str(error).startswith("Error(s) in loading state_dict"):
             raise does_not_fit(error, args) from error
@@ -119,8 +118,8 @@ def _cli_class() -> type["LightningCLI"]:
                 super().setup(trainer, pl_module, stage)
 
     class NeuidoCLI(LightningCLI):
-        def __init__(self, stated: Mapping[str, str] = MappingProxyType({}), **settings: Any):
-            self.stated = stated
+        def __init__(self, given: Sequence[str] = (), **settings: Any):
+            self.given = list(given)
             super().__init__(save_config_callback=BesideTheLog, **settings)
 
         def add_arguments_to_parser(self, parser: "LightningArgumentParser") -> None:
@@ -130,9 +129,9 @@ def _cli_class() -> type["LightningCLI"]:
             check_checkpoint(self.config[self.config.subcommand].get("ckpt_path"))
             options = self.config[self.config.subcommand]
             if options.get("ckpt_path") and Path(options["ckpt_path"]).is_file():
-                numbers = numbers_of(options["ckpt_path"], options.model.class_path)
-                tell_differences(options["ckpt_path"], numbers, options.model.init_args, self.stated)
-                taken = {name: value for name, value in numbers.items() if name not in self.stated}
+                numbers, stated = numbers_of(options["ckpt_path"], options.model.class_path), stated_options(self.given)
+                tell_differences(options["ckpt_path"], numbers, options.model.init_args, stated)
+                taken = {name: value for name, value in numbers.items() if name not in stated}
                 model = {"class_path": options.model.class_path, "init_args": taken}
                 self.config = self.parser.parse_object({self.config.subcommand: {"model": model}}, self.config)
 

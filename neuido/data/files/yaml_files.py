@@ -150,7 +150,10 @@ def _chain(path: Path, above: tuple[Path, ...]) -> list[Path]:
     if own in above:
         names = " -> ".join(shown(file) for file in (*above[above.index(own) :], own))
         raise UserError(f"{BASE} leads in a circle: {names}")
-    given = read_yaml(path).get(BASE, [])
+    content = read_yaml(path)
+    if BASE not in content:
+        return [path]
+    given = content[BASE]
     names = [given] if isinstance(given, str) else given
     line = f"{shown(path)}:{key_lines(path).get((BASE,), 1)}"
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
