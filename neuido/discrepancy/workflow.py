@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuido.data.files.output_folder import held_folder
-from neuido.data.files.writing import check_writable, make_real_folder
+from neuido.data.files.writing import check_writable, made_folder, make_real_folder
 from neuido.data.progress import Progress, duration
 from neuido.discrepancy.report.diagnosis import Diagnosis
 from neuido.errors import UserError
@@ -123,9 +123,8 @@ def diagnose(
     options = {"effects": names, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": store.code_digest(), "data": data}
     options |= given | {"solver": solver}
     plan = "read-data" if folder is None else store.plan_of(place, options, out=target)
-    made, untouched = not target.is_dir(), not target.is_dir() or not any(target.iterdir())
-    target.mkdir(parents=True, exist_ok=True)
-    with held_folder(target, made=made):
+    untouched = not target.is_dir() or not any(target.iterdir())
+    with made_folder(target), held_folder(target):
         resumes = resume and folder is not None and not arrays and not candidates  # what a function does has no name to keep it by
         outdated = store.outdated(target, plan) if resumes else []
         work = store.workplace(target, plan, resume=resumes)
@@ -145,7 +144,7 @@ def diagnose(
                     own = infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds, statistics=statistics)
                 except UserError:
                     if untouched:
-                        _forget(target, made)
+                        _forget(target)
                     raise
                 found.append((own, time.monotonic() - started))
                 if statistics:
@@ -162,14 +161,12 @@ def diagnose(
     return Diagnosis.read(target, keep=temporary)
 
 
-def _forget(target: Path, made: bool) -> None:
-    """Remove what a diagnosis that is refused has written; `made`: the folder too, where it holds nothing else."""
+def _forget(target: Path) -> None:
+    """Remove what a diagnosis that is refused has written."""
     from neuido.discrepancy import store
 
     store.clear(target)
     (target / "log.csv").unlink(missing_ok=True)
-    if made and not any(target.iterdir()):
-        target.rmdir()
 
 
 def _content(given: str | os.PathLike | Mapping[str, Any] | None) -> str | None:

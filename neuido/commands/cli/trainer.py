@@ -25,7 +25,7 @@ from neuido.commands.cli.wrong_values import explained, placed, type_in_configur
 from neuido.data.files.output_folder import held_folder
 from neuido.data.files.renamed_options import rename_in_arguments, rename_in_configuration
 from neuido.data.files.sweep_run import own_folder, redirect
-from neuido.data.files.writing import check_writable
+from neuido.data.files.writing import check_writable, made_folder
 from neuido.errors import UserError, condensed
 
 if TYPE_CHECKING:
@@ -180,15 +180,8 @@ def _held_results(cli: "LightningCLI", command: str) -> Iterator[None]:
         yield
         return
     check_writable(folder, "model.out")
-    made = [each for each in (folder, *folder.parents) if not each.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with held_folder(folder, option="model.out"):
-            yield
-    finally:
-        for each in made:
-            with contextlib.suppress(OSError):  # it holds results
-                each.rmdir()
+    with made_folder(folder), held_folder(folder, option="model.out"):
+        yield
 
 
 def _summary(cli: "LightningCLI", command: str) -> list[str]:

@@ -66,7 +66,7 @@ def claimed_folder(
 
 
 @contextlib.contextmanager
-def held_folder(path: Path, *, option: str = "out", shard: int = 0, shards: int = 1, made: bool = False) -> Iterator[None]:
+def held_folder(path: Path, *, option: str = "out", shard: int = 0, shards: int = 1) -> Iterator[None]:
     """Hold a folder that is there while the block runs, alone or as one of several shards.
 
     Args:
@@ -74,23 +74,17 @@ def held_folder(path: Path, *, option: str = "out", shard: int = 0, shards: int 
         option: Name of the option that gives it.
         shard: Which share of the work this process does.
         shards: Number of shares.
-        made: Whether this process made the folder, which goes if it is empty in the end.
 
     Raises:
         UserError: Another process writes it, or a shard whose work overlaps.
     """
     purpose = f"{option} = {path}"
-    try:
-        with OwnedLock(path / _name(shard, shards), purpose, keep=False):
-            for other, own_shard, own_shards in _other_locks(path, shard, shards):
-                if (shard - own_shard) % math.gcd(shards, own_shards) == 0:
-                    with OwnedLock(other, f"{purpose}, shard {own_shard} of {own_shards},", keep=False):
-                        pass
-            yield
-    finally:
-        if made:
-            with contextlib.suppress(OSError):
-                path.rmdir()
+    with OwnedLock(path / _name(shard, shards), purpose, keep=False):
+        for other, own_shard, own_shards in _other_locks(path, shard, shards):
+            if (shard - own_shard) % math.gcd(shards, own_shards) == 0:
+                with OwnedLock(other, f"{purpose}, shard {own_shard} of {own_shards},", keep=False):
+                    pass
+        yield
 
 
 def check_unused(path: Path, option: str = "out") -> None:

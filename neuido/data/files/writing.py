@@ -53,29 +53,38 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     _check_writer(path)
-    made = [parent for parent in path.parents if not parent.exists()]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    hidden = temporary_path(path)
-    hidden.mkdir()
-    try:
-        yield hidden
-        for part in sorted(hidden.rglob("*"), reverse=True):
-            _sync(part)
-        _sync(hidden)
+    with made_folder(path.parent):
+        hidden = temporary_path(path)
+        hidden.mkdir()
         try:
-            _take_hidden_files(path, hidden)
-            os.replace(hidden, path)
-        except OSError as error:
-            if path.exists():
-                raise UserError(f"{path} was created by another process meanwhile and is not replaced: give another folder") from error
+            yield hidden
+            for part in sorted(hidden.rglob("*"), reverse=True):
+                _sync(part)
+            _sync(hidden)
+            try:
+                _take_hidden_files(path, hidden)
+                os.replace(hidden, path)
+            except OSError as error:
+                if path.exists():
+                    raise UserError(f"{path} was created by another process meanwhile and is not replaced: give another folder") from error
+                raise
+        except BaseException:
+            remove(hidden)
             raise
-    except BaseException:
-        remove(hidden)
-        for parent in made:
-            with contextlib.suppress(OSError):  # something else is in it by now
-                parent.rmdir()
-        raise
-    _sync(path.parent)
+        _sync(path.parent)
+
+
+@contextlib.contextmanager
+def made_folder(path: Path) -> Iterator[None]:
+    """Create a folder and those above it; when the block ends, those that were created and are empty are removed."""
+    made = [each for each in (path, *path.parents) if not each.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        for each in made:
+            with contextlib.suppress(OSError):  # something is in it
+                each.rmdir()
 
 
 def _take_hidden_files(path: Path, hidden: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from neuido.data.files.output_folder import check_unused, claimed_folder, held_folder
-from neuido.data.files.writing import new_folder
+from neuido.data.files.writing import made_folder, new_folder
 from neuido.errors import UserError
 
 PLAN = {"format": "test/1", "setup": {"steps": 3, "velocity": (1.0, 2.0)}}
@@ -94,9 +94,9 @@ def test_shards_write_side_by_side_but_not_twice_the_same(tmp_path):
         for shard, shards in ((0, 4), (0, 1), (4, 8), (0, 2), (3, 4)):
             with pytest.raises(UserError, match=f"held by process {os.getpid()}"), held_folder(tmp_path, shard=shard, shards=shards):
                 pass
-    with held_folder(tmp_path, made=True):
+    with made_folder(tmp_path / "new"), held_folder(tmp_path / "new"):
         pass
-    assert not tmp_path.exists()  # nothing is in it, neither locks
+    assert not list(tmp_path.iterdir())  # nothing is in either, neither locks
 
 
 def test_a_new_folder_takes_the_place_of_one_with_hidden_files(tmp_path):
