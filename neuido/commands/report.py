@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from neuido.data.files.html_page import Best, escaped, figure, page, plain, style_axes, svg, table, video
-from neuido.data.files.results import Entry, figures, logged_curves, mean, open_runs, scenes_of
+from neuido.data.files.results import Entry, figures, labelled, logged_curves, mean, open_runs, scenes_of
 from neuido.data.files.score_tables import read_rows
 from neuido.errors import UserError
 
@@ -91,10 +91,7 @@ def _diagnoses(runs: Sequence[str]) -> str | None:
     Raises:
         UserError: Only some of them do.
     """
-    named = []
-    for run in runs:
-        label, _, folder = run.rpartition("=")
-        named.append((label or Path(folder).name, Path(folder)))
+    named = [(label or folder.name, folder) for label, folder in map(labelled, runs)]
     there = [(folder / "diagnosis.json").is_file() for _, folder in named]
     if not any(there):
         return None

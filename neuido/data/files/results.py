@@ -58,8 +58,7 @@ def open_runs(given: Sequence[str]) -> list[Entry]:
     """
     entries: list[Entry] = []
     for one in given:
-        label, _, path = one.rpartition("=") if "=" in one and not Path(one).exists() else ("", "", one)
-        folder = Path(path).expanduser()
+        label, folder = labelled(one)
         if not folder.is_dir():
             raise UserError(f"runs: the folder {folder} is missing")
         sweep = sorted(each for each in folder.iterdir() if read_status(each).get("status") == "done")
@@ -68,6 +67,12 @@ def open_runs(given: Sequence[str]) -> list[Entry]:
             raise UserError(f"runs: {folder} has neither scores.csv, test.csv nor metrics.csv: run `neuido fit` or `neuido test` first")
         entries += found
     return _distinct(entries)
+
+
+def labelled(given: str) -> tuple[str, Path]:
+    """Return the label and the folder of `label=folder`; an empty label of a folder alone, whose path may hold a `=`."""
+    label, _, path = given.rpartition("=") if not Path(given).exists() else ("", "", given)
+    return label, Path(path).expanduser()
 
 
 def _entries(folder: Path, label: str, parameters: dict[str, Any]) -> list[Entry]:
