@@ -95,7 +95,7 @@ LIGHT = ("", ".__main__", ".errors", ".data.trajectories.options", ".data.scenes
          *(f".commands.{name}" for name in ("main", "doctor", "reconstruct", "film", "sweep", "report",
                                             "latents", "demo.demo",
                                             *(f"simulation.{n}" for n in ("simulate", "trajectories", "scenes", "undeclared", "replay",
-                                                                          "former_options")), "cli.config_files", "cli.suggestions",
+                                                                          "former_options")), "cli.config_files", "cli.abbreviations",
                                             "cli.trainer", "cli.trainer_help", "cli.signatures", "cli.functions")))  # fmt: skip
 
 
