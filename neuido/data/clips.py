@@ -16,8 +16,9 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, TensorDataset
 
+from neuido.data.bodies.families import check_entry
 from neuido.data.files.parsing import read_arrays, read_json
-from neuido.data.files.values import file_name, list_of_mappings, mapping, number, require_key
+from neuido.data.files.values import list_of_mappings
 from neuido.errors import UserError
 
 FORMAT = "neuido-films/1"
@@ -141,11 +142,7 @@ class FilmDataModule(LightningDataModule):
         if content.get("format") != FORMAT:
             raise UserError(f"{path} has the format {content.get('format')!r}, not {FORMAT!r}")
         for i, entry in enumerate(list_of_mappings(content.get("clips"), f"{path}: clips")):
-            where = f"{path}: clips[{i}]"
-            file_name(require_key(entry, "name", where), f"{where}.name")
-            file_name(require_key(entry, "family", where), f"{where}.family")
-            for key, value in mapping(require_key(entry, "parameters", where), f"{where}.parameters").items():
-                number(value, f"{where}.parameters.{key}")
+            check_entry(entry, f"{path}: clips[{i}]")
         return content
 
     @property

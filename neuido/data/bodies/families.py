@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.data.files.values import file_name, mapping, number, require_key
 from neuido.errors import UserError
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identity, Sigma, VonMises
@@ -48,6 +50,18 @@ def check_ranges(family: str, ranges: Mapping[str, tuple[float, float]]) -> None
         floor, ceiling = LIMITS[name]
         if not (floor < low and high < ceiling):
             raise UserError(f"families.{family}.{name} = [{low}, {high}]: both bounds must lie strictly between {floor:g} and {ceiling:g}")
+
+
+def check_entry(entry: dict[str, Any], where: str) -> None:
+    """Check the name, the family and the parameters of an entry of a file that lists bodies of drawn material.
+
+    Raises:
+        UserError: A key is missing, the name or the family cannot name a file, or a parameter is not a number.
+    """
+    for key in ("name", "family"):
+        file_name(require_key(entry, key, where), f"{where}.{key}")
+    for key, value in mapping(require_key(entry, "parameters", where), f"{where}.parameters").items():
+        number(value, f"{where}.parameters.{key}")
 
 
 def draw_parameters(family: str, ranges: Mapping[str, tuple[float, float]], random: np.random.Generator) -> dict[str, float]:

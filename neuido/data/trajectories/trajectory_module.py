@@ -10,8 +10,9 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
+from neuido.data.bodies.families import check_entry
 from neuido.data.files.parsing import naming, read_json
-from neuido.data.files.values import file_name, list_of_mappings, mapping, number, require_key
+from neuido.data.files.values import list_of_mappings, mapping, number, require_key
 from neuido.data.sampling import FixedBatches, SampleOrder, Step, TrainingSteps
 from neuido.data.trajectories.options import Throw, make_trajectories
 from neuido.data.trajectories.trajectory_files import COLUMNS, FORMAT, TrajectoryFiles, is_complete, to_batch
@@ -112,15 +113,11 @@ class TrajectoryDataModule(LightningDataModule):
                 if not isinstance(setup.get(key), int) or not 0 < setup[key] < 1 << 31:
                     raise UserError(f"setup.{key} must be a positive whole number, got {setup.get(key)!r}")
         for i, entry in enumerate(list_of_mappings(require_key(content, "trajectories", str(path)), f"{path}: trajectories")):
-            for key in ("name", "family", "split", "parameters", "stress_rms", "residual_rms"):
-                require_key(entry, key, f"{path}: trajectories[{i}]")
             where = f"{path}: trajectories[{i}]"
-            file_name(entry["name"], f"{where}.name")
-            file_name(entry["family"], f"{where}.family")
+            check_entry(entry, where)
+            require_key(entry, "split", where)
             for key in ("stress_rms", "residual_rms"):
-                number(entry[key], f"{where}.{key}", least=0.0)
-            for key, value in mapping(entry["parameters"], f"{where}.parameters").items():
-                number(value, f"{where}.parameters.{key}")
+                number(require_key(entry, key, where), f"{where}.{key}", least=0.0)
             if not is_complete(self.root / f"{entry['name']}.npy", self._shape(content)):
                 raise UserError(f"{self.root / entry['name']}.npy is missing or truncated: generate it again with `{command}`")
         return content
