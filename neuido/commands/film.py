@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from neuido.data.files.writing import check_writable
 from neuido.data.trajectories.options import FAMILIES, Range
 
 
@@ -75,7 +74,6 @@ def film(
         samples=samples,
         seed=seed,
     )
-    check_writable(Path(out))
     generate_clips(plan, out, device=device, batch=batch, shard=shard, shards=shards, progress=progress)
     there = sum((Path(out) / f"clip-{i:05d}.npz").is_file() for i in range(count))
     print(
