@@ -40,10 +40,15 @@ class _File(NamedTuple):
     context: Mapping[str, Any]
 
     def place(self, keys: Keys) -> str:
-        lines = key_lines(self.path)
-        while keys and keys not in lines:
-            keys = keys[:-1]
-        return f"{shown(self.path)}:{lines[keys]}" if keys else shown(self.path)
+        return _place(self.path, keys)
+
+
+def _place(path: Path, keys: Keys) -> str:
+    """Return file and line of a key, or of the nearest one above it that has a line."""
+    lines = key_lines(path)
+    while keys and keys not in lines:
+        keys = keys[:-1]
+    return f"{shown(path)}:{lines[keys]}" if keys else shown(path)
 
 
 def check_configurations(args: list[str], *, trust: bool = False) -> None:
@@ -178,11 +183,9 @@ def _check_name(path: Path, key: str, name: str, keys: Keys) -> None:
     found = signature_of(key, name)
     inside = "." not in name or any(name.startswith(f"{package}.") for package in TRUSTED)
     if not inside or (found is not None and not any(found.path.startswith(f"{package}.") for package in (*TRUSTED, "torch"))):
-        lines = key_lines(path)
-        place = f"{shown(path)}:{lines[keys]}" if keys in lines else shown(path)
         raise UserError(
-            f"{place}: {dotted(keys)} = {name} is of neither neuido, lightning, torch.optim nor torchmetrics: reading it runs its module; "
-            "give --trust if you trust this file"
+            f"{_place(path, keys)}: {dotted(keys)} = {name} is of neither neuido, lightning, torch.optim nor torchmetrics: reading it "
+            "runs its module; give --trust if you trust this file"
         )
 
 
