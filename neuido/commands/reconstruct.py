@@ -80,12 +80,11 @@ def reconstruct(
         UserError: What readers refuse, masks that do not meet, or a folder that holds another reconstruction.
     """
     options = dict(locals())
-    import json
 
     import torch
 
     from neuido.data.files.output_folder import claimed_folder
-    from neuido.data.files.writing import check_writable, write_text
+    from neuido.data.files.writing import check_writable, write_json
     from neuido.data.scenes.filmed_scene import RECONSTRUCTION, load_views, read_truth, write_setting
     from neuido.physics.runtime.device import choose_device
     from neuido.types import Gaussians
@@ -115,8 +114,8 @@ def reconstruct(
         _draw(target / "comparison.png", module, batch, body)
         write_setting(around, target / "scene.yaml")
         figures |= {"gaussians": len(found.means), "particles": len(body.x), "volume": float(body.volume.double().sum())}
-        report = json.dumps({key: float(f"{value:.5g}") for key, value in figures.items()}, indent=1) + "\n"
-        write_text(target / REPORT, report)
+        report = {key: float(f"{value:.5g}") for key, value in figures.items()}
+        write_json(target / REPORT, report)
         (target / RESUME).unlink(missing_ok=True)
         _tell(target)
 

@@ -1,6 +1,5 @@
 """Folder and status of one run of a sweep."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,9 +27,9 @@ def read_status(folder: Path) -> dict[str, Any]:
 
 def write_status(folder: Path, state: Mapping[str, Any]) -> None:
     """Write the status of a run to `run.json` in its folder."""
-    from neuido.data.files.writing import write_text
+    from neuido.data.files.writing import write_json
 
-    write_text(folder / "run.json", json.dumps(state, indent=1) + "\n")
+    write_json(folder / "run.json", state)
 
 
 def own_folder(environment: Mapping[str, str]) -> Path | None:

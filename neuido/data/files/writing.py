@@ -1,12 +1,14 @@
 """Atomic writing: files and folders get their final name only when complete. Links are never followed."""
 
 import contextlib
+import json
 import os
 import shutil
 import socket
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from neuido.errors import UserError
 
@@ -40,6 +42,11 @@ def write_text(path: Path, text: str) -> None:
     """Write a small file all at once; several processes may write the same one."""
     with atomic_write(path) as hidden:
         hidden.write_text(text)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a small JSON file all at once, an indent a level."""
+    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 @contextlib.contextmanager

@@ -5,7 +5,6 @@ and F and are coloured by a solid texture of the position at t = 0. A scene is a
 `neuido.data.scenes.filmed_scene` describes it. Scenes are written atomically, so a killed run continues with the missing ones.
 """
 
-import json
 import os
 import re
 from collections.abc import Callable, Mapping
@@ -26,7 +25,7 @@ from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.files.output_folder import claimed_folder
 from neuido.data.files.parsing import read_yaml
 from neuido.data.files.values import check_keys, mapping, vector
-from neuido.data.files.writing import new_folder, write_text
+from neuido.data.files.writing import new_folder, write_json
 from neuido.data.formats import nerfstudio
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
 from neuido.data.progress import Progress
@@ -191,7 +190,7 @@ def make_scenes(
                 except UserError as error:
                     raise UserError(f"scenes: {plan.name}: {error}") from error
         index = [{"name": p.name, "split": p.split, "law": p.law, "particles": len(p.body.x), "substeps": p.substeps} for p in plans]
-        write_text(folder / "index.json", json.dumps({"format": FORMAT, "scenes": index}, indent=1) + "\n")
+        write_json(folder / "index.json", {"format": FORMAT, "scenes": index})
     return paths
 
 

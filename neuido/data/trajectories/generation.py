@@ -4,12 +4,10 @@
 """
 
 import contextlib
-import json
 import math
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +16,7 @@ from torch import Tensor
 from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import cube
 from neuido.data.files.output_folder import claimed_folder
-from neuido.data.files.writing import atomic_write, write_text
+from neuido.data.files.writing import atomic_write, write_json
 from neuido.data.progress import Progress
 from neuido.data.trajectories.trajectory_files import COLUMNS, FORMAT, is_complete
 from neuido.errors import UserError
@@ -237,7 +235,7 @@ def _write_index(folder: Path, setup: Setup, instances: list[Instance]) -> None:
     from neuido import __version__
 
     entries = [{**asdict(instance), **_statistics(folder / f"{instance.name}.npy")} for instance in instances]
-    write_text(folder / "index.json", _json({"format": FORMAT, "version": __version__, "setup": asdict(setup), "trajectories": entries}))
+    write_json(folder / "index.json", {"format": FORMAT, "version": __version__, "setup": asdict(setup), "trajectories": entries})
 
 
 def _statistics(path: Path) -> dict[str, float]:
@@ -250,7 +248,3 @@ def _statistics(path: Path) -> dict[str, float]:
         residual += float(np.square(rows[..., 9:18] - rows[..., :9]).sum())
     count = array.shape[0] * array.shape[1]
     return {"stress_rms": math.sqrt(stress / count), "residual_rms": math.sqrt(residual / count)}
-
-
-def _json(content: dict[str, Any]) -> str:
-    return json.dumps(content, indent=1) + "\n"

@@ -4,7 +4,6 @@
 """
 
 import copy
-import json
 import math
 from pathlib import Path
 from typing import Any, Self
@@ -14,7 +13,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from neuido.data.files.parsing import read_json
-from neuido.data.files.writing import atomic_write, write_text
+from neuido.data.files.writing import atomic_write, write_json
 from neuido.data.weight_files import read_safetensors
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import rollout_laws
@@ -142,7 +141,7 @@ class Method(nn.Module):
     def write_card(self, folder: Path) -> None:
         """Write `method.json`."""
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / CARD, json.dumps(self.card(), indent=1) + "\n")
+        write_json(folder / CARD, self.card())
 
     def load(self, folder: Path) -> None:
         """Load what `save` wrote.

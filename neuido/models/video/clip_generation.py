@@ -3,7 +3,6 @@
 `neuido.data.clips` documents and reads the folder.
 """
 
-import json
 import math
 import os
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
 from neuido.data.clips import FORMAT, is_complete
 from neuido.data.files.output_folder import claimed_folder
-from neuido.data.files.writing import atomic_write, write_text
+from neuido.data.files.writing import atomic_write, write_json
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
@@ -116,7 +115,7 @@ def _generate_shard(plan: ClipPlan, folder: Path, chosen: torch.device, batch: i
         for i, name in enumerate(names):
             family, parameters = _material(plan, np.random.default_rng([plan.seed, i]), i)
             entries.append({"name": name, "family": family, "parameters": parameters})
-        write_text(folder / "index.json", json.dumps({"format": FORMAT, "plan": asdict(plan), "clips": entries}, indent=1) + "\n")
+        write_json(folder / "index.json", {"format": FORMAT, "plan": asdict(plan), "clips": entries})
 
 
 def sample_clip(plan: ClipPlan, number: int) -> ClipSetup:
