@@ -26,8 +26,6 @@ PAGES = sorted(p for p in DOCS.rglob("*.md") if not {"_build", "generated", "gal
 QUICK = {"Box", "Plane", "Scene", "Walls", "AttachedMass", "UserError", "configs_root", "shapes", "read_tracks", "load_scene"}
 RUN = ("neuido doctor", "neuido trajectories --out runs/small", "neuido fit --config configs/quickstart.yaml --data.root runs/small")
 """Commands that run at the size at which they stand, in the slow tier; the others are read by the command line that they are for."""
-LATER = ("demo", "report", "sweep", "diagnose", "reconstruct")
-"""Commands that take a folder of their own first: their options are looked up in their help."""
 
 
 def name_of(page: Path) -> str:

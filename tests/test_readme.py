@@ -16,8 +16,6 @@ README = ROOT / "README.md"
 if not README.is_file():
     pytest.skip("the README does not come with the installed package", allow_module_level=True)
 TEXT = README.read_text()
-MINUTES = ("neuido demo",)
-"""Commands that take minutes: run in the slow tier."""
 
 
 def blocks(language: str) -> list[str]:

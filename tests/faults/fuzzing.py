@@ -180,6 +180,27 @@ def swap(file: Path, how: str) -> None:
         file.symlink_to(outside)
 
 
+def make_sample(reader: Reader, folder: Path) -> list[Path]:
+    """Write a reader's sample into a new folder, and return its files that are damaged, relative to it."""
+    folder.mkdir()
+    reader.make(folder)
+    files = sorted(path.relative_to(folder) for path in folder.glob(reader.files) if path.is_file())
+    assert files, f"{reader.name}: no file of its sample is {reader.files}"
+    return files
+
+
+def damage(reader: Reader, folder: Path, files: list[Path], number: int) -> tuple[Path, str]:
+    """Damage a file of a whole sample as the number says, and return which one and how."""
+    rng = random.Random(f"{reader.name} {number}")
+    path = files[rng.randrange(len(files))]
+    if number < len(SWAPS):
+        swap(folder / path, SWAPS[number])
+        return path, SWAPS[number]
+    kind, new = mutated((folder / path).read_bytes(), path.suffix, rng)
+    (folder / path).write_bytes(new)
+    return path, kind
+
+
 def fuzz(reader: Reader, folder: Path, numbers: range, *, stop: float | None = None) -> tuple[list[Fault], int, float]:
     """Read damaged versions of a reader's sample.
 
@@ -193,11 +214,9 @@ def fuzz(reader: Reader, folder: Path, numbers: range, *, stop: float | None = N
         The faults, how many inputs were tried, and the longest time of a processor for one [s].
     """
     sample, work = folder / "sample", folder / "work"
-    sample.mkdir()
-    reader.make(sample)
-    files = sorted(path.relative_to(sample) for path in sample.glob(reader.files) if path.is_file())
-    assert files, f"{reader.name}: no file of its sample is {reader.files}"
-    names = sorted({part for path in sample.rglob("*") for part in (path.name, path.stem)} | {"work"})
+    files = make_sample(reader, sample)
+    stems = {path.stem for path in sample.rglob("*") if len(path.stem) > 2}  # a digit stands in any error
+    names = sorted({path.name for path in sample.rglob("*") if path.suffix} | stems | {"work"})
     content = {path: (sample / path).read_bytes() for path in files}
     faults, longest, tried = [], 0.0, 0
     shutil.copytree(sample, work)
@@ -207,14 +226,7 @@ def fuzz(reader: Reader, folder: Path, numbers: range, *, stop: float | None = N
         for number in numbers:
             if stop is not None and time.monotonic() > stop:
                 break
-            rng = random.Random(f"{reader.name} {number}")
-            path = files[rng.randrange(len(files))]
-            if number < len(SWAPS):
-                kind = SWAPS[number]
-                swap(work / path, kind)
-            else:
-                kind, new = mutated(content[path], path.suffix, rng)
-                (work / path).write_bytes(new)
+            path, kind = damage(reader, work, files, number)
             start = time.process_time()
             with limited():
                 what = fault_of(reader.read, work, names)
@@ -248,19 +260,8 @@ def main(args: list[str]) -> None:
 
     if len(args) > 1 and ":" not in args[1]:
         reader, number = READERS[args[0]], int(args[1])
-        folder = Path(tempfile.mkdtemp())
-        sample = folder / "sample"
-        sample.mkdir()
-        reader.make(sample)
-        files = sorted(path.relative_to(sample) for path in sample.glob(reader.files) if path.is_file())
-        rng = random.Random(f"{reader.name} {number}")
-        path = files[rng.randrange(len(files))]
-        if number < len(SWAPS):
-            swap(sample / path, SWAPS[number])
-        else:
-            kind, new = mutated((sample / path).read_bytes(), path.suffix, rng)
-            (sample / path).write_bytes(new)
-            print(sample / path, kind, len(new))
+        sample = Path(tempfile.mkdtemp()) / "sample"
+        print(sample, *damage(reader, sample, make_sample(reader, sample), number))
         print(reader.read(sample))
         return
     chosen = [READERS[name] for name in (args[0].split(",") if args and args[0] != "all" else READERS)]

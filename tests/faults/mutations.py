@@ -408,7 +408,7 @@ def bomb(shape: tuple[int, ...], name: str = "x") -> bytes:
     head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}"
     head = (head + " " * (63 - (len(head) + 10) % 64) + "\n").encode()
     total, stream = 8 * int(np.prod(shape, dtype=object)), io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
             file.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head)
             block = bytes(1 << 24)

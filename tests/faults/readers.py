@@ -2,13 +2,55 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 import yaml
+from plyfile import PlyData
 
+from neuido.commands.cli.checkpoint_options import check_checkpoint, numbers_of
+from neuido.commands.cli.sweep_file import command_of, read_sweep, runs_of
+from neuido.data.bodies.scene_files import load_scene
+from neuido.data.clips import FORMAT as CLIPS
+from neuido.data.clips import FilmDataModule, FlowWindows
+from neuido.data.files.html_page import video
+from neuido.data.files.results import figures, logged_curves, open_runs, scenes_of
+from neuido.data.files.score_tables import read_rows
+from neuido.data.files.sweep_run import FORMAT as SWEEP_RUN
+from neuido.data.formats.neuma import read_assets
+from neuido.data.importers.importing import import_file
+from neuido.data.measured.columns import errors_of
+from neuido.data.measured.experiment import read_declared_model, read_experiment
+from neuido.data.measured.material_test import read_material_tests
+from neuido.data.measured.track import read_tracks
+from neuido.data.scenes.filmed_scene import (
+    Motion,
+    Placement,
+    SceneSetting,
+    load_views,
+    read_body,
+    read_motion,
+    read_setting,
+    read_truth,
+    write_motion,
+    write_setting,
+)
+from neuido.data.scenes.readers import read as read_views
+from neuido.data.trajectories.trajectory_files import FORMAT as TRAJECTORIES
+from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
+from neuido.discrepancy.problems.declared_model import read_model_file
+from neuido.discrepancy.report.diagnosis import Diagnosis
+from neuido.models.baselines.nclaw import load_nclaw
+from neuido.models.fewshot.method import read_tensors, write_tensors
+from neuido.models.inference.law_file import load_law, save_law
+from neuido.models.inference.outputs import write_video
+from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+from neuido.models.render.gaussians import attach_gaussians, load_ply, save_ply
+from neuido.models.video.encoder import DynamicsEncoder
+from neuido.models.video.flow_vae import FlowVAE
 from tests.data import samples
 from tests.data.importers import test_importing as exports
 from tests.faults.fuzzing import Reader
@@ -44,6 +86,11 @@ TRACKS = {
 }  # fmt: skip
 
 
+def sample(write: Callable[..., object]) -> Callable[[Path], object]:
+    """Return a function that writes the common sample in a layout into a folder."""
+    return lambda folder: write(folder, SAMPLE)
+
+
 def _test(folder: Path) -> None:
     (folder / "test.yaml").write_text(yaml.safe_dump(TEST, sort_keys=False))
     (folder / "pull.csv").write_text("# made\na,b\n-,Pa\n" + "".join(f"{1 + 0.05 * i},{1e4 * i}\n" for i in range(9)))
@@ -61,31 +108,7 @@ def _scene(folder: Path) -> None:
     shutil.copy(ROOT / "configs" / "scenes" / "nclaw-cube.yaml", folder / "scene.yaml")
 
 
-def _experiment(folder: Path) -> None:
-    samples.experiment(folder, SAMPLE)
-
-
-def _read_experiment(folder: Path) -> object:
-    from neuido.data.measured.experiment import read_experiment
-
-    return read_experiment(folder)
-
-
-def _read_test(folder: Path) -> object:
-    from neuido.data.measured.material_test import read_material_tests
-
-    return read_material_tests(folder)
-
-
-def _read_tracks(folder: Path) -> object:
-    from neuido.data.measured.track import read_tracks
-
-    return read_tracks(folder)
-
-
 def _read_scene(folder: Path) -> object:
-    from neuido.data.bodies.scene_files import load_scene
-
     return load_scene(folder / "scene.yaml")
 
 
@@ -97,8 +120,6 @@ def _particles(folder: Path) -> None:
 
 
 def _read_particles(folder: Path) -> object:
-    from neuido.data.bodies.scene_files import load_scene
-
     return load_scene(folder / "scene.yaml", folder)
 
 
@@ -109,24 +130,13 @@ def _model(folder: Path) -> None:
 
 
 def _read_model(folder: Path) -> object:
-    from neuido.data.measured.experiment import read_declared_model
-    from neuido.discrepancy.problems.declared_model import read_model_file
-
     content = read_model_file(str(folder / "model.yaml"))
-    from neuido.data.measured.columns import errors_of
-
     with errors_of(folder / "model.yaml"):
         return read_declared_model(content)
 
 
 def _views(folder: Path) -> object:
-    from neuido.data.scenes.readers import read
-
-    return read(folder, frame_interval=0.02)
-
-
-def _blender(folder: Path) -> None:
-    samples.blender(folder, SAMPLE)
+    return read_views(folder, frame_interval=0.02)
 
 
 def _images(folder: Path) -> None:
@@ -147,26 +157,18 @@ def _images(folder: Path) -> None:
 
 
 def _read_images(folder: Path) -> object:
-    from neuido.data.scenes.filmed_scene import load_views
-
     return load_views(folder, workers=1)
 
 
 def _gaussians(folder: Path) -> None:
-    from neuido.models.render.gaussians import attach_gaussians, save_ply
-
     x = torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
     save_ply(folder / "gaussians.ply", attach_gaussians(x, torch.full((12,), 1e-3)))
     content = (folder / "gaussians.ply").read_bytes()
     (folder / "commented.ply").write_bytes(content.replace(b"end_header", "comment é\nend_header".encode()))
-    from plyfile import PlyData
-
     PlyData(PlyData.read(str(folder / "gaussians.ply")).elements, text=True).write(str(folder / "text.ply"))
 
 
 def _read_gaussians(folder: Path) -> object:
-    from neuido.models.render.gaussians import load_ply
-
     return [load_ply(path, device="cpu") for path in sorted(folder.glob("*.ply"))]
 
 
@@ -180,16 +182,8 @@ def _assets(folder: Path) -> None:
     np.savez(folder / "particles.npz", p_x=x.numpy(), vol=np.float32(1e-5))
 
 
-def _read_assets(folder: Path) -> object:
-    from neuido.data.formats.neuma import read_assets
-
-    return read_assets(folder)
-
-
 def _importer(name: str, make, file: str, count: int = 10_000, **options) -> Reader:
     def read(folder: Path) -> object:
-        from neuido.data.importers.importing import import_file
-
         return import_file(folder / file, None, **options)
 
     return Reader(f"import-{name}", make, file, read, count)
@@ -209,39 +203,31 @@ def _body(folder: Path) -> None:
 
 
 def _trajectories(folder: Path) -> None:
-    from neuido.data.trajectories.trajectory_files import FORMAT
-
     setup = {"wall_inset": 3, "steps": 8, "record_every": 4, "particles_per_side": 2}
     entries = []
     for i, split in enumerate(("train", "held_out")):
         np.save(folder / f"elastic-{i}.npy", np.ones((2, 8, 27), np.float32))
         entries.append({"name": f"elastic-{i}", "family": "elastic", "split": split, "parameters": {"young": 1e5, "poisson": 0.3},
                         "stress_rms": 1.0, "residual_rms": 0.1})  # fmt: skip
-    (folder / "index.json").write_text(json.dumps({"format": FORMAT, "setup": setup, "trajectories": entries}))
+    (folder / "index.json").write_text(json.dumps({"format": TRAJECTORIES, "setup": setup, "trajectories": entries}))
 
 
 def _read_trajectories(folder: Path) -> object:
-    from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
-
     module = TrajectoryDataModule(str(folder))
     return module.names, module.families, module.parameters, module.stress_rms, module.residual_rms, module.instance_names
 
 
 def _clips(folder: Path) -> None:
-    from neuido.data.clips import FORMAT
-
     rng = np.random.default_rng(0)
     entries = [{"name": f"clip-{i}", "family": "elastic", "parameters": {"young": 1e5, "poisson": 0.3}} for i in range(2)]
     for entry in entries:
         law = {key: rng.random((4, 3, 3), np.float32) for key in ("trial", "corrected", "stress")}
         np.savez(folder / f"{entry['name']}.npz", flow=np.zeros((2, 4, 8, 8, 2), np.float16), cell=np.ones(2, np.float32),
                  frame_interval=np.float32(0.02), **law)  # fmt: skip
-    (folder / "index.json").write_text(json.dumps({"format": FORMAT, "clips": entries}))
+    (folder / "index.json").write_text(json.dumps({"format": CLIPS, "clips": entries}))
 
 
 def _read_clips(folder: Path) -> object:
-    from neuido.data.clips import FilmDataModule, FlowWindows
-
     module = FilmDataModule(str(folder))
     paths = [folder / f"{clip['name']}.npz" for clip in module.clips]
     return [module.read(i) for i in range(len(module.clips))], module.training_count, FlowWindows(paths, 4, 1, 0)[0]
@@ -256,20 +242,18 @@ def _runs(folder: Path) -> None:
 
 
 def _read_runs(folder: Path) -> object:
-    from neuido.data.files.results import figures, logged_curves, open_runs, scenes_of
-
     entries = open_runs([str(folder)])
     rows = [entry.by_frame(scene) for scene in scenes_of(entries) for entry in entries]
     return [figures(own, "cd") for own in rows], [logged_curves(entry.root) for entry in entries]
 
 
 def _sweep_runs(folder: Path) -> None:
-    from neuido.data.files.sweep_run import FORMAT
-
     for i in range(2):
         run = folder / f"lr-{i}"
         run.mkdir()
-        (run / "run.json").write_text(json.dumps({"format": FORMAT, "status": "done", "parameters": {"model.lr": 0.1 * i}, "seconds": 3.5}))
+        (run / "run.json").write_text(
+            json.dumps({"format": SWEEP_RUN, "status": "done", "parameters": {"model.lr": 0.1 * i}, "seconds": 3.5})
+        )
         (run / "metrics.csv").write_text("epoch,step,loss\n0,1,2.5\n0,2,1.5\n")
 
 
@@ -286,16 +270,11 @@ def _sweep(folder: Path) -> None:
 
 
 def _read_sweep(folder: Path) -> object:
-    from neuido.commands.cli.sweep_file import command_of, read_sweep, runs_of
-
     sweep = read_sweep(folder / "sweep.yaml")
     return [command_of(sweep, run, {}) for run in runs_of(sweep, count=3)]
 
 
 def _setting(folder: Path) -> None:
-    from neuido.data.measured.experiment import read_experiment
-    from neuido.data.scenes.filmed_scene import Motion, Placement, SceneSetting, write_motion, write_setting
-
     own = folder.parent / "experiment-of-setting"
     samples.experiment(own, SAMPLE)
     found = read_experiment(own)
@@ -311,8 +290,6 @@ def _setting(folder: Path) -> None:
 
 
 def _read_setting(folder: Path) -> object:
-    from neuido.data.scenes.filmed_scene import read_body, read_motion, read_setting, read_truth
-
     return read_setting(folder / "scene.yaml"), read_motion(folder), read_body(folder / "body.npz"), read_truth(folder)
 
 
@@ -321,15 +298,11 @@ def _diagnosis(folder: Path) -> None:
 
 
 def _read_diagnosis(folder: Path) -> object:
-    from neuido.discrepancy.report.diagnosis import Diagnosis
-
     found = Diagnosis.read(folder)
     return found.name, found.bodies, found.answer, found.effects, found.error, found.line, found.summary(), repr(found)
 
 
 def _operator(folder: Path) -> None:
-    from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-
     torch.manual_seed(0)
     operator = IntrinsicDynamicsOperator(latent_dim=4, hidden_dim=8, head_dim=4, basis_dim=3)
     operator.set_latents(torch.zeros(2, 4), ["a", "b"], ["elastic", "elastic"])
@@ -337,49 +310,33 @@ def _operator(folder: Path) -> None:
 
 
 def _read_operator(folder: Path) -> object:
-    from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-
     return IntrinsicDynamicsOperator.load(folder / "operator.safetensors")
 
 
 def _law(folder: Path) -> None:
-    from neuido.models.inference.law_file import save_law
-    from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-
     torch.manual_seed(0)
     operator = IntrinsicDynamicsOperator(latent_dim=4, hidden_dim=8, head_dim=4, basis_dim=3)
     save_law(folder / "law.safetensors", operator, torch.zeros(4))
 
 
 def _read_law(folder: Path) -> object:
-    from neuido.models.inference.law_file import load_law
-
     return load_law(folder / "law.safetensors")
 
 
 def _encoder(folder: Path) -> None:
-    from neuido.models.video.encoder import DynamicsEncoder
-    from neuido.models.video.flow_vae import FlowVAE
-
     torch.manual_seed(0)
     DynamicsEncoder(FlowVAE(width=8), latent_dim=4, width=6, heads=2).save(folder / "encoder.safetensors")
 
 
 def _read_encoder(folder: Path) -> object:
-    from neuido.models.video.encoder import DynamicsEncoder
-
     return DynamicsEncoder.load(folder / "encoder.safetensors")
 
 
 def _fit(folder: Path) -> None:
-    from neuido.models.fewshot.method import write_tensors
-
     write_tensors(folder / "start.safetensors", {"twist": torch.zeros(2, 3)})
 
 
 def _read_fit(folder: Path) -> object:
-    from neuido.models.fewshot.method import read_tensors
-
     return read_tensors(folder / "start.safetensors")
 
 
@@ -389,8 +346,6 @@ def _checkpoint(folder: Path) -> None:
 
 
 def _read_checkpoint(folder: Path) -> object:
-    from neuido.commands.cli.checkpoint_options import check_checkpoint, numbers_of
-
     check_checkpoint(str(folder / "last.ckpt"))
     if (folder / "last.ckpt").is_dir():  # of a distributed strategy; Lightning reads it
         return None
@@ -408,20 +363,14 @@ def _nclaw(folder: Path) -> None:
 
 
 def _read_nclaw(folder: Path) -> object:
-    from neuido.models.baselines.nclaw import load_nclaw
-
     return load_nclaw(folder / "nclaw.npz")
 
 
 def _video(folder: Path) -> None:
-    from neuido.models.inference.outputs import write_video
-
     write_video(folder / "film.mp4", torch.rand(4, 16, 24, 3, generator=torch.Generator().manual_seed(0)))
 
 
 def _read_video(folder: Path) -> object:
-    from neuido.data.files.html_page import video
-
     return video(folder / "film.mp4", "film", width=32)
 
 
@@ -430,35 +379,33 @@ def _table(folder: Path) -> None:
 
 
 def _read_table(folder: Path) -> object:
-    from neuido.data.files.score_tables import read_rows
-
     return read_rows(folder / "paper.csv")
 
 
 GROUPS = {
     "measured": (
-        Reader("experiment", _experiment, "experiment.yaml", _read_experiment, 2_000),
-        Reader("experiment-arrays", _experiment, "*/particles.npz", _read_experiment, 2_000),
-        Reader("material-test", _test, "test.yaml", _read_test),
-        Reader("material-test-table", _test, "*.csv", _read_test),
-        Reader("track", _tracks, "track.yaml", _read_tracks),
-        Reader("track-table", _tracks, "*.csv", _read_tracks),
+        Reader("experiment", sample(samples.experiment), "experiment.yaml", read_experiment, 2_000),
+        Reader("experiment-arrays", sample(samples.experiment), "*/particles.npz", read_experiment, 2_000),
+        Reader("material-test", _test, "test.yaml", read_material_tests),
+        Reader("material-test-table", _test, "*.csv", read_material_tests),
+        Reader("track", _tracks, "track.yaml", read_tracks),
+        Reader("track-table", _tracks, "*.csv", read_tracks),
         Reader("scene", _scene, "scene.yaml", _read_scene),
         Reader("scene-particles", _particles, "body.npz", _read_particles),
         Reader("model", _model, "model.yaml", _read_model),
     ),
     "recordings": (
-        Reader("nerfstudio", lambda f: samples.nerfstudio(f, SAMPLE), "*.json", _views),
-        Reader("blender", _blender, "*.json", _views),
-        Reader("neuma-synthetic", lambda f: samples.neuma_synthetic(f, SAMPLE), "*.json", _views),
-        Reader("neuma-real", lambda f: samples.neuma_real(f, SAMPLE), "**/*.[jb][si][on]*", _views),
-        Reader("pacnerf", lambda f: samples.pacnerf(f, SAMPLE), "*.json", _views),
-        Reader("springgaus-synthetic", lambda f: samples.springgaus_synthetic(f, SAMPLE), "*.json", _views),
-        Reader("springgaus-real", lambda f: samples.springgaus_real(f, SAMPLE), "**/*.[jb][si][on]*", _views),
-        Reader("colmap", lambda f: samples.colmap(f, SAMPLE), "**/*.bin", _views),
+        Reader("nerfstudio", sample(samples.nerfstudio), "*.json", _views),
+        Reader("blender", sample(samples.blender), "*.json", _views),
+        Reader("neuma-synthetic", sample(samples.neuma_synthetic), "*.json", _views),
+        Reader("neuma-real", sample(samples.neuma_real), "**/*.[jb][si][on]*", _views),
+        Reader("pacnerf", sample(samples.pacnerf), "*.json", _views),
+        Reader("springgaus-synthetic", sample(samples.springgaus_synthetic), "*.json", _views),
+        Reader("springgaus-real", sample(samples.springgaus_real), "**/*.[jb][si][on]*", _views),
+        Reader("colmap", sample(samples.colmap), "**/*.bin", _views),
         Reader("images", _images, "*/*.*", _read_images),
         Reader("gaussians", _gaussians, "*.ply", _read_gaussians),
-        Reader("neuma-assets", _assets, "*.*", _read_assets),
+        Reader("neuma-assets", _assets, "*.*", read_assets),
     ),
     "imports": (
         _importer("instron", exports.instron, "instron.csv"),

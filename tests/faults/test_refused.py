@@ -1,6 +1,7 @@
 """What cannot be done is refused before work begins, and the clock does not say what is newer."""
 
 import os
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -8,10 +9,12 @@ import pytest
 from neuido.commands.simulation.trajectories import trajectories
 from neuido.commands.sweep import logged
 from neuido.data.bodies.scene_files import scene_from_dict
+from neuido.data.files.parsing import read_arrays, read_image
 from neuido.data.files.results import logged_curves
 from neuido.discrepancy import workflow
 from neuido.errors import UserError
 from tests.command import run
+from tests.faults.mutations import bomb, png_bomb
 
 PLANE = {"type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 1.0, 0.0], "contact": "separate", "friction": 0.0}
 SCENE = {"domain": [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], "gravity": [0.0, -9.8, 0.0]}
@@ -71,3 +74,25 @@ def test_too_many_colliders_are_refused(monkeypatch):
     monkeypatch.setenv("NEUIDO_MAX_COLLIDERS", "2")
     with pytest.raises(UserError, match="NEUIDO_MAX_COLLIDERS"):
         scene_from_dict(SCENE | {"colliders": [PLANE] * 3}, numbers)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "read", "limit"),
+    [
+        ("bomb.npz", lambda: bomb((2_000_000,)), lambda path: read_arrays(path, ["x"]), "NEUIDO_MAX_ARRAY_ELEMENTS"),
+        ("bomb.png", lambda: png_bomb(4_000, 4_000), read_image, "NEUIDO_MAX_IMAGE_PIXELS"),
+    ],
+)
+def test_a_small_file_of_much_content_is_refused_before_it_is_unpacked(name, content, read, limit, tmp_path, monkeypatch):
+    path = tmp_path / name
+    path.write_bytes(content())
+    unpacked = 16_000_000
+    assert path.stat().st_size < unpacked / 500
+    assert read(path) is not None  # whole, and below the usual limit
+    monkeypatch.setenv(limit, "1000000")
+    tracemalloc.start()
+    with pytest.raises(UserError, match=rf"{name}.*the limit of 1000000.*{limit}"):
+        read(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < unpacked / 10

@@ -92,7 +92,7 @@ def test_malformed(folder, old, new, message):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("0.2,2,7", "0.1,2,7", "but 0.1 s follows 0.1 s"),
+        ("0.2,2,7", "0.1,2,7", "times must increase from row to row, but 0.1 s follows 0.1 s"),
         ("0.2,2,7", "0.2,2,nan", "data row 2, up is 'nan', which is not a finite number"),
         ("0.2,2,7", "0.2,2,", "data row 2, up is '', which is not a finite number"),
         ("0.2,2,7", "0.2", "data row 2, across is missing"),

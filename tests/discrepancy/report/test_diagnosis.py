@@ -1,6 +1,7 @@
 """Diagnosis from Python: the command's answer, on a folder and on data that are read already, and what can be asked of it."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -71,8 +72,11 @@ def test_words_name_effect_figure_and_errors(found):
         assert part in repr(found)
     words = found.summary()
     assert words == "\n".join(found.words.paragraphs) == "\n".join(found.to_dict()["words"])
-    for part in (title(effect.name), f"{effect.parameter} = {effect.value:.1g}"[:7], f"{1e3 * found.error.after:.3g} mm after"):
-        assert part in words
+    assert title(effect.name) in words
+    (size,) = re.findall(rf"{effect.parameter} = ([\d.]+) per metre", words)
+    assert float(size) == pytest.approx(effect.value, rel=0.02) and effect.unit == "1/m"
+    (errors,) = re.findall(r"Held-out error ([\d.]+) mm before, ([\d.]+) mm after", words)
+    assert [float(e) for e in errors] == pytest.approx([1e3 * found.error.before, 1e3 * found.error.after], rel=5e-3)
 
 
 def test_plot_has_a_panel_for_each_recording(found):

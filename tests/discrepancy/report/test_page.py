@@ -162,8 +162,33 @@ def test_a_recording_that_cannot_be_predicted_has_no_figure():
     for when in ("before", "after"):
         c["error"][when]["by_recording"]["throw"] = None
     c["effects"][0]["parameters"]["k"]["interval90"] = [2.5, None]
-    said = read(page.page([c], [{}])).text
+    text = page.page([c], [{}])
+    said = read(text).text
     assert "2.50 to infinite" in said and "nan" not in said.lower().replace("dynamic", "")
+    assert re.search(r"<td[^>]*>throw \(fit\)</td>\s*(<td[^>]*></td>\s*){3}</tr>", text), "errors that there are not are empty cells"
+
+
+def test_other_settings_are_named():
+    c = content()
+    c["error"] |= {
+        "amounts": {"before": {"half <1>": 0.1}, "after": {"half <1>": -0.75}},
+        "one_setting": {
+            when: c["error"][when] | {"fit": fit, "held_out": held_out}
+            for when, fit, held_out in (("before", 0.3, 0.4), ("after", 0.03, 0.0625))
+        },
+    }
+    text = page.page([c], [{}])
+    assert "half &lt;1&gt;: 0.10 before, −0.75 after" in text
+    assert "One simulation without them leaves 400 mm before and 62.5 mm after." in text
+    del c["error"]["amounts"], c["error"]["one_setting"]
+    assert "One simulation without them" not in page.page([c], [{}])
+
+
+def test_what_was_rejected_has_a_table_of_its_own():
+    c = content(models=[], rejected=[{"name": "gravity", "reason": "leaves 9 times the error of drag_linear"}])
+    text = page.page([c], [{}])
+    assert ">Rejected</h3>" in text and "leaves 9 times the error of linear air drag" in text
+    assert ">Rejected</h3>" not in page.page([c | {"rejected": []}], [{}])
 
 
 def test_a_page_without_plots_holds_no_plotting_library():
@@ -191,6 +216,13 @@ def test_player_holds_the_motion():
     for key, packed in zip(motion_player.SETS, sets, strict=True):
         np.testing.assert_allclose(np.array(own["middle"]) + own["scale"] * packed, 1e3 * m["throw"][key], atol=0.1)
     assert own["down"] == [0.0, -1.0, 0.0] and own["name"] == "throw (fit)"
+
+
+def test_player_holds_so_many_points_and_frames_and_no_more():
+    x = np.random.default_rng(0).uniform(0, 1, (90, 600, 3))
+    arrays = {"positions": np.array(1), "t": np.linspace(0, 0.89, 90), "measured": x, "before": x + 0.1, "after": x + 0.01}
+    (own,) = motion_player.player({"throw": arrays}, content(), Units())["recordings"]
+    assert (own["points"], own["frames"]) == (motion_player.MOST_POINTS, motion_player.MOST_FRAMES) == (400, 60)
 
 
 def test_player_draws_a_floor_that_is_near_and_hides_what_was_not_seen():

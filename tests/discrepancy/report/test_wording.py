@@ -72,6 +72,7 @@ def test_next_experiment_is_told_with_its_odds():
         "expected_log_odds": 3.0,
         "others": [],
     }
+    assert words_of(content(next_experiment=None)).next == ""
     said = words_of(content(next_experiment=proposal)).next
     assert (
         said
@@ -108,6 +109,7 @@ def test_every_effect_of_the_library_has_words():
         (2e-4, (1.6e-4, 2.5e-4), "1/Pa", ("0.20", "0.16–0.25")),
         (1.0, (1.0, 1.0), "1", ("1.00", "")),
         (1.0, (None, 2.0), "1", ("1.00", "infinite to 2.00")),
+        (1.0, (None, None), "1", ("1.00", "infinite to infinite")),
     ],
 )
 def test_figures_have_as_many_digits_as_their_intervals_bear(value, interval, unit, shown):
