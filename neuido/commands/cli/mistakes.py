@@ -263,9 +263,9 @@ def _check_words(args: list[str], content: Mapping[str, Any], *, trust: bool) ->
 def _takes_text(rest: list[str], key: str, given: Any) -> bool:
     """Return whether `--model.method.init_from` and the like is text or a path: a file named there is no configuration."""
     rest = rest[1:] if rest[:1] == ["init_args"] else rest
-    given = {"class_path": given} if isinstance(given, str) else given
+    given = as_class(given)
     class_path = str(given.get("class_path")) if isinstance(given, Mapping) else ""
-    found = signature(TRAINER if key == "trainer" else class_named(key, class_path) or class_path)
+    found = signature(TRAINER) if key == "trainer" else signature_of(key, class_path)
     if not rest or found is None:
         return False
     if rest[0] in BASES:
