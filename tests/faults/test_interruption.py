@@ -13,11 +13,11 @@ import torch
 import yaml
 from lightning.pytorch import Callback, LightningModule, Trainer
 from safetensors.torch import load_file
-from torch.utils.data import DataLoader, TensorDataset
 
 from neuido.commands.cli.interruption import received, stop_at_step, watched
 from neuido.commands.main import main
 from neuido.commands.sweep import sweep
+from neuido.data.sampling import FixedBatches, ResumableLoader
 
 FIT = {
     "model": {"class_path": "PretrainModule", "init_args": {"latent_dim": 4, "instance_steps": 1}},
@@ -115,8 +115,18 @@ def test_an_interrupted_fit_goes_on_to_the_same_bits(made, tmp_path):
     assert resumed.keys() == whole.keys() and all(torch.equal(resumed[name], whole[name]) for name in whole)
 
 
+class Points(ResumableLoader[torch.Tensor]):
+    """Two batches of points an epoch."""
+
+    def __len__(self) -> int:
+        return 2
+
+    def batches(self, epoch: int, start: int) -> list[torch.Tensor]:
+        return list(torch.linspace(0.0, 1.0, 8).reshape(2, 2, 2)[start:])
+
+
 class Line(LightningModule):
-    """A line through points, in two batches an epoch."""
+    """A line through points."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -124,18 +134,19 @@ class Line(LightningModule):
         self.layer = torch.nn.Linear(2, 1)
 
     def training_step(self, batch, _):
-        return (self.layer(batch[0]) - 1.0).square().mean()
+        return (self.layer(batch) - 1.0).square().mean()
 
     def validation_step(self, batch, _):
-        self.layer(batch[0])
+        self.layer(batch)
 
     def configure_optimizers(self):
         return torch.optim.Adam(self.parameters(), lr=0.1)
 
     def train_dataloader(self):
-        return DataLoader(TensorDataset(torch.linspace(0.0, 1.0, 8).reshape(4, 2)), batch_size=2)
+        return Points({})
 
-    val_dataloader = train_dataloader
+    def val_dataloader(self):
+        return FixedBatches(Points({}).batches(0, 0))
 
 
 class Terminates(Callback):
