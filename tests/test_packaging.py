@@ -26,11 +26,13 @@ def imported_names() -> set[str]:
                 found |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 found.add(node.module.split(".")[0])
+            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "import_extra" and isinstance(node.args[0], ast.Constant):
+                found.add(node.args[0].value)
     return found
 
 
 def test_extras_are_imported_by_code():
-    names = {re.split(r"[<>=!\[]", part)[0] for extra in ("video", "gpu") for part in PROJECT["optional-dependencies"][extra]}
+    names = {re.split(r"[<>=!\[]", part)[0] for extra in ("video", "gpu", "import") for part in PROJECT["optional-dependencies"][extra]}
     assert names <= imported_names()
 
 

@@ -1,4 +1,4 @@
-"""The `import` command: tables of a testing machine or a tracker become a folder to diagnose."""
+"""The `import` command: tables of a testing machine or a tracker, or videos, become a folder to diagnose."""
 
 
 def import_data(
@@ -27,15 +27,19 @@ def import_data(
     diameter: float | None = None,
     volume: float | None = None,
     floor: float | None = None,
+    start: float | None = None,
+    end: float | None = None,
+    background: str | None = None,
+    picture: str | None = None,
     held_out: str = "",
     dry_run: bool = False,
 ) -> None:
-    """Turn tables of a testing machine, or exports of a tracker or of motion capture, into a folder that `neuido diagnose` reads.
+    """Turn tables of a testing machine, exports of a tracker or of motion capture, or videos into a folder that `neuido diagnose` reads.
 
     Prints what was understood. What a file does not say is asked for, by the name of its option.
 
     Args:
-        files: Files, one a recording; text of any dialect, xlsx, trc or c3d.
+        files: Files, one a recording; text of any dialect, xlsx, trc, c3d, or video (mp4, mov, avi, mkv).
         out: Folder to write, which must not be there.
         kind: auto, material (a testing machine), track (a body as one point) or body (points on a deforming body).
         mode: Of a material test: uniaxial, equibiaxial, pure_shear, biaxial or simple_shear.
@@ -53,12 +57,16 @@ def import_data(
         scale: Metres a unit of the positions, for example metres a pixel.
         y_down: Whether y points down, as in images.
         up: The axis that points up, y or z.
-        frame_rate: Frames a second, where the file counts frames.
+        frame_rate: Frames a second, where the file counts frames; of a video in slow motion, the true ones.
         point: Of several points the one to follow, or mean.
         mass: Of the body in kg.
-        diameter: Of the body in m.
+        diameter: Of the body in m; of a video without --scale, it gives the scale.
         volume: Of a deforming body in m^3; the hull of the first frame where absent.
         floor: Height of a floor in m.
+        start: Of a video, the first moment to use, s.
+        end: Of a video, the last moment to use, s.
+        background: Of a video, an image of the empty scene; the median of the frames where absent.
+        picture: Of videos, a PNG file for frames with the outline that was found; written with --dry_run too.
         held_out: Names of recordings that are only scored, with commas; the last of several where absent.
         dry_run: Only say what was understood.
 
@@ -68,6 +76,7 @@ def import_data(
     from pathlib import Path
 
     from neuido.data.files.writing import check_writable
+    from neuido.data.footage.filming import Filming
     from neuido.data.importers.importing import import_file
     from neuido.data.importers.testing_machine import Specimen
     from neuido.errors import UserError
@@ -84,6 +93,7 @@ def import_data(
         columns=columns,
         units={**({"strain": strain_unit} if strain_unit else {}), **(units or {})},
         specimen=Specimen(length, width, thickness, section_diameter),
+        filming=Filming(start, end, background, picture=picture),
         compression=compression,
         density=density,
         young=young,

@@ -10,6 +10,8 @@ import numpy as np
 import yaml
 
 from neuido.data.files.parsing import naming
+from neuido.data.footage.filming import Filming
+from neuido.data.footage.video_frames import is_video
 from neuido.data.importers.checked_folder import write_checked
 from neuido.data.importers.testing_machine import Specimen, read_machine
 from neuido.data.importers.titled_tables import read_cells
@@ -29,6 +31,7 @@ def import_file(
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     specimen: Specimen | None = None,
+    filming: Filming | None = None,
     compression: bool = False,
     density: float | None = None,
     young: float | None = None,
@@ -44,7 +47,7 @@ def import_file(
     floor: float | None = None,
     held_out: Sequence[str] = (),
 ) -> list[str]:
-    """Convert files of a testing machine or a tracker to a folder for `neuido diagnose`.
+    """Convert files of a testing machine, a tracker or a camera to a folder for `neuido diagnose`.
 
     `neuido import --help` describes the options.
 
@@ -82,8 +85,19 @@ def import_file(
     roles = {name: "held_out" if name in held else "fit" for name in names}
     columns, units = dict(columns or {}), dict(units or {})
     summary: list[str] = []
+    filming, sheet = filming or Filming(), None
+    if films := [path for path in paths if is_video(path)]:
+        from neuido.data.footage.contact_sheet import Sheet
+
+        if len(films) < len(paths):
+            raise UserError(
+                f"{films[0].name} is a video and {next(p for p in paths if p not in films).name} is not: import them one by one"
+            )
+        sheet = Sheet()
+        if filming.cameras is None and kind not in ("auto", "track"):
+            raise UserError(f"--kind {kind} is not for videos: leave it out, and give --cameras if the clips are views of one motion")
     with naming(paths[0]):
-        chosen = _kind(paths[0], columns) if kind == "auto" else kind
+        chosen = "track" if films else _kind(paths[0], columns) if kind == "auto" else kind
     if chosen == "material":
         tables, tests, secants = {}, [], []
         for path, name in zip(paths, names):
@@ -106,10 +120,18 @@ def import_file(
         content = {"format": "neuido-material-test/1", "name": names[0], "model": model, "tests": tests}
         _write(out, "test.yaml", content, tables)
     elif chosen == "track":
-        tables, recordings = {}, []
+        tables, recordings, scale_error = {}, [], 0.0
         for path, name in zip(paths, names):
             with naming(path):
-                t, points, notes = _motion(path, read_motion(path, columns), scale, y_down, up, frame_rate, units)
+                if sheet is None:
+                    motion = read_motion(path, columns)
+                else:
+                    from neuido.data.footage.centre_track import read_centres
+
+                    found = read_centres(path, filming, frame_rate=frame_rate, diameter=diameter, scaled=scale is not None, sheet=sheet)
+                    motion = Motion(found.t, {"object": found.x}, found.unit, False, found.notes)
+                    scale_error = max(scale_error, found.scale_error)
+                t, points, notes = _motion(path, motion, scale, y_down and sheet is None, up, frame_rate, units)
                 x = _one_point(points, point, path)
             summary += [f"{path.name}: {note}" for note in notes]
             seen = np.isfinite(x).all(axis=1)
@@ -126,6 +148,8 @@ def import_file(
             summary.append("mass or diameter of the body is unknown (--mass in kg, --diameter in m): forces are reported per unit mass")
         content = {"format": "neuido-track/1", "name": names[0], "model": {"gravity": [0.0, -9.81, 0.0]}, "bodies": {"body": figures},
                    "recordings": recordings}  # fmt: skip
+        if scale_error:
+            content["nuisances"] = {"length_scale": float(f"{scale_error:.2g}")}
         _write(out, "track.yaml", content, tables)
     else:
         from neuido.data.importers.deforming import write_deforming_body
@@ -140,6 +164,9 @@ def import_file(
             summary += write_deforming_body(
                 takes, out, roles=roles, density=density, young=young, poisson=poisson, volume=volume, floor=floor
             )
+    if sheet is not None and filming.picture is not None:
+        sheet.write(Path(filming.picture).expanduser())
+        summary.append(f"contact sheet in {filming.picture}")
     if out is not None:
         summary.append(f"next: neuido check {out}; neuido diagnose {out} --out {out}-answer")
     return summary

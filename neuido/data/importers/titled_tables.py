@@ -8,8 +8,9 @@ import numpy as np
 
 from neuido.data.files.delimited import is_number, read_delimited
 from neuido.data.files.parsing import parser_errors
-from neuido.data.importers.units import import_extra, is_unit
+from neuido.data.importers.units import is_unit
 from neuido.errors import UserError
+from neuido.physics.runtime.lazy import import_extra
 
 LONGEST_TITLE = 200
 """Characters of a title that are looked at."""

@@ -11,8 +11,9 @@ from neuido.data.files.delimited import is_number
 from neuido.data.files.parsing import parser_errors
 from neuido.data.importers.titled_tables import read_cells, read_titled
 from neuido.data.importers.titles import find_columns
-from neuido.data.importers.units import conversion_factor, import_extra
+from neuido.data.importers.units import conversion_factor
 from neuido.errors import UserError
+from neuido.physics.runtime.lazy import import_extra
 
 MIN_LIKELIHOOD = 0.6
 """Smallest likelihood at which a point of DeepLabCut counts as seen."""

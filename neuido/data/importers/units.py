@@ -5,6 +5,7 @@ from functools import lru_cache
 from typing import Any
 
 from neuido.errors import UserError
+from neuido.physics.runtime.lazy import import_extra
 from neuido.physics.runtime.once import cached
 
 _SPELLED = {
@@ -16,24 +17,6 @@ _SPELLED = {
 
 _TOWER = re.compile(r"(\^|\*\*)\s*[+-]?\s*\d{2}|\^.*\^|\*\*.*\*\*|\d{5}")
 """Powers above 9, and powers of powers: numbers without end, in a file that is not trusted."""
-
-
-def import_extra(module: str, what: str) -> Any:
-    """Import a library of the optional extra `import`.
-
-    Args:
-        module: Name of the library.
-        what: What needs it, for the error message.
-
-    Raises:
-        UserError: The library is not installed.
-    """
-    import importlib
-
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise UserError(f"{what} needs {module}: pip install 'neuido[import]'") from error
 
 
 @cached

@@ -1,8 +1,10 @@
-"""Lazy import of the public names of a package (PEP 562)."""
+"""Lazy import of the public names of a package (PEP 562), and of the libraries of optional extras."""
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
+
+from neuido.errors import UserError
 
 
 def lazy_names(package: str, modules: Mapping[str, Sequence[str]]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -26,3 +28,20 @@ def lazy_names(package: str, modules: Mapping[str, Sequence[str]]) -> tuple[Call
         return sorted({*source, *own})
 
     return get, names
+
+
+def import_extra(module: str, what: str, *, extra: str = "import") -> Any:
+    """Import a library of an optional extra.
+
+    Args:
+        module: Name of the library.
+        what: What needs it, for the error message.
+        extra: The extra that has it.
+
+    Raises:
+        UserError: The library is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise UserError(f"{what} needs {module}: pip install 'neuido[{extra}]'") from error

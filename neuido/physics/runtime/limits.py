@@ -21,13 +21,14 @@ LIMITS = {
     "NEUIDO_MAX_TABLE_CELLS": 5_000_000,
     "NEUIDO_MAX_ARRAY_ELEMENTS": 1 << 28,
     "NEUIDO_MAX_IMAGE_PIXELS": 1 << 27,
+    "NEUIDO_MAX_FRAMES": 100_000,
     "NEUIDO_MAX_PARTICLES": 20_000_000,
     "NEUIDO_MAX_COLLIDERS": 256,
     "NEUIDO_MAX_STEPS": 10_000_000,
     "NEUIDO_MAX_TRAJECTORIES": 1_000_000,
 }
 """Largest number of bytes of a text file and of a YAML file, nodes of a YAML file, cells of a table, elements of an array, pixels of an
-image, particles of a body or a PLY file, colliders of a scene, steps of a simulation, and trajectories of a folder."""
+image, frames of a video, particles of a body or a PLY file, colliders of a scene, steps of a simulation, and trajectories of a folder."""
 
 MEMORY = "NEUIDO_MAX_MEMORY_BYTES"
 """The environment variable with the largest memory that one simulation may need."""
