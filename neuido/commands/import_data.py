@@ -15,6 +15,12 @@ def import_data(
     thickness: str | None = None,
     section_diameter: str | None = None,
     compression: bool = False,
+    zero: str = "none",
+    rows: str = "",
+    average: int = 1,
+    cycles: str = "together",
+    step: str | None = None,
+    sheet: str | None = None,
     density: float | None = None,
     young: float | None = None,
     poisson: float | None = None,
@@ -39,10 +45,11 @@ def import_data(
     Prints what was understood. What a file does not say is asked for, by the name of its option.
 
     Args:
-        files: Files, one a recording; text of any dialect, xlsx, trc, c3d, or video (mp4, mov, avi, mkv).
+        files: Files, one a recording; text of any dialect, xlsx, xls, trc, c3d, or video (mp4, mov, avi, mkv). A table of several
+            specimens is several tests.
         out: Folder to write, which must not be there.
         kind: auto, material (a testing machine), track (a body as one point) or body (points on a deforming body).
-        mode: Of a material test: uniaxial, equibiaxial, pure_shear, biaxial or simple_shear.
+        mode: Of a material test: uniaxial, compression, equibiaxial, pure_shear, biaxial or simple_shear.
         columns: Quantity and title, where titles do not say it: --columns.force "Channel 2".
         units: Quantity and unit, where the table gives none: --units.force kN.
         strain_unit: Unit of the strain: percent, or a ratio such as mm/mm.
@@ -50,7 +57,14 @@ def import_data(
         width: Its width, with a unit.
         thickness: Its thickness, with a unit.
         section_diameter: Of a round specimen, with a unit.
-        compression: Whether the table counts compression as positive.
+        compression: Whether the table counts compression as positive. In mode compression the signs are found.
+        zero: Zero of the strain: none, first (the first row, of the stress too), toe (where the straight line of the first loading meets
+            zero stress, as in ASTM D638), or a preload as "0.5 N".
+        rows: Data rows to use, as START:STOP or START:STOP:STEP from 0.
+        average: Rows whose mean becomes one row.
+        cycles: together: one history. split: each loading and unloading is a test, of the same specimen.
+        step: Step of shear that a relaxation modulus belongs to, as 0.01 or "1 %".
+        sheet: Of a spreadsheet the only sheet to read.
         density: kg/m^3.
         young: A guess of Young's modulus, in Pa.
         poisson: Poisson's ratio; a material test without it is incompressible.
@@ -78,7 +92,8 @@ def import_data(
     from neuido.data.files.writing import check_writable
     from neuido.data.footage.filming import Filming
     from neuido.data.importers.importing import import_file
-    from neuido.data.importers.testing_machine import Specimen
+    from neuido.data.importers.machines.loading_path import Preparation
+    from neuido.data.importers.machines.testing_machine import Specimen
     from neuido.errors import UserError
 
     if out is None and not dry_run:
@@ -95,6 +110,9 @@ def import_data(
         specimen=Specimen(length, width, thickness, section_diameter),
         filming=Filming(start, end, background, picture=picture),
         compression=compression,
+        preparation=Preparation(rows, average, zero, cycles),
+        step=step,
+        sheet=sheet,
         density=density,
         young=young,
         poisson=poisson,

@@ -22,7 +22,7 @@ class Delimited(NamedTuple):
     """Cells of a text table; its numbers have a decimal point."""
 
     rows: list[list[str]]
-    """Rows that are neither empty nor comments."""
+    """Rows that are neither empty nor comments; titles that stand in a comment directly above the numbers are a row."""
     lines: list[int]
     """Line number of each row in the file, from 1."""
     encoding: str
@@ -56,7 +56,26 @@ def read_delimited(path: Path) -> Delimited:
         if any(cells):
             rows.append(cells)
             lines.append(i)
+    titles = _titles_in_comment(text, rows, lines, separator)
+    if titles is not None:
+        rows, lines = [titles[1], *rows], [titles[0], *lines]
     return Delimited(rows, lines, encoding, separator, decimal)
+
+
+def _titles_in_comment(text: str, rows: list[list[str]], lines: list[int], separator: str) -> tuple[int, list[str]] | None:
+    """Return the line and the cells of the comment above a table without titles, `# t x y`, if it has as many cells as a row."""
+    if not rows or not all(is_number(cell) for cell in rows[0] if cell):
+        return None
+    above = [(i, line) for i, line in enumerate(text.splitlines()[: lines[0] - 1], 1) if line.strip()]
+    if not above:
+        return None
+    number, line = above[-1]
+    bare = line.strip().lstrip("#").strip()
+    for own in (separator, " ", ","):
+        cells = _split(bare, own) if own == " " or '"' not in bare else []
+        if len(cells) == len(rows[0]) and len(cells) > 1 and not any(is_number(cell) for cell in cells) and all(cells):
+            return number, cells
+    return None
 
 
 def _decoded(path: Path) -> tuple[str, str]:

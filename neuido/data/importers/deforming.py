@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from neuido.data.importers.checked_folder import write_checked
+from neuido.data.importers.tables.checked_folder import write_checked
 from neuido.errors import UserError
 
 VELOCITY_FRAMES = 4

@@ -9,9 +9,9 @@ import numpy as np
 
 from neuido.data.files.delimited import is_number
 from neuido.data.files.parsing import parser_errors
-from neuido.data.importers.titled_tables import read_cells, read_titled
-from neuido.data.importers.titles import find_columns
-from neuido.data.importers.units import conversion_factor
+from neuido.data.importers.tables.titled_tables import read_cells, read_titled
+from neuido.data.importers.tables.titles import find_columns
+from neuido.data.importers.tables.units import conversion_factor
 from neuido.errors import UserError
 from neuido.physics.runtime.lazy import import_extra
 
@@ -32,6 +32,8 @@ class Motion(NamedTuple):
     """Whether `t` holds frame numbers."""
     notes: list[str]
     """How the file was read, for the summary."""
+    timed: bool = False
+    """Whether the file states the unit of its times."""
 
 
 def read_motion(path: Path, columns: dict[str, str]) -> Motion:
@@ -148,6 +150,11 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
     found = find_columns(table.titles, columns)
     axes = [axis for axis in "xyz" if axis in found]
     clock = next((name for name in ("time", "frame") if name in found), None)
+    if not axes and "angle" in found:
+        raise UserError(
+            f"{path.name} has the angle of a body on a pivot: a track is a free point, and no kind of data holds a constraint; "
+            "give x and y of the bob (length times sine and cosine), and name the columns with --columns.x and --columns.y"
+        )
     if not axes or clock is None:
         titles = ", ".join(filter(None, table.titles))
         raise UserError(
@@ -156,15 +163,16 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
     units = {table.units[found[axis]] for axis in axes}
     if len(units) > 1:
         raise UserError(f"{path.name}: the axes have different units ({', '.join(sorted(units))}): export them in one unit")
-    t = table.data[:, found[clock]]
+    t, timed = table.data[:, found[clock]], False
     if clock == "time" and table.units[found["time"]]:
         t = t * conversion_factor(table.units[found["time"]], "s", f"{path.name}, time")
+        timed = True
     x = table.data[:, [found[axis] for axis in axes]]
     notes = [*table.notes, *(f"column {found[key] + 1} {table.titles[found[key]]!r} -> {key}" for key in (clock, *axes))]
     if axes == ["y"]:
         x = np.stack([np.zeros(len(x)), x[:, 0]], 1)
     if "id" not in found:
-        return Motion(t, {_label(path): x}, units.pop(), clock == "frame", notes)
+        return Motion(t, {_label(path): x}, units.pop(), clock == "frame", notes, timed)
     ids, times = table.data[:, found["id"]], np.unique(t[np.isfinite(t)])
     points = {}
     for own in np.unique(ids[np.isfinite(ids)]):
@@ -172,7 +180,7 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
         values = np.full((len(times), x.shape[1]), np.nan)
         values[np.searchsorted(times, t[chosen])] = x[chosen]
         points[f"{own:g}"] = values
-    return Motion(times, points, units.pop(), clock == "frame", [*notes, f"{len(points)} points by id"])
+    return Motion(times, points, units.pop(), clock == "frame", [*notes, f"{len(points)} points by id"], timed)
 
 
 def _label(path: Path) -> str:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import neuido
-from neuido.data.importers.testing_machine import Specimen
+from neuido.data.importers.machines.testing_machine import Specimen
 from neuido.errors import UserError
 
 pytest.importorskip("pint")
@@ -55,9 +55,10 @@ def trios(path):
 
 
 def excel(path):
-    pandas = pytest.importorskip("pandas")
-    pytest.importorskip("openpyxl")
-    pandas.DataFrame({"Engineering strain [mm/mm]": STRETCH - 1, "Stress [kPa]": STRESS / 1e3}).to_excel(path / "sheet.xlsx", index=False)
+    book = pytest.importorskip("openpyxl").Workbook()
+    for row in [["Engineering strain [mm/mm]", "Stress [kPa]"], *zip((STRETCH - 1).tolist(), (STRESS / 1e3).tolist())]:
+        book.active.append(row)
+    book.save(path / "sheet.xlsx")
     return path / "sheet.xlsx"
 
 

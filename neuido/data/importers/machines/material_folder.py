@@ -1,0 +1,156 @@
+"""Write tables of testing machines and rheometers as a folder of material tests."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from neuido.data.files.parsing import naming
+from neuido.data.importers.machines.loading_path import Part, Preparation, prepare
+from neuido.data.importers.machines.rheometer import read_relaxation, refuse_curve
+from neuido.data.importers.machines.testing_machine import MODES, MeasuredTest, Specimen, read_machine
+from neuido.data.importers.tables.checked_folder import recording_name, roles_of, write_tables
+from neuido.data.importers.tables.titled_tables import Table, read_tables
+from neuido.data.importers.tables.titles import find_columns
+from neuido.errors import UserError
+
+
+class Material(NamedTuple):
+    """The declared material; what is None is taken from the data or assumed, and said."""
+
+    density: float | None = None
+    """[kg/m^3]"""
+    young: float | None = None
+    """[Pa]"""
+    poisson: float | None = None
+
+
+def write_material_tests(
+    files: Mapping[str, Path],
+    out: str | os.PathLike | None,
+    *,
+    held_out: Sequence[str],
+    mode: str,
+    columns: dict[str, str],
+    units: Mapping[str, str],
+    specimen: Specimen,
+    compression: bool,
+    preparation: Preparation,
+    step: str | None,
+    sheet: str | None,
+    material: Material,
+) -> list[str]:
+    """Write the tests of several files as a folder `neuido-material-test/1`; return the lines of the summary.
+
+    Args:
+        files: The files by the names of their recordings.
+        out: The folder to create. None: check the content and write nothing.
+        held_out: Names of tests, or of files, that are only scored.
+        mode: One of `MODES`.
+        columns: Title of the column of a quantity.
+        units: Unit of a quantity.
+        specimen: Dimensions of the specimen.
+        compression: Whether the tables count compression as positive.
+        preparation: What is done to each path.
+        step: Step of shear of a relaxation modulus.
+        sheet: Name of the only sheet to read.
+        material: The declared material.
+
+    Raises:
+        UserError: Something cannot be read or is missing.
+    """
+    from neuido.data.measured.material_test import read_material_tests
+
+    if mode not in MODES:
+        raise UserError(f"--mode {mode} is unknown: choose from {', '.join(MODES)}")
+    summary: list[str] = []
+    tables: dict[str, dict[str, np.ndarray]] = {}
+    tests: list[dict[str, Any]] = []
+    of_file: dict[str, list[str]] = {}
+    secants = []
+    for file, path in files.items():
+        with naming(path):
+            found = read_tables(path, sheet, numbered=mode != "biaxial")
+            kept = [table for table in found if len(found) == 1 or _has_test(table, columns)] or found[:1]
+            for table in kept:
+                own = recording_name(f"{file}-{table.label}" if len(kept) > 1 else file, tables)
+                try:
+                    measured, used = _measured(table, path.name, mode, columns, units, specimen, compression, step)
+                    prepared, parts = prepare(measured.columns, preparation, measured.summary, area=measured.area)
+                    secants.append(modulus(prepared))
+                except UserError as error:
+                    raise UserError(f"{error} ({table.label})" if len(kept) > 1 else str(error)) from error
+                label = f" ({table.label})" if len(kept) > 1 else ""
+                summary += [f"{path.name}{label}: {note}" for note in dict.fromkeys(measured.summary)]
+                tables[own] = prepared
+                entries = [_entry(own, part, used, prepared) for part in parts]
+                tests += entries
+                of_file.setdefault(file, []).extend(entry["name"] for entry in entries)
+            left = len(found) - len(kept)
+            if left:
+                summary.append(f"{path.name}: {left} tables without strain and stress are left out")
+    roles = roles_of([test["name"] for test in tests], held_out, of_file)
+    tests = [test | {"role": roles[test["name"]]} for test in tests]
+    if len(tests) > 1:
+        summary.append(f"held out: {', '.join(name for name, role in roles.items() if role == 'held_out') or 'none'} (--held_out NAMES)")
+    guess = material.young or float(f"{np.median(secants):.2g}")
+    summary.append(
+        f"model: neo-Hooke, Young's modulus {guess:g} Pa {'as given' if material.young else 'from the first rows'}, fitted; density "
+        f"{material.density or 1000.0:g} kg/m^3{'' if material.density else ' (assumed: --density)'}"
+    )
+    model = {
+        "density": material.density or 1000.0,
+        "elasticity": {"law": "neo_hookean", "young": guess, "poisson": 0.499 if material.poisson is None else material.poisson},
+        "plasticity": {"law": "identity"},
+        "free": ["young"],
+    }
+    if material.poisson is None:
+        model["incompressible"] = True
+        summary.append("incompressible (else give --poisson)")
+    content = {"format": "neuido-material-test/1", "name": next(iter(files)), "model": model, "tests": tests}
+    write_tables(out, "test.yaml", content, tables, read_material_tests)
+    return summary
+
+
+def modulus(columns: Mapping[str, np.ndarray]) -> float:
+    """Estimate Young's modulus [Pa] from the rows of smallest strain, as the starting value of the fit."""
+    path, stress = next(iter(columns.values())), next(values for key, values in columns.items() if "stress" in key)
+    strain = path - (0.0 if next(iter(columns)) in ("shear", "log_strain") else 1.0)
+    kept = np.abs(strain) > 0.02 * np.abs(strain).max() if len(strain) else strain > 0
+    near = np.argsort(np.abs(strain[kept]))[:10]
+    secant = float(np.median(np.abs(stress[kept][near] / strain[kept][near]))) if kept.any() else 0.0
+    if not secant > 0:
+        raise UserError("the stress is zero although the specimen deforms: name the right columns with --columns")
+    return secant * (3.0 if next(iter(columns)) == "shear" else 1.0)
+
+
+def _has_test(table: Table, columns: dict[str, str]) -> bool:
+    """Whether a table of several has a strain and a stress; results and statistics of a machine's sheets have none."""
+    given = {quantity: title for quantity, title in columns.items() if title in table.titles}
+    found = set(find_columns(table.titles, given))
+    path = found & {"strain", "log_strain", "stretch", "stretch_1", "strain_1", "displacement", "displacement_1", "shear", "time"}
+    load = found & {"force", "force_1", "nominal_stress", "nominal_stress_1", "true_stress", "shear_stress", "relaxation_modulus",
+                    "storage_modulus", "compliance"}  # fmt: skip
+    return bool(path and load)
+
+
+def _measured(
+    table: Table, name: str, mode: str, columns: dict[str, str], units: Mapping[str, str], specimen: Specimen, compression: bool,
+    step: str | None,
+) -> tuple[MeasuredTest, str]:  # fmt: skip
+    """Convert one table; return the test and the mode of the format that it has."""
+    relaxation = read_relaxation(table, name, step, columns, units)
+    if relaxation is not None:
+        return relaxation, "simple_shear"
+    refuse_curve(find_columns(table.titles, columns), name)
+    if step is not None:
+        raise UserError(f"--step is for a relaxation modulus, and {name} has none")
+    return read_machine(table, name, specimen, mode, columns, units, compression), "uniaxial" if mode == "compression" else mode
+
+
+def _entry(name: str, part: Part, mode: str, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    entry = {"name": f"{name}-{part.name}" if part.name else name, "file": f"{name}.csv", "mode": mode,
+             "columns": {key: key for key in columns}}  # fmt: skip
+    return entry | {"rows": [part.start, part.stop]} if part.name else entry

@@ -1,0 +1,248 @@
+"""Reader of measured tables, from a text file of any dialect or a spreadsheet: titles, units, numbers and preamble."""
+
+import math
+import re
+from datetime import date
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from neuido.data.files.delimited import is_number, read_delimited
+from neuido.data.importers.tables.spreadsheets import is_spreadsheet, read_spreadsheet
+from neuido.data.importers.tables.titles import SPECIMEN, UNIT_IN_TITLE, bare_title, find_columns
+from neuido.data.importers.tables.units import is_unit
+from neuido.errors import UserError
+
+LONGEST_TITLE = 200
+"""Characters of a title that are looked at."""
+LEAST_ROWS = 3
+"""Rows of numbers that make a table, at the least."""
+MOST_TABLES = 200
+"""Tables of one file, at the most."""
+
+_CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?)(?::(\d\d))?")
+"""Time as hours:minutes:seconds, with a date before it or hundredths of a second after it."""
+
+
+class Table(NamedTuple):
+    """A table of C columns and n rows."""
+
+    titles: list[str]
+    units: list[str]
+    """Unit of each column; empty if the table does not state it."""
+    data: np.ndarray
+    """(n, C) float64; NaN if a cell contains no number."""
+    preamble: list[list[str]]
+    """Rows above the titles."""
+    notes: list[str]
+    """How the file was read, for the summary."""
+    label: str = ""
+    """What tells this table from the others of its file: the name of its sheet or of its specimen."""
+
+
+def read_cells(path: Path) -> tuple[list[list[str]], list[str]]:
+    """Read the rows of a text file or of the first sheet of a spreadsheet; return them and notes for the summary."""
+    sheets, notes = _sheets(path)
+    name, rows = next(iter(sheets.items()))
+    return rows, [*notes, f"first sheet {name!r}"] if name else notes
+
+
+def _sheets(path: Path) -> tuple[dict[str, list[list[str]]], list[str]]:
+    """Read the rows of each sheet by name; a text file is one sheet without a name."""
+    if is_spreadsheet(path):
+        return read_spreadsheet(path), []
+    table = read_delimited(path)
+    names = {"\t": "tabs", " ": "blanks", ",": "commas", ";": "semicolons"}
+    notes = [f"{names[table.separator]} between columns", f"encoding {table.encoding}"]
+    return {"": table.rows}, [*notes, "decimal commas"] if table.decimal == "," else notes
+
+
+def read_titled(path: Path) -> Table:
+    """Read the first table of a file; `read_tables` describes it."""
+    rows, notes = read_cells(path)
+    return _block(rows, *_extent(rows, 0, path), notes)
+
+
+def read_tables(path: Path, sheet: str | None = None, *, numbered: bool = True) -> list[Table]:
+    """Read all tables of a file whose titles stand directly above their numbers, with or without a row of units between them.
+
+    A file has several where its sheets, blocks one below the other, groups of columns with the same titles, or the entries of a column
+    `Specimen` are specimens of their own.
+
+    Args:
+        path: The file.
+        sheet: Name of the only sheet to read; None: all sheets that contain a table.
+        numbered: Whether the number at the end of a title counts specimens; in a biaxial test it names an axis.
+
+    Raises:
+        UserError: The file has no block of at least three rows of numbers, or no sheet of this name.
+    """
+    sheets, notes = _sheets(path)
+    if sheet is not None:
+        if sheet not in sheets:
+            raise UserError(f"{path.name} has no sheet {sheet!r}: choose from {', '.join(sheets) if '' not in sheets else 'a spreadsheet'}")
+        sheets = {sheet: sheets[sheet]}
+    tables: list[Table] = []
+    for name, rows in sheets.items():
+        if len(sheets) > 1 and _first_block(rows, 0) is None:
+            notes.append(f"sheet {name!r} has no table")
+            continue
+        own = _stacked(rows, path, [*notes, f"sheet {name!r}"] if name else notes, numbered)
+        tables += [one._replace(label=" ".join(filter(None, (name if len(sheets) > 1 else "", one.label)))) for one in own]
+    if not tables:
+        raise UserError(f"{path} has no sheet with three rows of numbers: is it a table of measured values?")
+    if len(tables) > MOST_TABLES:
+        raise UserError(f"{path} has {len(tables)} tables, more than {MOST_TABLES}: split the file")
+    return tables
+
+
+def _stacked(rows: list[list[str]], path: Path, notes: list[str], numbered: bool) -> list[Table]:
+    """Read the blocks of one sheet, one below the other, each with titles of its own."""
+    out: list[Table] = []
+    start, stop = _extent(rows, 0, path)
+    above = 0
+    while True:
+        following = _next_titled(rows, stop)
+        end = len(rows) if following is None else _titles_row(rows, following)
+        block = _block(rows[above:end], start - above, end - above, notes)
+        block = block._replace(preamble=[*(out[0].preamble if out else []), *block.preamble])
+        beside = _side_by_side(block, numbered)
+        out += beside if len(beside) > 1 else _by_specimen(block, rows[start:end])
+        if following is None:
+            break
+        above, start = stop, following
+        stop = _end_of_block(rows, start)
+    if len(out) > 1:
+        out = [one if one.label else one._replace(label=str(i + 1)) for i, one in enumerate(out)]
+    return out
+
+
+def _first_block(rows: list[list[str]], start: int) -> int | None:
+    """Return the first row from which three rows of numbers follow."""
+    numeric = [_numeric(row) for row in rows[start:]]
+    return next((start + i for i in range(len(numeric) - LEAST_ROWS + 1) if all(numeric[i : i + LEAST_ROWS])), None)
+
+
+def _extent(rows: list[list[str]], start: int, path: Path) -> tuple[int, int]:
+    first = _first_block(rows, start)
+    if first is None:
+        raise UserError(f"{path} has no block of three rows of numbers: is it a table of measured values?")
+    return first, _end_of_block(rows, first)
+
+
+def _end_of_block(rows: list[list[str]], first: int) -> int:
+    return next((i for i in range(first, len(rows)) if not any(is_number(cell) for cell in rows[i])), len(rows))
+
+
+def _next_titled(rows: list[list[str]], stop: int) -> int | None:
+    """Return the first row of the next block below `stop` that has titles of its own: a name of a quantity in two columns or more."""
+    while stop < len(rows):
+        first = _first_block(rows, stop)
+        if first is None or first == stop:
+            return None
+        if len(find_columns(rows[_titles_row(rows, first)])) > 1:
+            return first
+        stop = _end_of_block(rows, first)
+    return None
+
+
+def _titles_row(rows: list[list[str]], first: int) -> int:
+    """Return the row of titles above the first row of numbers: the one above it, or the next where that is a row of units."""
+    units = first > 1 and all(is_unit(cell) for cell in rows[first - 1]) and not all(is_unit(cell) for cell in rows[first - 2])
+    return first - 2 if units else first - 1
+
+
+def _block(rows: list[list[str]], first: int, stop: int, notes: list[str]) -> Table:
+    """Read one table; `rows` begin with its preamble, its numbers are in the rows from `first` to `stop`, or interrupted by other rows."""
+    notes = list(notes)
+    width = max(len(row) for row in rows[first:])
+    units, head = [""] * width, first - 1
+    above = rows[first - 1] if first else [f"column {i + 1}" for i in range(width)]
+    if first and _titles_row(rows, first) == first - 2:
+        units = [cell.strip("()[]<> ") for cell in above] + [""] * (width - len(above))
+        above, head = rows[first - 2], first - 2
+        notes.append("a row of units")
+    titles = [" ".join(cell[:LONGEST_TITLE].split()) for cell in above] + [""] * (width - len(above))
+    for i, title in enumerate(titles[:width]):
+        found = UNIT_IN_TITLE.search(title)
+        if found and not units[i] and is_unit(found[1] or found[2] or ""):
+            units[i] = (found[1] or found[2] or "").strip()
+    data = np.full((len(rows) - first, width), np.nan)
+    for i, row in enumerate(rows[first:]):
+        for j, cell in enumerate(row):
+            data[i, j] = _value(cell)
+    empty = int((~np.isfinite(data)).all(axis=1).sum())
+    if head > 0:
+        notes.append(f"{head} lines of preamble skipped")
+    if empty:
+        notes.append(f"{empty} rows without data")
+    return Table(titles[:width], units[:width], data, rows[: max(head, 0)], notes)
+
+
+def _side_by_side(table: Table, numbered: bool) -> list[Table]:
+    """Split a table whose titles repeat from left to right, once for each specimen."""
+    names = [bare_title(title) for title in table.titles]
+    for strip in (False, True)[: 1 + numbered]:
+        keys = [re.sub(r"[ _.#]*\d+$", "", name) if strip else name for name in names]
+        filled = [i for i, key in enumerate(keys) if key]
+        own = [keys[i] for i in filled]
+        size = next((k for k in range(2, len(own) // 2 + 1) if own[:k] * (len(own) // k) == own and len(set(own[:k])) == k), None)
+        if size is None:
+            continue
+        out = []
+        for start in range(0, len(filled), size):
+            chosen = filled[start : start + size]
+            labels = [cell for row in table.preamble[-1:] for cell in row[chosen[0] : chosen[-1] + 1] if cell and not is_number(cell)]
+            out.append(
+                Table(
+                    [re.sub(r"[ _.#]*\d+(?=\s*([(\[<]|$))", "", table.titles[i]) if strip else table.titles[i] for i in chosen],
+                    [table.units[i] for i in chosen],
+                    table.data[:, chosen],
+                    table.preamble,
+                    [*table.notes, f"columns {chosen[0] + 1} to {chosen[-1] + 1}"],
+                    labels[0][:40] if labels else str(start // size + 1),
+                )
+            )
+        return out
+    return [table]
+
+
+def _by_specimen(table: Table, rows: list[list[str]]) -> list[Table]:
+    """Split a table by its column that names the specimen of each row."""
+    column = next((i for i, title in enumerate(table.titles) if SPECIMEN.fullmatch(bare_title(title))), None)
+    if column is None:
+        return [table]
+    names = [row[column] if column < len(row) else "" for row in rows[: len(table.data)]]
+    own = [name for name in dict.fromkeys(names) if name]
+    if len(own) < 2 or any(names.count(name) < LEAST_ROWS for name in own):
+        return [table]
+    out = []
+    for name in own:
+        chosen = [i for i, other in enumerate(names) if other == name]
+        notes = [*table.notes, f"{table.titles[column]} {name[:40]}"]
+        out.append(table._replace(data=table.data[chosen], notes=notes, label=name[:40]))
+    return out
+
+
+def _value(cell: str) -> float:
+    """Return a cell as a number, a time of day or date and time in seconds; NaN for anything else."""
+    if is_number(cell):
+        return float(cell)
+    found = _CLOCK.fullmatch(cell)
+    if found is None:
+        return math.nan
+    hours, minutes, seconds, hundredths = (float((part or "0").replace(",", ".")) for part in found.groups()[1:])
+    days = 0
+    if found[1]:
+        try:
+            days = date.fromisoformat(found[1]).toordinal()
+        except ValueError:
+            return math.nan
+    return 86400.0 * days + 3600 * hours + 60 * minutes + seconds + 0.01 * hundredths
+
+
+def _numeric(row: list[str]) -> bool:
+    """Whether more than half of the filled cells of a row are numbers."""
+    filled = [cell for cell in row if cell]
+    return len(filled) > 1 and sum(is_number(cell) or _CLOCK.fullmatch(cell) is not None for cell in filled) > 0.5 * len(filled)

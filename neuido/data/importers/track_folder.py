@@ -1,0 +1,209 @@
+"""Convert motions to SI units, and write one point of each as a folder of tracks."""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from neuido.data.files.parsing import naming
+from neuido.data.importers.tables.checked_folder import roles_of, write_tables
+from neuido.data.importers.tables.units import conversion_factor
+from neuido.data.importers.tracker_exports import Motion
+from neuido.errors import UserError
+
+EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "µs"), (1e11, 1e3, "ms"))
+"""Unix times since 1973 in smaller units than seconds: from which number on, units in a second, and name."""
+LOST = 10.0
+"""Usual steps from frame to frame by which a position of exactly zero is away from its neighbours where the point was not seen."""
+SENTINELS = (-9999.0, 9999.0, -999999.0)
+"""Numbers that trackers write for a point that they did not see."""
+
+
+class Axes(NamedTuple):
+    """What converts positions and times of a tracker to metres with +y up, and to seconds."""
+
+    scale: float | None = None
+    """Metres a unit of the positions; None: by the unit of the file."""
+    y_down: bool = False
+    up: str = "y"
+    frame_rate: float | None = None
+    """[1/s], where the file counts frames."""
+
+
+class RecordedMotion(NamedTuple):
+    """A motion in SI units."""
+
+    t: np.ndarray
+    """Times [s] (T,), increasing from 0."""
+    points: dict[str, np.ndarray]
+    """Positions [m] of each point by its name, (T, A), +y up; NaN where it was not seen."""
+    notes: list[str]
+    scale_error: float = 0.0
+    """Relative error of the scale; 0 if it is given."""
+
+
+def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> RecordedMotion:
+    """Convert a motion to SI units, with +y up and increasing times from 0.
+
+    Raises:
+        UserError: The unit, scale or frame rate is unknown, or fewer than three frames have a time. The message names the option.
+    """
+    if not motion.points:
+        raise UserError(f"{path.name} contains no positions: name their columns with --columns.x TITLE --columns.y TITLE")
+    notes = list(motion.notes)
+    t, order = _times(path, motion, units, axes, notes)
+    unit = units.get("x", motion.unit)
+    if axes.scale is not None:
+        if not np.isfinite(axes.scale) or axes.scale == 0:
+            raise UserError(f"--scale {axes.scale:g} must not be zero: give metres a unit of the positions")
+        ratio = axes.scale
+    elif unit.lower() in ("px", "pixel", "pixels"):
+        raise UserError(f"{path.name} has positions in pixels: give --scale (metres per pixel), and --y_down true if y points down")
+    else:
+        ratio = conversion_factor(unit, "m", f"{path.name}, positions") if unit else 1.0
+        notes.append(f"positions in {unit}" if unit else "positions without a unit, taken as metres (--scale)")
+    points, lost = {}, 0
+    for name, x in motion.points.items():
+        x = x[order].copy()
+        unseen = np.isin(x, SENTINELS).any(axis=1) | _lost_at_zero(x)
+        lost += int(unseen.sum())
+        x[unseen] = np.nan
+        x = x * ratio
+        if axes.y_down and x.shape[1] > 1:
+            x[:, 1] *= -1
+        if axes.up == "z" and x.shape[1] == 3:
+            x = np.stack([x[:, 0], x[:, 2], -x[:, 1]], 1)
+        points[name] = x
+    if lost:
+        notes.append(f"{lost} positions of exactly 0 or {SENTINELS[0]:g} count as not seen")
+    return RecordedMotion(t, points, notes)
+
+
+def write_tracks(
+    files: Mapping[str, Path],
+    read: Callable[[Path], RecordedMotion],
+    out: str | os.PathLike | None,
+    *,
+    held_out: Sequence[str],
+    point: str | None,
+    mass: float | None,
+    diameter: float | None,
+) -> list[str]:
+    """Write one point of each file as a folder `neuido-track/1`; return the lines of the summary.
+
+    Args:
+        files: The files by the names of their recordings.
+        read: Reads the motion of a file in SI units.
+        out: The folder to create. None: check the content and write nothing.
+        held_out: Names of recordings that are only scored.
+        point: Name of the point to follow, or `mean`.
+        mass: Of the body [kg].
+        diameter: Of the body [m].
+
+    Raises:
+        UserError: Something cannot be read or is missing.
+    """
+    from neuido.data.measured.track import read_tracks
+
+    summary, tables, recordings, scale_error = [], {}, [], 0.0
+    roles = roles_of(list(files), held_out)
+    for name, path in files.items():
+        with naming(path):
+            t, points, notes, error = read(path)
+            x = one_point(points, point, path)
+        scale_error = max(scale_error, error)
+        summary += [f"{path.name}: {note}" for note in notes]
+        seen = np.isfinite(x).all(axis=1)
+        if seen.sum() < 3:
+            raise UserError(f"{path.name}: the point is seen in {seen.sum()} frames; at least 3 are needed")
+        if not seen.all():
+            summary.append(f"{path.name}: {int((~seen).sum())} frames without the point are left out")
+        names = "xyz"[: x.shape[1]]
+        still = [axis for a, axis in enumerate(names) if np.ptp(x[seen, a]) == 0]
+        if len(still) == len(names):
+            raise UserError(f"{path.name}: the point is at the same place in all {seen.sum()} frames: name the right columns, or --point")
+        if still:
+            summary.append(f"{path.name}: {', '.join(still)} does not change and is left out")
+        kept = [axis for axis in names if axis not in still]
+        tables[name] = {"t": t[seen] - t[seen][0], **{axis: x[seen, names.index(axis)] for axis in kept}}
+        recordings.append({"name": name, "body": "body", "file": f"{name}.csv", "columns": {key: key for key in ("t", *kept)},
+                           "role": roles[name]})  # fmt: skip
+    figures = {key: value for key, value in (("mass", mass), ("diameter", diameter)) if value is not None}
+    if len(figures) < 2:
+        summary.append("mass or diameter of the body is unknown (--mass in kg, --diameter in m): forces are reported per unit mass")
+    content = {"format": "neuido-track/1", "name": next(iter(files)), "model": {"gravity": [0.0, -9.81, 0.0]}, "bodies": {"body": figures},
+               "recordings": recordings}  # fmt: skip
+    if scale_error:
+        content["nuisances"] = {"length_scale": float(f"{scale_error:.2g}")}
+    write_tables(out, "track.yaml", content, tables, read_tracks)
+    return summary
+
+
+def one_point(points: Mapping[str, np.ndarray], point: str | None, path: Path) -> np.ndarray:
+    """Select the point to track by name; `mean` is the mean of all points.
+
+    Raises:
+        UserError: There are several points and none is chosen, or none has this name.
+    """
+    if point == "mean":
+        return np.mean(list(points.values()), axis=0)
+    if point is None and len(points) == 1:
+        return next(iter(points.values()))
+    if point is None or point not in points:
+        raise UserError(
+            f"{path.name} has the points {', '.join(list(points)[:12])}: select one with --point NAME, or give --point mean or --kind body"
+        )
+    return points[point]
+
+
+def _times(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Return increasing times from 0 [s], and the rows that they belong to; append what was done to `notes`."""
+    t = motion.t
+    if motion.frames:
+        if axes.frame_rate is None:
+            raise UserError(f"{path.name} has frame numbers and no times: give --frame_rate (frames per second)")
+        if not axes.frame_rate > 0:
+            raise UserError(f"--frame_rate {axes.frame_rate:g} must be above 0")
+        t = t / axes.frame_rate
+    elif "time" in units:
+        t = t * conversion_factor(units["time"], "s", "--units.time")
+    elif not motion.timed and np.isfinite(t).any():
+        for least, count, name in EPOCHS:
+            if float(np.nanmedian(t)) > least:
+                t = t / count
+                notes.append(f"times are Unix times in {name}")
+                break
+    order = np.argsort(t, kind="stable")
+    order = order[np.isfinite(t[order])]
+    kept = order[np.concatenate([[True], np.diff(t[order]) > 0])] if len(order) else order
+    if len(kept) < 3:
+        raise UserError(f"{path.name} has {len(kept)} frames with distinct times; at least 3 are needed")
+    if (np.diff(order) < 0).any():
+        notes.append("rows sorted by time")
+    if len(kept) < len(t):
+        notes.append(f"{len(t) - len(kept)} rows with a missing or repeated time are left out")
+    t = t[kept]
+    if t[0] != 0:
+        notes.append(f"times start at {t[0]:.10g} s, which becomes 0 s")
+    steps = np.diff(t)
+    if steps.max() > 3 * np.median(steps):
+        row = int(np.argmax(steps))
+        notes.append(f"a gap of {steps.max():.3g} s after {t[row] - t[0]:.4g} s; frames are {np.median(steps):.3g} s apart")
+    return t - t[0], kept
+
+
+def _lost_at_zero(x: np.ndarray) -> np.ndarray:
+    """Return which positions (T, A) of exactly zero are far from those before and after them: the point was not seen."""
+    zero = (x == 0).all(axis=1)
+    good = np.flatnonzero(~zero & np.isfinite(x).all(axis=1))
+    out = np.zeros(len(x), bool)
+    if not zero.any() or len(good) < 2 or x.shape[1] < 2:
+        return out
+    usual = float(np.median(np.linalg.norm(np.diff(x[good], axis=0), axis=1) / np.diff(good)))
+    for i in np.flatnonzero(zero):
+        j = int(np.searchsorted(good, i))
+        near = [good[k] for k in (j - 1, j) if 0 <= k < len(good)]
+        out[i] = all(np.linalg.norm(x[k]) > LOST * max(usual, 1e-12) * abs(int(k) - int(i)) for k in near)
+    return out
