@@ -243,6 +243,7 @@ def score_all(folders: list[Path], out: Path, ablations: list[str]) -> str:
 
 def replay_all(folders: list[Path], out: Path) -> str:
     """Decide all cases again from their kept fits, write replay.csv, and return the table of search recall and decision accuracy."""
+    from neuido.discrepancy.inference.calibration import calibration
     from neuido.discrepancy.inference.evidence import evidences, judged
     from neuido.discrepancy.inference.search.decision import decide
     from neuido.discrepancy.inference.statistics import read_fits
@@ -255,8 +256,8 @@ def replay_all(folders: list[Path], out: Path) -> str:
                 case, fits = read_fits(place / "fits" / f"{i}.npz")
                 key = key_of(folder)
                 row = {"case": folder.name} | blind_scores.replayed(key, diagnosis, case, decide(case))
-                verdict = judged(evidences(case, fits)) if any(not fit.record.effects for fit in fits) else None
-                rows.append(row | blind_scores.by_evidence(key, diagnosis, verdict))
+                verdict = judged(evidences(case, fits), calibration()) if any(not fit.record.effects for fit in fits) else None
+                rows.append(row | blind_scores.by_evidence(key, diagnosis, case, verdict))
     if not rows:
         return "no case has kept fits: diagnose with --statistics"
     write_table(out / "replay.csv", rows)

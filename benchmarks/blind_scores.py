@@ -103,12 +103,10 @@ def replayed(key: Mapping[str, Any], diagnosis: Mapping[str, Any], case: Any, de
         decision: What `decide` says of it.
     """
     true = key.get("undeclared") or []
-    known = [one for one in true if not one.get("outside_library")]
-    outside = len(known) < len(true)
+    outside = any(one.get("outside_library") for one in true)
     fits = [end for r in case.judged for fit in r.fits for end in (fit, fit.finished) if end is not None]
-    own = [fit for fit in fits if known and _is_of(fit.effects, known)]
-    noise = [case.recordings[n][3] for n, *_ in case.parts]
-    reached = [fit for fit in own if _is_near(fit, known) or all(e < (AT_NOISE * s) ** 2 for e, s in zip(fit.errors, noise, strict=True))]
+    own = of_the_truth(key, fits)
+    reached = near_the_truth(key, case, own)
     effects = [{"name": name.partition(":")[0], "class": list(c), "parameters": {}}
                for name, c in zip(decision.effects, decision.classes, strict=True)]  # fmt: skip
     now = score(key, {**diagnosis, "answer": decision.answer, "effects": effects})
@@ -129,22 +127,49 @@ def replayed(key: Mapping[str, Any], diagnosis: Mapping[str, Any], case: Any, de
     }
 
 
-def by_evidence(key: Mapping[str, Any], diagnosis: Mapping[str, Any], verdict: Any) -> dict[str, Any]:
-    """Return what the evidence of stored fits says of a case; `verdict`: of `judged`, none where the declared model has no statistics.
+def by_evidence(key: Mapping[str, Any], diagnosis: Mapping[str, Any], case: Any, verdict: Any) -> dict[str, Any]:
+    """Return what the evidence of stored fits says of a case.
 
-    An effect's class holds what takes its place in a set of the verdict that has the best one's other effects.
+    An effect's class holds what takes its place in a set of the verdict that has the best one's other effects. A search that was cut off
+    is as unfinished here as in the diagnosis.
+
+    Args:
+        key: The truth.
+        diagnosis: The content of diagnosis.json.
+        case: A `CaseRecord`.
+        verdict: Of `judged`, none where the declared model has no statistics.
     """
     if verdict is None:
-        return {"evidence_answer": "", "evidence_sets": "", "evidence_lead": math.nan, "evidence_named": False}
+        return {"evidence_answer": "", "evidence_sets": "", "evidence_lead": math.nan, "evidence_p": math.nan, "evidence_named": False}
     sets = [[name.partition(":")[0] for name in one] for one in verdict.sets]
     effects = []
     for name in sets[0] if sets else []:
         rest = [other for other in sets[0] if other != name]
         others = {n for one in sets if len(one) == len(sets[0]) and set(rest) <= set(one) for n in set(one) - set(rest)}
         effects.append({"name": name, "class": sorted({name} | others), "parameters": {}})
-    now = score(key, {**diagnosis, "answer": verdict.answer, "effects": effects})
-    named = " or ".join("+".join(one) for one in sets)
-    return {"evidence_answer": verdict.answer, "evidence_sets": named, "evidence_lead": verdict.lead, "evidence_named": now["in_class"]}
+    answer = "unfinished" if case.facts["cut"] else "insufficient" if case.facts["wrong"] else verdict.answer
+    now = score(key, {**diagnosis, "answer": answer, "effects": effects})
+    named = " or ".join("+".join(one) for one in sets) or verdict.answer
+    return {
+        "evidence_answer": answer,
+        "evidence_sets": named,
+        "evidence_lead": verdict.lead,
+        "evidence_p": verdict.p_value,
+        "evidence_named": now["in_class"],
+    }
+
+
+def of_the_truth(key: Mapping[str, Any], fits: Sequence[Any]) -> list[Any]:
+    """Return the fits of the true effects of the library and no others."""
+    known = [one for one in key.get("undeclared") or [] if not one.get("outside_library")]
+    return [fit for fit in fits if known and _is_of(fit.effects, known)]
+
+
+def near_the_truth(key: Mapping[str, Any], case: Any, fits: Sequence[Any]) -> list[Any]:
+    """Return those fits of the true effects of a `CaseRecord` that ended near their optimum."""
+    known = [one for one in key.get("undeclared") or [] if not one.get("outside_library")]
+    noise = [case.recordings[n][3] for n, *_ in case.parts]
+    return [fit for fit in fits if _is_near(fit, known) or all(e < (AT_NOISE * s) ** 2 for e, s in zip(fit.errors, noise, strict=True))]
 
 
 def _is_of(effects: Sequence[str], known: Sequence[Mapping[str, Any]]) -> bool:

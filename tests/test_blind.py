@@ -29,6 +29,7 @@ def load(name: str):
 
 scores = load("blind_scores")
 blind = load("blind")
+calibrate = load("calibrate")
 
 
 def effect(name, value=1.0, interval=(0.8, 1.2), others=(), key="k"):
@@ -108,14 +109,17 @@ def test_search_and_decision_are_reported_apart():
 def test_what_the_evidence_says_is_scored_beside_the_decision():
     live, key = answer(kind="none"), truth("drag_linear", "yield")
 
-    def row(kind, *sets):
-        return scores.by_evidence(key, live, SimpleNamespace(answer=kind, sets=sets, lead=9.0))
+    def row(kind, *sets, cut=False):
+        case = SimpleNamespace(facts={"cut": cut, "wrong": []})
+        return scores.by_evidence(key, live, case, SimpleNamespace(answer=kind, sets=sets, lead=9.0, p_value=0.05))
 
     assert row("effect", ("drag_linear", "yield"))["evidence_named"]
     swapped = row("class", ("drag_quadratic", "yield"), ("drag_linear", "yield"), ("softening",))
     assert swapped["evidence_named"] and swapped["evidence_sets"] == "drag_quadratic+yield or drag_linear+yield or softening"
     assert not row("class", ("drag_quadratic", "yield"), ("drag_linear", "softening"))["evidence_named"]
-    assert not row("unknown")["evidence_named"] and scores.by_evidence(key, live, None)["evidence_answer"] == ""
+    assert not row("unknown")["evidence_named"] and scores.by_evidence(key, live, None, None)["evidence_answer"] == ""
+    cut = row("effect", ("drag_linear", "yield"), cut=True)
+    assert cut["evidence_answer"] == "unfinished" and not cut["evidence_named"] and cut["evidence_sets"] == "drag_linear+yield"
 
 
 def test_one_effect_too_many_or_too_few():
@@ -236,12 +240,17 @@ def test_a_case_that_its_solver_does_not_allow_is_made_by_the_suggested_one(tmp_
 def test_from_a_case_to_its_score(case):
     folder, out = case
     place = out / "answers" / "none" / folder.name
-    assert blind.diagnose_one(str(folder), str(place), "none", "cpu") == ""
+    assert blind.diagnose_one(str(folder), str(place), "none", "cpu", statistics=True) == ""
     text = blind.score_all([folder], out, [])
     assert text.startswith("|  | full | plain-bic | no-unknown | take-smallest-error |")
     key = yaml.safe_load((folder.parent / "keys" / f"{folder.name}.yaml").read_text())
     row = next(line for line in (out / "scores.csv").read_text().splitlines() if ",none," in line)
     assert row.startswith(f"{folder.name},none,{scores.group_of(key)}")
+    table = blind.replay_all([folder], out)
+    assert "| replay equal to the diagnosis | 1 of 1 (100 %) |" in table
+    ((row, found),) = calibrate.cases(out)
+    assert (row["case"], row["kind"], row["run"]) == (folder.name, "none", out.name) and row["behind"] >= 0.0
+    assert not found[0].effects or row["behind"] > 0.0
 
 
 def test_a_key_that_was_changed_is_refused(case):

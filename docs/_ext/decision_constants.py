@@ -41,8 +41,8 @@ UNNAMED = [  # figures of the present decision that stand in its code: module, f
     ("decision", "enough", "3 and 10", "data for each free figure, and beside them"),
 ]
 SHADOW = {  # of the decision by evidence, which is reported beside it: see `neuido.discrepancy.inference.evidence`
-    "evidence": {"KINDS": LEVEL, "ALPHA": LEVEL, "WIDE": CHOSEN, "LEAST": CHOSEN},
-    "likelihood": {"FREEDOM": CHOSEN},
+    "evidence": {"KINDS": LEVEL, "WIDE": CHOSEN, "LEAST": CHOSEN},
+    "calibration": {"ALPHA": LEVEL},
 }
 SEARCHES = {  # constants of the same files that steer the search, or only what is computed
     "judging": {
@@ -65,6 +65,7 @@ SEARCHES = {  # constants of the same files that steer the search, or only what 
     "intervals": {"QUANTILE", "NORMAL", "ROOM", "NEARBY", "FREE_AT"},
     "attribution": {"FURTHER"},
     "likelihood": {"SCALES"},
+    "calibration": {"TABLE"},
 }  # fmt: skip
 
 

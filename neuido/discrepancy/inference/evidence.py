@@ -3,29 +3,26 @@
     E(M) = log p(y_validation | y_fitted, M) - log(k C(K, m))
 
 for a set of m of K effects, with k kinds of model (`KINDS`). The exponential of E is a prior weight times a predictive density, and the
-weights of all models sum to one at most. Under the declared model the mean of a ratio of densities is one; so by Markov's inequality the
-probability that any model leads it by more than log((k - 1) / alpha) is below alpha, whatever was tried.
+weights of all models sum to one. How far the best model must lead, and when two are told apart, is measured: `calibration`.
 
 This is computed beside the present decision, from stored fits, and decides nothing yet.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from scipy.special import logsumexp
 
+from neuido.discrepancy.inference.calibration import ALPHA, Calibration
 from neuido.discrepancy.inference.journal import CaseRecord, FitRecord
-from neuido.discrepancy.inference.likelihood import SCALES, Rotated, log_densities, log_mean, log_prior, rotated, share
+from neuido.discrepancy.inference.likelihood import SCALES, Rotated, log_densities, log_mean, rotated, share
 from neuido.discrepancy.inference.statistics import FitStatistics, PartStatistics
 from neuido.discrepancy.problems.problem import Parameter
 
-KINDS = 5
-"""Kinds of model, of equal prior weight: none, one, two or three effects, and what no effect explains."""
-ALPHA = 0.05
-"""Probability of naming anything where nothing is missing, and of a class that lacks the true effect."""
+KINDS = 4
+"""Kinds of model, of equal prior weight: none, one, two or three effects."""
 WIDE = 10.0
 """Prior standard deviation of a parameter without a finite range, in its typical steps."""
 LEAST = 0.1
@@ -38,10 +35,9 @@ class Evidence:
 
     record: FitRecord
     value: float
-    scale: float
-    """About which the patterns' scale is taken: what the settings leave of one another after a refit, in the unit of the data."""
-    unknown: bool = False
-    """Whether its patterns' scale is free, so that they stand for what no effect explains."""
+    beyond: float = 0.0
+    """Log-density of all recordings with any scale of the patterns, over that with the one that the settings leave of one another. Where
+    it is large, something is missing that the model has not."""
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -56,9 +52,11 @@ class Verdict:
     answer: str
     """`effect`, `class`, `unknown` or `none`."""
     sets: tuple[tuple[str, ...], ...]
-    """The smallest group of sets that holds all but a probability of `ALPHA`, the best first."""
+    """The sets of effects that the data do not tell apart, the best first; of those that hold another one only that."""
     lead: float
     """Of the best model over the declared one."""
+    p_value: float
+    """Share of nulls on which something led by as much, this case counted among them."""
 
 
 def price(effects: int, candidates: int) -> float:
@@ -118,8 +116,8 @@ def at_the_prior_mean(parts: Sequence[PartStatistics], away: np.ndarray) -> list
 
 def densities(
     parts: Sequence[PartStatistics], recordings: Sequence[int], fitted: Sequence[bool], variances: np.ndarray, scale: float
-) -> tuple[float, float, float]:
-    """Return log-densities: of the validation parts given the fitted ones, and of all parts with a free scale and with the prior's.
+) -> tuple[float, float]:
+    """Return the log-density of the validation parts given the fitted ones, and how much a free scale adds to that of all parts.
 
     Where nothing is held out the first is that of the fitted parts themselves.
 
@@ -128,12 +126,10 @@ def densities(
         recordings: The recording of each part.
         fitted: Which parts were fitted.
         variances: Prior variances of the coordinates of the free parameters.
-        scale: About which the patterns' scale is taken; a free one is any above it.
+        scale: Below which the patterns' scale is not.
     """
     shared = [np.concatenate([p.settings, p.slopes], axis=1) for p in parts]
     prior = np.concatenate([np.ones(parts[0].settings.shape[1]), variances])
-    scales = SCALES * scale
-    weights = log_prior(scales, scale)
     counted = {n: share([p for p, own in zip(parts, recordings, strict=True) if own == n]) for n in recordings}
 
     @cache  # a recording that is fitted as a whole is asked for twice
@@ -144,58 +140,65 @@ def densities(
         by_recording: dict[int, list[int]] = {}
         for i in chosen:
             by_recording.setdefault(recordings[i], []).append(i)
-        return log_densities([turned(tuple(own)) for own in by_recording.values()], prior, scales)
+        return log_densities([turned(tuple(own)) for own in by_recording.values()], prior, SCALES * scale)
 
     early = [i for i, f in enumerate(fitted) if f]
     everything = by_scale(range(len(parts)))
-    whole = log_mean(everything, weights)
-    foretold = whole - log_mean(by_scale(early), weights) if len(early) < len(parts) else whole
-    above = everything[scales >= scale]  # what is unknown is more than the settings show, never less
-    return foretold, log_mean(above, np.full(len(above), -math.log(len(above)))), whole
+    whole = log_mean(everything)
+    foretold = whole - log_mean(by_scale(early)) if len(early) < len(parts) else whole
+    return foretold, whole - float(everything[0])
 
 
 def evidences(case: CaseRecord, fits: Sequence[FitStatistics]) -> list[Evidence]:
-    """Return the evidence of every stored fit, the best first, and of the declared model with patterns of a free scale.
+    """Return the evidence of every stored fit, the best first.
 
-    What is unknown is told by the scale that all recordings show, for a scale that the fitted ones have shown foretells the others.
+    The least scale of the patterns is that of the declared model by the same method, whatever a set adds: how far simulations of the body
+    differ does not depend on what is asked about it, and no set leads by ending where they happen to differ less.
+
+    Raises:
+        ValueError: The declared model is not among the fits of a method.
     """
     recordings, fitted = [n for n, *_ in case.parts], [f for _, f, *_ in case.parts]
     declared = {p["name"] for p in case.declared}
+    scales: dict[int, float] = {}
+    for fit in fits:
+        if not fit.record.effects:
+            own = unseen([p for p, f in zip(fit.parts, fitted, strict=True) if f], [name in declared for name in fit.record.names])
+            scales[fit.record.method] = max(own, scales.get(fit.record.method, 0.0))
     out = []
     for fit in fits:
-        own = fit.record
-        scale = unseen([p for p, f in zip(fit.parts, fitted, strict=True) if f], [name in declared for name in own.names])
-        away, variances = prior_of(case, own)
-        foretold, free, whole = densities(at_the_prior_mean(fit.parts, away), recordings, fitted, variances, scale)
-        value = foretold - price(len(own.effects), len(case.candidates))
-        out.append(Evidence(own, value, scale))
-        if not own.effects:
-            out.append(Evidence(own, value + free - whole, scale, unknown=True))
+        if fit.record.method not in scales:
+            raise ValueError("the declared model has no statistics")
+        away, variances = prior_of(case, fit.record)
+        foretold, beyond = densities(at_the_prior_mean(fit.parts, away), recordings, fitted, variances, scales[fit.record.method])
+        out.append(Evidence(fit.record, foretold - price(len(fit.record.effects), len(case.candidates)), beyond))
     return sorted(out, key=lambda e: -e.value)
 
 
-def judged(found: Sequence[Evidence], alpha: float = ALPHA) -> Verdict:
+def judged(found: Sequence[Evidence], calibration: Calibration, alpha: float = ALPHA) -> Verdict:
     """Return what evidences say: each set counts by its best fit, of whatever method.
+
+    Args:
+        found: With the declared model among them.
+        calibration: What leads nulls had, and how far true effects were behind.
+        alpha: Probability of naming anything where nothing is missing.
 
     Raises:
         ValueError: The declared model is not among them.
     """
-    best: dict[tuple[str, ...] | None, Evidence] = {}
+    best: dict[tuple[str, ...], Evidence] = {}
     for e in sorted(found, key=lambda e: -e.value):
-        best.setdefault(None if e.unknown else e.effects, e)
+        best.setdefault(e.effects, e)
     if () not in best:
         raise ValueError("the declared model has no evidence")
-    base = best.pop(())
-    unknown = best.pop(None, None)
-    ranked: Mapping[tuple[str, ...] | None, Evidence] = best
-    top = max((e.value for e in ranked.values()), default=-math.inf)
-    other = unknown.value if unknown is not None else -math.inf
-    lead = max(top, other) - base.value
-    if lead < math.log((KINDS - 1) / alpha):
-        return Verdict("none", (), lead)
-    if other >= top:
-        return Verdict("unknown", (), lead)
-    order = sorted(ranked, key=lambda key: -ranked[key].value)
-    weights = np.exp(np.array([ranked[key].value for key in order]) - logsumexp([ranked[key].value for key in order]))
-    count = int(np.searchsorted(np.cumsum(weights), 1.0 - alpha)) + 1
-    return Verdict("effect" if count == 1 else "class", tuple(order[:count]), lead)
+    top = next(iter(best.values()))
+    lead = top.value - best[()].value
+    p = calibration.p_value(lead)
+    if top.beyond > calibration.foreign(alpha):
+        return Verdict("unknown", (), lead, p)
+    if lead <= calibration.least_lead(alpha):
+        return Verdict("none", (), lead, p)
+    near = [key for key, e in best.items() if key and top.value - e.value <= calibration.apart(alpha)]
+    sets = tuple(key for key in near if not any(set(other) < set(key) for other in near))
+    names = {tuple(sorted(key.partition(":")[0] for key in own)) for own in sets}
+    return Verdict("effect" if len(names) == 1 else "class", sets, lead, p)
