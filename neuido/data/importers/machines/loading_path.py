@@ -16,8 +16,9 @@ REVERSAL = 0.05
 """Share of the range of a path by which it must turn back for a new loading or unloading to begin; noise of the strain is far below."""
 TOE = (0.05, 0.2)
 """Shares of the largest stress of the first loading between which its straight line is taken, that of ASTM D638, annex A1."""
-SLACK = (0.02, 0.1)
-"""Share of the largest stress below which a specimen may hang loose, and share of the path from which that is said."""
+SLACK = (0.02, 0.05, 0.5)
+"""A specimen may hang loose where the stress stays below this share of the largest, over this share of the path or more, and grows less
+there than by this share of what it grows by over as much path again."""
 CYCLES, ZEROS = ("together", "split"), ("none", "first", "toe")
 
 
@@ -43,7 +44,7 @@ class Part(NamedTuple):
 
 
 def prepare(
-    columns: dict[str, np.ndarray], how: Preparation, summary: list[str], *, area: float | None = None
+    columns: dict[str, np.ndarray], how: Preparation, summary: list[str], *, area: float | None = None, at_rest: bool = False
 ) -> tuple[dict[str, np.ndarray], list[Part]]:
     """Prepare the columns of a test, prescribed ones first; append what was done to `summary`.
 
@@ -52,6 +53,7 @@ def prepare(
         how: The steps.
         summary: Lines of the summary.
         area: Cross-section [m^2], for a preload that is given as a force.
+        at_rest: Whether the specimen is at rest until time zero; a row of zeros is then put before the first.
 
     Returns:
         The columns, and the parts of the path; one part without a name where it is not split.
@@ -69,25 +71,27 @@ def prepare(
     if how.average > 1:
         count = len(next(iter(columns.values()))) // how.average
         columns = {key: values[: count * how.average].reshape(count, how.average).mean(1) for key, values in columns.items()}
-        summary.append(f"means of {how.average} rows each: {count} rows")
+        summary.append(f"means of {how.average} rows each: {count} rows, whose noise is independent")
     count = len(next(iter(columns.values())))
     every = max(1, -(-count // MAX_ROWS))
     if every > 1:
-        summary.append(f"every {every}th of {count} rows is used (--rows 0:{count}:STEP or --average N chooses)")
+        summary.append(f"one row in {every} of {count} is used (--average {every} takes means)")
         columns = {key: values[::every] for key, values in columns.items()}
     if len(next(iter(columns.values()))) < LEAST_ROWS:
         raise UserError(f"{len(next(iter(columns.values())))} rows remain; at least {LEAST_ROWS} are needed: check --rows and --average")
-    if "time" in columns:
+    if at_rest:
+        columns = {key: np.concatenate([[0.0], values]) for key, values in columns.items()}
+    elif "time" in columns:
         if columns["time"][0] != 0:
             summary.append(f"times start at {columns['time'][0]:g} s, which becomes 0 s")
         columns["time"] = columns["time"] - columns["time"][0]
     prescribed, _ = _keys(columns)
     path, rest = columns[prescribed], 1.0 if prescribed.startswith("stretch") else 0.0
-    parts = _parts(path - rest) if how.cycles == "split" else []
+    parts = loading_parts(path - rest) if how.cycles == "split" else []
     if len(parts) > 1:
         summary.append(f"{len(parts)} loadings and unloadings: {', '.join(part.name for part in parts[:12])}")
         return columns, parts
-    turns = len(_parts(path - rest)) - 1
+    turns = len(loading_parts(path - rest)) - 1
     if turns > 0 and how.cycles == "together":
         summary.append(f"the path turns back {turns} times (--cycles split makes each loading and unloading a test)")
     return columns, [Part("", 0, len(path))]
@@ -142,8 +146,10 @@ def _check_zero(columns: dict[str, np.ndarray], zero: str, summary: list[str], a
     top = int(np.argmax(np.abs(stress)))
     loose = np.flatnonzero(np.abs(stress[: top + 1]) > SLACK[0] * np.abs(stress[top]))
     if zero == "none" and len(loose) and top > 0:
-        share = abs(path[loose[0]] - path[0]) / max(float(np.ptp(path[: top + 1])), 1e-30)
-        if share > SLACK[1]:
+        i = int(loose[0])
+        share = abs(path[i] - path[0]) / max(float(np.ptp(path[: top + 1])), 1e-30)
+        later = int(np.argmax(np.abs(path[i : top + 1] - path[0]) >= min(2 * abs(path[i] - path[0]), abs(path[top] - path[0])))) + i
+        if share > SLACK[1] and abs(stress[i] - stress[0]) < SLACK[2] * abs(stress[later] - stress[i]):
             summary.append(
                 f"the first {100 * share:.0f} % of the path carry less than {100 * SLACK[0]:.0f} % of the stress: slack? (--zero toe)"
             )
@@ -202,7 +208,7 @@ def _preload(text: str, area: float | None) -> float:
     return float(found[1]) * conversion_factor(found[2].strip(), "Pa", "--zero")
 
 
-def _parts(path: np.ndarray) -> list[Part]:
+def loading_parts(path: np.ndarray) -> list[Part]:
     """Split a strain path (n,) where it turns back by more than `REVERSAL` of its range; parts of fewer than three rows are none."""
     span = float(np.ptp(path))
     if span == 0:

@@ -8,13 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuido.data.files.parsing import naming
-from neuido.data.importers.machines.loading_path import Part, Preparation, prepare
+from neuido.data.importers.machines.loading_path import LEAST_ROWS, Part, Preparation, loading_parts, prepare
 from neuido.data.importers.machines.rheometer import read_relaxation, refuse_curve
 from neuido.data.importers.machines.testing_machine import MODES, MeasuredTest, Specimen, read_machine
 from neuido.data.importers.tables.checked_folder import recording_name, roles_of, write_tables
 from neuido.data.importers.tables.titled_tables import Table, read_tables
 from neuido.data.importers.tables.titles import find_columns
 from neuido.errors import UserError
+
+START = 0.1
+"""Share of the first loading whose slope is the modulus that a fit starts from."""
+FLOWS = 0.1
+"""Slope at the start, relative to that of the whole first loading, below which the latter is taken."""
 
 
 class Material(NamedTuple):
@@ -66,6 +71,7 @@ def write_material_tests(
     if mode not in MODES:
         raise UserError(f"--mode {mode} is unknown: choose from {', '.join(MODES)}")
     summary: list[str] = []
+    notes: dict[str, list[str]] = {}
     tables: dict[str, dict[str, np.ndarray]] = {}
     tests: list[dict[str, Any]] = []
     of_file: dict[str, list[str]] = {}
@@ -78,12 +84,12 @@ def write_material_tests(
                 own = recording_name(f"{file}-{table.label}" if len(kept) > 1 else file, tables)
                 try:
                     measured, used = _measured(table, path.name, mode, columns, units, specimen, compression, step)
-                    prepared, parts = prepare(measured.columns, preparation, measured.summary, area=measured.area)
+                    prepared, parts = prepare(measured.columns, preparation, measured.summary, area=measured.area, at_rest=measured.at_rest)
                     secants.append(modulus(prepared))
                 except UserError as error:
                     raise UserError(f"{error} ({table.label})" if len(kept) > 1 else str(error)) from error
                 label = f" ({table.label})" if len(kept) > 1 else ""
-                summary += [f"{path.name}{label}: {note}" for note in dict.fromkeys(measured.summary)]
+                notes[f"{path.name}{label}"] = list(dict.fromkeys(measured.summary))
                 tables[own] = prepared
                 entries = [_entry(own, part, used, prepared) for part in parts]
                 tests += entries
@@ -91,6 +97,7 @@ def write_material_tests(
             left = len(found) - len(kept)
             if left:
                 summary.append(f"{path.name}: {left} tables without strain and stress are left out")
+    summary = said(notes) + summary
     roles = roles_of([test["name"] for test in tests], held_out, of_file)
     tests = [test | {"role": roles[test["name"]]} for test in tests]
     if len(tests) > 1:
@@ -115,15 +122,33 @@ def write_material_tests(
 
 
 def modulus(columns: Mapping[str, np.ndarray]) -> float:
-    """Estimate Young's modulus [Pa] from the rows of smallest strain, as the starting value of the fit."""
+    """Estimate Young's modulus [Pa] by the slope at the start of the first loading, as the starting value of the fit.
+
+    Raises:
+        UserError: The stress does not change.
+    """
     path, stress = next(iter(columns.values())), next(values for key, values in columns.items() if "stress" in key)
-    strain = path - (0.0 if next(iter(columns)) in ("shear", "log_strain") else 1.0)
-    kept = np.abs(strain) > 0.02 * np.abs(strain).max() if len(strain) else strain > 0
-    near = np.argsort(np.abs(strain[kept]))[:10]
-    secant = float(np.median(np.abs(stress[kept][near] / strain[kept][near]))) if kept.any() else 0.0
-    if not secant > 0:
+    strain = path - (1.0 if next(iter(columns)).startswith("stretch") else 0.0)
+    first = loading_parts(strain)[0]
+    away = np.abs(strain[: first.stop] - strain[0])
+    near = np.flatnonzero(away <= START * away.max())
+    near = near if len(near) >= LEAST_ROWS else np.argsort(away, kind="stable")[:LEAST_ROWS]
+    offset = strain[near] - strain[near].mean()
+    slope = abs(float(offset @ stress[near]) / float(offset @ offset)) if np.ptp(strain[near]) > 0 else 0.0
+    secant = float(np.ptp(stress[: first.stop]) / away.max()) if away.max() > 0 else 0.0
+    if slope < FLOWS * secant:  # the specimen flows, or did not rest, at the start
+        slope = secant
+    if not slope > 0:
         raise UserError("the stress is zero although the specimen deforms: name the right columns with --columns")
-    return secant * (3.0 if next(iter(columns)) == "shear" else 1.0)
+    return slope * (3.0 if next(iter(columns)) == "shear" else 1.0)
+
+
+def said(notes: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the lines of a summary from the notes on each file; what holds for all of several files is said once."""
+    lists = list(notes.values())
+    common = [note for note in lists[0] if all(note in other for other in lists)] if len(lists) > 1 else []
+    lines = [f"all files: {note}" for note in common]
+    return lines + [f"{name}: {note}" for name, own in notes.items() for note in own if note not in common]
 
 
 def _has_test(table: Table, columns: dict[str, str]) -> bool:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from neuido.data.importers.machines.testing_machine import MachineTable, MeasuredTest
+from neuido.data.importers.machines.testing_machine import MachineTable, MeasuredTest, Specimen
 from neuido.data.importers.tables.titled_tables import Table
 from neuido.errors import UserError
 
@@ -54,8 +54,6 @@ def read_relaxation(table: Table, name: str, step: str | None, columns: dict[str
     Raises:
         UserError: The table has no time, or the step is missing or malformed.
     """
-    from neuido.data.importers.machines.testing_machine import Specimen
-
     given = MachineTable(table, name, Specimen(), columns, units)
     if "relaxation_modulus" not in given.found or PATHS & set(given.found):
         return None
@@ -73,11 +71,5 @@ def read_relaxation(table: Table, name: str, step: str | None, columns: dict[str
     if not (time[kept] > 0).all():
         raise UserError(f"{name}: a relaxation modulus starts after the step: the times must be above 0 s")
     given.summary.append(f"relaxation modulus after a step of shear of {size:g} -> shear stress; a row at rest before it")
-    return MeasuredTest(
-        {
-            "shear": np.concatenate([[0.0], np.full(kept.sum(), size)]),
-            "shear_stress": np.concatenate([[0.0], size * modulus[kept]]),
-            "time": np.concatenate([[0.0], time[kept]]),
-        },
-        given.summary,
-    )
+    shear = np.where(kept, size, np.nan)
+    return MeasuredTest({"shear": shear, "shear_stress": size * modulus, "time": time}, given.summary, at_rest=True)

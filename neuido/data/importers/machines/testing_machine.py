@@ -38,6 +38,8 @@ class MeasuredTest(NamedTuple):
     summary: list[str]
     area: float | None = None
     """Cross-section [m^2], where a force was converted."""
+    at_rest: bool = False
+    """Whether the specimen is at rest until time zero, before the first row."""
 
 
 class MachineTable:
@@ -67,8 +69,9 @@ class MachineTable:
         own = self.units.get(quantity) or self.table.units[index]
         if not own and required:
             raise UserError(f"{self.name}: column {self.title(quantity)!r} has no unit: give --units.{quantity} {unit or 'percent'}")
-        self.summary.append(f"column {index + 1} {self.title(quantity)!r} -> {quantity}, {own or 'a ratio'}")
-        return self.table.data[:, index] * conversion_factor(own, unit, f"{self.name}, {quantity}")
+        known = own or (f"taken as {unit} (--units.{quantity})" if unit else "a ratio")
+        self.summary.append(f"column {index + 1} {self.title(quantity)!r} -> {quantity}, {known}")
+        return self.table.data[:, index] * (conversion_factor(own, unit, f"{self.name}, {quantity}") if own else 1.0)
 
     def missing(self, what: str, quantity: str) -> UserError:
         titles = ", ".join(filter(None, self.table.titles))
@@ -130,10 +133,7 @@ def read_machine(
     else:
         out = _one_axis(given, mode, compression)
     if "time" in given.found:
-        known = table.units[given.found["time"]] or units.get("time")
-        out["time"] = given.column("time", "s") if known else table.data[:, given.found["time"]]
-        if not known:
-            given.summary.append(f"column {given.found['time'] + 1} {given.title('time')!r} -> time, taken as s (--units.time)")
+        out["time"] = given.column("time", "s", required=False)
     return MeasuredTest(out, given.summary, given.used_area)
 
 

@@ -60,8 +60,9 @@ def _sheets(path: Path) -> tuple[dict[str, list[list[str]]], list[str]]:
 
 def read_titled(path: Path) -> Table:
     """Read the first table of a file; `read_tables` describes it."""
-    rows, notes = read_cells(path)
-    return _block(rows, *_extent(rows, 0, path), notes)
+    sheets, notes = _sheets(path)
+    name = next((name for name, rows in sheets.items() if _first_block(rows, 0) is not None), next(iter(sheets)))
+    return _block(sheets[name], *_extent(sheets[name], 0, path), [*notes, f"sheet {name!r}"] if name else notes)
 
 
 def read_tables(path: Path, sheet: str | None = None, *, numbered: bool = True) -> list[Table]:
