@@ -58,7 +58,7 @@ PAIRS = (
 def plan(cases: int, curves: int, seed: int, *, particles: int = 0, seconds: float = 0.0) -> list[tuple[str, int, Case]]:
     """Return names, seeds and options of the cases in random order."""
     rng = np.random.default_rng(seed)
-    nulls, two, outside = round(cases / 3), round(cases * 5 / 60), round(cases * 7 / 60)
+    nulls, two, outside = round(cases / 3), round(cases * 5 / 60), round(cases * 5 / 60)
     kinds: list[tuple[str, bool]] = [("none", i < nulls // 2) for i in range(nulls)]
 
     def deal(names: tuple[str, ...], count: int) -> list[str]:

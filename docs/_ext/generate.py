@@ -100,7 +100,8 @@ def effect_page() -> str:
     rows = []
     for e in LIBRARY:
         marks = ["✓" if ok else "" for ok in (True, e.name in OF_TESTS, e.name in OF_TRACKS, True, True)]
-        rows.append([f"[{e.name}](#{anchor(e.name)})", *marks, ", ".join(e.confusions)])
+        alike = ", ".join(e.confusions) + (f"; needs {e.needs}" if e.needs else "")
+        rows.append([f"[{e.name}](#{anchor(e.name)})", *marks, alike])
     head = ["effect", "points or video of a body", "stress and stretch", "track of a point", "MPM", "finite elements", "looks like"]
     parts.append(table(head, rows))
     for e in LIBRARY:
@@ -109,6 +110,8 @@ def effect_page() -> str:
             f"The model lacks {e.title}: `{e.equation}`\n",
             f"Shows in {e.stage}: {UNDERSTOOD.get(e.stage, e.stage)}. Source: {e.source}.\n",
         ]
+        if e.needs:
+            parts.append(f"It needs {e.needs}.\n")
         if e.limits:
             parts.append(f"At an end of its range it becomes {', '.join(e.limits)}.\n")
         rows = [

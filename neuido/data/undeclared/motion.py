@@ -118,7 +118,7 @@ def simulate_motion(
     return Motion(place, velocity, interval)
 
 
-OUTSIDE_PREFIXES = ("dry_drag.", "moving_floor.", "delayed_spring.", "swelling.", "magnet.", "density_gradient.", "spin_decay.")
+OUTSIDE_PREFIXES = ("dry_drag.", "moving_floor.", "delayed_spring.", "magnet.", "density_gradient.")
 
 
 def _simulator(solver: Solver, scene: Scene, bodies: Sequence[Body], density: float, device: str) -> Simulator | FiniteElements:
@@ -196,8 +196,6 @@ def _rollout_with_kicks(
         state = _kick(state, _fields(own, mean, scene, state, past, h), 0.5 * h)
         out = simulator.rollout(steps, elasticity, plasticity, state=state, effects=effects, every=steps, check=n == 0)
         state = ParticleState(*(t[-1] for t in out))
-        if "swelling" in own:
-            state = state._replace(F=state.F * math.exp(-own["swelling"]["rate"] * h / 3))
         past.append(mean(state.x))
         state = _kick(state, _fields(own, mean, scene, state, past, h), 0.5 * h)
         if (n + 1) % pieces == 0:
@@ -220,9 +218,6 @@ def _fields(own: Mapping[str, Mapping[str, float]], mean, scene: Tensor, state: 
         then = past[max(len(past) - 1 - round(one["delay"] / h), 0)]
         pull = (-one["k"] * (then - vector(one)))[scene]
         fields.append(lambda x, v: pull)
-    if (one := own.get("spin_decay")) is not None:
-        k, centre = one["k"], mean(state.v)[scene]
-        fields.append(lambda x, v: -k * (v - centre))
     return fields
 
 

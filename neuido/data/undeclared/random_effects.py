@@ -200,6 +200,9 @@ KINDS: dict[str, Kind] = {
     "stick": Kind(_scalar("rate", lambda s: 0.1 / s.dt, 50.0), SOLID, "contact", ("stick",), "velocity at the floor decays", grid=True),
     "restitution": Kind(_scalar("rate", lambda s: 0.5 / s.dt, 30.0), SOLID, "contact", ("restitution",), "its normal part alone",
                         grid=True),
+    "swelling": Kind(_scalar("rate", lambda s: 0.1 / s.duration, 6.0, negative=0.4, low=0.8), SOLID, "material", ("swelling",),
+                     "the stress-free size grows as 1 + rate t"),
+    "spin_decay": Kind(_scalar("k", lambda s: 0.4 / s.duration, 12.0), ANY, "flight", ("spin_decay",), "torque -k L about the centre"),
     "cohesion": Kind(_scalar("c", lambda s: 0.3 * s.density * 9.8 * s.length, 10.0), (GRAINS,), "material", ("cohesion",), "Coulomb's c"),
 }  # fmt: skip
 """Effects of the library, by name."""
@@ -213,16 +216,11 @@ OUTSIDE: dict[str, Kind] = {
     "delayed_spring": Kind(_delayed, SOLID, "flight", (), "acceleration -k (x(t - delay) - place) of the centre of mass", outside=True,
                      grid=True,
                            near=("position_force", "time_force"), units={"k": "1/s^2", "delay": "s", "x": "m", "y": "m", "z": "m"}),
-    "swelling": Kind(_scalar("rate", lambda s: 1.0, 4.0, negative=0.4), SOLID, "material", (), "the natural volume grows as exp(rate t)",
-                     outside=True, grid=True, units={"rate": "1/s"}),
     "magnet": Kind(_magnet, SOLID, "flight", (), "acceleration -m (x - place) / |x - place|^5, |x - place| at least 0.08 m", outside=True,
                      grid=True,
                    near=("position_force", "gravity", "uniform_acceleration"), units={"m": "m^4/s^2", "x": "m", "y": "m", "z": "m"}),
     "density_gradient": Kind(_gradient, (ELASTIC,), "material", (), "density times exp(s . (X - mean) / L), the same mass", outside=True,
                              directed=True, near=("stiffness_gradient",), units={"x": "1", "y": "1", "z": "1"}),
-    "spin_decay": Kind(_scalar("k", lambda s: 1.0, 10.0), SOLID, "flight", (), "acceleration -k (v - mean v)", outside=True,
-                     grid=True,
-                       near=("drag_linear", "viscosity_shear", "maxwell"), units={"k": "1/s"}),
 }  # fmt: skip
 """Effects that the library cannot express, by name."""
 

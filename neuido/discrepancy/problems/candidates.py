@@ -118,6 +118,10 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
         *vector(waves, "m/s^2", 0.1 * g, 5 * g), ("frequency", "Hz", 0.15, 0.3 / s.duration, 20 / s.duration, True),
         form="harmonic", sizes=" ".join(waves))  # fmt: skip
     add("added_mass", "flight", [{"c": 0.1}], ("c", "1", 0.1, -0.5, 3.0, False))
+    k = 0.3 / s.duration
+    add("spin_decay", "rotation", [{"k": k}], ("k", "1/s", k, 0.0, 30 * k, False))
+    rate = 0.05 / s.duration  # below -1 over the duration nothing of the body would be left
+    add("swelling", "rest", [{"rate": rate}], ("rate", "1/s", rate, -0.8 / s.duration, 2.0 / s.duration, False))
     eta = 0.05 * s.young * s.wave
     add("viscosity_shear", "internal modes", [{"eta": 0.1 * eta}, {"eta": eta}], ("eta", "Pa s", eta, 0.0, 20 * eta, False))
     add("viscosity_bulk", "internal modes", [{"zeta": eta}, {"zeta": 5 * eta}], ("zeta", "Pa s", eta, 0.0, 60 * eta, False))

@@ -137,6 +137,7 @@ class Constitutive:
         viscosity = effects.viscosity(scenes, like)
         self._viscosity = None if viscosity is None else viscosity[self.scene]
         self._rate = None if effects.stiffness_change is None else effects.rows("stiffness_change", scenes, like)[self.scene, 0]
+        self._swelling = None if effects.swelling is None else effects.rows("swelling", scenes, like)[self.scene, 0]
         self._stiffness = effects.particle_stiffness(count, like)
 
     def start(self) -> History:
@@ -195,13 +196,16 @@ class Constitutive:
             C: Velocity gradient of the step [1/s], (P, 3, 3).
             history: The history before the step.
             dt: Step [s], a number or (P,).
-            time: Time at the start of the step [s]; only `stiffness_change` of a body that yields depends on it.
+            time: Time at the start of the step [s]; `swelling` and the `stiffness_change` of a body that yields depend on it.
 
         Returns:
             The corrected deformation gradient, (P, 3, 3), and the history after the step.
         """
         dt = torch.as_tensor(dt, dtype=self.like.dtype, device=self.like.device).expand(self.count)
         layout = self.tables.layout
+        if self._swelling is not None:
+            begun = 1 + self._swelling * time
+            trial = (begun / (begun + self._swelling * dt))[:, None, None] * trial
         if self.tables.branches is not None or layout.backstress:
             R = spin(C, dt[:, None, None])
         if self.tables.branches is not None:

@@ -39,6 +39,8 @@ class Entry(NamedTuple):
     """Reference of the equation."""
     limits: tuple[str, ...] = ()
     """Effects with fewer parameters that this one becomes at an end of its range."""
+    needs: str = ""
+    """What must be measured for it to show, beside what `stage` says."""
 
 
 def _vector(field: str, unit: str, size: float, names: Sequence[str] = "xyz") -> tuple[Parameter, ...]:
@@ -313,6 +315,26 @@ LIBRARY = (
         "flight",
         ("gravity", "drag_linear"),
         "Lamb, Hydrodynamics, 92",
+    ),
+    Entry(
+        "swelling",
+        "swelling or drying",
+        "F_e = F/g(t), g = 1 + rate t",
+        (Parameter("rate", "swelling", "1/s", -1.0, 1.0, True),),
+        "rest",
+        ("time_force", "viscosity_bulk", "stiffness_change"),
+        "Rodriguez, Hoger and McCulloch 1994, isotropic growth at constant mass",
+        needs="two points of the body at least, and times; a video that shows its size",
+    ),
+    Entry(
+        "spin_decay",
+        "a decay of the spin",
+        "dL/dt = -k L about the centre of mass",
+        (Parameter("k", "spin_decay", "1/s", 0.0, 20.0),),
+        "rotation",
+        ("drag_linear", "viscosity_shear", "friction"),
+        "Landau and Lifshitz, Fluid Mechanics, 20: torque on a rotating sphere",
+        needs="the orientation of a body that rotates; the track of one point has none",
     ),
 )
 """One entry for each effect, grouped by kind."""

@@ -41,6 +41,7 @@ _MATERIAL = (
 )
 _LOWER_BOUNDS = {
     "added_mass": (-1.0, ""),
+    "spin_decay": (0.0, " 1/s"),
     "drag_linear": (0.0, " 1/s"),
     "drag_quadratic": (0.0, " 1/m"),
     "viscosity_shear": (0.0, " Pa s"),
@@ -128,6 +129,11 @@ class Effects(NamedTuple):
     """Rate of the factor exp(-stick dt) on the velocity of a node inside a collider, after contact [1/s]; infinity is a sticky floor."""
     restitution: Number = None
     """Rate of the factor exp(-restitution dt) on the outward normal velocity of such a node [1/s]: a lossy floor."""
+    swelling: Number = None
+    """rate of the stress-free size g = 1 + rate t, the same along all axes [1/s]; negative: drying. The elastic gradient is F / g, which is
+    what a rollout returns as F. The energy of a piece of matter is that of the elastic gradient: swelling adds no stiffness."""
+    spin_decay: Number = None
+    """k of a torque -k L on a body with the angular momentum L about its centre of mass [1/s]; it leaves the centre of mass alone."""
     added_mass: Number = None
     """c of the factor 1 + c on the inertia at unchanged weight [-]."""
     relative_density: Tensor | None = None
@@ -259,6 +265,31 @@ class Effects(NamedTuple):
             return None
         times = torch.arange(steps, dtype=torch.float64, device=dt.device)[:, None] * dt.double()
         return torch.exp(self.rows("stiffness_change", len(dt), dt)[:, 0] * times.to(dt))
+
+    def stress_free_size(self, dt: Tensor, steps: int) -> Tensor | None:
+        """Return g = 1 + rate t of `swelling` at the end of each substep, (T, S) float64; None without it.
+
+        Raises:
+            UserError: A body that would shrink to nothing.
+        """
+        if self.swelling is None:
+            return None
+        rate = self.rows("swelling", len(dt), dt)[:, 0].double()
+        size = 1 + rate * (torch.arange(1, steps + 1, dtype=torch.float64, device=dt.device)[:, None] * dt.double())
+        if bool((size <= 0).any()):
+            raise UserError(f"swelling is {rate.min().item():g} 1/s; the body would vanish within {steps * dt.max().item():g} s")
+        return size
+
+    def shrinkage(self, dt: Tensor, steps: int) -> Tensor | None:
+        """Return e of the factor 1 - e = g(t) / g(t + dt) of each substep, (T, S), with g of `stress_free_size`; None without it."""
+        size = self.stress_free_size(dt, steps)
+        return None if size is None else (self.rows("swelling", len(dt), dt)[:, 0].double() * dt.double() / size).to(dt)
+
+    def spin_loss(self, dt: Tensor) -> Tensor | None:
+        """Return the share 1 - exp(-k dt) of the angular momentum that `spin_decay` takes in a substep, (S, 1); None without it."""
+        if self.spin_decay is None:
+            return None
+        return -torch.expm1(-self.rows("spin_decay", len(dt), dt) * dt[:, None])
 
     def __repr__(self) -> str:
         return brief_fields(self)

@@ -122,6 +122,7 @@ class Assembly:
         self.volume = torch.cat([p.volume for p in meshes]).contiguous()
         scenes = torch.arange(len(meshes), dtype=torch.int32)
         self.node_scene = scenes.repeat_interleave(torch.tensor(nodes)).to(device)
+        self.first_node = torch.tensor([*shift, sum(nodes)], dtype=torch.int32, device=device)
         self.particles = Particles(
             scenes.repeat_interleave(torch.tensor(elements)).to(device), tuple(sum(elements[:s]) for s in range(len(meshes) + 1))
         )

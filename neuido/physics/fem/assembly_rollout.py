@@ -39,6 +39,10 @@ class Inputs(NamedTuple):
     """Factor of each particle's elastic stress [-], (P,)."""
     growth: Tensor | None
     """`Effects.growth` over the inner steps [-], (T, S)."""
+    size: Tensor | None
+    """`Effects.stress_free_size` over the inner steps [-], (T, S)."""
+    spin_loss: Tensor | None
+    """`Effects.spin_loss` of an inner step [-], (S, 1)."""
     dt: Tensor
     """Inner step of each scene [s], (S,)."""
 
@@ -92,7 +96,8 @@ class AssemblyRollout:
         recorder = MarkRecorder(len(F), F)
         for k in range(steps // every):
             own = slice(k * count, (k + 1) * count)
-            loop.advance(given.pull[own] if len(given.pull) > 1 else None, None if given.growth is None else given.growth[own])
+            growth, size = (None if t is None else t[own] for t in (given.growth, given.size))
+            loop.advance(given.pull[own] if len(given.pull) > 1 else None, growth, size)
             assembly.frame(frames, k + 1, *loop.state)
             recorder.add(loop.lowest, loop.since, start=k * count)
         x, v, C, F = (t.clone() for t in loop.state)
@@ -119,6 +124,8 @@ class AssemblyRollout:
             given.dt,
             given.pull[:count],
             None if given.growth is None else given.growth[:count],
+            None if given.size is None else given.size[:count],
+            given.spin_loss,
             given.viscosity,
             stiffness,
             *((None,) * 3 if tables is None else (tables.material, tables.branches, tables.flow)),

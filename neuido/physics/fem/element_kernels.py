@@ -82,12 +82,22 @@ def build(real: type) -> SimpleNamespace:
         gradients[i] = wp.inverse(D)
 
     @kernel
-    def reshape(trial: wp.array(dtype=mat33), F: wp.array(dtype=mat33), gradients: wp.array(dtype=mat33), shape: wp.array(dtype=mat33)):
-        """Write the stress-free shape G F of the elements whose F was corrected by plastic flow."""
+    def reshape(
+        scene: wp.array(dtype=wp.int32),
+        size: wp.array(dtype=real),
+        trial: wp.array(dtype=mat33),
+        F: wp.array(dtype=mat33),
+        gradients: wp.array(dtype=mat33),
+        shape: wp.array(dtype=mat33),
+    ):
+        """Write the stress-free shape G F of the elements whose F was corrected by plastic flow; `size`: what swelling divides F by."""
         i = wp.tid()
         change = F[i] - trial[i]
         if wp.ddot(change, change) != zero:
-            shape[i] = gradients[i] * F[i]
+            own = gradients[i] * F[i]
+            if size:
+                own = size[scene[i]] * own
+            shape[i] = own
 
     @kernel
     def corner_forces(

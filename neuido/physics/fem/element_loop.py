@@ -1,7 +1,7 @@
 """The inner steps of a finite-element rollout between two frames, as kernel launches that run eagerly or as a CUDA graph.
 
 A graph spans the interval between two frames and not the whole rollout. It takes the time of one interval to capture, and serves rollouts
-of any length. Inputs that change over time (accelerations, growth) are copied into the loop's memory before each interval.
+of any length. Inputs that change over time (accelerations, growth, size) are copied into the loop's memory before each interval.
 """
 
 import math
@@ -11,8 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuido.physics.effects import stress_kernels
+from neuido.physics.effects import stress_kernels, swelling_kernels
 from neuido.physics.effects.coefficients import Layout, Tables
+from neuido.physics.effects.spin_decay import SpinDecay
 from neuido.physics.fem.assembly import Assembly
 from neuido.physics.laws.base import Engine, Law
 from neuido.physics.mpm.graphs import capture
@@ -35,6 +36,10 @@ class Fields(NamedTuple):
     """Gravity and other uniform accelerations [m/s^2], (1 or T, S, 3)."""
     growth: Tensor | None
     """`Effects.growth` [-], (T, S)."""
+    size: Tensor | None
+    """`Effects.stress_free_size` [-], (T, S)."""
+    spin_loss: Tensor | None
+    """`Effects.spin_loss` of an inner step [-], (S, 1)."""
     viscosity: Tensor | None
     """`Effects.viscosity` [Pa s], (S, 2)."""
     stiffness: Tensor | None
@@ -95,6 +100,10 @@ class Loop:
         self.smoothed = torch.empty_like(self.F) if self.nodal else self.F
         self.J, self.J_mean, self.pressure = (like.new_empty(elements if self.nodal else 0) for _ in range(3))
         self.at_node = like.new_empty(nodes if self.nodal else 0)
+        self.swelling = None if fields.size is None else swelling_kernels.build(real_of(solver.dtype))
+        self.spin = None
+        if fields.spin_loss is not None:
+            self.spin = SpinDecay(assembly.node_scene, assembly.first_node, torch.zeros_like(self.fields.dt), inside=False)
         self.rest = torch.empty_like(self.x) if solver.dtype == torch.float32 else None
         self.lowest = like.new_empty(elements)
         self.since = torch.empty(elements, dtype=torch.int32, device=like.device)
@@ -129,15 +138,16 @@ class Loop:
             self._launch(assembly.solver.kernels.reference, len(self.F), assembly.elements, self.x, self.gradients)
         torch.matmul(self.gradients, self.F, out=self.shape)
 
-    def advance(self, pull: Tensor | None = None, growth: Tensor | None = None) -> None:
+    def advance(self, pull: Tensor | None = None, growth: Tensor | None = None, size: Tensor | None = None) -> None:
         """Run one interval; `since` counts from its start.
 
         Args:
             pull: Accelerations of this interval, (count, S, 3); None: as before.
             growth: Growth of this interval, (count, S); None: as before.
+            size: Stress-free sizes of this interval, (count, S); None: as before.
         """
         self.since.fill_(-1)
-        for own, value in ((self.fields.pull, pull), (self.fields.growth, growth)):
+        for own, value in ((self.fields.pull, pull), (self.fields.growth, growth), (self.fields.size, size)):
             if own is not None and value is not None:
                 own.copy_(value)
         if not self.warm:  # the first interval compiles and loads the kernels
@@ -165,14 +175,16 @@ class Loop:
             for n in range(self.count):
                 growth = None if self.fields.growth is None else self.fields.growth[n]
                 self._stress(elastic, growth)
-                self._move(self.fields.pull[n if len(self.fields.pull) > 1 else 0], n)
+                size = None if self.fields.size is None else self.fields.size[n]
+                self._move(self.fields.pull[n if len(self.fields.pull) > 1 else 0], n, size)
                 if plastic is not None:
                     plastic.forward(self.trial, self.F)
                 if self.layout.width > 0 or self.flows:
                     self._update_history(growth)
                     self.history, self.history_next = self.history_next, self.history
                 if self.changes:
-                    self._launch(self.assembly.solver.kernels.reshape, len(self.F), self.trial, self.F, self.gradients, self.shape)
+                    arrays = self.trial, self.F, self.gradients, self.shape
+                    self._launch(self.assembly.solver.kernels.reshape, len(self.F), self.assembly.particles.scene, size, *arrays)
         self.history, self.history_next = begun
 
     def _engines(self) -> tuple[Engine, Engine | None]:
@@ -199,15 +211,26 @@ class Loop:
             self._launch(k.node_mean, nodes, a.first, a.corner, a.volume, self.pressure, self.at_node)
             self._launch(k.spread_pressure, elements, a.elements, self.at_node, self.J, self.tau)
 
-    def _move(self, pull: Tensor, n: int) -> None:
-        """Move the nodes in inner step n, and compute the trial F of the elements (F itself if nothing corrects it)."""
+    def _move(self, pull: Tensor, n: int, size: Tensor | None) -> None:
+        """Move the nodes in inner step n, and compute the trial F of the elements (F itself if nothing corrects it).
+
+        Args:
+            pull: Accelerations [m/s^2], (S, 3).
+            n: The inner step.
+            size: Stress-free size at its end [-], (S,), by which swelling divides F, or None.
+        """
         k, a, f = self.assembly.solver.kernels, self.assembly, self.fields
         rates = n == self.count - 1 or f.viscosity is not None or self.layout.width > 0
         self._launch(k.corner_forces, len(self.F), a.volume, self.gradients, self.tau, self.force)
+        if self.spin is not None and f.spin_loss is not None:
+            self.spin.damp(f.spin_loss, f.mass, self.x, self.v, None, self.v, None)
         self._launch(k.move, len(self.x), a.first, a.corner, a.node_scene, a.held, f.mass, f.dt, pull, f.force, self.plane, self.kind,
                      f.friction, self.force, self.x, self.v, self.rest)  # fmt: skip
-        self._launch(k.kinematics, len(self.F), a.elements, self.x, self.v, self.shape, rates, self.gradients, self.C,
-                     self.trial if self.changes else self.F, n, a.volume, self.lowest, self.since)  # fmt: skip
+        gradient = self.trial if self.changes else self.F
+        self._launch(k.kinematics, len(self.F), a.elements, self.x, self.v, self.shape, rates, self.gradients, self.C, gradient, n, 
+                     a.volume, self.lowest, self.since)  # fmt: skip
+        if self.swelling is not None:
+            self._launch(self.swelling.elastic_part, len(self.F), a.particles.scene, size, gradient)
 
     def _update_history(self, growth: Tensor | None) -> None:
         """Advance the history by a step, and correct the trial F if a plastic effect is present."""

@@ -145,6 +145,7 @@ class FiniteElements:
         mass: Tensor | None = None,
         stiffening: tuple[Tensor, Tensor] | None = None,
         refused: list[int] | None = None,
+        smallest: Tensor | None = None,
     ) -> list[int]:
         """Return the inner steps per step of each scene, by the bound 2/omega of its worst element (Belytschko et al., sec. 6.2).
 
@@ -155,11 +156,12 @@ class FiniteElements:
             stiffening: What effects add to each scene's P-wave modulus [Pa], and the largest factor on the sum, (S,) each.
             refused: A list to which scenes that need more than `max_inner_steps` are appended instead of raising; they run with the
                 inner steps of the others.
+            smallest: Smallest stress-free size of each scene [-], (S,), where it swells or dries.
 
         Raises:
             UserError: A negative modulus, or a scene that needs more than `max_inner_steps`.
         """
-        needs = [math.ceil(need - 1e-9) for need in self._needs(elasticity, viscosity, mass, stiffening)]
+        needs = [math.ceil(need - 1e-9) for need in self._needs(elasticity, viscosity, mass, stiffening, smallest)]
         out = []
         for assembly in self.assemblies:
             count = 1
@@ -175,7 +177,12 @@ class FiniteElements:
         return out
 
     def _needs(
-        self, elasticity: ElasticLaw, viscosity: Tensor | None, mass: Tensor | None, stiffening: tuple[Tensor, Tensor] | None
+        self,
+        elasticity: ElasticLaw,
+        viscosity: Tensor | None,
+        mass: Tensor | None,
+        stiffening: tuple[Tensor, Tensor] | None,
+        smallest: Tensor | None,
     ) -> list[float]:
         """Return the ratio of the step to the stable inner step of each scene; arguments as for `inner_steps`."""
         bounds = inputs.waves(self, elasticity, mass, stiffening)
@@ -185,6 +192,8 @@ class FiniteElements:
             for s in range(assembly.a, assembly.b):
                 modulus, density = bounds[s]
                 bound = assembly.meshes[s - assembly.a].stiffness_bound
+                if smallest is not None:  # elements of a body that dries become smaller
+                    bound = bound / min(float(smallest[s]), 1.0) ** 2
                 omega = 2.0 * math.sqrt(modulus / density * bound)
                 damping = 0.0
                 if viscosities is not None:
@@ -204,7 +213,13 @@ class FiniteElements:
             UserError: As `rollout`, except for too many inner steps.
         """
         given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
-        return self.max_inner_steps / max(self._needs(elasticity, given.viscosity, given.mass, given.stiffening(self)))
+        needs = self._needs(elasticity, given.viscosity, given.mass, given.stiffening(self), self._smallest(given.effects, steps))
+        return self.max_inner_steps / max(needs)
+
+    def _smallest(self, effects: Effects, steps: int) -> Tensor | None:
+        """Return the smallest stress-free size of each scene [-], (S,); None without swelling."""
+        size = effects.stress_free_size(self.dt, steps)
+        return None if size is None else size.detach().amin(dim=0)
 
     def rollout(
         self,
@@ -283,7 +298,8 @@ class FiniteElements:
         refused: list[int] = []
         if inner is None:
             refused_or_raise = refused if nan_on_failure else None
-            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self), refused_or_raise)
+            smallest = self._smallest(effects, steps)
+            inner_of = self.inner_steps(elasticity, viscosity, given.mass, given.stiffening(self), refused_or_raise, smallest)
         else:
             inner_of = [inner] * self.scene_count
         inner_of = [n * inner_factor for n in inner_of]
@@ -301,6 +317,7 @@ class FiniteElements:
             scenes, own = slice(a, b), slice(self.particles.offsets[a], self.particles.offsets[b])
             dt = self.dt[scenes] / n
             growth = effects.growth(self.dt / n, steps * n)
+            size, loss = effects.stress_free_size(self.dt / n, steps * n), effects.spin_loss(self.dt / n)
             part = Inputs(
                 ParticleState(*(t[own] for t in state)),
                 given.mass[own],
@@ -311,6 +328,8 @@ class FiniteElements:
                 None if tables is None else assembly.rows(tables),
                 None if stiffness is None else stiffness[own],
                 None if growth is None else growth[:, scenes].contiguous(),
+                None if size is None else size[:, scenes].to(self.dtype).contiguous(),
+                None if loss is None else loss[scenes].contiguous(),
                 dt.contiguous(),
             )
             return run.run(steps, every, n, elasticity, plasticity, part, ParticleState(*(t[:, own] for t in frames)))

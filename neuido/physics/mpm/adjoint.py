@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from neuido.physics.effects import swelling_kernels
 from neuido.physics.laws.base import Engine
-from neuido.physics.mpm.plan import FIXED, STATES, Material, Plan, at_step
-from neuido.physics.mpm.rollout import Tape, flow_inputs, grid_inputs, stress, stress_inputs, to_grid, update_nodes
-from neuido.physics.runtime.device import torch_stream
+from neuido.physics.mpm.plan import FIXED, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step
+from neuido.physics.mpm.rollout import Tape, flow_inputs, grid_inputs, stress, stress_inputs, swell, to_grid, update_nodes
+from neuido.physics.runtime.device import real_of, torch_stream
 
 
 def run_backward(
@@ -34,6 +35,7 @@ def run_backward(
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
     a_fixed = [torch.zeros_like(t) for t in inputs[STATES:FIXED]]
     a_mass, a_pull, a_force, a_friction, a_viscosity = a_fixed[:5]
+    a_shrinkage, a_loss = a_fixed[SHRINKAGE - STATES], a_fixed[SPIN_LOSS - STATES]
     parameters = any(wanted[STATES + 1 : STATES + 4])
     now = [torch.zeros_like(t) for t in inputs[:STATES]]
     then = [torch.empty_like(t) for t in now]
@@ -44,24 +46,35 @@ def run_backward(
         elastic.start_adjoint(wanted[FIXED : plan.split])
         if plastic is not None:
             plastic.start_adjoint(wanted[plan.split :])
+        spin = plan.spin_decay(inputs)
+        damped = None if spin is None else (torch.empty_like(now[1]), torch.empty_like(now[2]))
         for n in reversed(range(plan.steps if steps is None else steps)):
             if (n + 1) % plan.every == 0:
                 _add(now, gradients, (n + 1) // plan.every)
             x, v, C, F, history = state = tuple(t[n] for t in tape.states)
             v_next, C_next, F_next = tape.v[n + 1], tape.C[n + 1], tape.F[n + 1]
             material, a_material = plan.material(inputs, n), plan.material((*inputs[:STATES], *a_fixed), n)
-            tau, grid, velocity = recompute(plan, inputs, tape, n, state, elastic, material, scratch)
+            v_in, C_in = v, C  # what P2G reads
+            if spin is not None and damped is not None:
+                spin.damp(inputs[SPIN_LOSS], mass, x, v, C, *damped)
+                v_in, C_in = damped
+            tau, grid, velocity = recompute(plan, inputs, tape, n, state, (v_in, C_in), elastic, material, scratch)
+            shrinkage = at_step(inputs[SHRINKAGE], n)
             a_x, a_v, a_C, a_F, a_history = then
             a_out = now[3]
             trial = None
             if plan.corrects:
-                trial = trial_gradient(plan, F, C_next, other) if tape.trial is None else tape.trial[n]
+                trial = trial_gradient(plan, F, C_next, shrinkage, other) if tape.trial is None else tape.trial[n]
                 a_out = a_trial.zero_()
             if material is not None and a_material is not None:
                 update_history_adjoint(plan, material, a_material, trial, C_next, history, F_next, now, a_out, a_history.zero_())
             if plastic is not None:
                 assert trial is not None  # a plastic law corrects it
                 plastic.adjoint(trial, now[3], a_trial)
+            if shrinkage.numel():
+                arguments = [shrinkage, F, C_next, a_out, at_step(a_shrinkage, n)]
+                swelling = swelling_kernels.build(real_of(setup.dtype))
+                plan.launch(swelling.swell_adjoint, len(x), [setup.particles.scene, setup.dt, *arguments])
             plan.launch(k.grid_to_particles_adjoint, len(x),
                         [setup.particles.scene, setup.sorted_held, setup.origin, setup.dx, setup.dt, setup.nodes, velocity, x, F, v_next,
                          C_next, *now[:3], a_out, a_velocity.zero_(), a_x, a_F], plan.block)  # fmt: skip
@@ -69,8 +82,10 @@ def run_backward(
             inputs_n = grid_inputs(plan, at_step(pull, n), force, friction)
             plan.launch(k.update_grid_adjoint, setup.node_count // setup.chunk, [*inputs_n, *arguments])
             plan.launch(k.particles_to_grid_adjoint, len(x),
-                        [setup.particles.scene, setup.origin, setup.dx, setup.dt, setup.nodes, mass, setup.sorted_volume, x, v, C, tau,
-                         a_grid, a_mass, a_x, a_v, a_C, a_tau], plan.block)  # fmt: skip
+                        [setup.particles.scene, setup.origin, setup.dx, setup.dt, setup.nodes, mass, setup.sorted_volume, x, v_in, C_in,
+                         tau, a_grid, a_mass, a_x, a_v, a_C, a_tau], plan.block)  # fmt: skip
+            if spin is not None:
+                spin.adjoint(inputs[SPIN_LOSS], mass, x, v, C, a_loss, a_mass, a_x, a_v, a_C)
             if viscosity.numel():
                 plan.launch(k.add_viscous_stress_adjoint, len(x),
                             [setup.particles.scene, viscosity, C, F, a_tau, a_C, a_F, a_viscosity])  # fmt: skip
@@ -93,6 +108,7 @@ def recompute(
     tape: Tape,
     n: int,
     state: Sequence[Tensor],
+    moving: tuple[Tensor, Tensor],
     elastic: Engine,
     material: Material | None,
     scratch: Tensor,
@@ -105,17 +121,18 @@ def recompute(
         tape: Tape of the forward pass.
         n: Number of the substep.
         state: x, v, C, F and the history before the substep.
+        moving: v and C that the nodes receive, after a torque that damps the rotation.
         elastic: Engine of the elastic law.
         material: Tables of material effects in the substep, or None.
         scratch: Memory for a recomputed stress, (P, 3, 3).
     """
     setup = plan.setup
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
-    x, v, C, F, history = state
+    x, _, C, F, history = state
     tau = scratch if tape.tau is None else tape.tau[n]
     if tape.tau is None:
         stress(plan, elastic, F, C, history, viscosity, material, tau)
-    grid = to_grid(plan, x, v, C, tau, mass, setup.scratch("grid")) if tape.grid is None else tape.grid[n]
+    grid = to_grid(plan, x, *moving, tau, mass, setup.scratch("grid")) if tape.grid is None else tape.grid[n]
     velocity = setup.scratch("velocity") if tape.velocity is None else tape.velocity[n]
     if tape.velocity is None:
         update_nodes(plan, grid, at_step(pull, n), force, friction, velocity)
@@ -151,16 +168,19 @@ def update_history_adjoint(
         plan.launch(k.relax_adjoint, len(F), [setup.particles.scene, setup.dt, material.branches, *arguments])
 
 
-def trial_gradient(plan: Plan, F: Tensor, C_next: Tensor, out: Tensor) -> Tensor:
-    """Compute the trial gradient F_tr = (I + dt C) F of a substep, as the forward pass did.
+def trial_gradient(plan: Plan, F: Tensor, C_next: Tensor, shrinkage: Tensor, out: Tensor) -> Tensor:
+    """Compute the trial gradient F_tr = (I + dt C) F of a substep, less what swelling takes, as the forward pass did.
 
     Args:
         plan: The rollout.
         F: Deformation gradient before the substep [-], (P, 3, 3).
         C_next: Affine velocity after the substep [1/s], (P, 3, 3).
+        shrinkage: `Effects.shrinkage` of the substep [-], (S,), or empty.
         out: The trial gradient [-], (P, 3, 3); overwritten and returned.
     """
     plan.launch(plan.setup.kernels.trial_gradient, len(F), [plan.setup.particles.scene, plan.setup.dt, F, C_next, out])
+    if shrinkage.numel():
+        swell(plan, shrinkage, out)
     return out
 
 

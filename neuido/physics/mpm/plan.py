@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neuido.physics.effects import stress_kernels
 from neuido.physics.effects.coefficients import Layout, Tables
+from neuido.physics.effects.spin_decay import SpinDecay
 from neuido.physics.laws.base import Engine, Law
 from neuido.physics.mpm.state import Setup
 from neuido.physics.runtime.device import launch, real_of
@@ -17,11 +18,13 @@ from neuido.physics.runtime.events import MarkRecorder
 
 STATES = 5
 """Number of inputs that form the initial state: x, v, C, F and the history (no columns if no effect has a history)."""
-KINDS = ("particle",) * 6 + ("time",) + ("scene",) * 3 + ("particle", "time") + ("scene",) * 3
+KINDS = ("particle",) * 6 + ("time",) + ("scene",) * 3 + ("particle", "time") + ("scene",) * 3 + ("time", "scene")
 """The leading axis of each input before the tensors of the laws: the initial state (5), mass, acceleration, force, friction,
-viscosity, and the tables of material effects: stiffness, growth, material, branches, flow. `time` is (T, S, ...), or (1, S, ...) if
-constant. An absent input has no elements."""
+viscosity, the tables of material effects (stiffness, growth, material, branches, flow), and those of swelling and of spin decay. `time` is
+(T, S, ...), or (1, S, ...) if constant. An absent input has no elements."""
 FIXED = len(KINDS)
+MATERIAL, SHRINKAGE, SPIN_LOSS = STATES + 5, STATES + 10, STATES + 11
+"""Index of the first table of the material effects, of `Effects.shrinkage` and of `Effects.spin_loss`."""
 
 LARGE = 1 << 17
 """Number of particles from which a GPU uses blocks of 256 threads, else of 32: small bodies need more blocks to fill the GPU."""
@@ -133,10 +136,17 @@ class Plan:
         """Return the tables of material effects in substep n; None without such effects."""
         if self.tables is None:
             return None
-        stiffness, growth, *tables = inputs[STATES + 5 : FIXED]
+        stiffness, growth, *tables = inputs[MATERIAL:SHRINKAGE]
         given = (stiffness, at_step(growth, n), *tables)
         stiffness, growth, material, branches, flow = (t if t.numel() else None for t in given)
         return Material(stiffness, growth, material, branches, flow, all_branches)
+
+    def spin_decay(self, inputs: Sequence[Tensor]) -> SpinDecay | None:
+        """Return the launches of the torque of `Effects.spin_decay`; None without it."""
+        setup = self.setup
+        if not inputs[SPIN_LOSS].numel():
+            return None
+        return SpinDecay(setup.particles.scene, setup.first, 0.25 * setup.dx**2, inside=True)
 
 
 def at_step(t: Tensor, n: int) -> Tensor:

@@ -38,6 +38,32 @@ def _contact(v: Tensor, normal: Tensor, kind: int, friction: Tensor) -> Tensor:
     return torch.where(vn < 0.0, slid, v)
 
 
+def damp_spin(x: Tensor, v: Tensor, C: Tensor | None, mass: Tensor, spread: Tensor | float, loss: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Return v and C of one body after the torque of `Effects.spin_decay`, by explicit sums.
+
+    Args:
+        x: Positions [m], (P, 3).
+        v: Velocities [m/s], (P, 3).
+        C: Affine velocities [1/s], (P, 3, 3); None: nodes, which do not rotate within themselves.
+        mass: Masses [kg], (P,).
+        spread: dx^2/4 [m^2].
+        loss: Share of the angular momentum that goes [-].
+    """
+    share = (mass / mass.sum())[:, None]
+    r, u = x - (share * x).sum(0), v - (share * v).sum(0)
+    eye = torch.eye(3, dtype=x.dtype, device=x.device)
+    inertia = (mass[:, None, None] * ((r * r).sum(1)[:, None, None] * eye - r[:, :, None] * r[:, None, :])).sum(0)
+    L = (mass[:, None] * torch.linalg.cross(r, u)).sum(0)
+    if C is not None:
+        inertia = inertia + 2 * spread * mass.sum() * eye
+        turn = torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], dim=1)
+        L = L + spread * (mass[:, None] * turn).sum(0)
+    w = loss * torch.linalg.solve(inertia, L)
+    if C is not None:
+        C = C - torch.linalg.cross(w.expand(3, 3), eye).mT
+    return v - torch.linalg.cross(w.expand_as(r), r), C
+
+
 def substep(
     sim: Simulator,
     state: ParticleState,
@@ -68,6 +94,7 @@ def substep(
     if force.shape[1] == 6:
         force = torch.cat([force, force.new_zeros(sim.scene_count, 5)], dim=1)
     eye = torch.eye(3, dtype=sim.dtype, device=sim.device)
+    loss = effects.spin_loss(sim.dt)
     parts = []
     tau_all = material.stress(state.F, state.C, history, time)
     for s in range(sim.scene_count):
@@ -75,6 +102,8 @@ def substep(
         x, v, C, F = (t[own] for t in state)
         tau, m, volume = tau_all[own], mass[own], sim.volume[own]
         dx, dt = sim.dx[s], sim.dt[s]
+        if loss is not None:
+            v, C = damp_spin(x, v, C, m, dx**2 / 4, loss[s, 0])
         base, w = _splines((x - setup.origin[s]) / dx)
         offsets = torch.cartesian_prod(*[torch.arange(3, device=sim.device)] * 3)
         nodes = base[:, None, :] + offsets

@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.effects import swelling_kernels
+from neuido.physics.effects.spin_decay import SpinDecay
 from neuido.physics.laws.base import Engine
 from neuido.physics.mpm import transfers as kernels
-from neuido.physics.mpm.plan import STATES, Material, Plan, at_step
-from neuido.physics.runtime.device import torch_stream
+from neuido.physics.mpm.plan import SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step
+from neuido.physics.runtime.device import real_of, torch_stream
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.launches import LaunchRecordings
 
@@ -98,7 +100,8 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
     for name in ("grid", "velocity") if clears else ():
         setup.scratch(name).zero_()
     recordings = LaunchRecordings()
-    steady = all(len(t) <= 1 for t in (pull, inputs[STATES + 6]))  # neither pull nor growth has a row for each substep
+    changing = pull, inputs[STATES + 6], inputs[SHRINKAGE]
+    steady = all(len(t) <= 1 for t in changing)  # none has a row for each substep
     tape.status.zero_()
     tape.lowest.fill_(math.inf)
     tape.since.fill_(-1)
@@ -107,6 +110,8 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
             rest.zero_()
     with torch_stream(setup.device):
         elastic, plastic = plan.engines(inputs)
+        spin = plan.spin_decay(inputs)
+        damped = None if spin is None else (torch.empty_like(now[1]), torch.empty_like(now[2]))
         for n in range(plan.steps if steps is None else steps):
             frame = tuple(frames[(n + 1) // stride] for frames in tape.states) if (n + 1) % stride == 0 else None
             # on the CPU a frame is copied out: launches that always use the same buffers can be recorded once and repeated
@@ -121,9 +126,10 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
                 material, pull_now = plan.material(inputs, n, all_branches=tape.whole), at_step(pull, n)
             if not clears:
                 grid.zero_()
-            to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid)
+            to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid, spin, damped)
             on_nodes = partial(update_nodes, plan, grid, pull_now, force, friction, velocity, reach, clears)
-            to_particles = partial(gather, plan, n, now, then, material, plastic, velocity, trial, tape)
+            shrinkage = at_step(inputs[SHRINKAGE], n)
+            to_particles = partial(gather, plan, n, now, then, material, plastic, velocity, trial, tape, shrinkage)
             if same is None:
                 to_nodes()
                 on_nodes()
@@ -139,7 +145,15 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
 
 
 def scatter(
-    plan: Plan, inputs: Sequence[Tensor], now: Sequence[Tensor], material: Material | None, elastic: Engine, tau: Tensor, grid: Tensor
+    plan: Plan,
+    inputs: Sequence[Tensor],
+    now: Sequence[Tensor],
+    material: Material | None,
+    elastic: Engine,
+    tau: Tensor,
+    grid: Tensor,
+    spin: SpinDecay | None = None,
+    damped: tuple[Tensor, Tensor] | None = None,
 ) -> None:
     """Compute the stress, and add momentum and mass of the particles to the nodes (P2G).
 
@@ -151,9 +165,14 @@ def scatter(
         elastic: Engine of the elastic law.
         tau: Kirchhoff stress [Pa], (P, 3, 3); overwritten.
         grid: Momentum and mass of the nodes, (nodes, 4); added to, and zero before.
+        spin: The torque that damps the rotation, or None.
+        damped: Memory for v and C after that torque.
     """
     x, v, C, F, history = now
     stress(plan, elastic, F, C, history, inputs[STATES + 4], material, tau)
+    if spin is not None and damped is not None:
+        spin.damp(inputs[SPIN_LOSS], inputs[STATES], x, v, C, *damped)
+        v, C = damped
     add_to_grid(plan, x, v, C, tau, inputs[STATES], grid)
 
 
@@ -167,6 +186,7 @@ def gather(
     velocity: Tensor,
     trial: Tensor,
     tape: Tape,
+    shrinkage: Tensor,
 ) -> None:
     """Update the particles from the nodal velocities (G2P), then correct F and advance the history.
 
@@ -180,17 +200,34 @@ def gather(
         velocity: Velocity of the nodes, (nodes, 4).
         trial: Memory for the trial gradient, (P, 3, 3).
         tape: Receives failures and events.
+        shrinkage: `Effects.shrinkage` of the substep [-], (S,), or empty.
     """
     setup = plan.setup
     x, _, _, F, history = now
+    raw = trial if plan.corrects else then[3]
     plan.launch(setup.kernels.grid_to_particles, len(x),
                 [setup.particles.scene, setup.sorted_held, setup.origin, setup.dx, setup.dt, setup.nodes, velocity, x, F, *then[:3],
-                 trial if plan.corrects else then[3], n, tape.status, setup.span, tape.lowest, tape.since,
+                 raw, n, tape.status, setup.span, tape.lowest, tape.since,
                  tape.rest_x, tape.rest_F], plan.block)  # fmt: skip
+    if shrinkage.numel():
+        swell(plan, shrinkage, raw, tape.rest_F)
     if plastic is not None:
         plastic.forward(trial, then[3])
     if material is not None:
         update_history(plan, material, trial, then[2], history, then[3], then[4])
+
+
+def swell(plan: Plan, shrinkage: Tensor, F: Tensor, rest: Tensor | None = None) -> None:
+    """Take from F the change of the stress-free size in a substep.
+
+    Args:
+        plan: The rollout.
+        shrinkage: `Effects.shrinkage` of the substep [-], (S,).
+        F: Trial gradient [-], (P, 3, 3); overwritten.
+        rest: What the rounding of F left out, if it is kept.
+    """
+    kernels = swelling_kernels.build(real_of(plan.setup.dtype))
+    plan.launch(kernels.swell, len(F), [plan.setup.particles.scene, shrinkage, rest, F])
 
 
 def stress(

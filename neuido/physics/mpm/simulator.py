@@ -276,13 +276,16 @@ class Simulator:
         elif check:
             self.check_step(*step)
         tables, mass = given.tables, given.mass
-        compensated = self._rounds_off(given.state, pull, steps)
+        shrinkage, loss = given.effects.shrinkage(self.dt, steps), given.effects.spin_loss(self.dt)
+        swells = shrinkage is not None and self.dtype == torch.float32  # a change of 1e-6 a substep is lost in the rounding of F
+        compensated = swells or self._rounds_off(given.state, pull, steps)
         plan = Plan(self.setup, elasticity, plasticity, steps, every, tables, nan_on_failure, compensated=compensated)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
         history = mass.new_zeros(len(mass), plan.layout.width)
         start = [t[self.order] for t in (*given.state, history, mass)]
         optional = [given.viscosity, None if given.stiffness is None else given.stiffness[self.order], given.growth]
         optional += [None] * 3 if tables is None else [tables.material, tables.branches, tables.flow]
+        optional += [shrinkage, loss]
         optional = [mass.new_empty(0) if t is None else t.contiguous() for t in optional]
         with self.cache.lock:
             frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, self.pool)

@@ -89,6 +89,7 @@ class Setup:
         mass: [kg], (P,).
         volume: [m^3], (P,).
         held: Particles in a clamp, (P,) uint8.
+        first: First particle of each scene, then their number, (S + 1,) int32.
         order: The order in which the kernels see the particles, (P,): scene by scene, then by cell.
         inverse: The inverse permutation.
         nodes: Grid nodes along each axis, padding included.
@@ -192,6 +193,7 @@ class Setup:
         for part in x:
             offsets.append(offsets[-1] + len(part))
         self.particles = Particles(torch.cat(scene_index), tuple(offsets))
+        self.first = torch.tensor(offsets, dtype=torch.int32, device=self.device)
         self.state = ParticleState(join(x), join(v), join(C), join(F))
         self.mass, self.volume = join(mass), join(volume)
         self.held = torch.cat(held).to(torch.uint8)

@@ -26,8 +26,8 @@ TOLERANCE = 1e-9
 """Lateral stress that counts as zero, relative to the larger of P-wave modulus and axial stress [-]."""
 ITERATIONS = 60
 """Largest number of Newton iterations."""
-RATES = ("viscosity_shear", "viscosity_bulk", "maxwell_ratio", "hysteresis", "rate_yield", "stiffness_change")
-"""Effects that depend on the rate, and therefore need the times of the path."""
+RATES = ("viscosity_shear", "viscosity_bulk", "maxwell_ratio", "hysteresis", "rate_yield", "stiffness_change", "swelling")
+"""Effects that depend on the rate or on time, and therefore need the times of the path."""
 
 
 class Specimen(NamedTuple):
@@ -79,7 +79,8 @@ def stress_along(
         Stress [Pa], (P, n, 1), or (P, n, 2) for `biaxial`. A parameter set without lateral equilibrium or finite stress is all NaN.
 
     Raises:
-        UserError: An unknown mode, a path of a wrong shape or with a stretch that is not positive, or a rate effect without times.
+        UserError: An unknown mode, a path of a wrong shape or with a stretch that is not positive, a rate effect without times, or
+            swelling of an incompressible specimen.
     """
     if mode not in MODES:
         raise UserError(f"mode = {mode!r} is not known; one of {', '.join(MODES)}")
@@ -93,6 +94,8 @@ def stress_along(
     timed = [name for name in RATES if getattr(specimen.effects, name) is not None]
     if timed and time is None:
         raise UserError(f"{timed[0]} depends on the rate: give the times of the path")
+    if specimen.incompressible and specimen.effects.swelling is not None:
+        raise UserError("swelling changes the volume: leave it out, or declare the specimen as compressible")
     if not step > 0:
         raise UserError(f"step = {step} must be positive")
     with torch.no_grad():

@@ -15,10 +15,12 @@ from neuido.types import ParticleState, Plane, Scene
 from tests.physics.bodies import DEVICE, block, busy_scenes, same
 
 FORCES = {"gravity.g": 0.3, "magnus.x": 1.0, "magnus.y": [2.0, 1.0], "magnus.z": 0.7, "stick.rate": 3.0, "restitution.rate": [4.0, 9.0],
-          "added_mass.c": 0.1, "friction.mu": 0.1, "time_force.x0": 0.3, "time_force.y2": [1.0, 2.0]}  # fmt: skip
+          "added_mass.c": 0.1, "friction.mu": 0.1, "spin_decay.k": [2.0, 5.0],
+          "time_force.x0": 0.3, "time_force.y2": [1.0, 2.0]}  # fmt: skip
 ELASTIC = {"maxwell.ratio": 0.5, "maxwell.time": [0.1, 0.2], "hysteresis.eta": [0.1, 0.05], "strain_stiffening.k": 1.0,
            "second_invariant.c": 0.3, "tension_compression.r": 0.4, "fibre.c": [1e4, 2e4], "fibre.azimuth": 0.3, "fibre.elevation": 0.2,
-           "stiffness_change.rate": [1.0, 2.0], "stiffness_gradient.x": 0.3, "stiffness_gradient.log_ratio": 0.4,
+           "stiffness_change.rate": [1.0, 2.0], "swelling.rate": [2.0, -3.0],
+           "stiffness_gradient.x": 0.3, "stiffness_gradient.log_ratio": 0.4,
            "stiffness_gradient.radius": 0.1, "stiffness_gradient.cy": 0.02, "stiffness_gradient.width": 0.05}  # fmt: skip
 PLASTIC = {"hardening.h": 1e3, "softening.s": 2.0, "kinematic_hardening.h": 1e3, "rate_yield.eta": 1.0}
 KEPT = {"maxwell.time": 0.1, "stiffness_gradient.radius": 0.1, "stiffness_gradient.width": 0.05, "fibre.azimuth": 0.3}
@@ -358,7 +360,7 @@ def test_the_library_has_the_vocabulary():
     names = """
         gravity uniform_acceleration drag_linear drag_quadratic magnus position_force time_force viscosity_shear viscosity_bulk maxwell
         hysteresis strain_stiffening second_invariant tension_compression fibre yield hardening softening kinematic_hardening rate_yield
-        stiffness_gradient stiffness_change friction stick restitution cohesion added_mass
+        stiffness_gradient stiffness_change friction stick restitution cohesion added_mass swelling spin_decay
     """.split()
     assert sorted(entry.name for entry in LIBRARY) == sorted(names)
     stages = {"flight", "rotation", "internal modes", "contact", "rest", "power"}

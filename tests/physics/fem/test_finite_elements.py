@@ -15,6 +15,7 @@ from neuido.physics.fem.assembly_rollout import AssemblyRollout
 from neuido.physics.fem.finite_elements import FiniteElements
 from neuido.physics.fem.meshing import mesh_body
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identity, NeoHookean, VonMises, lame
+from neuido.physics.mpm import reference
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import AttachedMass, Body, Box, ParticleState, Plane, Scene
 from tests.physics.bodies import block
@@ -161,6 +162,7 @@ def slow_twin(sim, steps, law, plastic, effects, dt):
     x, v, C, F = (t.clone() for t in a.start(sim.state))
     history, mass = model.start(), a.node_mass(sim.mass)[:, None]
     plane = sim.colliders.plane[0]
+    loss = effects.spin_loss(torch.tensor([dt], dtype=torch.float64))
     for n in range(steps):
         corner = x[elements]
         G = torch.linalg.inv((corner[:, 1:] - corner[:, :1]).mT)
@@ -170,6 +172,7 @@ def slow_twin(sim, steps, law, plastic, effects, dt):
         force.index_add_(0, elements[:, 0], -H.sum(dim=2))
         for c in range(3):
             force.index_add_(0, elements[:, c + 1], H[:, :, c])
+        v = v if loss is None else reference.damp_spin(x, v, None, mass[:, 0], 0.0, loss)[0]
         v = v + dt * (force / mass + sim.gravity[0])
         for p in plane:
             gap = x @ p[:3] - p[3]
@@ -193,6 +196,7 @@ CASES = {
     "yielding": ((FixedCorotated(4e4, 0.3), None), {"yield_inverse": 1 / 1.5e3, "hardening": 2e3,
                  "kinematic_hardening": 5e3, "rate_yield": 20.0}),
     "damage": ((FixedCorotated(4e4, 0.3), None), {"softening": 0.5, "second_invariant": 0.2}),
+    "drying": ((FixedCorotated(4e4, 0.3), VonMises(1.5e3, 4e4, 0.3)), {"swelling": -3.0, "spin_decay": 20.0}),
 }  # fmt: skip
 
 
@@ -245,8 +249,9 @@ REPLAYED = {
     "elastic": ((FixedCorotated, None), {}),
     "pulled": ((FixedCorotated, None), {"time_force": ((3.0, 0.0, 0.0), (-4.0, 1.0, 0.0)), "stiffness_change": 5.0}),
     "yielding": ((FixedCorotated, Identity()), {"yield_inverse": 1 / 1.5e3, "hardening": 2e3, "kinematic_hardening": 5e3}),
-    "branches": ((NeoHookean, VonMises(3e3, 4e4, 0.3)), {"maxwell_ratio": 0.5, "maxwell_time": 0.01, "viscosity_shear": 5.0}),
-}
+    "branches": ((NeoHookean, VonMises(3e3, 4e4, 0.3)), {"maxwell_ratio": 0.5, "maxwell_time": 0.01, "viscosity_shear": 5.0}
+                 | {"swelling": 2.0, "spin_decay": 10.0}),
+}  # fmt: skip
 
 
 def replayed(name: str, device: str, graphs: bool, every: int, dtype: torch.dtype) -> list[ParticleState]:
