@@ -36,6 +36,10 @@ def import_data(
     start: float | None = None,
     end: float | None = None,
     background: str | None = None,
+    cameras: str | None = None,
+    board: str | None = None,
+    synchronise: str = "none",
+    offsets: list[float] | None = None,
     picture: str | None = None,
     held_out: str = "",
     dry_run: bool = False,
@@ -68,9 +72,9 @@ def import_data(
         density: kg/m^3.
         young: A guess of Young's modulus, in Pa.
         poisson: Poisson's ratio; a material test without it is incompressible.
-        scale: Metres a unit of the positions, for example metres a pixel.
+        scale: Metres a unit of the positions, for example metres a pixel; of several cameras, a unit of their positions.
         y_down: Whether y points down, as in images.
-        up: The axis that points up, y or z.
+        up: The axis that points up, y or z; of a board, z if it lies flat and y if it stands upright.
         frame_rate: Frames a second, where the file counts frames; of a video in slow motion, the true ones.
         point: Of several points the one to follow, or mean.
         mass: Of the body in kg.
@@ -80,6 +84,10 @@ def import_data(
         start: Of a video, the first moment to use, s.
         end: Of a video, the last moment to use, s.
         background: Of a video, an image of the empty scene; the median of the frames where absent.
+        cameras: Of the clips of one motion from several cameras: board (a printed ChArUco board), colmap, or a recording with their views.
+        board: Its squares in x and y, side of a square, side of a marker, dictionary, as "7x5 40 mm 30 mm 4X4_50".
+        synchronise: How clips of several cameras are aligned in time: none (started together), flash (of light) or audio (a clap).
+        offsets: Instead, what to add to the times of each clip, s.
         picture: Of videos, a PNG file for frames with the outline that was found; written with --dry_run too.
         held_out: Names of recordings that are only scored, with commas; the last of several where absent.
         dry_run: Only say what was understood.
@@ -108,7 +116,7 @@ def import_data(
         columns=columns,
         units={**({"strain": strain_unit} if strain_unit else {}), **(units or {})},
         specimen=Specimen(length, width, thickness, section_diameter),
-        filming=Filming(start, end, background, picture=picture),
+        filming=Filming(start, end, background, cameras, board, synchronise, offsets, picture),
         compression=compression,
         preparation=Preparation(rows, average, zero, cycles),
         step=step,

@@ -36,6 +36,17 @@ class Filming(NamedTuple):
         return None if self.background is None else Path(self.background).expanduser()
 
 
+class View(NamedTuple):
+    """The camera of one clip."""
+
+    viewmat: np.ndarray
+    """OpenCV world-to-camera matrix, (4, 4) float64."""
+    K: np.ndarray
+    """Intrinsic matrix [px], (3, 3) float64; pixel centres at half-integers."""
+    distortion: tuple[float, ...] = ()
+    """OpenCV's k1, k2, p1, p2, k3."""
+
+
 def chosen_frames(clip: Clip, filming: Filming) -> np.ndarray:
     """Return the indices of the frames between `start` and `end`.
 

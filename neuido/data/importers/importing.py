@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from neuido.data.files.parsing import naming
 from neuido.data.footage.filming import Filming
@@ -16,6 +17,9 @@ from neuido.data.importers.tables.titles import find_columns
 from neuido.data.importers.track_folder import Axes, RecordedMotion, in_si, write_tracks
 from neuido.data.importers.tracker_exports import Motion, read_motion
 from neuido.errors import UserError
+
+if TYPE_CHECKING:
+    from neuido.data.footage.contact_sheet import Sheet
 
 KINDS = ("auto", "material", "track", "body")
 
@@ -67,7 +71,7 @@ def import_file(
         raise UserError("no file is given: name at least one")
     if kind not in KINDS:
         raise UserError(f"--kind {kind} is unknown: choose from {', '.join(KINDS)}")
-    if up not in ("y", "z"):
+    if up not in ("y", "z") and not (filming and filming.cameras):
         raise UserError(f"--up {up} must be y or z")
     if out is not None and Path(out).expanduser().exists():
         raise UserError(f"--out {out} exists already: give another folder")
@@ -91,7 +95,14 @@ def import_file(
                 f"{films[0].name} is a video and {next(p for p in paths if p not in films).name} is not: import them one by one"
             )
         contact = Sheet()
-        if filming.cameras is None and kind not in ("auto", "track"):
+        if filming.cameras is not None:
+            from neuido.data.importers.view_folder import write_view_folder
+
+            summary = write_view_folder(
+                files_by_name, out, filming, contact, held_out=held_out, scale=scale, up=up, floor=floor, frame_rate=frame_rate
+            )
+            return summary + _contact_sheet(contact, filming)
+        if kind not in ("auto", "track"):
             raise UserError(f"--kind {kind} is not for videos: leave it out, and give --cameras if the clips are views of one motion")
 
     def read(path: Path) -> RecordedMotion:
@@ -142,12 +153,18 @@ def import_file(
                 volume=volume,
                 floor=floor,
             )
-    if contact is not None and filming.picture is not None:
-        contact.write(Path(filming.picture).expanduser())
-        summary.append(f"contact sheet in {filming.picture}")
+    summary += _contact_sheet(contact, filming)
     if out is not None:
         summary.append(f"next: neuido check {out}; neuido diagnose {out} --out {out}-answer")
     return summary
+
+
+def _contact_sheet(contact: "Sheet | None", filming: Filming) -> list[str]:
+    """Write the contact sheet of videos if the user wants one; return the line of the summary."""
+    if contact is None or filming.picture is None:
+        return []
+    contact.write(Path(filming.picture).expanduser())
+    return [f"contact sheet in {filming.picture}"]
 
 
 def _kind(path: Path, columns: Mapping[str, str]) -> str:

@@ -80,3 +80,58 @@ def throw(path: Path, *, count: int = 50, rate: int = 60, seed: int = 0, change:
     background = scenery(seed)
     film(path, (change(i, ball(background, centre)) for i, centre in enumerate(pixels(x))), rate=rate)
     return x
+
+
+BOARD = "5x4 60 mm 45 mm 4X4_50"
+STAGE = 480, 360
+"""Size of the images of several cameras [px]."""
+
+
+def board_texture(dots: int = 500) -> np.ndarray:
+    """Draw the board, (H, W, 3) float32; its width is `dots`."""
+    from neuido.data.footage.board_cameras import parse_board
+
+    board = parse_board(BOARD)
+    image = board.opencv().generateImage((dots, dots * board.rows // board.columns), marginSize=0)
+    return image[..., None].repeat(3, axis=2).astype(np.float32)
+
+
+def staged(cameras, x: np.ndarray, radius: float = 0.02):
+    """Yield for each camera the images of a ball with centres x (T, 3) [m] above a board that lies on the floor.
+
+    The board lies in the plane y = 0, from the origin to (0.3, 0, 0.24) m, seen from above with its first corner at the origin.
+    """
+    texture = board_texture()
+    high, wide = texture.shape[:2]
+    to_floor = np.array([[0.3 / wide, 0, 0], [0, 0, 0], [0, 0.24 / high, 0], [0, 0, 1]])  # dots of the texture to points of the floor
+    for v in range(len(cameras.viewmats)):
+        P = (cameras.Ks[v].double() @ cameras.viewmats[v].double()[:3]).numpy()
+        H = np.diag([4.0, 4, 1]) @ (P @ to_floor)  # finer, then averaged
+        size = 4 * cameras.width, 4 * cameras.height
+        floor = cv2.warpPerspective(texture, H, size, flags=cv2.INTER_AREA, borderValue=(120.0,) * 3, borderMode=cv2.BORDER_CONSTANT)
+        floor = cv2.resize(floor, (cameras.width, cameras.height), interpolation=cv2.INTER_AREA)
+        images = []
+        for point in x:
+            h = P @ [*point, 1.0]
+            images.append(ball(floor, h[:2] / h[2], radius * float(cameras.Ks[v, 0, 0]) / h[2], (230, 40, 40)))
+        yield images
+
+
+def corner_of_a_room(cameras):
+    """Yield an image for each camera of a floor and two walls, painted with discs, that fill the unit square of each plane."""
+    rng = np.random.default_rng(0)
+    planes = []
+    for to_space in ([[1, 0, 0], [0, 0, 0], [0, 1, 0]], [[1, 0, 0], [0, 1, 0], [0, 0, 0]], [[0, 0, 0], [0, 1, 0], [1, 0, 0]]):
+        paint = np.full((600, 600, 3), 120, np.float32)
+        for _ in range(700):
+            centre, colour = rng.integers(0, 600, 2), rng.uniform(0, 255, 3)
+            cv2.circle(paint, (int(centre[0]), int(centre[1])), int(rng.integers(4, 22)), tuple(float(c) for c in colour), cv2.FILLED)
+        planes.append((paint, np.vstack([np.array(to_space) / [600, 600, 1], [0, 0, 1]])))
+    size = (cameras.width, cameras.height)
+    for K, viewmat in zip(cameras.Ks.double(), cameras.viewmats.double()):
+        P, image = (K @ viewmat[:3]).numpy(), np.full((*size[::-1], 3), 120, np.float32)
+        for paint, to_space in planes:
+            fine = cv2.warpPerspective(paint, np.diag([2.0, 2, 1]) @ P @ to_space, (2 * size[0], 2 * size[1]), borderValue=(-1e4,) * 3)
+            part = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
+            image = np.where(part > -50, part, image)
+        yield image

@@ -1,0 +1,79 @@
+"""Cameras of several views from a recording that has them, or from COLMAP run on one frame of each clip."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from neuido.data.footage.filming import Filming, View, chosen_frames
+from neuido.data.footage.video_frames import Clip, images
+from neuido.data.formats import colmap
+from neuido.data.formats.layout import MultiView
+from neuido.data.scenes.readers import read
+from neuido.errors import UserError
+from neuido.physics.runtime.lazy import import_extra
+
+
+def recorded_cameras(path: Path, clips: Sequence[Clip]) -> tuple[list[View], list[str]]:
+    """Take the cameras from a recording whose views are named like the clips; return them and a line for the summary.
+
+    Args:
+        path: A recording in any format that `neuido.read_recording` reads, such as a COLMAP project with one image per clip.
+        clips: The clips. The view of `left.mp4` is `left`, or an image `left.png`.
+
+    Raises:
+        UserError: The recording cannot be read, a clip has no view of its name, or the image sizes have other aspect ratios.
+    """
+    found = read(path)
+    return _of_views(found, clips, f"--cameras {path}"), [f"cameras of {path} ({found.format})"]
+
+
+def reconstructed_cameras(clips: Sequence[Clip], filming: Filming) -> tuple[list[View], list[str]]:
+    """Reconstruct the cameras with COLMAP from the first frame of each clip; return them and a line for the summary.
+
+    Raises:
+        UserError: pycolmap is not installed, or COLMAP does not register all clips.
+    """
+    pycolmap = import_extra("pycolmap", "--cameras colmap", extra="colmap")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "images").mkdir()
+        for clip in clips:
+            image = next(images(clip, chosen_frames(clip, filming)[:1]))
+            cv2.imwrite(str(folder / "images" / f"{clip.path.stem}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+        pycolmap.extract_features(folder / "database.db", folder / "images", camera_mode=pycolmap.CameraMode.PER_IMAGE)
+        pycolmap.match_exhaustive(folder / "database.db")
+        models = pycolmap.incremental_mapping(folder / "database.db", folder / "images", folder)
+        largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+        if largest is None or largest.num_reg_images() < len(clips):
+            count = 0 if largest is None else largest.num_reg_images()
+            raise UserError(
+                f"--cameras colmap: COLMAP places {count} of {len(clips)} views: put more texture into the scene and the cameras closer "
+                "together, or use a printed board (--cameras board)"
+            )
+        (folder / "sparse").mkdir(exist_ok=True)
+        largest.write(folder / "sparse")
+        found = colmap.views(folder / "sparse", folder / "images", folder=folder, name="clips")
+        error = float(largest.compute_mean_reprojection_error())
+        return _of_views(found, clips, "--cameras colmap"), [f"cameras by COLMAP, {largest.num_points3D()} points within {error:.2g} px"]
+
+
+def _of_views(found: MultiView, clips: Sequence[Clip], option: str) -> list[View]:
+    stems = {Path(view).stem: v for v, view in enumerate(found.views)} | {view: v for v, view in enumerate(found.views)}
+    views = []
+    for clip in clips:
+        if clip.path.stem not in stems:
+            raise UserError(f"{option} has no view {clip.path.stem!r} for {clip.path.name}: it has {', '.join(found.views[:12])}")
+        v = stems[clip.path.stem]
+        ratio = np.array([clip.width / found.cameras.width, clip.height / found.cameras.height, 1.0])
+        if abs(ratio[0] / ratio[1] - 1) > 0.01:
+            raise UserError(
+                f"{clip.path} has {clip.width} x {clip.height} px, its camera in {option} {found.cameras.width} x {found.cameras.height}, "
+                "another aspect ratio"
+            )
+        lens = () if found.distortion is None else tuple(found.distortion[v].tolist())
+        views.append(View(found.cameras.viewmats[v].double().numpy(), found.cameras.Ks[v].double().numpy() * ratio[:, None], lens))
+    return views
