@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuido.data.files.output_folder import claimed_folder
-from neuido.data.files.writing import check_writable
+from neuido.data.files.writing import check_writable, write_figure
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 
@@ -99,7 +99,7 @@ def _interpolation(
     import numpy as np
 
     from neuido.data.files.score_tables import write_rows
-    from neuido.data.files.writing import atomic_write
+    from neuido.data.files.writing import write_arrays
     from neuido.models.operator.interpolation import interpolate, monotonicity, pairwise_monotonicity, softest_and_stiffest
 
     pairs = [{"family": each, **pairwise_monotonicity(operator, each)} for each in dict.fromkeys(operator.latent_families)]
@@ -108,8 +108,8 @@ def _interpolation(
     write_rows(folder / "interpolation.csv", found.rows)
     rows = [{"measure": name, **monotonicity([row[name] for row in found.rows])} for name in ("modulus", "compression", "contact")]
     write_rows(folder / "monotonicity.csv", rows)
-    with atomic_write(folder / "interpolation.npz", keep_suffix=True) as hidden:
-        np.savez_compressed(hidden, x=found.motion.numpy(), shares=found.shares.numpy(), names=np.array(found.names))
+    arrays = {"x": found.motion.numpy(), "shares": found.shares.numpy(), "names": np.array(found.names)}
+    write_arrays(folder / "interpolation.npz", arrays)
     draw_interpolation(found, folder / "interpolation.png")
     print(f"from {found.names[0]} to {found.names[1]}:")
     for row in rows:
@@ -133,7 +133,7 @@ def draw_embedding(points: list[dict[str, Any]], path: Path) -> None:
         axes.scatter([p["x"] for p in own], [p["y"] for p in own], s=22, color=shades, linewidths=0, label=family)
     axes.set(xticks=[], yticks=[], title="t-SNE of the latents of Stage I (darker: stiffer)")
     axes.legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=150)
+    write_figure(path, figure, dpi=150)
 
 
 def draw_interpolation(found: "Interpolation", path: Path) -> None:
@@ -156,4 +156,4 @@ def draw_interpolation(found: "Interpolation", path: Path) -> None:
         axes.set_xlabel(f"share of {found.names[1]}", fontsize=8)
         axes.set_title(label, fontsize=8)
         axes.tick_params(labelsize=7)
-    figure.savefig(path, dpi=150)
+    write_figure(path, figure, dpi=150)

@@ -62,12 +62,11 @@ def main(args: Sequence[str] | None = None) -> None:
     with interruption.watched():
         try:
             status = _dispatch(list(sys.argv[1:] if args is None else args))
-            sys.stdout.flush()
+            _flush()
         except KeyboardInterrupt:
             status = 128 + (interruption.received() or signal.SIGINT)
         except BrokenPipeError:  # as of `neuido ... | head`
-            with contextlib.suppress(OSError, ValueError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            _discard_output()
             status = 128 + signal.SIGPIPE
         except SystemExit as stop:
             status = stop.code
@@ -83,6 +82,22 @@ def main(args: Sequence[str] | None = None) -> None:
         number = number or signal.SIGINT
         _fail("interrupted" + (f" by {signal.Signals(number).name}" if number != signal.SIGINT else ""), 128 + number)
     sys.exit(status)
+
+
+def _flush() -> None:
+    """Write what was printed; where that fails, as on a full disk, nothing is left for the interpreter to try again at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        _discard_output()
+        if isinstance(error, BrokenPipeError):
+            raise
+        raise UserError(f"stdout cannot be written: {error.strerror}; results in files are whole") from error
+
+
+def _discard_output() -> None:
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fault(error: Exception) -> str:
@@ -139,5 +154,6 @@ def _help() -> str:
 
 
 def _fail(line: str, status: int) -> None:
-    print(f"neuido: {shortened(line)}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # of a stderr that is closed
+        print(f"neuido: {shortened(line)}", file=sys.stderr, flush=True)
     sys.exit(status)

@@ -4,6 +4,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from neuido.data.files.writing import write_arrays
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
@@ -303,15 +304,11 @@ def _compare(body: "Body", found: "Gaussians", truth: "Truth | None") -> dict[st
 
 
 def _write(target: Path, found: "Gaussians", body: "Body") -> None:
-    import numpy as np
-
-    from neuido.data.files.writing import atomic_write
     from neuido.models.render.gaussians import save_ply
 
-    with atomic_write(target / "gaussians.ply") as hidden:
-        save_ply(hidden, found)
-    with atomic_write(target / "body.npz", keep_suffix=True) as hidden:
-        np.savez(hidden, x0=body.x.numpy(), v0=body.v.numpy(), volume=body.volume.numpy())
+    save_ply(target / "gaussians.ply", found)
+    arrays = {"x0": body.x.numpy(), "v0": body.v.numpy(), "volume": body.volume.numpy()}
+    write_arrays(target / "body.npz", arrays, compressed=False)
 
 
 def _draw(path: Path, module: "ReconstructModule", batch: "MultiViewBatch", body: "Body", side: int = 320) -> None:

@@ -1,6 +1,5 @@
 """Measured arrays as a folder of one of the three formats, so that a diagnosis of arrays is read and checked as one of files is."""
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 import yaml
 
 from neuido.data.files.values import file_name
+from neuido.data.files.writing import write_text
 from neuido.errors import UserError
 
 TRACK, TEST, BODY = ("x", "y", "z"), ("stretch", "log_strain", "shear"), ("x0", "v0", "volume")
@@ -56,10 +56,8 @@ def _table(path: Path, columns: Mapping[str, Any]) -> None:
     if len({a.shape for a in arrays.values()}) != 1 or next(iter(arrays.values())).ndim != 1:
         shapes = ", ".join(f"{key} {a.shape}" for key, a in arrays.items())
         raise UserError(f"arrays of {path.stem}: columns must be vectors of one length, got {shapes}")
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(arrays)
-        rows.writerows([repr(float(v)) for v in row] for row in zip(*arrays.values()))
+    rows = ([repr(float(v)) for v in row] for row in zip(*arrays.values()))
+    write_text(path, "".join(f"{','.join(row)}\n" for row in (arrays, *rows)))
 
 
 def _is_column(value: Any) -> bool:
@@ -96,7 +94,7 @@ def _write_bodies(data: Mapping[str, Mapping[str, Any]], model: dict[str, Any], 
         particles = {key: np.asarray(given[key]) for key in PARTICLES if key in given}
         more = {key: value for key, value in given.items() if key not in particles}
         (folder / name).mkdir()
-        np.savez(folder / name / "particles.npz", **particles)
+        write_arrays(folder / name / "particles.npz", particles, compressed=False)
         times = np.asarray(given.get("t", [0.0, 1.0]), dtype=np.float64)
         interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
         recordings.append({"name": name, "role": "fit", "frame_interval": interval} | _plain(more))
@@ -116,4 +114,4 @@ def _plain(value: Any) -> Any:
 
 
 def _write(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(yaml.safe_dump(dict(content), sort_keys=False), encoding="utf-8")
+    write_text(path, yaml.safe_dump(dict(content), sort_keys=False))

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import neuido
-from neuido.data.files.writing import atomic_write, make_real_folder, remove
+from neuido.data.files.writing import make_real_folder, remove, write_bytes
 from neuido.discrepancy.problems.problem import Ask, Point, Problem, Recording, Rows
 from neuido.errors import shortened
 
@@ -239,8 +239,7 @@ class CachedProblem(Problem):
             return
         content = io.BytesIO()
         np.save(content, stored)
-        with atomic_write(path) as hidden:
-            hidden.write_bytes(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
+        write_bytes(path, content.getvalue() + hashlib.sha256(content.getvalue()).digest())
         self.used += stored.nbytes
 
 

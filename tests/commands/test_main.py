@@ -1,6 +1,7 @@
 """The command line: help without torch, and one line with status 2 for whatever the user can mend."""
 
 import functools
+import os
 import subprocess
 import sys
 import tempfile
@@ -176,6 +177,28 @@ def test_step_above_the_stability_limit(capsys, tmp_path):
         "0",
     ]
     assert_one_line(capsys, [*args, "--setup.particles_per_side", "3", "--progress", "false", "--device", "cpu"], "dt", "0.1")
+
+
+@pytest.mark.parametrize(("stream", "status"), [("/dev/full", 2), (None, 128 + 13)])
+def test_stdout_that_cannot_be_written_is_one_line_and_stderr_may_be_gone(stream, status):
+    """In a fork, whose own stdout is full or closed, and stderr closed."""
+    child = os.fork()
+    if child == 0:
+        code: object = 99
+        try:
+            if stream:
+                os.dup2(os.open(stream, os.O_WRONLY), 1)
+            for number in (1, 2) if stream is None else (2,):
+                reads, writes = os.pipe()
+                os.close(reads)
+                os.dup2(writes, number)
+            sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))
+            main(["--help"])
+        except SystemExit as stop:
+            code = stop.code
+        finally:
+            os._exit(int(str(code)))
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == status
 
 
 def test_interrupt(capsys, monkeypatch):

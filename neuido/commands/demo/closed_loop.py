@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from neuido.data.files.writing import write_figure
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
@@ -287,5 +288,4 @@ def draw(diagnosis: Path, path: Path) -> None:
     else:
         ranks.axis("off")
     ranks.tick_params(labelsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    write_figure(path, figure, dpi=130)

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from neuido.data.files.writing import write_figure
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -121,5 +123,4 @@ def _draw(compared: list[Comparison], path: Path) -> None:
     for panel in panels[-1]:
         panel.set_xlabel("x [m]", fontsize=8)
     panels[0][0].legend(fontsize=6, loc="upper right")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    write_figure(path, figure, dpi=150)

@@ -6,20 +6,23 @@ import os
 import shutil
 import socket
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neuido.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False) -> Iterator[Path]:
     """Write a file atomically: yield a temporary path, and rename it to `path` when the block ends.
 
-    The data are synchronised to disk before the renaming. If the block raises, as on a full disk, the temporary file is removed and an
-    earlier file stays unchanged. Several processes may write the same file, because each has its own temporary path. A link is replaced,
-    not followed.
+    The data are synchronised to disk before the renaming; inside of a `new_folder`, when that ends. If the block raises, as on a full
+    disk, the temporary file is removed and an earlier file stays unchanged. Several processes may write the same file, because each has
+    its own temporary path. A link is replaced, not followed.
 
     Args:
         path: The file; its folder is created if it does not exist.
@@ -30,18 +33,68 @@ def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False) -> Itera
     hidden = temporary_path(path, path.suffix if keep_suffix else "")
     try:
         yield hidden
-        _sync(hidden)
+        durable = not _in_new_folder(path)
+        if durable:
+            _sync(hidden)
         os.replace(hidden, path)
     except BaseException:
         remove(hidden)
         raise
-    _sync(path.parent)
+    if durable:
+        _sync(path.parent)
+
+
+def _in_new_folder(path: Path) -> bool:
+    """Return whether a file lies in a folder under its temporary name, which is synchronised as a whole."""
+    return any(parent.name.startswith(".") and parent.name.endswith(".tmp") for parent in path.parents)
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a small file all at once; several processes may write the same one."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file that memory holds all at once."""
     with atomic_write(path) as hidden:
-        hidden.write_text(text)
+        hidden.write_bytes(content)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, "np.ndarray"], *, compressed: bool = True) -> None:
+    """Write NumPy arrays as one .npz file all at once."""
+    import numpy as np
+
+    with atomic_write(path) as hidden, hidden.open("wb") as stream:
+        (np.savez_compressed if compressed else np.savez)(stream, **arrays)  # type: ignore[arg-type]
+
+
+def write_png(path: Path, image: "np.ndarray", *, compression: int | None = None) -> None:
+    """Write an image in OpenCV's order of colours, (H, W), (H, W, 3) or (H, W, 4) uint8, as a PNG file all at once.
+
+    Args:
+        path: The file.
+        image: The image.
+        compression: Level from 0 to 9; OpenCV's own where absent.
+    """
+    import cv2
+
+    options = [] if compression is None else [cv2.IMWRITE_PNG_COMPRESSION, compression]
+    done, content = cv2.imencode(".png", image, options)  # imwrite reports no full disk
+    if not done:
+        raise UserError(f"OpenCV cannot encode the picture {path}")
+    write_bytes(path, content.tobytes())
+
+
+def write_figure(path: Path, figure: Any, *, dpi: float) -> None:
+    """Write a figure of matplotlib as a PNG file all at once."""
+    with atomic_write(path) as hidden:
+        figure.savefig(hidden, dpi=dpi, format="png")
+
+
+def copy_file(source: str | os.PathLike, path: Path) -> None:
+    """Copy the content of a file all at once."""
+    with atomic_write(path) as hidden:
+        shutil.copyfile(source, hidden)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -56,9 +109,12 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
     If the block raises, the temporary folder is removed.
 
     Raises:
-        UserError: Another process of this machine is writing the folder; or by then `path` exists, and is a file or a folder with content.
+        UserError: `path` is a link; another process of this machine is writing the folder; or by then `path` exists, and is a file or a
+            folder with content.
     """
     path = Path(path)
+    if path.is_symlink():
+        raise UserError(f"{path} is a link, which is not followed here: remove it, or give another out")
     _check_writer(path)
     with made_folder(path.parent):
         hidden = temporary_path(path)

@@ -4,7 +4,6 @@ neuido adds two keys to a frame: `time` [s] and `view`, the number of the camera
 have the same pose. If frames have neither key, each pose is a view of the same moment.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from torch import Tensor
 from neuido.data import cameras as convert
 from neuido.data.files.parsing import image_size, read_json
 from neuido.data.files.values import list_of_mappings, number, path_inside, require_key
+from neuido.data.files.writing import write_json, write_png
 from neuido.data.formats.layout import MultiView, Shot, assemble, natural_key, read_matrix, viewmat_from_opengl
 from neuido.errors import UserError
 from neuido.types import Cameras
@@ -116,7 +116,7 @@ def write_transforms(
         kept = {int(names[v]) for v in held_out}
         content["train_filenames"] = [frame["file_path"] for frame in frames if frame["view"] not in kept]
         content["test_filenames"] = [frame["file_path"] for frame in frames if frame["view"] in kept]
-    (folder / "transforms.json").write_text(json.dumps(content, indent=1))
+    write_json(folder / "transforms.json", content)
     return names
 
 
@@ -130,8 +130,7 @@ def write_image(path: Path, image: np.ndarray, *, size: tuple[int, int] | None =
     if image.ndim != 3 or image.shape[2] not in (3, 4) or image.dtype != np.uint8 or (size and image.shape[1::-1] != size):
         raise UserError(f"{path.name} must be (H, W, 3 or 4) uint8{f' of size {size}' if size else ''}, got {image.shape} {image.dtype}")
     order = cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
-    if not cv2.imwrite(str(path), cv2.cvtColor(image, order)):
-        raise UserError(f"the image {path} cannot be written")
+    write_png(path, cv2.cvtColor(image, order))
 
 
 def _files(folder: Path) -> list[Path]:

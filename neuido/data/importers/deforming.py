@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from neuido.data.files.writing import write_arrays, write_text
 from neuido.data.importers.tables.checked_folder import write_checked
 from neuido.errors import UserError
 
@@ -95,9 +96,8 @@ def write_deforming_body(
 
     def fill(folder: Path) -> None:
         for name, take in arrays.items():
-            (folder / name).mkdir()
-            np.savez_compressed(folder / name / "particles.npz", **take)
-        (folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+            write_arrays(folder / name / "particles.npz", take)
+        write_text(folder / "experiment.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
     write_checked(out, fill, read_experiment)
     return summary

@@ -1,7 +1,6 @@
 """Experiments: measured motion of one object, in the folder format `neuido-experiment/1`, read, checked and written."""
 
 import os
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from torch import Tensor
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.files.parsing import read_arrays
 from neuido.data.files.values import check_keys, file_name, mapping, number, path_inside
+from neuido.data.files.writing import copy_file, write_arrays, write_text
 from neuido.data.formats import nerfstudio
 from neuido.data.formats.layout import MultiView
 from neuido.data.measured.columns import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
@@ -115,7 +115,7 @@ def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None 
 
 
 def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
-    """Write an experiment's folder, with copies of its images and Gaussians.
+    """Write an experiment's folder, with copies of its images and Gaussians; `experiment.yaml` is written last, when all else is there.
 
     Raises:
         UserError: The folder already holds an experiment, or the experiment cannot be expressed in the format.
@@ -141,7 +141,7 @@ def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
         content["recordings"].append(entry if recording.noise is None else {**entry, "noise": recording.noise})
         path_inside(folder, recording.name, "name of the recording").mkdir(parents=True, exist_ok=True)
         _write_files(recording, folder / recording.name)
-    (folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
+    write_text(folder / "experiment.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
 
 
 def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -324,7 +324,7 @@ def _write_files(recording: Recording, folder: Path) -> None:
                   "track": recording.track, "anchor": recording.anchor}  # fmt: skip
         kinds = {"t": np.float64, "track": np.int32}
         given = {key: array.numpy().astype(kinds.get(key, np.float32)) for key, array in arrays.items() if array is not None}
-        np.savez_compressed(folder / "particles.npz", **given)  # type: ignore[arg-type]
+        write_arrays(folder / "particles.npz", given)
     if recording.video is not None:
         source = recording.video.folder
         if not (source / "transforms.json").is_file():
@@ -332,9 +332,7 @@ def _write_files(recording: Recording, folder: Path) -> None:
                 f"the video of recording {recording.name} has no transforms.json in {source}: write its images with nerfstudio.write"
             )
         for path in (path for grid in (recording.video.images, recording.video.masks or ()) for row in grid for path in row if path):
-            target = folder / path.relative_to(source)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, target)
-        shutil.copyfile(source / "transforms.json", folder / "transforms.json")
+            copy_file(path, folder / path.relative_to(source))
+        copy_file(source / "transforms.json", folder / "transforms.json")
     if recording.gaussians is not None:
-        shutil.copyfile(recording.gaussians, folder / "gaussians.ply")
+        copy_file(recording.gaussians, folder / "gaussians.ply")

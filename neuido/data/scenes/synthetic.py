@@ -25,7 +25,7 @@ from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.files.output_folder import claimed_folder
 from neuido.data.files.parsing import read_yaml
 from neuido.data.files.values import check_keys, mapping, vector
-from neuido.data.files.writing import new_folder, write_json
+from neuido.data.files.writing import new_folder, write_arrays, write_json, write_png, write_text
 from neuido.data.formats import nerfstudio
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
 from neuido.data.progress import Progress
@@ -208,10 +208,11 @@ def make_scene(
         previews = _film(dense, frames, cameras, film, recording, draw, pool, advance)
     _write_preview(previews, folder / "preview.png")
     x = frames.x.cpu().numpy()
-    np.savez(folder / "truth.npz", x=x, x0=x[0], volume=plan.body.volume.numpy(), times=times.numpy())
+    arrays = {"x": x, "x0": x[0], "volume": plan.body.volume.numpy(), "times": times.numpy()}
+    write_arrays(folder / "truth.npz", arrays, compressed=False)
     truth = {"format": "neuido-truth/1", "name": plan.name, "law": plan.law, "split": plan.split, "substeps": plan.substeps}
     truth |= {"dt": plan.scene.dt, "particles": len(plan.body.x), "gaussians": len(dense.colour), "source": plan.source}
-    (folder / "truth.yaml").write_text(yaml.safe_dump(truth, sort_keys=False, default_flow_style=None))
+    write_text(folder / "truth.yaml", yaml.safe_dump(truth, sort_keys=False, default_flow_style=None))
     write_motion(plan.motion, folder)
     interval = plan.substeps * plan.scene.dt
     free = tuple(key for part in ("elasticity", "plasticity") for key in plan.declared[part] if key != "law")
@@ -313,8 +314,7 @@ def _film(
 
 
 def _write_png(path: Path, rgba: np.ndarray, compression: int) -> None:
-    if not cv2.imwrite(str(path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, compression]):
-        raise UserError(f"the image {path} cannot be written")
+    write_png(path, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), compression=compression)
 
 
 def _write_preview(images: np.ndarray, path: Path, side: int = 160) -> None:

@@ -1,6 +1,5 @@
 """Generate material tests and tracks with an undeclared effect."""
 
-import csv
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 import yaml
 
+from neuido.data.files.writing import write_text
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.case import Case
@@ -167,7 +167,7 @@ def _write_tests(name: str, model: Mapping[str, Any], tests: Sequence[tuple[str,
         columns = {"time": "time_s", "stretch": "stretch", "nominal_stress": "stress_pa"}
         entries.append({"name": title, "file": f"{title}.csv", "mode": mode, "columns": columns, "role": role})
     content = {"format": "neuido-material-test/1", "name": name, "model": model, "tests": entries}
-    (folder / "test.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    write_text(folder / "test.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
     read_material_tests(folder)
 
 
@@ -239,12 +239,10 @@ def _write_tracks(name: str, gravity: Vector, noise: float, tracks: Sequence[tup
         "format": "neuido-track/1", "name": name, "model": {"gravity": list(gravity), "effects": {}, "free": []},
         "nuisances": {"release_time": 0.002, "length_scale": 0.002, "time_base": 0.001}, "bodies": {"ball": {}}, "recordings": entries,
     }  # fmt: skip
-    (folder / "track.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    write_text(folder / "track.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
     read_tracks(folder)
 
 
 def _write_csv(path: Path, titles: tuple[str, ...], rows: np.ndarray) -> None:
-    with path.open("w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(titles)
-        writer.writerows([[f"{value:.7g}" for value in row] for row in rows])
+    lines = (titles, *([f"{value:.7g}" for value in row] for row in rows))
+    write_text(path, "".join(f"{','.join(line)}\r\n" for line in lines))

@@ -1,5 +1,6 @@
 """Write a case with an undeclared effect: a folder for `neuido diagnose` and a sealed key."""
 
+import contextlib
 import hashlib
 import math
 import re
@@ -11,7 +12,7 @@ import numpy as np
 import yaml
 
 from neuido.data.files.parsing import read_yaml
-from neuido.data.files.writing import new_folder, write_text
+from neuido.data.files.writing import made_folder, new_folder, remove, write_text
 from neuido.data.progress import Progress
 from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.case import Case
@@ -40,12 +41,16 @@ def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, pro
         if key.is_file() and _plan_of(key) == plan and (folder / "README.md").is_file():
             return key
         raise UserError(f"out = {folder} exists and is not the case of seed {seed} with these options: give another folder")
-    with new_folder(folder) as hidden:
-        text = _make(int(seed), hidden, folder.name, case, plan, str(choose_device(device)), progress)
-        if folder.exists():
-            raise UserError(f"out = {folder} was created by another process in the meantime; nothing was overwritten")
-        key.parent.mkdir(exist_ok=True)
-        write_text(key, text)
+    with contextlib.ExitStack() as undo:
+        undo.enter_context(made_folder(key.parent))
+        with new_folder(folder) as hidden:
+            text = _make(int(seed), hidden, folder.name, case, plan, str(choose_device(device)), progress)
+            if folder.exists():
+                raise UserError(f"out = {folder} was created by another process in the meantime; nothing was overwritten")
+            if not key.exists():
+                undo.callback(remove, key)
+            write_text(key, text)
+        undo.pop_all()
     return key
 
 
@@ -66,7 +71,7 @@ def _make(seed: int, hidden: Path, name: str, case: Case, plan: dict[str, Any], 
     sealed = {**truth, "sealed": {**plan, "attempt": attempt, "salt": rng.bytes(16).hex()}}
     text = yaml.safe_dump(sealed, sort_keys=False, default_flow_style=None, width=140)
     write_folder(hidden)
-    (hidden / "README.md").write_text(_readme(name, text))
+    write_text(hidden / "README.md", _readme(name, text))
     return text
 
 

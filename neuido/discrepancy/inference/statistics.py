@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neuido.data.files.writing import atomic_write
+from neuido.data.files.writing import write_arrays
 from neuido.discrepancy.inference.base_fits import BaseFits
 from neuido.discrepancy.inference.floors import Floor, score
 from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, Journal, fit_of, from_json, to_json
@@ -141,8 +141,7 @@ def read(arrays: Mapping[str, np.ndarray]) -> list[FitStatistics]:
 def write_fits(path: Path, case: CaseRecord, arrays: Mapping[str, np.ndarray] | None) -> None:
     """Write a case, and the statistics of its fits where there are some, as one compressed file."""
     text = np.frombuffer(to_json(case).encode(), np.uint8)
-    with atomic_write(path) as hidden, hidden.open("wb") as stream:
-        np.savez_compressed(stream, case=text, **(arrays or {}))
+    write_arrays(path, {"case": text, **(arrays or {})})
 
 
 def read_fits(path: Path) -> tuple[CaseRecord, list[FitStatistics]]:

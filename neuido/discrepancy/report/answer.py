@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from neuido.data.files.values import file_name
-from neuido.data.files.writing import atomic_write, make_real_folder, remove, write_text
+from neuido.data.files.writing import make_real_folder, remove, write_arrays, write_text
 from neuido.discrepancy.inference.floors import Round, Trial
 from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.discrepancy.inference.search.judging import ALPHA
@@ -142,5 +142,4 @@ def _body(d: Diagnosis) -> str:
 
 
 def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with atomic_write(path) as hidden, hidden.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
+    write_arrays(path, arrays)

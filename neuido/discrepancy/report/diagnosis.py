@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import shutil
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neuido.data.files.html_page import plain
 from neuido.data.files.parsing import read_arrays
+from neuido.data.files.writing import copy_file
 from neuido.discrepancy.report import diagnosis_format
 from neuido.discrepancy.report.reader_units import Units, axis_of
 from neuido.discrepancy.report.wording import LEADING, MORE, Words, scored_by, words_of
@@ -285,8 +285,7 @@ class Diagnosis:
             return made
         target = Path(path).expanduser()
         target = target / made.name if target.is_dir() else target
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(made, target)
+        copy_file(made, target)
         return target
 
     def to_dict(self) -> dict[str, Any]:

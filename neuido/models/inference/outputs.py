@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.files.writing import atomic_write
+from neuido.data.files.writing import atomic_write, write_png
 from neuido.errors import UserError
 from neuido.types import ParticleState
 
@@ -26,7 +26,8 @@ def write_plys(folder: str | os.PathLike, motion: ParticleState) -> None:
         vertices = np.empty(len(position), [(name, "f4") for name in ("x", "y", "z", "vx", "vy", "vz")])
         for name, column in zip(vertices.dtype.names, np.concatenate([position, velocity], 1).T):
             vertices[name] = column
-        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(folder / f"{k:0{digits}d}.ply"))
+        with atomic_write(folder / f"{k:0{digits}d}.ply") as hidden:
+            PlyData([PlyElement.describe(vertices, "vertex")]).write(str(hidden))
     for old in folder.glob("*.ply"):  # left by an earlier, longer run
         if old.stem.isdigit() and int(old.stem) >= len(x):
             old.unlink()
@@ -53,6 +54,13 @@ def write_video(path: str | os.PathLike, images: Tensor, *, rate: float = 20.0) 
         for frame in frames:
             writer.write(cv2.cvtColor(np.ascontiguousarray(frame[:height, :width]), cv2.COLOR_RGB2BGR))
         writer.release()
+        written = cv2.VideoCapture(str(hidden))  # OpenCV reports no full disk
+        count = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
+        written.release()
+        if count != len(frames):
+            raise UserError(
+                f"the video {path} cannot be written whole, {count} of {len(frames)} frames: free some space, or give another out"
+            )
 
 
 def contact_sheet(path: str | os.PathLike, rows: Sequence[Tensor], *, columns: int = 8) -> None:
@@ -63,7 +71,4 @@ def contact_sheet(path: str | os.PathLike, rows: Sequence[Tensor], *, columns: i
         bands.append(torch.cat(list(row[pick].detach().clamp(0, 1).cpu()), 1))
     width = min(band.shape[1] for band in bands)
     sheet = torch.cat([band[:, :width] for band in bands])
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    image = cv2.cvtColor((255 * sheet).round().to(torch.uint8).numpy(), cv2.COLOR_RGB2BGR)
-    if not cv2.imwrite(str(path), image):
-        raise UserError(f"cannot write the picture {path}")
+    write_png(Path(path), cv2.cvtColor((255 * sheet).round().to(torch.uint8).numpy(), cv2.COLOR_RGB2BGR))

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.data.files.writing import atomic_write
 from neuido.data.formats.gaussian_ply import column_names, read_gaussian_vertices
 from neuido.errors import UserError
 from neuido.physics.linalg.decompositions import polar
@@ -210,7 +211,8 @@ def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
     vertices = np.empty(len(table), [(name, "f4") for name in column_names(rest.shape[1])])
     for name, column in zip(vertices.dtype.names or (), table.T, strict=True):
         vertices[name] = column
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
+    with atomic_write(path) as hidden:
+        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(hidden))
 
 
 def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device: str | torch.device = "auto") -> Gaussians:

@@ -20,7 +20,7 @@ from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
 from neuido.data.clips import FORMAT, is_complete
 from neuido.data.files.output_folder import claimed_folder
-from neuido.data.files.writing import atomic_write, write_json
+from neuido.data.files.writing import write_arrays, write_json
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
@@ -185,8 +185,7 @@ def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str,
     options = {"size": plan.flow_size, "preset": plan.flow_preset}
     seen = measure_velocities(filmed.pop("images"), filmed.pop("masks"), times, clip.cameras, clip.body.x.mean(0), **options)
     content = {"flow": seen.flow.half(), "cell": seen.cell, "frame_interval": torch.tensor(seen.frame_interval), **filmed}
-    with atomic_write(folder / f"{clip.name}.npz") as hidden, hidden.open("wb") as file:
-        np.savez(file, **{name: t.numpy() for name, t in content.items()})
+    write_arrays(folder / f"{clip.name}.npz", {name: t.numpy() for name, t in content.items()}, compressed=False)
 
 
 def _samples(motion: ParticleState, clip: ClipSetup, count: int, seed: int) -> dict[str, Tensor]:

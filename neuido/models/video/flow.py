@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from neuido.data.files.parsing import read_arrays
-from neuido.data.files.writing import atomic_write
+from neuido.data.files.writing import write_arrays
 from neuido.errors import UserError
 from neuido.types import Cameras
 
@@ -138,8 +138,7 @@ def measure_velocities(
     if found is None:
         found = _crop_flow(optical_flow(images, preset=preset), masks.cpu(), size)
         if path is not None:
-            with atomic_write(path) as hidden, hidden.open("wb") as file:
-                np.savez(file, flow=found[0].numpy(), side=found[1].numpy())
+            write_arrays(path, {"flow": found[0].numpy(), "side": found[1].numpy()}, compressed=False)
     flow, side = found
     return Velocities(flow * (pixel / interval)[:, None, None, None, None], pixel * side / size, interval)
 

@@ -154,3 +154,12 @@ def test_names_that_would_be_paths_are_refused(name):
 def test_errors_of_the_machine_are_one_short_line(error):
     line = one_line(error)
     assert line and len(line) <= 300 and line.isprintable()
+
+
+@pytest.mark.parametrize("target", ["nowhere", "folder"])
+def test_a_new_folder_does_not_take_the_place_of_a_link(tmp_path, target):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / target)
+    with pytest.raises(UserError, match="is a link"), new_folder(tmp_path / "out"):
+        pytest.fail("work began")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "out"] and not list((tmp_path / "folder").iterdir())

@@ -104,6 +104,24 @@ def test_a_wanted_case_that_cannot_be_made_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_case_whose_folder_cannot_be_published_leaves_no_key(tmp_path, monkeypatch):
+    """Another process makes the folder when the key is there already."""
+    from neuido.data.undeclared import sealed_folder
+
+    write = sealed_folder.write_text
+
+    def between(path, text):
+        write(path, text)
+        if path.parent.name == "keys":
+            (tmp_path / "case").mkdir()
+            (tmp_path / "case" / "mine.txt").touch()
+
+    monkeypatch.setattr(sealed_folder, "write_text", between)
+    with pytest.raises(UserError, match="another process"):
+        make_undeclared(3, tmp_path / "case", case=Case(measured="track"), device="cpu", progress=False)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["case", "mine.txt"]
+
+
 def test_null_with_wrong_nuisances(tmp_path):
     folder, key = made(tmp_path, kind="none", nuisances=True)
     assert key["undeclared"] == [] and set(key["nuisances"]) == {"take1", "take2"}
