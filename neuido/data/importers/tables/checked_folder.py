@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from neuido.data.files.writing import new_folder
+from neuido.data.files.writing import new_folder, write_text
 from neuido.errors import UserError
 
 
@@ -61,8 +61,8 @@ def write_tables(
     def fill(folder: Path) -> None:
         for file, columns in tables.items():
             lines = [",".join(columns), *(",".join(repr(float(v)) for v in row) for row in zip(*columns.values()))]
-            (folder / f"{file}.csv").write_text("\n".join(lines) + "\n")
-        (folder / name).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
+            write_text(folder / f"{file}.csv", "\n".join(lines) + "\n")
+        write_text(folder / name, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
 
     write_checked(out, fill, read)
 
