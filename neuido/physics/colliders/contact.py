@@ -1,7 +1,8 @@
 """Kinds of contact: Warp functions for the velocity of a node inside a collider, and their adjoints.
 
 `sticky` sets the velocity to zero, `slip` removes its normal part, `separate` removes an inward normal part and brakes the tangential one
-with Coulomb's friction (Stomakhin et al. 2013, eq. 8).
+with Coulomb's friction (Stomakhin et al. 2013, eq. 8). A node sticks where its tangential speed is strictly below what friction takes:
+without friction a node never sticks, also at a tangential speed of zero, where a gradient of the tangential velocity would be lost.
 """
 
 import functools
@@ -41,7 +42,7 @@ def functions(real: type, module: str) -> SimpleNamespace:
             if vn < real(0.0):
                 t = v - vn * n
                 speed = wp.length(t)
-                if speed <= -friction * vn:
+                if speed < -friction * vn:
                     out = vec3(real(0.0), real(0.0), real(0.0))
                 else:
                     out = t * (real(1.0) + friction * vn / wp.max(speed, real(1.0e-30)))
@@ -61,7 +62,7 @@ def functions(real: type, module: str) -> SimpleNamespace:
             if vn < real(0.0):
                 t = v - vn * n
                 speed = wp.length(t)
-                if speed <= -friction * vn:
+                if speed < -friction * vn:
                     out = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
                 else:
                     s = wp.max(speed, real(1.0e-30))

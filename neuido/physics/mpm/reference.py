@@ -32,8 +32,8 @@ def _contact(v: Tensor, normal: Tensor, kind: int, friction: Tensor) -> Tensor:
         return tangent
     assert kind == SEPARATE
     speed = tangent.norm(dim=-1, keepdim=True)
-    stuck = (speed <= -friction * vn) | (vn >= 0.0)
-    safe = torch.where(stuck, torch.ones_like(speed), speed)
+    stuck = (speed < -friction * vn) | (vn >= 0.0)
+    safe = torch.where(stuck | (speed == 0.0), torch.ones_like(speed), speed)
     slid = torch.where(stuck, torch.zeros_like(v), tangent * (1.0 + torch.where(stuck, 0.0, friction * vn) / safe))
     return torch.where(vn < 0.0, slid, v)
 

@@ -95,6 +95,32 @@ def test_rollout_gradient_equals_finite_differences():
         assert abs(numeric - analytic) <= 1e-6 * max(abs(analytic), 1e-3 * abs(float(gradient.norm() * direction.norm()))), name
 
 
+@pytest.mark.parametrize("contact", [dict(contact="separate"), dict(contact="separate", friction=0.4), dict(contact="slip")])
+@pytest.mark.parametrize("slow", [False, True], ids=["kernels", "twin"])
+def test_gradient_at_the_branch_of_a_body_that_falls_straight_onto_a_floor(contact, slow):
+    """Every node meets the floor at a tangential speed of exactly zero: without friction it slides on, with friction it sticks."""
+    body = block((0.3, 0.2, 0.3), (0.7, 0.6, 0.7), (6, 6, 6), velocity=(0.0, -2.0, 0.0))
+    scene = Scene(cells=8, dt=1e-3, gravity=(0.0, 0.0, 0.0), walls=None, colliders=(Plane((0.0, 0.4, 0.0), (0.0, 1.0, 0.0), **contact),))
+    sim = Simulator(scene, body, dtype=torch.float64, device=DEVICE)
+    run = (lambda *a, **k: reference.rollout(sim, *a, **k)) if slow else sim.rollout
+    weights = torch.randn(sim.state.v.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(DEVICE)
+
+    def loss(v):
+        return (run(2, FixedCorotated(1e5, 0.3), state=sim.state._replace(v=v), every=2).v[1] * weights).sum()
+
+    v = sim.state.v.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(v), v)
+    step = 1e-6
+    for axis in (0, 2):
+        along = torch.zeros(3, dtype=torch.float64, device=DEVICE)
+        along[axis] = step
+        with torch.no_grad():
+            numeric = float(loss(sim.state.v + along) - loss(sim.state.v - along)) / (2 * step)
+        assert abs(numeric - float(gradient[:, axis].sum())) <= 1e-6 * float(weights.abs().sum()), axis
+    held = float(gradient[sim.state.x[:, 1] < 0.25, 0].abs().max())
+    assert (held > 0.1) == ("friction" not in contact)  # particles whose nodes all lie inside the floor
+
+
 class Stage:
     """The arrays of one substep of the busy scenes, for one kernel at a time."""
 
