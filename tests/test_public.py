@@ -37,9 +37,9 @@ PUBLIC = {
     "neuido.physics": "FiniteElements Frames MassSpring Mesh Simulator effects laws mesh_body",
     "neuido.physics.effects": "Effects Entry LIBRARY Parameter ball_inclusion linear_gradient",
     "neuido.physics.laws": """
-        AutogradElastic AutogradPlastic DruckerPrager ElasticLaw FixedCorotated Identity InvariantElastic InvariantPlastic NeoHookean
-        ObjectiveElastic ObjectivePlastic PlasticLaw RawElastic RawPlastic Sigma SymbolicElastic SymbolicPlastic VonMises by_body
-        material stack
+        AutogradElastic AutogradPlastic BoundedElastic DruckerPrager ElasticLaw FixedCorotated Identity InvariantElastic
+        InvariantPlastic NeoHookean ObjectiveElastic ObjectivePlastic PlasticLaw RawElastic RawPlastic Sigma SymbolicElastic
+        SymbolicPlastic VonMises by_body material stack
     """,
     "neuido.discrepancy": "DiagnosedEffects Diagnosis Effect ErrorChange OwnEffect Quantity diagnose",
 }

@@ -20,7 +20,8 @@ from neuido.data.files.missing_weights import weights_hint
 from neuido.data.files.writing import atomic_write
 from neuido.data.weight_files import build, parse_metadata, read_safetensors
 from neuido.errors import UserError
-from neuido.physics.laws.neural import networks, readouts
+from neuido.physics.laws.neural import readouts
+from neuido.physics.laws.neural.bounded import BoundedElastic
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 
 FORMAT = "neuido-operator/1"
@@ -28,7 +29,13 @@ PRETRAINED = {
     "pretrained": Path(__file__).parents[1] / "weights" / "stage1.safetensors",
     "pretrained-family": Path(__file__).parents[1] / "weights" / "stage1_family.safetensors",
 }
-LAWS = {"raw": (RawElastic, RawPlastic), "objective": (ObjectiveElastic, ObjectivePlastic)}
+ElasticNetwork = RawElastic | ObjectiveElastic
+PlasticNetwork = RawPlastic | ObjectivePlastic
+LAWS = {
+    "raw": (RawElastic, RawPlastic),
+    "objective": (ObjectiveElastic, ObjectivePlastic),
+    "bounded": (BoundedElastic, ObjectivePlastic),
+}
 
 
 class Trunk(nn.Module):
@@ -83,8 +90,8 @@ class IntrinsicDynamicsOperator(nn.Module):
     """Neural operator that maps a latent z to an elastic and a plastic law.
 
     Args:
-        trunk: `raw` (as in the paper: from F to nine components) or `objective` (from invariants to the coefficients of an isotropic,
-            frame-indifferent law).
+        trunk: `raw` (as in the paper: from F to nine components), `objective` (from invariants to the coefficients of an isotropic,
+            frame-indifferent law) or `bounded` (the same with a stress that cannot have the wrong sign).
         latent_dim: Latent dimension d (paper: 128).
         basis_dim: Number of basis functions D (the paper does not say).
         hidden_dim: Width of the trunks (the paper does not say; 64 suits a fused kernel).
@@ -101,7 +108,7 @@ class IntrinsicDynamicsOperator(nn.Module):
 
     def __init__(
         self,
-        trunk: Literal["raw", "objective"] = "objective",
+        trunk: Literal["raw", "objective", "bounded"] = "objective",
         latent_dim: int = 128,
         basis_dim: int = 64,
         hidden_dim: int = 64,
@@ -109,7 +116,7 @@ class IntrinsicDynamicsOperator(nn.Module):
     ):
         super().__init__()
         if trunk not in LAWS:
-            raise UserError(f"trunk = {trunk!r}: choose raw or objective")
+            raise UserError(f"trunk = {trunk!r}: choose raw, objective or bounded")
         self.config = {
             "trunk": trunk,
             "latent_dim": latent_dim,
@@ -158,42 +165,37 @@ class IntrinsicDynamicsOperator(nn.Module):
         """Return lambda^E and lambda^P, (S, D) each, of z (S, d)."""
         return self.elastic_head(z), self.plastic_head(z)
 
-    def features(self, F: Tensor) -> Tensor:
-        """Return the input features of the trunks for F, (..., 3, 3) -> (..., 9)."""
-        if self.trunk == "raw":
-            return networks.raw_features(F)
-        if F.requires_grad:
-            return networks.strain_features(*networks.hencky_strain(F))
-        return readouts.compute_strain_features(F.reshape(-1, 3, 3)).view(*F.shape[:-2], 9)
+    def features(self, F: Tensor, law: type[ElasticNetwork] | type[PlasticNetwork]) -> Tensor:
+        """Return the input features of the trunk of a law for F, (..., 3, 3) -> (..., 9)."""
+        if self.trunk == "raw" or F.requires_grad:
+            return law.features_of(F)
+        return readouts.compute_strain_features(F.reshape(-1, 3, 3), law).view(*F.shape[:-2], 9)
 
     def basis(self, F: Tensor) -> tuple[Tensor, Tensor]:
         """Evaluate the elastic and the plastic basis functions at F (..., 3, 3), (..., D, n) each."""
-        features = self.features(F)
-        return self.elastic_trunk(features), self.plastic_trunk(features)
+        return self.elastic_trunk(self.features(F, self._elastic_law)), self.plastic_trunk(self.features(F, self._plastic_law))
 
     def elastic(self, z: Tensor, F: Tensor) -> Tensor:
         """Evaluate the Kirchhoff stress [Pa] (S, n, 3, 3) at deformation gradients F (S, n, 3, 3) for S latents z (S, d)."""
-        y = self._outputs(self.elastic_trunk, self.elastic_head(z), F)
-        if self.trunk == "raw":
-            return networks.RAW_STRESS_SCALE * y.unflatten(-1, (3, 3))
-        if F.requires_grad:
-            return networks.isotropic_stress(F, y)
-        return readouts.StressReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRESS_SCALE).view(F.shape)
+        law = self._elastic_law
+        y = self._outputs(self.elastic_trunk, self.elastic_head(z), self.features(F, law))
+        if self.trunk == "raw" or F.requires_grad:
+            return law.stress_of(F, y, law.unit)
+        return readouts.StressReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), law).view(F.shape)
 
     def plastic(self, z: Tensor, F: Tensor) -> Tensor:
         """Return the plastically corrected trial deformation gradients (S, n, 3, 3) for S latents z (S, d)."""
-        y = self._outputs(self.plastic_trunk, self.plastic_head(z), F)
-        if self.trunk == "raw":
-            return F + networks.STRAIN_SCALE * y.unflatten(-1, (3, 3))
-        if F.requires_grad:
-            return networks.return_map(F, y)
-        return readouts.CorrectionReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), networks.STRAIN_SCALE).view(F.shape)
+        law = self._plastic_law
+        y = self._outputs(self.plastic_trunk, self.plastic_head(z), self.features(F, law))
+        if self.trunk == "raw" or F.requires_grad:
+            return law.corrected_of(F, y, law.unit)
+        return readouts.CorrectionReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), law.unit).view(F.shape)
 
-    def _outputs(self, trunk: Trunk, coefficients: Tensor, F: Tensor) -> Tensor:
+    def _outputs(self, trunk: Trunk, coefficients: Tensor, features: Tensor) -> Tensor:
         weight, bias = trunk.contract(coefficients)
-        return torch.baddbmm(bias.unsqueeze(1), trunk.hidden(self.features(F)), weight.mT)
+        return torch.baddbmm(bias.unsqueeze(1), trunk.hidden(features), weight.mT)
 
-    def laws(self, z: Tensor) -> tuple[RawElastic | ObjectiveElastic, RawPlastic | ObjectivePlastic]:
+    def laws(self, z: Tensor) -> tuple[ElasticNetwork, PlasticNetwork]:
         """Return the elastic and plastic law of z (S, d) or (d,) for a rollout of S scenes, differentiable in z and all weights."""
         elastic, plastic = self.coefficients(z.reshape(-1, self.latent_dim))
         return self._elastic_law(*_effective(self.elastic_trunk, elastic)), self._plastic_law(*_effective(self.plastic_trunk, plastic))

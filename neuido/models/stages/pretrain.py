@@ -22,7 +22,7 @@ class PretrainModule(LightningModule):
 
     Args:
         trajectory_count: Number of training trajectories, M (linked to the data by the command line).
-        trunk: `objective` or `raw`.
+        trunk: `objective`, `bounded` or `raw` (as of `IntrinsicDynamicsOperator`).
         latent_dim: d (paper: 128).
         basis_dim: Number of basis functions D (the paper does not say).
         hidden_dim: Width of the trunks (the paper does not say).
@@ -48,7 +48,7 @@ class PretrainModule(LightningModule):
     def __init__(
         self,
         trajectory_count: int,
-        trunk: Literal["raw", "objective"] = "objective",
+        trunk: Literal["raw", "objective", "bounded"] = "objective",
         latent_dim: int = 128,
         basis_dim: int = 64,
         hidden_dim: int = 64,

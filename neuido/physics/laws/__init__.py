@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from neuido.physics.laws.classical import material as material
     from neuido.physics.laws.classical import stack as stack
     from neuido.physics.laws.composite import by_body as by_body
+    from neuido.physics.laws.neural.bounded import BoundedElastic as BoundedElastic
     from neuido.physics.laws.neural.invariants import InvariantElastic as InvariantElastic
     from neuido.physics.laws.neural.invariants import InvariantPlastic as InvariantPlastic
     from neuido.physics.laws.neural.networks import ObjectiveElastic as ObjectiveElastic
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AutogradElastic",
     "AutogradPlastic",
+    "BoundedElastic",
     "DruckerPrager",
     "ElasticLaw",
     "FixedCorotated",
@@ -53,6 +55,7 @@ __all__ = [
 _PLACES = {
     "AutogradElastic": "base:AutogradElastic",
     "AutogradPlastic": "base:AutogradPlastic",
+    "BoundedElastic": "neural.bounded:BoundedElastic",
     "DruckerPrager": "classical:DruckerPrager",
     "ElasticLaw": "base:ElasticLaw",
     "FixedCorotated": "classical:FixedCorotated",

@@ -8,6 +8,7 @@ from neuido.errors import UserError
 from neuido.models.operator import dynamics_operator as module
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator, affine
 from neuido.physics.laws.neural import networks
+from neuido.physics.laws.neural.bounded import bounded_stress
 from neuido.types import Particles
 
 SMALL = {"latent_dim": 6, "basis_dim": 5, "hidden_dim": 16, "head_dim": 8}
@@ -23,7 +24,7 @@ def deformations(scenes=3, samples=7):
     return torch.eye(3, dtype=torch.float64) + 0.05 * torch.randn(scenes, samples, 3, 3, generator=generator, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("trunk", ["raw", "objective"])
+@pytest.mark.parametrize("trunk", ["raw", "objective", "bounded"])
 def test_contraction_equals_the_sum_over_basis_functions(trunk):
     operator, F = make(trunk), deformations()
     z = torch.randn(3, 6, dtype=torch.float64)
@@ -33,7 +34,8 @@ def test_contraction_equals_the_sum_over_basis_functions(trunk):
     if trunk == "raw":
         tau, corrected = networks.RAW_STRESS_SCALE * c_e.view(F.shape), F + networks.STRAIN_SCALE * c_p.view(F.shape)
     else:
-        tau, corrected = networks.isotropic_stress(F, c_e), networks.return_map(F, c_p)
+        stress = bounded_stress if trunk == "bounded" else networks.isotropic_stress
+        tau, corrected = stress(F, c_e), networks.return_map(F, c_p)
     torch.testing.assert_close(operator.elastic(z, F), tau)
     torch.testing.assert_close(operator.plastic(z, F), corrected)
     for law, expected in zip(operator.laws(z), (tau, corrected)):
@@ -41,7 +43,7 @@ def test_contraction_equals_the_sum_over_basis_functions(trunk):
         torch.testing.assert_close(law(F.view(-1, 3, 3), particles), expected.view(-1, 3, 3))
 
 
-@pytest.mark.parametrize("trunk", ["raw", "objective"])
+@pytest.mark.parametrize("trunk", ["raw", "objective", "bounded"])
 def test_gradients_of_kernels_and_twins_agree(trunk):
     """Stage I (F fixed, kernels) and the twin (F differentiable) give the same gradient of z and of every weight."""
     operator, F = make(trunk), deformations()
@@ -58,7 +60,7 @@ def test_gradients_of_kernels_and_twins_agree(trunk):
         assert twin.abs().max() > 0
         if trunk == "raw":
             torch.testing.assert_close(kernel, twin)
-    for i in range(1 + 6 if trunk == "objective" else 0):  # z and the elastic trunk: no clamp, so no straight-through gradient
+    for i in range(0 if trunk == "raw" else 1 + 6):  # z and the elastic trunk: no clamp, so no straight-through gradient
         if i > 0:
             torch.testing.assert_close(grads[0][i], grads[1][i], rtol=1e-7, atol=1e-9)
 
@@ -90,8 +92,9 @@ def test_wrapped_linear_layers_are_merged():
     torch.testing.assert_close(bias, base.bias)
 
 
-def test_file_round_trip(tmp_path):
-    operator = IntrinsicDynamicsOperator("raw", **SMALL)
+@pytest.mark.parametrize("trunk", ["raw", "objective", "bounded"])
+def test_file_round_trip(tmp_path, trunk):
+    operator = IntrinsicDynamicsOperator(trunk, **SMALL)
     operator.set_latents(torch.randn(2, 6), ["jelly", "sand"], ["elastic", "sand"])
     operator.save(tmp_path / "weights.safetensors", {"stress_error": 0.01})
     loaded = IntrinsicDynamicsOperator.load(tmp_path / "weights.safetensors")

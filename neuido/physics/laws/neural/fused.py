@@ -18,7 +18,7 @@ import warp as wp
 from torch import Tensor
 
 from neuido.physics.laws.base import Engine
-from neuido.physics.laws.neural import network_kernels
+from neuido.physics.laws.neural import bounded_kernels, network_kernels
 from neuido.physics.laws.neural.fused_source import BACKWARD, FORWARD
 from neuido.physics.runtime.device import launch, start_warp
 from neuido.physics.runtime.once import cached
@@ -27,6 +27,9 @@ from neuido.types import Particles
 WIDTHS = (32, 64)
 """Hidden widths for which fused kernels exist."""
 
+STRESS, CORRECTION, BOUNDED = "stress", "correction", "bounded"
+"""Read-outs of an objective law: coefficients of a stress, radii of a yield surface, moduli of a bounded stress."""
+
 BLOCK = 32
 """Threads per block; with one warp per block, the warps of a small body spread evenly over the multiprocessors."""
 
@@ -34,9 +37,26 @@ INPUTS = 16
 """Columns of the first operand: nine features, a one for the bias, padding."""
 
 
+def _readout(kind: str, name: str) -> SimpleNamespace:
+    """Return the functions of one particle around the network: features, value, and the adjoints of coefficients and F."""
+    if kind == BOUNDED:
+        own = bounded_kernels.functions(wp.float32, name)
+        return SimpleNamespace(**vars(own), value=own.stress_of, coefficients=own.stress_coefficients, gradient=own.stress_gradient)
+    own = network_kernels.functions(wp.float32, name)
+    if kind == STRESS:
+        return SimpleNamespace(**vars(own), value=own.stress_of, coefficients=own.stress_coefficients, gradient=own.stress_gradient)
+    vec4, mat33, correction_coefficients = own.vec4, own.mat33, own.correction_coefficients
+
+    @wp.func(module=name)
+    def coefficients(F: mat33, l: float, A: mat33, q: float, c: vec4, scale: float, g: mat33):
+        return correction_coefficients(F, l, A, q, c, scale, 0, g)
+
+    return SimpleNamespace(**vars(own), value=own.correction_of, coefficients=coefficients, gradient=own.correction_gradient)
+
+
 @cached
-def build(width: int) -> SimpleNamespace:
-    """Return the fused kernels for one hidden width, one of `WIDTHS`."""
+def build(width: int, kind: str) -> SimpleNamespace:
+    """Return the fused kernels for one hidden width, one of `WIDTHS`, and one read-out: `STRESS`, `CORRECTION` or `BOUNDED`."""
     start_warp()
     tiles = width // 8
     kept = 8 * tiles + 4
@@ -44,20 +64,14 @@ def build(width: int) -> SimpleNamespace:
         "H": width, "NT": tiles, "KEPT": kept, "SIZE1": 2 * tiles * 128, "SIZE2": tiles * tiles * 128, "SIZE3": tiles * 128,
         "SIZE3T": tiles * 128,
     }  # fmt: skip
-    name = f"neuido.fused.{width}"
+    name = f"neuido.fused.{width}.{kind}"
     # approximate logarithms, roots and divisions: relative error 1e-6 with a third of the instructions
     wp.set_module_options({"fast_math": True}, module=wp.get_module(name))
-    own = network_kernels.functions(wp.float32, name)
+    own = _readout(kind, name)
     vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
     vecK = wp.types.vector(length=kept, dtype=wp.float32)
-    strain_invariants, features_of, stress_of, stress_coefficients = (
-        own.strain_invariants,
-        own.features_of,
-        own.stress_of,
-        own.stress_coefficients,
-    )
-    stress_gradient, correction_of = own.stress_gradient, own.correction_of
-    correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
+    strain_invariants, features_of = own.strain_invariants, own.features_of
+    value, coefficients, gradient = own.value, own.coefficients, own.gradient
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     func = functools.partial(wp.func, module=name)
     floats = wp.array(dtype=wp.float32)
@@ -77,22 +91,7 @@ def build(width: int) -> SimpleNamespace:
         return vec4(k[wp.static(kept - 4)], k[wp.static(kept - 3)], k[wp.static(kept - 2)], k[wp.static(kept - 1)])
 
     @kernel
-    def stress(
-        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
-        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, tau: wp.array(dtype=mat33),
-    ):  # fmt: skip
-        tid = wp.tid()
-        warp = tid / 32
-        p = firsts[warp] + tid % 32
-        s = scenes[warp]
-        Fp = F[wp.min(p, lasts[warp] - 1)]
-        N, h, l, A, q = strain_invariants(Fp)
-        k = network(features_of(l, A, q), wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2, B2, W3, B3)
-        if p < lasts[warp]:
-            tau[p] = stress_of(l, A, q, outputs(k), scale)
-
-    @kernel
-    def correct(
+    def forward(
         F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
         W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, out: wp.array(dtype=mat33),
     ):  # fmt: skip
@@ -104,10 +103,10 @@ def build(width: int) -> SimpleNamespace:
         N, h, l, A, q = strain_invariants(Fp)
         k = network(features_of(l, A, q), wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2, B2, W3, B3)
         if p < lasts[warp]:
-            out[p] = correction_of(Fp, l, A, q, outputs(k), scale)
+            out[p] = value(Fp, l, A, q, outputs(k), scale)
 
     @kernel
-    def stress_adjoint(
+    def adjoint(
         F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
         W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, W2T: floats, W3T: floats, W1T: floats,
         g_out: wp.array(dtype=mat33), g_F: wp.array(dtype=mat33),
@@ -128,7 +127,7 @@ def build(width: int) -> SimpleNamespace:
         N, h, l, A, q = strain_invariants(F[pp])
         x = features_of(l, A, q)
         k = network(x, s, r, W1, W2, B2, W3, B3)
-        gy = stress_coefficients(l, A, q, scale, g)
+        gy = coefficients(F[pp], l, A, q, outputs(k), scale, g)
         if p >= last:
             gy = vec4(0.0, 0.0, 0.0, 0.0)
         gx = network_adjoint(x, k, gy, s, r, W1, W2T, W3T, W1T, warp, firsts[warp], last, P3, PB, H1, G1, G2)
@@ -137,38 +136,9 @@ def build(width: int) -> SimpleNamespace:
                 X[p] = x
             # computed again, since keeping it would cost registers
             N2, h2, l2, A2, q2 = strain_invariants(F[p])
-            g_F[p] = g_F[p] + stress_gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, g_out[p], gx)
+            g_F[p] = g_F[p] + gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, g_out[p], gx)
 
-    @kernel
-    def correct_adjoint(
-        F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
-        W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, W2T: floats, W3T: floats, W1T: floats,
-        g_out: wp.array(dtype=mat33), g_F: wp.array(dtype=mat33),
-        P3: floats, PB: floats, X: wp.array(dtype=vec9), H1: floats, G1: floats, G2: floats,
-    ):  # fmt: skip
-        """Compute the adjoint of `correct`; arguments as for `stress_adjoint`."""
-        tid = wp.tid()
-        warp = tid / 32
-        last = lasts[warp]
-        p = firsts[warp] + tid % 32
-        s = wp.min(scenes[warp], shared - 1)
-        r = wp.min(scenes[warp], rows - 1)
-        pp = wp.min(p, last - 1)
-        g = g_out[pp]
-        N, h, l, A, q = strain_invariants(F[pp])
-        x = features_of(l, A, q)
-        k = network(x, s, r, W1, W2, B2, W3, B3)
-        gy = correction_coefficients(F[pp], l, A, q, outputs(k), scale, 0, g)
-        if p >= last:
-            gy = vec4(0.0, 0.0, 0.0, 0.0)
-        gx = network_adjoint(x, k, gy, s, r, W1, W2T, W3T, W1T, warp, firsts[warp], last, P3, PB, H1, G1, G2)
-        if p < last:
-            if X:
-                X[p] = x
-            N2, h2, l2, A2, q2 = strain_invariants(F[p])
-            g_F[p] = g_F[p] + correction_gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, g_out[p], gx)
-
-    return SimpleNamespace(stress=stress, correct=correct, stress_adjoint=stress_adjoint, correct_adjoint=correct_adjoint)
+    return SimpleNamespace(forward=forward, adjoint=adjoint)
 
 
 @cached(limit=16)
@@ -214,10 +184,7 @@ class FusedEngine(Engine):
         super().__init__(law, tensors, particles)
         W1, b1, W2, b2, W3, b3 = self.tensors
         self.width, self.outputs = W1.shape[1], W3.shape[1]
-        self.kernels = build(self.width)
-        elastic = self.outputs == network_kernels.STRESS_COEFFICIENTS
-        self._forward = self.kernels.stress if elastic else self.kernels.correct
-        self._adjoint = self.kernels.stress_adjoint if elastic else self.kernels.correct_adjoint
+        self.kernels = build(self.width, law.readout)
         shared, own = max(t.shape[0] for t in (W1, b1, W2, b2)), max(W3.shape[0], b3.shape[0])
         first = W1.new_zeros(shared, INPUTS, self.width)
         first[:, :9], first[:, 9] = W1.mT, b1
@@ -235,7 +202,7 @@ class FusedEngine(Engine):
 
     def forward(self, F: Tensor, out: Tensor) -> None:
         arguments = [F, *self.warps, *self.rows, *self.packed, self.law.scale, out]
-        launch(self._forward, self.threads, arguments, F.device, block=BLOCK)
+        launch(self.kernels.forward, self.threads, arguments, F.device, block=BLOCK)
 
     def start_adjoint(self, wanted: Sequence[bool]) -> None:
         super().start_adjoint(wanted)
@@ -252,7 +219,7 @@ class FusedEngine(Engine):
     def adjoint(self, F: Tensor, grad_out: Tensor, grad_F: Tensor) -> None:
         arguments = [F, *self.warps, *self.rows, *self.packed, self.law.scale, *self.transposed, grad_out, grad_F,
                      self.P3, self.PB, self.X, self.H1, self.G1, self.G2]  # fmt: skip
-        launch(self._adjoint, self.threads, arguments, F.device, block=BLOCK)
+        launch(self.kernels.adjoint, self.threads, arguments, F.device, block=BLOCK)
         if self.full:
             self._add_layer_gradients(len(F))
 

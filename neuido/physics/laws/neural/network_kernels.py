@@ -19,6 +19,7 @@ The exponential of a symmetric matrix is the Taylor polynomial of degree 4 of a 
 import functools
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -189,13 +190,13 @@ def functions(real: type, name: str) -> SimpleNamespace:
         return symmetric(g) + ((gl - wp.trace(g) / real(3.0)) * identity())
 
     @func
-    def stress_of(l: real, A: mat33, q: real, c: vec4, scale: real):
+    def stress_of(F: mat33, l: real, A: mat33, q: real, c: vec4, scale: real):
         a = wp.ddot(A, A)
         D = A * A - (a / real(3.0)) * identity()
         return scale * ((c[0] * l + c[3] * a / q) * identity() + c[1] * A + (c[2] / q) * D)
 
     @func
-    def stress_coefficients(l: real, A: mat33, q: real, scale: real, g_tau: mat33):
+    def stress_coefficients(F: mat33, l: real, A: mat33, q: real, c: vec4, scale: real, g_tau: mat33):
         """Return the adjoint of the coefficients c."""
         a = wp.ddot(A, A)
         D = A * A - (a / real(3.0)) * identity()
@@ -277,11 +278,17 @@ def functions(real: type, name: str) -> SimpleNamespace:
         return gF + strain_adjoint(F, N, h, hencky_adjoint(gl, gq, gA, A, q))
 
     return SimpleNamespace(
+        vec3=vec3,
         vec4=vec4,
         vec9=vec9,
         mat33=mat33,
+        symmetric=symmetric,
+        cofactor=cofactor,
         strain_invariants=strain_invariants,
+        strain_adjoint=strain_adjoint,
+        hencky_adjoint=hencky_adjoint,
         features_of=features_of,
+        features_adjoint=features_adjoint,
         stress_of=stress_of,
         stress_coefficients=stress_coefficients,
         stress_gradient=stress_gradient,
@@ -291,42 +298,40 @@ def functions(real: type, name: str) -> SimpleNamespace:
     )
 
 
-@cached
-def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
-    """Return the kernels for one scalar type, compiled on first launch; features (P, 9), coefficients (P, 4) or (P, 3).
+def _rows(own: SimpleNamespace, real: type, name: str) -> tuple[Any, Any]:
+    """Return the functions that read a row of four coefficients, or of nine feature adjoints."""
+    vec4, vec9 = own.vec4, own.vec9
 
-    Args:
-        real: `wp.float32` or `wp.float64`.
-        enable_backward: Let Warp generate adjoints too, for tests.
-    """
-    start_warp()
-    name = f"neuido.networks.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
-    own = functions(real, name)
-    vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
-    strain_invariants, features_of, stress_of, stress_coefficients = (
-        own.strain_invariants,
-        own.features_of,
-        own.stress_of,
-        own.stress_coefficients,
-    )
-    stress_gradient, correction_of = own.stress_gradient, own.correction_of
-    correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
-    func = functools.partial(wp.func, module=name)
-    kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
-
-    @func
+    @wp.func(module=name)
     def row4(c: wp.array2d(dtype=real), p: int):
         last = real(0.0)
         if c.shape[1] > 3:
             last = c[p, 3]
         return vec4(c[p, 0], c[p, 1], c[p, 2], last)
 
-    @func
+    @wp.func(module=name)
     def row9(X: wp.array2d(dtype=real), p: int):
         x = vec9()
         for i in range(9):
             x[i] = X[p, i]
         return x
+
+    return row4, row9
+
+
+def elastic_kernels(own: SimpleNamespace, real: type, name: str, enable_backward: bool) -> SimpleNamespace:
+    """Return the kernels of an elastic law: features (P, 9), stress from coefficients (P, 4), and their adjoints.
+
+    Args:
+        own: Functions of one particle, as `functions` returns them.
+        real: `wp.float32` or `wp.float64`.
+        name: Name of the Warp module.
+        enable_backward: Let Warp generate adjoints too.
+    """
+    mat33, strain_invariants, features_of, stress_of = own.mat33, own.strain_invariants, own.features_of, own.stress_of
+    stress_coefficients, stress_gradient = own.stress_coefficients, own.stress_gradient
+    row4, row9 = _rows(own, real, name)
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
 
     @kernel
     def features(F: wp.array(dtype=mat33), X: wp.array2d(dtype=real)):
@@ -340,14 +345,20 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     def stress(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, tau: wp.array(dtype=mat33)):
         p = wp.tid()
         N, h, l, A, q = strain_invariants(F[p])
-        tau[p] = stress_of(l, A, q, row4(c, p), scale)
+        tau[p] = stress_of(F[p], l, A, q, row4(c, p), scale)
 
     @kernel
-    def stress_coefficients_adjoint(F: wp.array(dtype=mat33), scale: real, g_tau: wp.array(dtype=mat33), g_c: wp.array2d(dtype=real)):
+    def stress_coefficients_adjoint(
+        F: wp.array(dtype=mat33),
+        c: wp.array2d(dtype=real),
+        scale: real,
+        g_tau: wp.array(dtype=mat33),
+        g_c: wp.array2d(dtype=real),
+    ):
         """Write the adjoint of the coefficients c."""
         p = wp.tid()
         N, h, l, A, q = strain_invariants(F[p])
-        g = stress_coefficients(l, A, q, scale, g_tau[p])
+        g = stress_coefficients(F[p], l, A, q, row4(c, p), scale, g_tau[p])
         for i in range(4):
             g_c[p, i] = g[i]
 
@@ -364,6 +375,31 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         p = wp.tid()
         N, h, l, A, q = strain_invariants(F[p])
         g_F[p] = g_F[p] + stress_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_tau[p], row9(g_X, p))
+
+    return SimpleNamespace(
+        mat33=mat33,
+        features=features,
+        stress=stress,
+        stress_coefficients_adjoint=stress_coefficients_adjoint,
+        stress_adjoint=stress_adjoint,
+    )
+
+
+@cached
+def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
+    """Return the kernels for one scalar type, compiled on first launch; features (P, 9), coefficients (P, 4) or (P, 3).
+
+    Args:
+        real: `wp.float32` or `wp.float64`.
+        enable_backward: Let Warp generate adjoints too, for tests.
+    """
+    start_warp()
+    name = f"neuido.networks.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
+    own = functions(real, name)
+    mat33, strain_invariants, correction_of = own.mat33, own.strain_invariants, own.correction_of
+    correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
+    row4, row9 = _rows(own, real, name)
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
 
     @kernel
     def correction(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, out: wp.array(dtype=mat33)):
@@ -401,12 +437,9 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         N, h, l, A, q = strain_invariants(F[p])
         g_F[p] = g_F[p] + correction_gradient(F[p], N, h, l, A, q, row4(c, p), scale, g_out[p], row9(g_X, p))
 
+    elastic = elastic_kernels(own, real, name, enable_backward)
     return SimpleNamespace(
-        mat33=mat33,
-        features=features,
-        stress=stress,
-        stress_coefficients_adjoint=stress_coefficients_adjoint,
-        stress_adjoint=stress_adjoint,
+        **vars(elastic),
         correction=correction,
         correction_coefficients_adjoint=correction_coefficients_adjoint,
         correction_adjoint=correction_adjoint,

@@ -2,7 +2,7 @@
 
 The operator's coefficients lambda are constant over a rollout, and its last layer is linear. So the sum of lambda_k W3_k over k is
 one matrix per scene, exactly, and the law is a small network F -> 9 -> hidden -> hidden -> outputs with SiLU (paper, "Model Architecture
-Details"). There are two kinds:
+Details"). There are two kinds, and a third in `bounded`:
 
     raw        input 10 (F - I), outputs nine components of tau, or of F_hat - F (the paper's form)
     objective  input invariants of the Hencky strain, outputs coefficients of an isotropic stress, or radii of a yield surface
@@ -63,6 +63,28 @@ def kernels(like: Tensor):
 
 
 # The same functions in plain torch: any leading shape, differentiable by autograd.
+
+
+def raw_features(F: Tensor) -> Tensor:
+    """Compute the input features 10 (F - I) of a raw network.
+
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
+
+    Returns:
+        Features [-], (..., 9).
+    """
+    return RAW_GAIN * (F - torch.eye(3, dtype=F.dtype, device=F.device)).flatten(-2)
+
+
+def raw_stress(F: Tensor, y: Tensor, scale: float = RAW_STRESS_SCALE) -> Tensor:
+    """Return the stress [Pa], (..., 3, 3), of a raw network from its outputs (..., 9); F plays no part."""
+    return scale * y.unflatten(-1, (3, 3))
+
+
+def raw_correction(F: Tensor, y: Tensor, scale: float = STRAIN_SCALE) -> Tensor:
+    """Return the corrected deformation gradient, (..., 3, 3), of a raw network from F (..., 3, 3) and its outputs (..., 9)."""
+    return F + scale * y.unflatten(-1, (3, 3))
 
 
 def hencky_strain(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -288,6 +310,8 @@ class _Network(Law):
 
 
 class _Raw(_Network):
+    features_of = staticmethod(raw_features)
+
     def _features(self, F: Tensor, out: Tensor) -> None:
         out.copy_(F.view(-1, 9))
         out[:, ::4] -= 1  # no rounding error near F = I
@@ -296,15 +320,25 @@ class _Raw(_Network):
 
 class _Objective(_Network):
     strain_limit = STRAIN_LIMIT
+    readout: str
+    """Read-out of the fused kernels, one of `fused.STRESS`, `fused.CORRECTION` and `fused.BOUNDED`."""
+    kernels = staticmethod(kernels)
+    """The kernels of features and read-out for the scalar type of a tensor."""
+
+    @staticmethod
+    def features_of(F: Tensor) -> Tensor:
+        """Compute the input features of F (..., 3, 3) in plain torch, (..., 9)."""
+        return strain_features(*hencky_strain(F))
 
     def _features(self, F: Tensor, out: Tensor) -> None:
-        launch(kernels(F).features, F, F, out)
+        launch(self.kernels(F).features, F, F, out)
 
 
 class RawElastic(_Raw, ElasticLaw):
     """The paper's elastic network: tau = scale * network(10 (F - I)) [Pa]."""
 
     unit = RAW_STRESS_SCALE
+    stress_of = staticmethod(raw_stress)
 
     def forward(self, tensors, F, out, particles=None) -> None:
         torch.mul(self._evaluate(tensors, F, particles).y, self.scale, out=out.view(-1, 9))
@@ -316,7 +350,7 @@ class RawElastic(_Raw, ElasticLaw):
         grad_F.view(-1, 9).add_(w.gx, alpha=RAW_GAIN)
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
-        return self.scale * self._twin(raw_features(F), particles).unflatten(-1, (3, 3))
+        return self.stress_of(F, self._twin(self.features_of(F), particles), self.scale)
 
     def modulus(self) -> Tensor:
         """Return the secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,)."""
@@ -328,6 +362,7 @@ class RawPlastic(_Raw, PlasticLaw):
 
     identity = False
     unit = STRAIN_SCALE
+    corrected_of = staticmethod(raw_correction)
 
     def forward(self, tensors, F, out, particles=None) -> None:
         torch.add(F.view(-1, 9), self._evaluate(tensors, F, particles).y, alpha=self.scale, out=out.view(-1, 9))
@@ -340,7 +375,7 @@ class RawPlastic(_Raw, PlasticLaw):
         grad_F.view(-1, 9).add_(w.gx, alpha=RAW_GAIN)
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
-        return F + self.scale * self._twin(raw_features(F), particles).unflatten(-1, (3, 3))
+        return self.corrected_of(F, self._twin(self.features_of(F), particles), self.scale)
 
 
 class ObjectiveElastic(_Objective, ElasticLaw):
@@ -351,19 +386,22 @@ class ObjectiveElastic(_Objective, ElasticLaw):
 
     outputs = network_kernels.STRESS_COEFFICIENTS
     unit = STRESS_SCALE
+    readout = fused.STRESS
+    stress_of = staticmethod(isotropic_stress)
+    """Stress [Pa] of F and the coefficients in plain torch."""
 
     def forward(self, tensors, F, out, particles=None) -> None:
         w = self._evaluate(tensors, F, particles)
-        launch(kernels(F).stress, F, F, w.y, self.scale, out)
+        launch(self.kernels(F).stress, F, F, w.y, self.scale, out)
 
     def adjoint(self, tensors, F, grad_out, grad_F, grad_tensors, particles=None) -> None:
         w = self._evaluate(tensors, F, particles)
-        launch(kernels(F).stress_coefficients_adjoint, F, F, self.scale, grad_out, w.gy)
+        launch(self.kernels(F).stress_coefficients_adjoint, F, F, w.y, self.scale, grad_out, w.gy)
         self._backpropagate(w, tensors, grad_tensors, F, particles)
-        launch(kernels(F).stress_adjoint, F, F, w.y, self.scale, grad_out, w.gx, grad_F)
+        launch(self.kernels(F).stress_adjoint, F, F, w.y, self.scale, grad_out, w.gx, grad_F)
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
-        return isotropic_stress(F, self._twin(strain_features(*hencky_strain(F)), particles), self.scale)
+        return self.stress_of(F, self._twin(self.features_of(F), particles), self.scale)
 
     def modulus(self) -> Tensor:
         """Return the secant P-wave modulus over F_11 = 1 +- 1e-3 [Pa], (S,)."""
@@ -379,6 +417,8 @@ class ObjectivePlastic(_Objective, PlasticLaw):
     identity = False
     outputs = network_kernels.YIELD_COEFFICIENTS
     unit = STRAIN_SCALE
+    readout = fused.CORRECTION
+    corrected_of = staticmethod(return_map)
 
     def forward(self, tensors, F, out, particles=None) -> None:
         w = self._evaluate(tensors, F, particles)
@@ -391,16 +431,4 @@ class ObjectivePlastic(_Objective, PlasticLaw):
         launch(kernels(F).correction_adjoint, F, F, w.y, self.scale, grad_out, w.gx, grad_F)
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
-        return return_map(F, self._twin(strain_features(*hencky_strain(F)), particles), self.scale)
-
-
-def raw_features(F: Tensor) -> Tensor:
-    """Compute the input features 10 (F - I) of a raw network.
-
-    Args:
-        F: Deformation gradient [-], (..., 3, 3).
-
-    Returns:
-        Features [-], (..., 9).
-    """
-    return RAW_GAIN * (F - torch.eye(3, dtype=F.dtype, device=F.device)).flatten(-2)
+        return self.corrected_of(F, self._twin(self.features_of(F), particles), self.scale)

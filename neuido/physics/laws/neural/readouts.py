@@ -4,25 +4,25 @@ import torch
 from torch import Tensor
 
 from neuido.physics.laws.neural import network_kernels
-from neuido.physics.laws.neural.networks import kernels, launch
+from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, kernels, launch
 
 
 class StressReadout(torch.autograd.Function):
-    """`isotropic_stress` by a Warp kernel, differentiable with respect to the coefficients c (B, 4) alone."""
+    """The stress of an objective or bounded law by a Warp kernel, differentiable with respect to the coefficients c (B, 4) alone."""
 
     @staticmethod
-    def forward(ctx, c: Tensor, F: Tensor, scale: float) -> Tensor:
-        out = torch.empty_like(F)
-        launch(kernels(F).stress, F, F, c.detach().contiguous(), scale, out)
-        ctx.save_for_backward(F)
-        ctx.scale = scale
+    def forward(ctx, c: Tensor, F: Tensor, law: type[ObjectiveElastic]) -> Tensor:
+        c, out = c.detach().contiguous(), torch.empty_like(F)
+        launch(law.kernels(F).stress, F, F, c, law.unit, out)
+        ctx.save_for_backward(F, c)
+        ctx.law = law
         return out
 
     @staticmethod
     def backward(ctx, grad: Tensor):
-        (F,) = ctx.saved_tensors
-        out = torch.empty(F.shape[0], network_kernels.STRESS_COEFFICIENTS, dtype=F.dtype, device=F.device)
-        launch(kernels(F).stress_coefficients_adjoint, F, F, ctx.scale, grad.contiguous(), out)
+        F, c = ctx.saved_tensors
+        out = torch.empty_like(c)
+        launch(ctx.law.kernels(F).stress_coefficients_adjoint, F, F, c, ctx.law.unit, grad.contiguous(), out)
         return out, None, None
 
 
@@ -49,15 +49,16 @@ class CorrectionReadout(torch.autograd.Function):
         return out, None, None
 
 
-def compute_strain_features(F: Tensor) -> Tensor:
-    """Compute the input features of an objective network by a Warp kernel, without gradient.
+def compute_strain_features(F: Tensor, law: type[ObjectiveElastic | ObjectivePlastic]) -> Tensor:
+    """Compute the input features of a law by a Warp kernel, without gradient.
 
     Args:
         F: Deformation gradient [-], (B, 3, 3).
+        law: The law that reads them.
 
     Returns:
-        The same as `strain_features` [-], (B, 9).
+        The same as `law.features_of` [-], (B, 9).
     """
     out = torch.empty(F.shape[0], network_kernels.FEATURES, dtype=F.dtype, device=F.device)
-    launch(kernels(F).features, F, F.detach().contiguous(), out)
+    launch(law.kernels(F).features, F, F.detach().contiguous(), out)
     return out

@@ -68,7 +68,7 @@ class SymbolicEngine(Engine):
         self._evaluate(F)
         k, scale = networks.kernels(F), self.law.scale
         if self.law.elastic:
-            networks.launch(k.stress_coefficients_adjoint, F, F, scale, grad_out, self.gc)
+            networks.launch(k.stress_coefficients_adjoint, F, F, self.c, scale, grad_out, self.gc)
         else:
             networks.launch(k.correction_coefficients_adjoint, F, F, self.c, scale, 0, grad_out, self.gc)
         linear_adjoint(self.terms, self.tensors[0], self.gc, self.particles.offsets, None, self.g_terms, self.grads[0], None)

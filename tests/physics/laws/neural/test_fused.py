@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from neuido.physics.laws.base import Engine
+from neuido.physics.laws.neural.bounded import BoundedElastic
 from neuido.physics.laws.neural.fused import FusedEngine
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic
 from neuido.physics.mpm.simulator import Simulator
@@ -12,7 +13,7 @@ from tests.physics.bodies import block
 
 pytestmark = pytest.mark.gpu
 
-KINDS = {ObjectiveElastic: [0.5, 1.0, 0.1, -0.1], ObjectivePlastic: [2.0, 0.3, 1.0]}
+KINDS = {ObjectiveElastic: [0.5, 1.0, 0.1, -0.1], ObjectivePlastic: [2.0, 0.3, 1.0], BoundedElastic: [0.1, 0.3, 0.5, -0.4]}
 
 
 def network(kind, width, scenes, shared, device="cuda"):
@@ -39,6 +40,9 @@ def test_fused_engine_equals_the_laws_own(width, kind, scenes, shared, wanted):
     g = torch.Generator().manual_seed(1)
     F = torch.eye(3) + 0.05 * torch.randn(700, 3, 3, generator=g)
     F[0] = torch.eye(3)
+    F[1:5] = torch.diag(torch.tensor([0.05, 1.2, 4.0])) @ F[1:5]  # beyond the range of the bounded law's features
+    if kind is BoundedElastic:
+        F[5:9] = torch.diag(torch.tensor([-0.4, 1.1, 0.9])) @ F[5:9]
     F, grad = F.cuda(), torch.randn(700, 3, 3, generator=g).cuda()
     flags = {"all": [True] * 6, "last": [False] * 4 + [True] * 2, "none": [False] * 6}[wanted]
     law, particles = kind(*weights), Particles(scene, offsets)
@@ -56,15 +60,16 @@ def test_fused_engine_equals_the_laws_own(width, kind, scenes, shared, wanted):
             assert float((a - b).norm()) <= 2e-5 * float(a.norm()), f"result {n}: {float((a - b).norm() / a.norm()):.1e}"
 
 
-def test_captured_rollout_equals_the_eager_one_and_its_gradient():
+@pytest.mark.parametrize("kind", [ObjectiveElastic, BoundedElastic])
+def test_captured_rollout_equals_the_eager_one_and_its_gradient(kind):
     body = block((0.3, 0.05, 0.3), (0.7, 0.45, 0.7), (12, 12, 12), velocity=(0.0, -2.0, 0.5))
     scene = Scene(cells=16, dt=5e-4, walls=Walls("separate", 0.3))
     results = []
     for graphs in (False, True):
         sim = Simulator([scene] * 2, [body] * 2, device="cuda", graphs=graphs, store="all" if graphs else "state")
-        elastic, plastic = (network(kind, 64, 2, 1) for kind in KINDS)
+        elastic, plastic = network(kind, 64, 2, 1), network(ObjectivePlastic, 64, 2, 1)
         leaves = [t.requires_grad_() for t in (*elastic, *plastic)]
-        laws = ObjectiveElastic(*elastic), ObjectivePlastic(*plastic)
+        laws = kind(*elastic), ObjectivePlastic(*plastic)
         if not graphs:
             for law in laws:
                 law.engine = lambda tensors, particles, law=law: Engine(law, tensors, particles)

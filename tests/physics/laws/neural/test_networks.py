@@ -5,11 +5,12 @@ import torch
 import warp as wp
 
 from neuido.errors import UserError
-from neuido.physics.laws.neural import network_kernels, networks, readouts
+from neuido.physics.laws.neural import bounded_kernels, network_kernels, networks, readouts
+from neuido.physics.laws.neural.bounded import BoundedElastic
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 from neuido.types import Particles
 
-LAWS = [RawElastic, RawPlastic, ObjectiveElastic, ObjectivePlastic]
+LAWS = [RawElastic, RawPlastic, ObjectiveElastic, ObjectivePlastic, BoundedElastic]
 OFFSETS = (0, 9, 20, 32)
 
 
@@ -121,18 +122,18 @@ def test_unwanted_gradients_are_skipped(kind):
     assert torch.equal(full, partial) and torch.equal(grads[4], last[4])
 
 
-@pytest.mark.parametrize("kind", [ObjectiveElastic, ObjectivePlastic])
+@pytest.mark.parametrize("kind", [ObjectiveElastic, ObjectivePlastic, BoundedElastic])
 def test_kernels_equal_warps_autodiff(kind):
-    """The kernels have no loops, so the adjoints that Warp generates of them are right."""
+    """The kernels have no dynamic loops, so the adjoints that Warp generates of them are right."""
     F, the_law = deformations()[2:], law(kind, scenes=1)
-    own, oracle = networks.kernels(F), network_kernels.build(wp.float64, enable_backward=True)
+    own, oracle = kind.kernels(F), (bounded_kernels if kind is BoundedElastic else network_kernels).build(wp.float64, enable_backward=True)
     generator = torch.Generator().manual_seed(4)
-    elastic = kind is ObjectiveElastic
+    elastic = kind is not ObjectivePlastic
     c = torch.randn(30, kind.outputs, generator=generator, dtype=F.dtype) + (0 if elastic else 1.0)
     g, gX = (torch.randn(30, *s, generator=generator, dtype=F.dtype) for s in ((3, 3), (9,)))
     got_F, got_c = torch.zeros_like(F), torch.zeros_like(c)
     if elastic:
-        networks.launch(own.stress_coefficients_adjoint, F, F, the_law.scale, g, got_c)
+        networks.launch(own.stress_coefficients_adjoint, F, F, c, the_law.scale, g, got_c)
         networks.launch(own.stress_adjoint, F, F, c, the_law.scale, g, gX, got_F)
     else:
         networks.launch(own.correction_coefficients_adjoint, F, F, c, the_law.scale, 0, g, got_c)
@@ -151,9 +152,10 @@ def test_kernels_equal_warps_autodiff(kind):
         assert error.max() < 1e-8
 
 
-def test_objective_laws_are_objective_and_isotropic():
+@pytest.mark.parametrize("kind", [ObjectiveElastic, BoundedElastic])
+def test_objective_laws_are_objective_and_isotropic(kind):
     F = deformations()
-    elastic, plastic = law(ObjectiveElastic), law(ObjectivePlastic)
+    elastic, plastic = law(kind), law(ObjectivePlastic)
     Q, R = (torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(s), dtype=F.dtype))[0] for s in (5, 6))
     Q, R = Q * Q.det(), R * R.det()
     tau, corrected = run(elastic, F, particles()), run(plastic, F, particles())
@@ -164,9 +166,10 @@ def test_objective_laws_are_objective_and_isotropic():
     assert (corrected - F).abs().amax() > 1e-2  # the yield surface is crossed
 
 
-def test_objective_laws_rest_at_rest():
+@pytest.mark.parametrize("kind", [ObjectiveElastic, BoundedElastic])
+def test_objective_laws_rest_at_rest(kind):
     rest = torch.eye(3).repeat(32, 1, 1)
-    assert run(law(ObjectiveElastic, dtype=torch.float32), rest, particles()).abs().max() == 0
+    assert run(law(kind, dtype=torch.float32), rest, particles()).abs().max() == 0
     assert torch.equal(run(law(ObjectivePlastic, dtype=torch.float32), rest, particles()), rest)
 
 
@@ -187,7 +190,7 @@ def test_constant_coefficients_are_hencky_elasticity_and_von_mises():
     assert (norm > radius).any() and (norm < radius).any()
 
 
-@pytest.mark.parametrize("kind", [ObjectiveElastic, ObjectivePlastic])
+@pytest.mark.parametrize("kind", [ObjectiveElastic, ObjectivePlastic, BoundedElastic])
 @pytest.mark.parametrize("strain", [1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.3])
 def test_float32_agrees_with_float64(kind, strain):
     """The SVD-free strain keeps small strains: F itself is rounded to 6e-8, so the error is at most some 1e-7 / strain."""
@@ -195,7 +198,7 @@ def test_float32_agrees_with_float64(kind, strain):
     F = (torch.eye(3) + strain * torch.randn(200, 3, 3, generator=generator) / 3).float()
     exact = run(law(kind, scenes=1), F.double(), None)
     rough = run(law(kind, scenes=1, dtype=torch.float32), F, None).double()
-    reference = exact if kind is ObjectiveElastic else torch.full_like(exact, strain)
+    reference = exact if kind is not ObjectivePlastic else torch.full_like(exact, strain)
     assert (rough - exact).norm() / reference.norm() < 2e-6 + 1e-7 / strain
 
 

@@ -1,0 +1,87 @@
+"""The bounded elastic law: an objective network whose stress cannot have the wrong sign (`bounded_kernels` has the formula).
+
+In the fused kernels of `fused`, and by the kernels of `bounded_kernels` elsewhere; `bounded_stress` is the same in plain torch.
+"""
+
+import torch
+from torch import Tensor
+
+from neuido.physics.laws.neural import bounded_kernels, fused
+from neuido.physics.laws.neural.bounded_kernels import EXPONENT, RANGE, SHORTEST, SPREAD, T1, VOLUME_FLOOR
+from neuido.physics.laws.neural.networks import STRESS_SCALE, ObjectiveElastic, hencky_strain, strain_features
+from neuido.physics.runtime.device import real_of
+
+
+def kernels(like: Tensor):
+    """Return the kernels of `bounded_kernels` for the scalar type of a tensor."""
+    return bounded_kernels.build(real_of(like.dtype))
+
+
+def bounded_features(F: Tensor) -> Tensor:
+    """Compute the features of `strain_features`, of a strain that is shortened to the norm `RANGE`.
+
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
+
+    Returns:
+        Features, (..., 9).
+    """
+    l, A, q = hencky_strain(F)
+    s = (RANGE / (l * l + q * q).sqrt()).clamp(max=1.0)
+    return strain_features(s * l, s[..., None, None] * A, s * q)
+
+
+def bounded_stress(F: Tensor, c: Tensor, scale: float = STRESS_SCALE) -> Tensor:
+    """Compute the Kirchhoff stress [Pa], (..., 3, 3), of a bounded network from its outputs.
+
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
+        c: Outputs of the network, (..., 4); the formula is in `bounded_kernels`.
+        scale: Unit of the moduli [Pa].
+    """
+    l, A, q = hencky_strain(F)
+    eye = torch.eye(3, dtype=F.dtype, device=F.device)
+    lam, d = scale * c[..., :2].clamp(-EXPONENT, EXPONENT).exp().movedim(-1, 0)
+    root = (1 + c[..., 2:].square()).sqrt().sum(-1)
+    p, r = (SPREAD * c[..., 2:] / root[..., None]).movedim(-1, 0)
+
+    H = A + l[..., None, None] / 3 * eye
+    A2 = A @ A
+    T2 = 3 * (A2 - A2.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * eye) / q.square()[..., None, None]
+    M = eye + p[..., None, None] * T1 * A / q[..., None, None] + r[..., None, None] * T2
+    K = torch.stack([torch.linalg.cross(F[..., i, :], F[..., j, :]) for i, j in ((1, 2), (2, 0), (0, 1))], -2)
+    J = (K[..., 0, :] * F[..., 0, :]).sum(-1)
+    log = torch.where(J > 0.5, volume_change(F).clamp(min=-0.5).log1p(), J.clamp(min=VOLUME_FLOOR).log())
+    upright = d[..., None, None] * (M @ H) + (lam * log)[..., None, None] * eye
+
+    C = K @ K.mT / K.square().sum((-2, -1)).clamp(min=SHORTEST)[..., None, None]
+    turned = d[..., None, None] * C + (lam * (-J).clamp(min=0.0).log1p())[..., None, None] * eye
+    inverted = J < 0
+    return torch.where(inverted[..., None, None], turned, upright)
+
+
+def volume_change(F: Tensor) -> Tensor:
+    """Return det F - 1 [-], (...), without loss of digits near F = I.
+
+    Args:
+        F: Deformation gradient [-], (..., 3, 3).
+    """
+    G = F - torch.eye(3, dtype=F.dtype, device=F.device)
+    trace = G.diagonal(dim1=-2, dim2=-1).sum(-1)
+    minors = 0.5 * (trace.square() - (G @ G).diagonal(dim1=-2, dim2=-1).sum(-1))
+    a, b, c = G.unbind(-2)
+    return trace + minors + (torch.linalg.cross(a, b) * c).sum(-1)
+
+
+class BoundedElastic(ObjectiveElastic):
+    """An isotropic elastic law that resists every deformation, from a network of the strain's invariants.
+
+    Frame-indifferent, free of stress at F = I, compressive under compression and tensile under tension at any strain, and it turns inverted
+    matter back, for any weights.
+    """
+
+    strain_limit = RANGE
+    readout = fused.BOUNDED
+    kernels = staticmethod(kernels)
+    features_of = staticmethod(bounded_features)
+    stress_of = staticmethod(bounded_stress)
