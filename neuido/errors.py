@@ -21,6 +21,10 @@ class UserError(ValueError):
         super().__init__(shortened(message))
 
 
+class PlausibilityWarning(UserWarning):
+    """Measured data that are odd and may be right. The message is one line; the command line prints it."""
+
+
 def suggest(word: str, known: Iterable[str], *, before: str = "", after: str = "") -> str:
     """Return `, did you mean '…'?` for the known word closest to one that is not known, or nothing where none is close.
 

@@ -1,8 +1,9 @@
 """The `check` command: whether measured data are plausible."""
 
+import warnings
 from pathlib import Path
 
-from neuido.errors import UserError
+from neuido.errors import PlausibilityWarning, UserError
 
 KINDS = ("experiment.yaml", "test.yaml", "track.yaml")
 
@@ -16,7 +17,14 @@ def check(folder: str) -> None:
     Raises:
         UserError: What is wrong, with the file and the key to change.
     """
-    print("\n".join(contents(folder)))
+    with warnings.catch_warnings(record=True) as odd:
+        warnings.simplefilter("always", PlausibilityWarning)
+        lines = contents(folder)
+    print("\n".join(lines))
+    for each in odd:
+        print(f"  odd: {each.message}")
+    if odd:
+        print(f"{len(odd)} odd {'thing' if len(odd) == 1 else 'things'}, otherwise", end=" ")
     print(f"plausible: `neuido diagnose {folder} --out FOLDER` goes on with it")
 
 

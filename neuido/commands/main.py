@@ -21,6 +21,7 @@ import neuido
 from neuido.commands.cli import interruption
 from neuido.commands.cli.abbreviations import refuse_abbreviations
 from neuido.commands.cli.config_files import find_configs
+from neuido.commands.cli.console import print_oddities
 from neuido.commands.cli.functions import run_function
 from neuido.commands.cli.trainer import run_lightning
 from neuido.commands.cli.trainer_help import HEAVY, help_text, wants_help
@@ -138,6 +139,7 @@ def _dispatch(args: list[str]) -> int:
     if name in LIGHT:
         name, options = current_command(name, args[1:])
         module, function, _ = LIGHT[name]
+        print_oddities()
         return run_function(name, module, function, options)
     run_lightning(args)
     return 0

@@ -1,8 +1,12 @@
-"""What Lightning says at the start of every run and what nobody reads twice."""
+"""Warnings on the terminal: what is odd in measured data, one line each, without what Lightning says at the start of every run."""
 
 import logging
 import re
+import sys
 import warnings
+from typing import Any
+
+from neuido.errors import PlausibilityWarning
 
 
 def quiet_lightning() -> None:
@@ -16,3 +20,17 @@ def quiet_lightning() -> None:
     warnings.filterwarnings("ignore", message=r".*does not have many workers")  # the data sets are memory maps
     warnings.filterwarnings("ignore", message=r".*but have no `validation_step`")  # adaptation scores before and after each scene
     warnings.filterwarnings("ignore", message=r".*in eval mode at the start of training")  # what is frozen is meant to be
+
+
+def print_oddities() -> None:
+    """Print warnings of odd data as one line of stderr each, all of them; other warnings are printed as before."""
+    usual = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
+        if issubclass(category, PlausibilityWarning):
+            print(f"neuido: odd: {message}", file=sys.stderr)
+        else:
+            usual(message, category, *place)
+
+    warnings.showwarning = show
+    warnings.simplefilter("always", PlausibilityWarning)

@@ -99,8 +99,7 @@ def write_deforming_body(
             write_arrays(folder / name / "particles.npz", take)
         write_text(folder / "experiment.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
-    write_checked(out, fill, read_experiment)
-    return summary
+    return summary + write_checked(out, fill, read_experiment)
 
 
 def _velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:

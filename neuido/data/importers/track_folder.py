@@ -11,14 +11,11 @@ from neuido.data.files.parsing import naming
 from neuido.data.importers.tables.checked_folder import roles_of, write_tables
 from neuido.data.importers.tables.units import conversion_factor
 from neuido.data.importers.tracker_exports import Motion
+from neuido.data.measured.motion_plausibility import lost_positions
 from neuido.errors import UserError
 
 EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "µs"), (1e11, 1e3, "ms"))
 """Unix times since 1973 in smaller units than seconds: from which number on, units in a second, and name."""
-LOST = 10.0
-"""Usual steps from frame to frame by which a position of exactly zero is away from its neighbours where the point was not seen."""
-SENTINELS = (-9999.0, 9999.0, -999999.0)
-"""Numbers that trackers write for a point that they did not see."""
 
 
 class Axes(NamedTuple):
@@ -67,7 +64,7 @@ def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> R
     points, lost = {}, 0
     for name, x in motion.points.items():
         x = x[order].copy()
-        unseen = np.isin(x, SENTINELS).any(axis=1) | _lost_at_zero(x)
+        unseen = lost_positions(x)
         lost += int(unseen.sum())
         x[unseen] = np.nan
         x = x * ratio
@@ -77,7 +74,7 @@ def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> R
             x = np.stack([x[:, 0], x[:, 2], -x[:, 1]], 1)
         points[name] = x
     if lost:
-        notes.append(f"{lost} positions of exactly 0 or {SENTINELS[0]:g} count as not seen")
+        notes.append(f"{lost} positions of exactly 0 or -9999 count as not seen")
     return RecordedMotion(t, points, notes)
 
 
@@ -137,8 +134,7 @@ def write_tracks(
                "recordings": recordings}  # fmt: skip
     if scale_error:
         content["nuisances"] = {"length_scale": float(f"{scale_error:.2g}")}
-    write_tables(out, "track.yaml", content, tables, read_tracks)
-    return summary
+    return summary + write_tables(out, "track.yaml", content, tables, read_tracks)
 
 
 def one_point(points: Mapping[str, np.ndarray], point: str | None, path: Path) -> np.ndarray:
@@ -192,18 +188,3 @@ def _times(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes, not
         row = int(np.argmax(steps))
         notes.append(f"a gap of {steps.max():.3g} s after {t[row] - t[0]:.4g} s; frames are {np.median(steps):.3g} s apart")
     return t - t[0], kept
-
-
-def _lost_at_zero(x: np.ndarray) -> np.ndarray:
-    """Return which positions (T, A) of exactly zero are far from those before and after them: the point was not seen."""
-    zero = (x == 0).all(axis=1)
-    good = np.flatnonzero(~zero & np.isfinite(x).all(axis=1))
-    out = np.zeros(len(x), bool)
-    if not zero.any() or len(good) < 2 or x.shape[1] < 2:
-        return out
-    usual = float(np.median(np.linalg.norm(np.diff(x[good], axis=0), axis=1) / np.diff(good)))
-    for i in np.flatnonzero(zero):
-        j = int(np.searchsorted(good, i))
-        near = [good[k] for k in (j - 1, j) if 0 <= k < len(good)]
-        out[i] = all(np.linalg.norm(x[k]) > LOST * max(usual, 1e-12) * abs(int(k) - int(i)) for k in near)
-    return out

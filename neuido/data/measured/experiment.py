@@ -18,7 +18,8 @@ from neuido.data.files.writing import copy_file, write_arrays, write_text
 from neuido.data.formats import nerfstudio
 from neuido.data.formats.layout import MultiView
 from neuido.data.measured.columns import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
-from neuido.data.measured.plausibility import check_positions, mask_unseen
+from neuido.data.measured.motion_plausibility import check_motion, check_positions, mask_unseen
+from neuido.data.measured.plausibility import check_density
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY
 from neuido.types import Body, Box, Plane, Scene, Walls
@@ -200,6 +201,7 @@ def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
         if isinstance(given.get(part), Mapping):
             read_text(given[part].get("law"), f"model.{part}.law")
     model = scenes.model_from_dict(given)
+    check_density(model["density"])
     known = ["density", *(key for part in ("elasticity", "plasticity") for key in model[part] if key != "law")]
     free = read_free(free, tuple(known))
     if effects:
@@ -292,6 +294,7 @@ def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
     if "track" in arrays and not ((arrays["track"] >= -1) & (arrays["track"] < sizes["P"])).all():
         raise UserError(f"{path}: track must lie in -1..{sizes['P'] - 1}, got {arrays['track'].min()}..{arrays['track'].max()}")
     check_positions(x, arrays["x0"], arrays.get("track"), lower, upper, str(path))
+    check_motion(x, t, arrays["x0"], arrays["v0"], arrays["volume"], scene.gravity, str(path))
     tensors = {key: torch.from_numpy(array.astype(np.float32)) for key, array in arrays.items() if key not in ("t", "track")}
     return {
         "x": tensors["x"],

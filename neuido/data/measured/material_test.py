@@ -20,7 +20,7 @@ from neuido.data.measured.columns import (
     read_text,
 )
 from neuido.data.measured.experiment import read_model
-from neuido.data.measured.plausibility import check_order, check_stress, check_stretches
+from neuido.data.measured.plausibility import check_order, check_rows, check_stress, check_stretches
 from neuido.errors import UserError
 from neuido.types import Vector
 
@@ -195,6 +195,7 @@ def _check(tests: tuple[MaterialTest, ...], model: Mapping[str, Any]) -> None:
         groups.setdefault((test.file, test.columns, test.mode, test.direction), []).append(i)
         if test.time is None and test.path.shape[1] == 1:
             check_order(test.path[:, 0], f"tests[{i}] ({test.name}), {test.file.name}")
+        check_rows(test.path, test.stress, test.time, f"tests[{i}] ({test.name}), {test.file.name}")
     for members in groups.values():
         first = tests[members[0]]
         where = f"tests[{members[0]}] ({first.name}), {first.file.name}"

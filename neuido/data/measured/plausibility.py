@@ -1,6 +1,6 @@
-"""Plausibility checks of measured data: units, signs, order of rows and unseen markers.
+"""Plausibility checks of material tests: units, signs and order of rows.
 
-Each error is one line that says what is implausible and what to change.
+Each error or warning is one line that says what is implausible and what to change.
 """
 
 import math
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.errors import UserError
+from neuido.errors import PlausibilityWarning, UserError
 
 MAX_UNIT_FACTOR = 300.0
 """Ratio of measured to declared stiffness above which, or below whose inverse, the unit is taken to be wrong."""
@@ -18,8 +18,16 @@ MAX_REST_FACTOR = 3.0
 """Factor from 1 within which at least one stretch of a test must lie."""
 MAX_STRETCH = 20.0
 """Largest plausible stretch."""
-SENTINELS = (0.0, -9999.0, 9999.0, -999999.0)
-"""Values that trackers write into all three coordinates of a marker that they did not see."""
+ODD_UNIT_FACTOR = 30.0
+"""The same ratio above which it is said, without an error: a guess may be as far off, a unit is farther."""
+LONGEST_TEST = 3e8
+"""Duration [s] above which times are taken for milliseconds or Unix times in them: ten years."""
+DENSITIES = (5.0, 3e4)
+"""Densities [kg/m^3] between that of the lightest foams and that of osmium."""
+JUMP = (10.0, 0.3)
+"""A lone row is away from its neighbours by this many usual distances, and by this share of the range of all other rows."""
+FEW = 3
+"""Rows from which a ratio is taken, at the least."""
 
 
 def check_stretches(path: np.ndarray, where: str) -> None:
@@ -70,6 +78,8 @@ def check_stress(path: np.ndarray, stress: np.ndarray, model: Mapping[str, Any],
     Raises:
         UserError: The stresses fail one of these checks.
     """
+    if len(path) > 4 and np.ptp(path) == 0 and (not timed or path[0, 0] == rest):
+        raise UserError(f"{where}: the stretch or shear is {path[0, 0]:g} in all {len(path)} rows: name the right column (columns)")
     if not stress.any():
         raise UserError(
             f"{where}: the stress is zero in all {len(stress)} rows: name the right column (columns), or check the force channel"
@@ -91,93 +101,69 @@ def check_stress(path: np.ndarray, stress: np.ndarray, model: Mapping[str, Any],
         )
     if not isinstance(young, int | float) or not young > 0:
         return
-    ratios = np.abs(secant) / young
-    if ratios.max() < 1 / MAX_UNIT_FACTOR or ratios.min() > MAX_UNIT_FACTOR:
-        power = 10.0 ** (3 * round(math.log10(float(np.median(ratios))) / 3))
-        raise UserError(
-            f"{where}: stress over strain is {np.median(np.abs(secant)):.3g} Pa, about {power:g} times model.elasticity.young = {young:g} "
-            f"Pa; are the stresses in Pa? Give the stress the scale 1.0e{round(-math.log10(power)):+d}, or correct young"
-        )
-
-
-def check_flight(t: np.ndarray, x: np.ndarray, gravity: float, axis: str, where: str) -> None:
-    """Check that the coordinates of a flight are in metres with the declared direction of gravity.
-
-    Args:
-        t: Times [s], (n,).
-        x: Coordinates along one axis, (n,).
-        gravity: Declared gravity along this axis [m/s^2].
-        axis: Name of the axis.
-        where: Name of the recording in error messages.
-
-    Raises:
-        UserError: The path is a parabola whose acceleration differs from gravity by a unit (pixels, millimetres) or by its sign.
-    """
-    if len(t) < 6 or abs(gravity) < 1 or np.ptp(x) == 0:
+    near = np.argsort(np.abs(strain[kept]), kind="stable")[: max(FEW, int(kept.sum()) // 3)]  # large strains may stiffen or flow
+    ratio = float(np.median(np.abs(secant[near]))) / young
+    if 1 / ODD_UNIT_FACTOR < ratio < ODD_UNIT_FACTOR:
         return
-    time = (t - t[0]) / (t[-1] - t[0])
-    parabola = np.polynomial.Polynomial.fit(time, x, 2, domain=[0, 1], window=[0, 1])
-    left = np.std(x - parabola(time)) / np.ptp(x)
-    acceleration = 2 * parabola.coef[2] / (t[-1] - t[0]) ** 2
-    ratio = acceleration / gravity
-    if left > 0.03 or not (abs(ratio) > 30 or -1.3 < ratio < -0.7):
+    modulus = f"stress over strain is {ratio * young:.3g} Pa at small strain, {{}} times model.elasticity.young = {young:g} Pa"
+    if 1 / MAX_UNIT_FACTOR <= ratio <= MAX_UNIT_FACTOR:
+        warnings.warn(f"{where}: {modulus.format(f'{ratio:.2g}')}: check the unit, or correct young", PlausibilityWarning, stacklevel=2)
         return
-    sign = f"{axis} points down" if ratio < 0 else ""
-    unit = "the unit is not metres" if abs(ratio) > 30 else ""
+    power = 10.0 ** (3 * round(math.log10(ratio) / 3))
     raise UserError(
-        f"{where}: the acceleration along {axis} is {acceleration:.4g} /s^2, {ratio:.3g} times model.gravity: "
-        f"{' and '.join(filter(None, (unit, sign)))}; give about scale: {{{axis}: {1 / ratio:.3g}}}, or use `neuido import --scale`"
+        f"{where}: {modulus.format(f'about {power:g}')}; are the stresses in Pa? Give the stress the scale "
+        f"1.0e{round(-math.log10(power)):+d}, or correct young"
     )
 
 
-def mask_unseen(x: np.ndarray, where: str) -> np.ndarray:
-    """Replace sentinel positions (T, N, 3) of markers that were not seen by NaN, with a warning that counts them.
-
-    Raises:
-        UserError: No point was seen in any frame.
-    """
-    x = x.copy()
-    count, size = 0, float(np.nanmedian(np.abs(x))) if np.isfinite(x).any() else 0.0
-    for value in SENTINELS:
-        hit = (x == value).all(axis=2)
-        if not hit.any():
-            continue
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # points that were never seen
-            usual = np.nanmedian(np.where(hit[..., None], np.nan, x), axis=0)
-        far = ~(np.abs(usual - value).max(axis=1) < 1e-3 * size)
-        hit &= far & (hit.sum(axis=0) > 0)
-        count += int(hit.sum())
-        x[hit] = np.nan
-    if not np.isfinite(x).any():
-        raise UserError(f"{where}: no point of x was seen in any frame (all NaN): export the positions again")
-    if count:
-        warnings.warn(f"{where}: {count} positions of exactly 0 or -9999 count as not seen", stacklevel=2)
-    return x
-
-
-def check_positions(x: np.ndarray, x0: np.ndarray, track: np.ndarray | None, lower: np.ndarray, upper: np.ndarray, where: str) -> None:
-    """Check that positions x (T, N, 3) have the unit and frame of the particles x0 (P, 3) and of the domain.
-
-    Raises:
-        UserError: The median position is farther outside the domain than the size of the domain, or the points of the first frame are
-            farther from their particles (`track`) than the size of the body.
-    """
-    size = float((upper - lower).max())
-    middle = np.nanmedian(x.reshape(-1, 3), axis=0)
-    if ((middle < lower - size) | (middle > upper + size)).any():
-        raise UserError(
-            f"{where}: the median position is {', '.join(f'{v:.3g}' for v in middle)} m, but scene.domain ends at "
-            f"{', '.join(f'{v:g}' for v in upper)} m; is x in millimetres? Give metres, as for x0"
+def check_density(density: float) -> None:
+    """Warn of a declared density [kg/m^3] that looks like one in g/cm^3 or in kg/mm^3."""
+    if not DENSITIES[0] <= density <= DENSITIES[1]:
+        warnings.warn(
+            f"model.density = {density:g} kg/m^3 is that of no soft or solid body: check the unit", PlausibilityWarning, stacklevel=2
         )
-    if track is None:
-        return
-    known = (track >= 0) & np.isfinite(x[0, :, 0])
-    if known.any():
-        gap = np.linalg.norm(x[0, known] - x0[track[known]], axis=1)
-        body = float(np.linalg.norm(np.ptp(x0, axis=0)))
-        if len(x0) > 1 and np.median(gap) > max(body, 1e-12):
-            raise UserError(
-                f"{where}: in the first frame the points are {np.median(gap):.3g} m from the particles of x0 that they follow (track), "
-                f"more than the size of the body, {body:.3g} m: give x and x0 in the same unit and frame"
-            )
+
+
+def check_rows(path: np.ndarray, stress: np.ndarray, time: np.ndarray | None, where: str) -> None:
+    """Warn of rows that stand still, of single rows that jump, and of gaps in time.
+
+    Args:
+        path: Stretches or shears (n, A).
+        stress: [Pa], (n, A).
+        time: [s], (n,), or None.
+        where: Name of the test in messages.
+    """
+    same = (np.diff(path, axis=0) == 0).all(axis=1) & (np.diff(stress, axis=0) == 0).all(axis=1)
+    if len(same) > 8 and same.mean() > 0.5:
+        row = int(np.argmax(same))
+        warnings.warn(
+            f"{where}: {int(same.sum())} of {len(path)} rows repeat the one before (data row {row + 1}): was the clock faster than the "
+            "channels? Leave the repeats out (rows)", PlausibilityWarning, stacklevel=2,
+        )  # fmt: skip
+    for j in range(stress.shape[1]):
+        if stress.shape[1] > 1 and not stress[:, j].any():
+            warnings.warn(f"{where}: stress {j + 1} is zero in all rows: check the channel (columns)", PlausibilityWarning, stacklevel=2)
+        row = lone_jump(stress[:, j])
+        if row is not None:
+            warnings.warn(
+                f"{where}: the stress jumps to {stress[row, j]:.4g} Pa in data row {row} and back: leave it out (rows) if the "
+                "channel failed",
+                PlausibilityWarning, stacklevel=2,
+            )  # fmt: skip
+    if time is not None and len(time) > 1 and np.ptp(time) > LONGEST_TEST:
+        warnings.warn(
+            f"{where}: the test lasts {np.ptp(time):.3g} s; are the times in ms? (scale: {{time: 0.001}})",
+            PlausibilityWarning,
+            stacklevel=2,
+        )
+
+
+def lone_jump(values: np.ndarray) -> int | None:
+    """Return the row of the largest value that is away from both neighbours, by far more than other rows; None if there is none."""
+    if len(values) < 8 or np.ptp(values) == 0:
+        return None
+    off = np.abs(values[1:-1] - 0.5 * (values[:-2] + values[2:]))
+    row = int(np.argmax(off)) + 1
+    back = abs(values[row + 1] - values[row - 1])
+    alone = off[row - 1] > JUMP[0] * max(float(np.median(off)), back) and off[row - 1] > JUMP[1] * np.ptp(np.delete(values, row))
+    return row if alone else None

@@ -21,7 +21,7 @@ from neuido.data.measured.columns import (
     read_role,
     read_text,
 )
-from neuido.data.measured.plausibility import check_flight
+from neuido.data.measured.motion_plausibility import check_figures, check_flight, check_track
 from neuido.errors import UserError
 from neuido.types import Vector
 
@@ -102,7 +102,10 @@ def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = No
         recordings = read_entries(
             content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, bodies, file.parent)
         )
+        for body, figures in bodies.items():
+            check_figures(body, figures)
         for i, track in enumerate(recordings):
+            check_track(track.t, track.x, [AXES[a] for a in track.axes], f"recordings[{i}] ({track.name})")
             for column, a in enumerate(track.axes):
                 check_flight(track.t, track.x[:, column], gravity[a], AXES[a], f"recordings[{i}] ({track.name})")
         for body in bodies:

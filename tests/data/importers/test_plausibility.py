@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 import neuido
-from neuido.data.measured.plausibility import check_flight, check_order, check_stress, check_stretches, mask_unseen
+from neuido.data.measured.motion_plausibility import check_flight, mask_unseen
+from neuido.data.measured.plausibility import check_order, check_stress, check_stretches
 from neuido.errors import UserError
 
 MODEL = {"elasticity": {"law": "neo_hookean", "young": 1e6, "poisson": 0.49}}

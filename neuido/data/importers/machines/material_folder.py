@@ -117,8 +117,7 @@ def write_material_tests(
         model["incompressible"] = True
         summary.append("incompressible (else give --poisson)")
     content = {"format": "neuido-material-test/1", "name": next(iter(files)), "model": model, "tests": tests}
-    write_tables(out, "test.yaml", content, tables, read_material_tests)
-    return summary
+    return summary + write_tables(out, "test.yaml", content, tables, read_material_tests)
 
 
 def modulus(columns: Mapping[str, np.ndarray]) -> float:

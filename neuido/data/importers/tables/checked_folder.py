@@ -3,6 +3,7 @@
 import os
 import re
 import tempfile
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,11 @@ import numpy as np
 import yaml
 
 from neuido.data.files.writing import new_folder, write_text
-from neuido.errors import UserError
+from neuido.errors import PlausibilityWarning, UserError
 
 
-def write_checked(out: str | os.PathLike | None, fill: Callable[[Path], None], read: Callable[[Path], object]) -> None:
-    """Write a new folder, read it back, and give it its final name only if the reader accepts it.
+def write_checked(out: str | os.PathLike | None, fill: Callable[[Path], None], read: Callable[[Path], object]) -> list[str]:
+    """Write a new folder, read it back, and give it its final name only if the reader accepts it; return what is odd in it.
 
     Args:
         out: The folder to create. None: check the content in a temporary folder and keep nothing.
@@ -26,19 +27,21 @@ def write_checked(out: str | os.PathLike | None, fill: Callable[[Path], None], r
         UserError: The reader refuses the content, or `out` exists. The message does not contain the path of the temporary folder.
     """
 
-    def attempt(folder: Path) -> None:
+    def attempt(folder: Path) -> list[str]:
         fill(folder)
         try:
-            read(folder)
+            with warnings.catch_warnings(record=True) as odd:
+                warnings.simplefilter("always", PlausibilityWarning)
+                read(folder)
         except UserError as error:
             raise UserError(str(error).replace(f"{folder}{os.sep}", "")) from error
+        return [f"odd: {str(each.message).replace(f'{folder}{os.sep}', '')}" for each in odd]
 
     if out is None:
         with tempfile.TemporaryDirectory() as folder:
-            attempt(Path(folder))
-    else:
-        with new_folder(Path(out).expanduser()) as folder:
-            attempt(folder)
+            return attempt(Path(folder))
+    with new_folder(Path(out).expanduser()) as folder:
+        return attempt(folder)
 
 
 def write_tables(
@@ -47,11 +50,11 @@ def write_tables(
     content: dict[str, Any],
     tables: Mapping[str, Mapping[str, np.ndarray]],
     read: Callable[[Path], object],
-) -> None:
-    """Write CSV tables and their YAML file to a new folder if the reader accepts them; without `out`, only check them.
+) -> list[str]:
+    """Write CSV tables and their YAML file to a new folder if the reader accepts them; return what is odd in them.
 
     Args:
-        out: The folder to create, or None.
+        out: The folder to create. None: check the content and write nothing.
         name: Name of the YAML file.
         content: Its content.
         tables: Columns by title, of each table by its name without `.csv`.
@@ -64,7 +67,7 @@ def write_tables(
             write_text(folder / f"{file}.csv", "\n".join(lines) + "\n")
         write_text(folder / name, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
 
-    write_checked(out, fill, read)
+    return write_checked(out, fill, read)
 
 
 def recording_name(text: str, others: Collection[str] = ()) -> str:
