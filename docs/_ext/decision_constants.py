@@ -21,10 +21,11 @@ DECIDES = {  # of the present decision: module -> constant -> what is behind it
         "GAIN_TO_NOISE": NULLS, "FIT_GAIN": ONE, "FIT_LEAD": ONE, "FEW": ONE, "FORETELLS": ONE, "SEEN": CHOSEN, "IMPLAUSIBLE": CHOSEN,
         "STANDS_OUT": CHOSEN, "WITHIN": CHOSEN, "LIKE_A_GRID": CASES,
     },
-    "laboratory": {"LEAST_GAIN": ONE, "UNSEEN": CHOSEN},
+    "comparing": {"LEAST_GAIN": ONE},
+    "discretisation": {"UNSEEN": CHOSEN},
     "bootstrap": {"NOISE_ALONE": CHOSEN},
     "floors": {"BOUND": CHOSEN, "REACH": CHOSEN, "PARSIMONY": CHOSEN},
-    "rounds": {"UNEXPLAINED": CHOSEN, "UNEXPLAINED_EXACT": CHOSEN},
+    "next_effect": {"UNEXPLAINED": CHOSEN, "UNEXPLAINED_EXACT": CHOSEN},
     "choosing": {"UNASKED": ONE},
     "intervals": {"TOLD": LEVEL, "AT_BOUND": CHOSEN},
     "attribution": {"MOST": CHOSEN},
@@ -37,7 +38,7 @@ UNNAMED = [  # figures of the present decision that stand in its code: module, f
     ("choosing", "first_rounds", "2 LEAST_GAIN", "the same for an effect by a method whose declared model is not the best one"),
     ("attribution", "drop", "LEAST_GAIN / 2", "what an effect must foretell beside the others, to be kept"),
     ("pairs", "look_ahead", "2 LEAST_GAIN", "what two effects must gain of which none gains enough alone"),
-    ("rounds", "unexplained", "2", "deviations of an estimated noise that widen the limit of what is unknown"),
+    ("next_effect", "unexplained", "2", "deviations of an estimated noise that widen the limit of what is unknown"),
     ("decision", "enough", "3 and 10", "data for each free figure, and beside them"),
 ]
 SHADOW = {  # of the decision by evidence, which is reported beside it: see `neuido.discrepancy.inference.evidence`
@@ -45,7 +46,7 @@ SHADOW = {  # of the decision by evidence, which is reported beside it: see `neu
     "calibration": {"ALPHA": LEVEL},
 }
 SEARCHES = {  # constants of the same files that steer the search, or only what is computed
-    "judging": {
+    "stand_ins": {
         "NEAR_IT",
         "ALIKE",
         "HALF",
@@ -58,9 +59,10 @@ SEARCHES = {  # constants of the same files that steer the search, or only what 
         "STEP",
         "STEPS",
     },
-    "laboratory": {"NEARLY", "ROUGH", "ALIKE"},
+    "comparing": {"NEARLY"},
+    "discretisation": {"ROUGH", "ALIKE"},
     "floors": {"LED"},
-    "rounds": {"CONFIRMED", "PLAIN", "AS_WELL", "MEMBERS"},
+    "next_effect": {"CONFIRMED", "PLAIN", "AS_WELL", "MEMBERS"},
     "choosing": {"CLEARLY", "LOOKS", "AS_SURE", "EARLY"},
     "intervals": {"QUANTILE", "NORMAL", "ROOM", "NEARBY", "FREE_AT"},
     "attribution": {"FURTHER"},

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuido.discrepancy.inference.search import attribution
+from neuido.discrepancy.inference import discretisation
+from neuido.discrepancy.inference.laboratory import Laboratory
+from neuido.discrepancy.inference.search import attribution, base_fits, next_effect
 from neuido.discrepancy.inference.search.attribution import diagnose
-from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.report import next_experiment
 from neuido.discrepancy.store import AFTER, LEAST_SEARCH, SEARCH, Deadline
@@ -69,14 +70,14 @@ def test_what_takes_long_after_the_search_is_left_out_too(block, monkeypatch):
 
 def test_the_floor_is_the_same_after_the_deadline(block):
     """The motions under other settings are refitted whatever the clock says: left as they are, any residual would lie within them."""
-    laboratory = Inference(replace(body_problem(block), solvers=(0,)))
+    laboratory = Laboratory(replace(body_problem(block), solvers=(0,)))
     point = dict(laboratory.as_declared)
-    floor, _ = laboratory.stand(point)
+    floor, _ = discretisation.stand(laboratory, point)
     free = laboratory.problem.declared
-    before = laboratory.floors(point, free, floor)
+    before = discretisation.floors(laboratory, point, free, floor)
     laboratory.deadline = Deadline(1.0, clock=Clock(1e6))
     assert laboratory.deadline.ends() and laboratory.deadline.cut
-    np.testing.assert_array_equal(laboratory.floors(point, free, floor), before)
+    np.testing.assert_array_equal(discretisation.floors(laboratory, point, free, floor), before)
     assert (before < laboratory.noise_squares + floor.spread_squares(laboratory.parts)).all()
 
 
@@ -114,7 +115,7 @@ def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
     """When the search ends with an effect named, that is fitted to its end, and nothing is looked for beside it."""
     clock, over, asked = Clock(0.0), [], []
     monkeypatch.setattr(attribution, "Deadline", lambda seconds, **options: Deadline(seconds, clock=clock, **options))
-    sought, finished = attribution.Inference.round, attribution.Inference.finished
+    sought, finished = next_effect.find, base_fits.finished
 
     def late(self, *args, **options):
         found = sought(self, *args, **options)
@@ -125,9 +126,9 @@ def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
         over.append(self.deadline.over)
         return finished(self, stand)
 
-    monkeypatch.setattr(attribution.Inference, "round", late)
-    monkeypatch.setattr(attribution.Inference, "finished", seen)
-    monkeypatch.setattr(attribution, "two_effects", lambda inference, *rest: asked.append(rest) or (inference, []))
+    monkeypatch.setattr(next_effect, "find", late)
+    monkeypatch.setattr(base_fits, "finished", seen)
+    monkeypatch.setattr(attribution, "two_effects", lambda search, *rest: asked.append(rest) or (search, []))
     problem = restricted(body_problem(block), "drag_linear,viscosity_shear")
     noise = 1.0 if settled else 0.25  # stated too small, it is never reached
     recordings = tuple(replace(r, noise=noise * r.noise) for r in problem.recordings)

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from neuido.data.files.writing import write_arrays
-from neuido.discrepancy.inference.base_fits import BaseFits
+from neuido.discrepancy.inference import directions, discretisation
 from neuido.discrepancy.inference.floors import Floor, score
 from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, Journal, fit_of, from_json, to_json
+from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.errors import UserError
 
 MOST = 24
@@ -73,7 +74,7 @@ def best_fits(journal: Journal, ends: Sequence[FitRecord] = (), most: int = MOST
 
 
 def statistics_of(
-    laboratories: Sequence[BaseFits], floors: Sequence[Floor], journal: Journal, ends: Sequence[FitRecord] = ()
+    laboratories: Sequence[Laboratory], floors: Sequence[Floor], journal: Journal, ends: Sequence[FitRecord] = ()
 ) -> dict[str, np.ndarray]:
     """Return the arrays to keep.
 
@@ -85,22 +86,22 @@ def statistics_of(
     """
     arrays: dict[str, np.ndarray] = {}
     listed, chosen = [], best_fits(journal, ends)
-    for laboratory, floor in zip(laboratories, floors, strict=True):
-        own = [fit for fit in chosen if fit.method == laboratory.own]
-        with laboratory.under(laboratory.own):
-            laboratory.foresee([fit.point for fit in own])
-            _foresee_slopes(laboratory, own)
-            common = _common(laboratory, floor)
-            for i, (part, (_, factor, sizes)) in enumerate(zip(laboratory.parts, common, strict=True)):
-                arrays[f"common-{laboratory.own}-{i}"] = factor.astype(np.float32)
-                arrays[f"sizes-{laboratory.own}-{i}"] = np.array([*sizes, int(part.rows.sum())])
+    for lab, floor in zip(laboratories, floors, strict=True):
+        own = [fit for fit in chosen if fit.method == lab.own]
+        with lab.under(lab.own):
+            discretisation.foresee(lab, [fit.point for fit in own])
+            _foresee_slopes(lab, own)
+            common = _common(lab, floor)
+            for i, (part, (_, factor, sizes)) in enumerate(zip(lab.parts, common, strict=True)):
+                arrays[f"common-{lab.own}-{i}"] = factor.astype(np.float32)
+                arrays[f"sizes-{lab.own}-{i}"] = np.array([*sizes, int(part.rows.sum())])
             for fit in own:
-                columns = _columns(laboratory, fit, floor)
+                columns = _columns(lab, fit, floor)
                 if columns is None:
                     continue
                 k = len(listed)
                 listed.append(json.dumps(asdict(replace(fit, finished=None, alone=None))))
-                for i, (part, (basis, *_)) in enumerate(zip(laboratory.parts, common, strict=True)):
+                for i, (part, (basis, *_)) in enumerate(zip(lab.parts, common, strict=True)):
                     own_columns = columns[part.recording][part.rows]
                     inside = basis.T @ own_columns
                     arrays[f"inside-{k}-{i}"] = inside.astype(np.float32)
@@ -158,37 +159,37 @@ def read_fits(path: Path) -> tuple[CaseRecord, list[FitStatistics]]:
         raise UserError(f"{path} holds no stored fits: {error}") from error
 
 
-def _common(laboratory: BaseFits, floor: Floor) -> list[tuple[np.ndarray, np.ndarray, tuple[int, int]]]:
+def _common(lab: Laboratory, floor: Floor) -> list[tuple[np.ndarray, np.ndarray, tuple[int, int]]]:
     """Return basis, factor and numbers of the smooth patterns and nuisances of each part."""
     out = []
-    for part in laboratory.parts:
-        smooth = laboratory.problem.directions(part.recording)[part.rows]
+    for part in lab.parts:
+        smooth = lab.problem.directions(part.recording)[part.rows]
         nuisances = floor.nuisances.get(part.recording, np.empty((len(part.rows), 0)))[part.rows]
         basis, factor = np.linalg.qr(np.concatenate([smooth, nuisances], axis=1))
         out.append((basis, factor, (smooth.shape[1], nuisances.shape[1])))
     return out
 
 
-def _columns(laboratory: BaseFits, fit: FitRecord, floor: Floor) -> dict[int, np.ndarray] | None:
+def _columns(lab: Laboratory, fit: FitRecord, floor: Floor) -> dict[int, np.ndarray] | None:
     """Return [D J r] of each recording where a fit ended; none where it or a slope does not run."""
-    parameters = [laboratory.problem.parameter(name) for name in fit.names]
-    recordings = laboratory.scored_recordings
-    there = laboratory.floor(fit.point, like=floor)
+    parameters = [lab.problem.parameter(name) for name in fit.names]
+    recordings = lab.scored_recordings
+    there = discretisation.floor_at(lab, fit.point, like=floor)
     try:
-        slopes = laboratory.slopes(parameters, fit.point, recordings, step=STEP)
+        slopes = directions.slopes(lab, parameters, fit.point, recordings, step=STEP)
     except UserError:
         return None
     out = {}
     for n in recordings:
-        residual = laboratory.residual(fit.point, n)
+        residual = lab.residual(fit.point, n)
         out[n] = np.concatenate([there.differences[n], slopes[n], residual[:, None]], axis=1)
     return out if all(np.isfinite(c).all() for c in out.values()) else None
 
 
-def _foresee_slopes(laboratory: BaseFits, fits: Sequence[FitRecord]) -> None:
+def _foresee_slopes(lab: Laboratory, fits: Sequence[FitRecord]) -> None:
     """Run what the slopes of all fits will ask for, side by side."""
     points = []
     for fit in fits:
-        points += laboratory.around([laboratory.problem.parameter(name) for name in fit.names], fit.point, STEP)[0]
-    with laboratory.memo.during("slopes"):
-        laboratory.predicted(points, laboratory.scored_recordings)
+        points += directions.around(lab, [lab.problem.parameter(name) for name in fit.names], fit.point, STEP)[0]
+    with lab.memo.during("slopes"):
+        lab.predicted(points, lab.scored_recordings)

@@ -19,9 +19,11 @@ from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.motion import Solver, simulate_motion
-from neuido.discrepancy.inference.search import attribution
+from neuido.discrepancy.inference import comparing
+from neuido.discrepancy.inference.floors import Round
+from neuido.discrepancy.inference.search import attribution, next_effect
 from neuido.discrepancy.inference.search.attribution import Diagnosis
-from neuido.discrepancy.inference.search.rounds import Inference, Round
+from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.body import BodyProblem, body_problem
 from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.problem import Problem
@@ -35,19 +37,19 @@ from neuido.types import Plane, Scene
 from tests.discrepancy import made
 
 
-class SmallestError(Inference):
-    """The inference with its decision replaced."""
+def smallest_error(monkeypatch) -> None:
+    """Replace the decision."""
+    real = next_effect.find
 
-    def is_noise(self, errors: np.ndarray, *, fitted: bool = False) -> bool:
-        return False
-
-    is_settled = is_noise
-
-    def round(self, base, floor, found, leaders=None) -> Round:
-        result = super().round(base, floor, found, leaders)
+    def smallest(search: Search, base, floor, found, leaders=None, **options) -> Round:
+        result = real(search, base, floor, found, leaders, **options)
         result.chosen = min(result.trials, key=lambda t: t.fit.cost, default=None)
         result.members = [result.chosen] if result.chosen else []
         return result
+
+    monkeypatch.setattr(next_effect, "find", smallest)
+    monkeypatch.setattr(comparing, "is_noise", lambda *_, **__: False)
+    monkeypatch.setattr(comparing, "is_settled", lambda *_, **__: False)
 
 
 def says(d: Diagnosis) -> tuple[str, ...]:
@@ -60,11 +62,11 @@ def both(problem: Problem, effects: str, folder: Path, monkeypatch, most: int) -
     folder.mkdir()
     cached = CachedProblem(restricted(problem, effects), folder)
     sound = attribution.diagnose(cached, draws=39, most=most)
-    monkeypatch.setattr(attribution, "Inference", SmallestError)
+    smallest_error(monkeypatch)
     monkeypatch.setattr(attribution, "FURTHER", 0.0)
-    monkeypatch.setattr(attribution, "two_effects", lambda inference, *rest: (inference, []))
-    monkeypatch.setattr(attribution, "drop", lambda inference, at, floor, found: (at, found))
-    monkeypatch.setattr(attribution, "narrow", lambda inference, at, floor, found, rounds: (at, found))
+    monkeypatch.setattr(attribution, "two_effects", lambda search, *rest: (search, []))
+    monkeypatch.setattr(attribution, "drop", lambda search, at, floor, found: (at, found))
+    monkeypatch.setattr(attribution, "narrow", lambda search, at, floor, found, rounds: (at, found))
     return sound, attribution.diagnose(cached, draws=39, most=most)
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from neuido.discrepancy.inference import base_fits
-from neuido.discrepancy.inference.search import attribution, contests, pairs, refining, rounds
+from neuido.discrepancy.inference import comparing
+from neuido.discrepancy.inference.laboratory import Laboratory
+from neuido.discrepancy.inference.search import attribution, base_fits, contests, next_effect, pairs, refining
 from neuido.discrepancy.inference.search.attribution import diagnose
-from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 
 T = np.linspace(0.01, 1.0, 300)
@@ -56,19 +56,19 @@ def swing(p, recording):
 
 def without(monkeypatch):
     """Fits of the whole alone."""
-    monkeypatch.setattr(Inference, "begun_anew", lambda self, made: [])
-    monkeypatch.setattr(Inference, "growing", lambda self, *_, **__: {})
+    monkeypatch.setattr(base_fits, "begun_anew", lambda search, made: [])
+    monkeypatch.setattr(refining, "growing", lambda *_, **__: {})
 
 
 @pytest.mark.parametrize("together", [True, False])
 def test_the_declared_model_is_found_past_side_valleys(together, monkeypatch):
     problem = Swing({"a": 1.3}, together=together)
-    found = Inference(problem).start()
+    found = base_fits.base_fit(next_effect.new_search(problem))
     assert found.fit.point["a"] == pytest.approx(1.3, rel=0.005)
-    assert Inference(problem).is_noise(found.errors)
+    assert comparing.is_noise(next_effect.new_search(problem).lab, found.errors)
     without(monkeypatch)
-    astray = Inference(problem).start()
-    assert abs(astray.fit.point["a"] - 1.3) > 0.05 and not Inference(problem).is_noise(astray.errors)
+    astray = base_fits.base_fit(next_effect.new_search(problem))
+    assert abs(astray.fit.point["a"] - 1.3) > 0.05 and not comparing.is_noise(next_effect.new_search(problem).lab, astray.errors)
 
 
 @pytest.mark.parametrize("together", [True, False])
@@ -82,21 +82,21 @@ def test_an_effect_is_found_past_side_valleys(together, monkeypatch):
 
 
 def test_what_the_first_fits_bring_near_the_noise_does_not_grow(monkeypatch):
-    def fail(self, *_, **__):
+    def fail(*_, **__):
         raise AssertionError
 
-    monkeypatch.setattr(Inference, "growing", fail)
+    monkeypatch.setattr(refining, "growing", fail)
     found = diagnose(Swing({"a": 1.0, "wind.c": 1.0}), draws=39)
     assert [t.candidate.name for t in found.effects] == ["wind"]
 
 
 @pytest.mark.parametrize("together", [True, False])
 def test_where_nothing_is_named_from_a_base_that_is_led_away_fits_grow_at_last(together, monkeypatch):
-    monkeypatch.setattr(Inference, "leaves_much", lambda self, errors: False)  # as after first fits that came nearer
+    monkeypatch.setattr(refining, "leaves_much", lambda lab, errors: False)  # as after first fits that came nearer
     problem = Swing({"a": 1.2, "chirp.c": 20.0}, together=together)
-    monkeypatch.setattr(rounds, "LED_AWAY", 2.0)
+    monkeypatch.setattr(next_effect, "LED_AWAY", 2.0)
     assert not diagnose(problem, draws=39).effects
-    monkeypatch.setattr(rounds, "LED_AWAY", 1.1)
+    monkeypatch.setattr(next_effect, "LED_AWAY", 1.1)
     found = diagnose(problem, draws=39)
     assert [t.candidate.name for t in found.effects] == ["chirp"]
     assert found.after["chirp.c"] == pytest.approx(20.0, abs=0.1)
@@ -104,15 +104,15 @@ def test_where_nothing_is_named_from_a_base_that_is_led_away_fits_grow_at_last(t
 
 def test_what_had_no_first_fit_may_grow_at_last(monkeypatch):
     """There may have been no time for it, or no hope by the directions at the base."""
-    contest = Inference.contest
+    contest = contests.contest
 
-    def without_chirp(self, *given, **options):
-        fits = contest(self, *given, **options)
+    def without_chirp(*given, **options):
+        fits = contest(*given, **options)
         return fits._replace(best={key: fit for key, fit in fits.best.items() if key != "chirp"})
 
-    monkeypatch.setattr(Inference, "leaves_much", lambda self, errors: False)
-    monkeypatch.setattr(Inference, "contest", without_chirp)
-    monkeypatch.setattr(rounds, "LED_AWAY", 1.1)
+    monkeypatch.setattr(refining, "leaves_much", lambda lab, errors: False)
+    monkeypatch.setattr(contests, "contest", without_chirp)
+    monkeypatch.setattr(next_effect, "LED_AWAY", 1.1)
     found = diagnose(Swing({"a": 1.2, "chirp.c": 20.0}), draws=39)
     assert [t.candidate.name for t in found.effects] == ["chirp"]
 
@@ -122,27 +122,27 @@ def test_where_the_base_fit_is_astray_fits_grow_after_the_first(together, monkey
     """They set the pace of the others then; where these cost nothing, they come after all of them."""
     monkeypatch.setattr(contests, "LEADERS", 1)
     problem = Swing({"a": 1.2, "chirp.c": 20.0}, together=together)
-    inference = Inference(problem)
-    base = inference.start()
-    assert inference.begun["a"] == pytest.approx(1.6, abs=0.2), "the phase of the first quarter, the chirp's too"
-    assert inference.is_astray(base.fit, base.floor)
-    events, grow, fits = [], Inference.growing, Inference.fits
-    monkeypatch.setattr(Inference, "growing", lambda self, *args, **o: events.append("growing") or grow(self, *args, **o))
-    monkeypatch.setattr(Inference, "fits", lambda self, *args, **o: events.append("fits") or fits(self, *args, **o))
-    look = inference.look(base.fit, base.floor)
+    search = next_effect.new_search(problem)
+    base = base_fits.base_fit(search)
+    assert search.begun["a"] == pytest.approx(1.6, abs=0.2), "the phase of the first quarter, the chirp's too"
+    assert refining.is_astray(search, base.fit, base.floor)
+    events, grow, fits = [], refining.growing, Laboratory.fits
+    monkeypatch.setattr(refining, "growing", lambda *args, **o: events.append("growing") or grow(*args, **o))
+    monkeypatch.setattr(Laboratory, "fits", lambda self, *args, **o: events.append("fits") or fits(self, *args, **o))
+    look = next_effect.first_look(search, base.fit, base.floor)
     assert look.contest.best["chirp"][1].point["chirp.c"] == pytest.approx(20.0, abs=0.2)
     assert events.count("growing") == 1
     after = len(events) - 1 - events.index("growing")
     assert after == 4 if together else after > 4
-    inference.begun, inference.seen = {"a": base.fit.point["a"]}, None
-    assert not inference.is_astray(base.fit, base.floor)
+    search.begun, search.seen = {"a": base.fit.point["a"]}, None
+    assert not refining.is_astray(search, base.fit, base.floor)
 
 
 def test_an_early_floor_weighs_nothing_later():
     problem = Swing({"a": 1.0})
-    inference = Inference(problem)
-    floor = inference.early(inference.noise(), 0.4)
-    here = floor.whitener(inference.parts)(np.ones(len(T)), 0)
+    search = next_effect.new_search(problem)
+    floor = base_fits.early(search.lab, search.lab.noise(), 0.4)
+    here = floor.whitener(search.lab.parts)(np.ones(len(T)), 0)
     assert here[T <= 0.01 + 0.4 * 0.99] == pytest.approx(1.0 / NOISE) and not here[T > 0.41].any()
     assert floor.weight[1] is not None and (floor.weight[1] > 0).all(), "what is held out is scored whole"
 
@@ -151,21 +151,21 @@ def test_few_candidates_grow_where_every_point_costs(monkeypatch):
     monkeypatch.setattr(refining, "ONE_BY_ONE", 2)
     told = []
     problem = Swing({"a": 1.2, "chirp.c": 20.0})
-    inference = Inference(problem, tell=told.append)
-    base = inference.start()
-    grown = inference.growing(base.fit, base.floor, problem.candidates)
+    search = next_effect.new_search(problem, tell=told.append)
+    base = base_fits.base_fit(search)
+    grown = refining.growing(search, base.fit, base.floor, problem.candidates)
     (line,) = (t for t in told if t.startswith("growing fits of"))
     assert line.count(",") == 1 and "chirp" in grown
-    assert grown["chirp"][1].cost == pytest.approx(inference.costs([grown["chirp"][1].point], base.floor)[0])
+    assert grown["chirp"][1].cost == pytest.approx(search.lab.costs([grown["chirp"][1].point], base.floor)[0])
 
 
 @pytest.mark.parametrize("together", [True, False])
 def test_one_of_many_parameters_does_not_grow_where_every_point_costs(together):
     told = []
     problem = Swing({"a": 1.2, "chirp.c": 20.0}, together=together)
-    inference = Inference(problem, tell=told.append)
-    base = inference.start()
-    grown = inference.growing(base.fit, base.floor, problem.candidates)
+    search = next_effect.new_search(problem, tell=told.append)
+    base = base_fits.base_fit(search)
+    grown = refining.growing(search, base.fit, base.floor, problem.candidates)
     (line,) = (t for t in told if t.startswith("growing fits of"))
     assert ("tide" in line) is together and "chirp" in grown
 
@@ -173,15 +173,15 @@ def test_one_of_many_parameters_does_not_grow_where_every_point_costs(together):
 @pytest.mark.parametrize(("over", "horizons"), [(False, 4), (True, 1)])
 def test_growing_fits_end_with_the_time(over, horizons, monkeypatch):
     problem = Swing({"a": 1.2, "chirp.c": 20.0})
-    inference = Inference(problem)
-    base = inference.start()
-    asked, fits = [], inference.fits
-    monkeypatch.setattr(type(inference.deadline), "ends", lambda self, share=1.0: over)
-    monkeypatch.setattr(Inference, "fits", lambda self, *args, **options: asked.append(1) or fits(*args, **options))
-    grown = inference.growing(base.fit, base.floor, problem.candidates)
+    search = next_effect.new_search(problem)
+    base = base_fits.base_fit(search)
+    asked, fits = [], search.lab.fits
+    monkeypatch.setattr(type(search.lab.deadline), "ends", lambda self, share=1.0: over)
+    monkeypatch.setattr(Laboratory, "fits", lambda self, *args, **options: asked.append(1) or fits(*args, **options))
+    grown = refining.growing(search, base.fit, base.floor, problem.candidates)
     assert len(asked) == horizons
     for c, fit in grown.values():
-        assert fit.cost == pytest.approx(inference.costs([fit.point], base.floor)[0]), c.key
+        assert fit.cost == pytest.approx(search.lab.costs([fit.point], base.floor)[0]), c.key
 
 
 PAIR = {"a": 0.83, "chirp.c": -18.6, "jerk.c": -17.2}
@@ -194,7 +194,7 @@ def test_two_effects_grow_together_where_neither_is_named_alone(monkeypatch):
     found = diagnose(problem, draws=39)
     assert {t.candidate.name for t in found.effects} == {"chirp", "jerk"}
     assert dict(found.after) == pytest.approx(PAIR, rel=0.02)
-    assert Inference(problem).is_noise(np.square(list(found.errors["after"].values())))
+    assert comparing.is_noise(next_effect.new_search(problem).lab, np.square(list(found.errors["after"].values())))
     monkeypatch.setattr(attribution, "by_growing", lambda *_: None)
     alone = diagnose(problem, draws=39)
     assert alone.answer == "unknown" and not alone.effects
@@ -210,10 +210,10 @@ def test_two_that_grow_together_take_the_place_of_one_that_was_named(monkeypatch
 
 
 def test_pairs_do_not_grow_where_little_is_left_or_late(monkeypatch):
-    def fail(self, *_):
+    def fail(*_):
         raise AssertionError
 
-    monkeypatch.setattr(Inference, "growing_pairs", fail)
+    monkeypatch.setattr(refining, "growing_pairs", fail)
     found = diagnose(Swing({"a": 1.2, "chirp.c": 20.0}, together=True, jerk=True), draws=39)
     assert [t.candidate.name for t in found.effects] == ["chirp"]
     monkeypatch.setattr(pairs, "IN_TIME", -1.0)
@@ -225,35 +225,35 @@ def test_pairs_do_not_grow_where_little_is_left_or_late(monkeypatch):
 @pytest.mark.parametrize("together", [True, False])
 def test_enough_iterations_at_a_horizon_follow_two_effects(together):
     problem = Swing(PAIR, together=together, jerk=True)
-    inference = Inference(problem)
-    base = inference.start()
-    made = inference.growing_pairs({**base.fit.point, "a": 1.0}, base.floor)
-    assert {c.name for c in made[0].candidates} == {"chirp", "jerk"} and inference.is_noise(
-        inference.mean_squares([made[0].fit.point], base.floor)[0]
+    search = next_effect.new_search(problem)
+    base = base_fits.base_fit(search)
+    made = refining.growing_pairs(search, {**base.fit.point, "a": 1.0}, base.floor)
+    assert {c.name for c in made[0].candidates} == {"chirp", "jerk"} and comparing.is_noise(
+        search.lab, search.lab.mean_squares([made[0].fit.point], base.floor)[0]
     )
 
 
 def test_pairs_that_cost_least_go_on(monkeypatch):
     monkeypatch.setattr(refining, "PAIRS", refining.PAIRS._replace(pairs=2))
     problem = Swing(PAIR, together=True, jerk=True)
-    inference = Inference(problem)
-    base = inference.start()
-    asked, fits = [], inference.fits
-    monkeypatch.setattr(inference, "fits", lambda requests, *args, **o: asked.append(len(requests)) or fits(requests, *args, **o))
-    made = inference.growing_pairs(base.fit.point, base.floor)
+    search = next_effect.new_search(problem)
+    base = base_fits.base_fit(search)
+    asked, fits = [], search.lab.fits
+    monkeypatch.setattr(search.lab, "fits", lambda requests, *args, **o: asked.append(len(requests)) or fits(requests, *args, **o))
+    made = refining.growing_pairs(search, base.fit.point, base.floor)
     firsts, together, *later = asked
     assert firsts == 3 and together == 3 and max(later) <= 2, "three small candidates and as many pairs, each once"
     assert {c.name for c in made[0].candidates} == {"chirp", "jerk"} and made[0].fit.cost == min(pair.fit.cost for pair in made)
 
 
 def test_a_base_that_was_looked_at_without_growing_fits_grows_once_when_it_is_asked_again(monkeypatch):
-    inference = Inference(Swing({"a": 1.2, "chirp.c": 20.0}))
-    base = inference.start()
-    grown, grow = [], Inference.growing
-    monkeypatch.setattr(Inference, "growing", lambda self, *args, **o: grown.append(1) or grow(self, *args, **o))
-    first = inference.look(base.fit, base.floor, grows=False)
-    assert not first.grown and not grown and not inference.is_noise(first.least[0])
-    again = inference.look(base.fit, base.floor)
-    assert again.grown and grown == [1] and inference.is_noise(again.least[0])
+    search = next_effect.new_search(Swing({"a": 1.2, "chirp.c": 20.0}))
+    base = base_fits.base_fit(search)
+    grown, grow = [], refining.growing
+    monkeypatch.setattr(refining, "growing", lambda *args, **o: grown.append(1) or grow(*args, **o))
+    first = next_effect.first_look(search, base.fit, base.floor, grows=False)
+    assert not first.grown and not grown and not comparing.is_noise(search.lab, first.least[0])
+    again = next_effect.first_look(search, base.fit, base.floor)
+    assert again.grown and grown == [1] and comparing.is_noise(search.lab, again.least[0])
     assert again.contest.best["chirp"][1].point["chirp.c"] == pytest.approx(20.0, abs=0.2)
-    assert inference.look(base.fit, base.floor) is again
+    assert next_effect.first_look(search, base.fit, base.floor) is again

@@ -12,11 +12,11 @@ import yaml
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.discrepancy import store
+from neuido.discrepancy.inference import directions, discretisation
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import levenberg_marquardt, run
 from neuido.discrepancy.inference.search.attribution import diagnose
 from neuido.discrepancy.inference.search.intervals import findings
-from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.noise import correlation, surface
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
@@ -111,7 +111,7 @@ def test_what_could_hide_is_told(tmp_path):
 def test_a_residual_within_a_large_floor_is_not_nothing(monkeypatch):
     """Twenty times the noise, and no more than the settings differ by: that much could hide."""
     problem = Line({"young": 1.5}, beside=0.2)
-    monkeypatch.setattr(Inference, "floors", lambda self, point, free, floor: self.noise_squares + 0.2**2)
+    monkeypatch.setattr(discretisation, "floors", lambda lab, point, free, floor: lab.noise_squares + 0.2**2)
     found = diagnose(problem, draws=39)
     assert found.answer == "insufficient" and "times the noise" in found.why[0]
     assert diagnose(Line({"young": 1.5}), draws=39).answer == "none"
@@ -133,11 +133,11 @@ def test_a_declared_figure_far_off_is_a_finding_where_the_data_tell_it(value, co
     (young,) = Line({"young": 1.5}).declared
     young = replace(young, value=1.0)
     problem = SimpleNamespace(declared=(young,))
-    inference = SimpleNamespace(problem=problem, costs=lambda points, floor: [cost * (p["young"] - value) ** 2 for p in points])
+    lab = SimpleNamespace(problem=problem, costs=lambda points, floor: [cost * (p["young"] - value) ** 2 for p in points])
     at = SimpleNamespace(fit=SimpleNamespace(point={"young": value}), floor=None)
-    assert bool(findings(inference, at)) is told
+    assert bool(findings(lab, at)) is told
     problem.declared = (replace(young, value=value),)
-    assert not findings(inference, at), "declared there"
+    assert not findings(lab, at), "declared there"
 
 
 def test_noise_is_the_same_from_any_origin_in_any_unit_and_order():
@@ -264,14 +264,14 @@ class Edge(Line):
 def test_slopes_that_fail_are_no_zeros():
     problem = Edge({"young": 1.0})
     problem.gap = math.inf
-    inference = Inference(problem)
+    lab = Laboratory(problem)
     with pytest.raises(UserError, match="cannot be simulated on either side of young = 1 Pa"):
-        inference.slopes(problem.declared, {"young": 1.0}, [0])
+        directions.slopes(lab, problem.declared, {"young": 1.0}, [0])
     (fit,) = run(problem, [levenberg_marquardt(problem.declared, {"young": 1.0})], lambda r, n: r / SIGMA, [0])
     assert not fit.converged
     problem = Edge({"young": 1.5})
     problem.gap, problem.side = 0.0, 1.0
-    assert np.abs(Inference(problem).slopes(problem.declared, {"young": 1.0}, [0])[0]).max() > 0.05
+    assert np.abs(directions.slopes(Laboratory(problem), problem.declared, {"young": 1.0}, [0])[0]).max() > 0.05
 
 
 class Gridded(Line):

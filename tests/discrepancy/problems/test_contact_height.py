@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.discrepancy.inference.search.attribution import Inference, diagnose
+from neuido.discrepancy.inference.search import base_fits, next_effect
+from neuido.discrepancy.inference.search.attribution import diagnose
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.problems.settings import CONTACT_HEIGHT, SETTINGS
 from neuido.discrepancy.report import answer_content
@@ -90,7 +91,7 @@ def test_a_floor_that_is_elsewhere_is_no_effect(effect, experiment):
     rng = np.random.default_rng(3)
     for n, own in enumerate(problem.recordings):
         own.y[:] = problem.predict([truth], n)[0] + own.noise * rng.standard_normal(len(own.y))
-    start = Inference(problem).start()
+    start = base_fits.base_fit(next_effect.new_search(problem))
     found = diagnose(problem, draws=39, most=1)
     assert [t.candidate.name for t in found.effects] == ([effect] if effect else [])
     assert found.after[CONTACT_HEIGHT] == pytest.approx(height, rel=0.2)

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neuido.discrepancy.inference.search import attribution, choosing
+from neuido.discrepancy.inference import discretisation
+from neuido.discrepancy.inference.laboratory import Laboratory
+from neuido.discrepancy.inference.search import base_fits, choosing, next_effect, refining
 from neuido.discrepancy.inference.search.attribution import diagnose
-from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.body import BodyProblem, body_problem
 from neuido.discrepancy.problems.settings import EVERY, SETTINGS, SOLVERS
 from neuido.discrepancy.store import CachedProblem
@@ -68,7 +69,7 @@ def test_directions_of_nuisances_are_those_of_the_own_setting_where_a_longer_ste
     assert EVERY[quick].dt > 1.0
     with monkeypatch.context() as patch:
         patch.setattr(BodyProblem, "quick", lambda self, setting: setting)
-        own = Inference(problem).nuisances({}, [0, 1])
+        own = discretisation.nuisance_directions(Laboratory(problem), {}, [0, 1])
     asked = []
 
     def without(self, asks):
@@ -80,7 +81,7 @@ def test_directions_of_nuisances_are_those_of_the_own_setting_where_a_longer_ste
     monkeypatch.setattr(BodyProblem, "predict_several", without)
     if why == "margin":
         monkeypatch.setattr(BodyProblem, "margin", lambda self, point, setting=0: 0.2 if setting == quick else 1.0)
-    found = Inference(problem).nuisances({}, [0, 1])
+    found = discretisation.nuisance_directions(Laboratory(problem), {}, [0, 1])
     assert asked == ([(0, quick), (1, quick), (1, 0)] if why == "run" else [(0, 0), (1, 0)])
     assert list(found) == [0, 1]
     assert np.abs(own[1]).max() > 1e-4
@@ -118,20 +119,20 @@ def test_a_quick_search_ends_with_the_setting_that_predicts(together):
 
 
 def test_what_came_close_ends_under_the_own_setting_and_the_rest_does_not():
-    inference = Inference(Hurried(lambda t: 3.0 * t + 0.8 * t**2), keep=7)
-    start = inference.start()
-    look = inference.look(start.fit, start.floor)
-    assert inference.setting == 0
+    search = next_effect.new_search(Hurried(lambda t: 3.0 * t + 0.8 * t**2), keep=7)
+    start = base_fits.base_fit(search)
+    look = next_effect.first_look(search, start.fit, start.floor)
+    assert search.lab.setting == 0
     fits = {key: fit for key, (_, fit) in look.contest.best.items()}
     assert fits["square"].setting == 0 and {fit.setting for fit in fits.values()} == {0, 2}
     least = min(fit.cost for fit in fits.values())
     assert all(fit.cost > 3.9 * least for fit in fits.values() if fit.setting == 2)
     # each is measured by what made it
     far = next(entry for entry in look.contest.best.values() if entry[1].setting == 2)
-    (stand,) = inference.measured({"far": far}, start.floor)
-    with inference.under(2):
-        (squares,) = inference.mean_squares([far[1].point], start.floor)
-    here = inference.mean_squares([far[1].point], start.floor)[0]
+    (stand,) = refining.measured(search.lab, {"far": far}, start.floor)
+    with search.lab.under(2):
+        (squares,) = search.lab.mean_squares([far[1].point], start.floor)
+    here = search.lab.mean_squares([far[1].point], start.floor)[0]
     assert np.all(stand.errors <= np.maximum(squares, here) * (1 + 1e-9))
 
 
@@ -148,8 +149,8 @@ class Exact(Hurried):
 
 @pytest.mark.parametrize(("law", "asked"), [(lambda t: 3.0 * t + 0.8 * t**2, False), (lambda t: 3.0 * t + 0.3 * np.sin(9 * t) * t, True)])
 def test_no_other_method_is_begun_where_one_simulation_leaves_the_noise(law, asked, monkeypatch):
-    begun, real = [], attribution.Inference.start
-    monkeypatch.setattr(attribution.Inference, "start", lambda self, near=None: begun.append(self.setting) or real(self, near))
+    begun, real = [], base_fits.base_fit
+    monkeypatch.setattr(base_fits, "base_fit", lambda search, near=None: begun.append(search.lab.setting) or real(search, near))
     monkeypatch.setattr(choosing, "EARLY", 0.0)
     diagnose(Exact(law), keep=3)
     assert begun == ([0, 1] if asked else [0])
@@ -167,12 +168,12 @@ def test_a_second_effect_near_the_noise_is_told_by_one_simulation(second):
 
 
 def test_a_base_is_looked_at_once():
-    inference = Inference(Hurried(lambda t: 3.0 * t + 0.8 * t**2), keep=3)
-    start = inference.start()
-    look = inference.look(start.fit, start.floor)
-    counts = dict(inference.problem.counts)
-    assert inference.look(start.fit, start.floor) is look and inference.problem.counts == counts
-    first = inference.round(start.fit, start.floor, [])
-    assert inference.asked is first and inference.seen is look
-    inference.round(first.chosen.fit, first.floor, [first.chosen])
-    assert inference.asked is first and inference.seen is look, "a second effect is looked for anew"
+    search = next_effect.new_search(Hurried(lambda t: 3.0 * t + 0.8 * t**2), keep=3)
+    start = base_fits.base_fit(search)
+    look = next_effect.first_look(search, start.fit, start.floor)
+    counts = dict(search.lab.problem.counts)
+    assert next_effect.first_look(search, start.fit, start.floor) is look and search.lab.problem.counts == counts
+    first = next_effect.find(search, start.fit, start.floor, [])
+    assert search.asked is first and search.seen is look
+    next_effect.find(search, first.chosen.fit, first.floor, [first.chosen])
+    assert search.asked is first and search.seen is look, "a second effect is looked for anew"

@@ -7,11 +7,11 @@ import pytest
 
 from neuido.commands.demo.closed_loop import ELASTIC, record
 from neuido.data.undeclared.motion import Solver, simulate_motion
-from neuido.discrepancy.inference import laboratory
+from neuido.discrepancy.inference import discretisation, floors
 from neuido.discrepancy.inference.bootstrap import gain
 from neuido.discrepancy.inference.floors import REACH, Floor, Part
+from neuido.discrepancy.inference.search import base_fits, next_effect
 from neuido.discrepancy.inference.search.attribution import diagnose
-from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.workflow import restricted
 from tests.discrepancy.inference.test_decisions import FALLS, over
@@ -77,12 +77,12 @@ def test_gain_is_the_held_out_one_where_the_fitted_recordings_are_noise():
 
 
 def test_a_fit_is_weighed_by_no_more_than_is_left():
-    inference = Inference(Line(lambda t: 3.0 * t))
-    start = inference.start()
+    search = next_effect.new_search(Line(lambda t: 3.0 * t))
+    start = base_fits.base_fit(search)
     assert np.allclose(start.floor.weight[0], 1 / NOISE, rtol=0.05)  # nothing but noise is left
-    wide = inference.floor(start.fit.point)
+    wide = discretisation.floor_at(search.lab, start.fit.point)
     assert wide.weight[0].min() < 0.1 / NOISE
-    assert np.allclose(inference.sharpened(wide, np.full(2, 1e3)).weight[0], wide.weight[0])
+    assert np.allclose(discretisation.sharpened(search.lab, wide, np.full(2, 1e3)).weight[0], wide.weight[0])
 
 
 class Bent(Line):
@@ -106,7 +106,7 @@ def test_a_prediction_goes_on_to_a_finer_step(monkeypatch):
     assert found.amounts["after"] == pytest.approx([-1.25], abs=0.05)  # (1 - 1/16) / (1 - 1/4)
     low, high = found.intervals["a"]
     assert low < 3.0 < high
-    monkeypatch.setattr(laboratory.Floor, "amounts", lambda self, residuals, parts: np.zeros(1))
+    monkeypatch.setattr(floors.Floor, "amounts", lambda self, residuals, parts: np.zeros(1))
     assert diagnose(Bent()).errors["after"]["two"] > 0.1
 
 

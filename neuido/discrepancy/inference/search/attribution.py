@@ -6,16 +6,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from neuido.discrepancy.inference import comparing, discretisation
+from neuido.discrepancy.inference.comparing import LEAST_GAIN
 from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, score, times_over
 from neuido.discrepancy.inference.journal import CaseRecord, Journal
-from neuido.discrepancy.inference.laboratory import LEAST_GAIN, Tell
+from neuido.discrepancy.inference.laboratory import Tell
 from neuido.discrepancy.inference.least_squares import Fit, NotFinite
+from neuido.discrepancy.inference.search import base_fits, judging, next_effect
 from neuido.discrepancy.inference.search.choosing import first_rounds, told_exactly
 from neuido.discrepancy.inference.search.decision import case_of, decided
 from neuido.discrepancy.inference.search.intervals import Hidden, blind_to_settings, findings, hidden, intervals, unable
 from neuido.discrepancy.inference.search.judging import CLASS_RATIO
 from neuido.discrepancy.inference.search.pairs import by_growing, neighbours, simpler, two_effects
-from neuido.discrepancy.inference.search.rounds import Inference
+from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.inference.statistics import statistics_of
 from neuido.discrepancy.problems.problem import Point, Problem
 from neuido.discrepancy.store import Deadline, Memo, Work
@@ -27,12 +30,12 @@ FURTHER = 1.5
 """Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 
 
-def widen(inference: Inference, r: Round, at: Stand, others: Iterable[Round]) -> None:
+def widen(search: Search, r: Round, at: Stand, others: Iterable[Round]) -> None:
     """Put into the class of a round what another method named that leaves about as much, where that is more than noise.
 
     The methods differ there by as much as the effects do, so that the data tell neither apart.
     """
-    if inference.is_settled(at.errors):
+    if comparing.is_settled(search.lab, at.errors):
         return
     for other in others:
         if other.chosen is None or other.chosen.score > score(at.errors) + 2.0 * math.log(CLASS_RATIO):
@@ -43,12 +46,13 @@ def widen(inference: Inference, r: Round, at: Stand, others: Iterable[Round]) ->
                 r.members = [*r.members, t]
 
 
-def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:
+def narrow(search: Search, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:
     """Weigh each class of effects again beside all others that were found: the best one of each stays, with those near it.
 
     So are simpler candidates that came close: before the others were found a force of many parameters may have stood for two effects. And
     where all of them together leave more than noise, the others that came close: a neighbour of the true one may have led alone.
     """
+    lab = search.lab
     for r in rounds:
         if r.chosen not in found:
             continue
@@ -56,8 +60,8 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
         beside = tuple(p for t in rest for p in t.candidate.parameters)
         own = {p.name for p in r.chosen.candidate.parameters}
         without = {k: v for k, v in base.point.items() if k not in own}
-        left = inference.mean_squares([base.point], floor)[0]
-        rivals = simpler(r, r.chosen) + ([] if inference.is_noise(left) else neighbours(r, r.chosen))
+        left = lab.mean_squares([base.point], floor)[0]
+        rivals = simpler(r, r.chosen) + ([] if comparing.is_noise(lab, left) else neighbours(r, r.chosen))
         taken = {o.candidate.name for o in rest}
         members = [t for t in dict.fromkeys((*r.members, *rivals)) if t.candidate.name not in taken]
         if len(members) == 1:
@@ -65,34 +69,35 @@ def narrow(inference: Inference, base: Fit, floor: Floor, found: list[Trial], ro
         requests = []
         for t in members:
             start = base.point if t is r.chosen else without | {p.name: t.fit.point[p.name] for p in t.candidate.parameters}
-            requests.append(inference.request((*inference.problem.declared, *beside, *t.candidate.parameters), start))
-        fits = inference.fits(requests, floor)
-        squares = inference.mean_squares([fit.point for fit in fits], floor)
+            requests.append(lab.request((*lab.problem.declared, *beside, *t.candidate.parameters), start))
+        fits = lab.fits(requests, floor)
+        squares = lab.mean_squares([fit.point for fit in fits], floor)
         weighed = [replace(t, stand=Stand(fit, floor, square)) for t, fit, square in zip(members, fits, squares, strict=True)]
         at = min(range(len(weighed)), key=lambda i: weighed[i].penalised)
         for t, new in zip(members, weighed, strict=True):
             above = math.exp(0.5 * (new.score - weighed[at].score))
-            near = new is weighed[at] or inference.as_good(new, weighed[at])
+            near = new is weighed[at] or judging.as_good(search, new, weighed[at])
             t.reason = "" if near else f"with all effects that were found it leaves {above:.1f} times the error of the best"
         found[found.index(r.chosen)] = members[at]
         base, r.chosen, r.members = fits[at], members[at], [t for t in members if not t.reason]
     return base, found
 
 
-def drop(inference: Inference, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:
+def drop(search: Search, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:
     """Leave out effects that the others make needless, from where all of them together brought the fit, the most needless one first.
 
     What is held out says so: what fits the fitted recordings alone as well may foretell nothing.
     """
+    lab = search.lab
     while len(found) > 1:
-        declared, requests = inference.problem.declared, []
+        declared, requests = lab.problem.declared, []
         rests = [[t for t in found if t is not trial] for trial in found]
         for trial, rest in zip(found, rests, strict=True):
             free = (*declared, *(p for t in rest for p in t.candidate.parameters))
-            requests.append(inference.request(free, trial.candidate.without(base.point)))
-        fits = inference.fits(requests, floor)
-        with_all, *squares = inference.mean_squares([base.point, *(fit.point for fit in fits)], floor)
-        lost = [inference.foretold(without, with_all) for without in squares]
+            requests.append(lab.request(free, trial.candidate.without(base.point)))
+        fits = lab.fits(requests, floor)
+        with_all, *squares = lab.mean_squares([base.point, *(fit.point for fit in fits)], floor)
+        lost = [comparing.foretold(lab, without, with_all) for without in squares]
         least = min(range(len(found)), key=lambda i: lost[i])
         if lost[least] > LEAST_GAIN / 2:
             break
@@ -188,7 +193,7 @@ def diagnose(
     """
     memo, journal = Memo(problem), Journal()
     deadline = Deadline(seconds, pace=lambda: memo.pace)
-    tried: list[Inference] = []
+    tried: list[Search] = []
     starts: list[Stand] = []
     for n in problem.solvers:
         if problem.margin({}, n) < 0.0:
@@ -196,26 +201,26 @@ def diagnose(
                 continue
             raise UserError(problem.refusal(n))
         shared = {"tell": tell, "memo": memo, "deadline": deadline, "journal": journal}
-        inference = Inference(problem, setting=n, keep=keep, draws=draws, seed=seed, **shared)
-        if starts and (tried[-1].is_settled(starts[-1].errors) or deadline.skips(problem.setting_name(n))):
+        search = next_effect.new_search(problem, setting=n, keep=keep, draws=draws, seed=seed, **shared)
+        if starts and (comparing.is_settled(tried[-1].lab, starts[-1].errors) or deadline.skips(problem.setting_name(n))):
             continue
         if len(starts) == 1 and told_exactly(tried[0], starts[0]):
             break
         # the problem's own parameters are about the other method
-        near = {name: starts[0].fit.point[name] for name in inference.as_declared} if starts else None
+        near = {name: starts[0].fit.point[name] for name in search.lab.as_declared} if starts else None
         try:
-            start = inference.start(near)
+            start = base_fits.base_fit(search, near)
         except NotFinite as error:
             raise UserError(problem.refusal(n)) from error
         if start is not None:
-            tried.append(inference)
+            tried.append(search)
             starts.append(start)
-            journal.bases.append(journal.fit(n, {}, None, start, inference.parts))
+            journal.bases.append(journal.fit(n, {}, None, start, search.lab.parts))
     chosen, firsts = first_rounds(tried, starts)
-    inference, rounds = tried[chosen], firsts[chosen]
+    search, rounds = tried[chosen], firsts[chosen]
     start = rounds[0].plain or starts[chosen]
     if len(tried) > 1:
-        inference.tell(f"solver: {problem.setting_name(inference.setting)}")
+        search.lab.tell(f"solver: {problem.setting_name(search.lab.setting)}")
     at = start
     found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
     others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
@@ -224,83 +229,84 @@ def diagnose(
         step = rounds[-1].chosen
         found.append(step)
         # near the noise too: what leaves that alone in one simulation is told by it, however little it gains
-        settled = len(found) == most or inference.is_noise(step.errors)
+        settled = len(found) == most or comparing.is_noise(search.lab, step.errors)
         hurried = deadline.over
         if hurried and not settled:
             deadline.skips("a further effect")
         if hurried:  # what is left of the time is for the last fit
             deadline.conclude()
-        at = inference.finished(step.stand)
-        if settled or hurried or inference.is_noise(at.errors):
+        at = base_fits.finished(search.lab, step.stand)
+        if settled or hurried or comparing.is_noise(search.lab, at.errors):
             break
-        if problem.together and len(found) == 1 and (grown := by_growing(inference, rounds[0], at, others)):
+        if problem.together and len(found) == 1 and (grown := by_growing(search, rounds[0], at, others)):
             break
-        if problem.settings > 1 and not inference.is_settled(at.errors) and inference.over(at) < FURTHER:
+        if problem.settings > 1 and not comparing.is_settled(search.lab, at.errors) and next_effect.over_floor(search.lab, at) < FURTHER:
             break
-        rounds.append(inference.round(at.fit, at.floor, found))
+        rounds.append(next_effect.find(search, at.fit, at.floor, found))
     # where every point costs pairs grow after what takes less, and where nothing was named last of all
     if not hurried and (not found or (len(found) == 1 and not problem.together)):
-        grown = by_growing(inference, rounds[0], at, others)
-    if hurried and 0 < len(found) < MOST and not inference.is_settled(at.errors):
+        grown = by_growing(search, rounds[0], at, others)
+    if hurried and 0 < len(found) < MOST and not comparing.is_settled(search.lab, at.errors):
         deadline.skips("two effects at once")
     if grown or (0 < len(found) < 3 and not hurried):
-        by, pair = grown or two_effects(inference, rounds, found, at, others)
-        if by is not inference:
-            inference, start = by, pair[0].plain or starts[tried.index(by)]
+        by, pair = grown or two_effects(search, rounds, found, at, others)
+        if by is not search:
+            search, start = by, pair[0].plain or starts[tried.index(by)]
         if pair:
             rounds = pair
             found = [r.chosen for r in pair if r.chosen is not None]
-            at = inference.finished(found[-1].stand)
+            at = base_fits.finished(search.lab, found[-1].stand)
     if len(found) == 1:
-        widen(inference, rounds[0], at, others.values())
+        widen(search, rounds[0], at, others.values())
     deadline.conclude()
     if len(found) > 1:
-        floor = inference.floor(at.fit.point)
-        fit, found = drop(inference, at.fit, floor, found)
-        fit, found = narrow(inference, fit, floor, found, rounds)
-        at = inference.finished(Stand(fit, floor, inference.mean_squares([fit.point], floor)[0]))
-    made = conclude(inference, start, at, found, rounds)
+        floor = discretisation.floor_at(search.lab, at.fit.point)
+        fit, found = drop(search, at.fit, floor, found)
+        fit, found = narrow(search, fit, floor, found, rounds)
+        at = base_fits.finished(search.lab, Stand(fit, floor, search.lab.mean_squares([fit.point], floor)[0]))
+    made = conclude(search, start, at, found, rounds)
     if statistics and made.case is not None:
-        made.statistics = statistics_of(tried, [s.floor for s in starts], journal, (made.case.before, made.case.after))
+        made.statistics = statistics_of([s.lab for s in tried], [s.floor for s in starts], journal, (made.case.before, made.case.after))
     return made
 
 
-def conclude(inference: Inference, before: Stand, after: Stand, found: list[Trial], rounds: list[Round]) -> Diagnosis:
+def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], rounds: list[Round]) -> Diagnosis:
     """The answer and its figures, each stand with the floor that its effects were weighed with."""
-    first, problem = rounds[0], inference.problem
-    cut = inference.deadline.cut and (bool(found) or not inference.is_noise(before.errors))
+    lab = search.lab
+    first, problem = rounds[0], lab.problem
+    cut = lab.deadline.cut and (bool(found) or not comparing.is_noise(lab, before.errors))
     kept = {t.candidate.key for t in found}
     steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
     leads = leading(rounds) if cut else []
-    over = inference.over(after) if found and not cut else first.over
-    wrong = [] if cut else findings(inference, after)
-    missing = bool(found) or first.unsure or inference.is_unexplained(first)
+    over = next_effect.over_floor(lab, after) if found and not cut else first.over
+    wrong = [] if cut else findings(lab, after)
+    missing = bool(found) or first.unsure or next_effect.is_unexplained(lab, first)
     if missing and not cut and not wrong:
-        inference.floor(after.fit.point, like=after.floor)  # which settings run there
-    facts = {"cut": cut, "wrong": wrong, "blind": missing and blind_to_settings(inference), "found": [t.candidate.key for t in found]}
-    answer, why = decided(inference, before.errors, found, steps, cut=cut, wrong=wrong, blind=facts["blind"])
-    case = case_of(inference, before, after, rounds, answer, why, facts)
+        discretisation.floor_at(lab, after.fit.point, like=after.floor)  # which settings run there
+    facts = {"cut": cut, "wrong": wrong, "blind": missing and blind_to_settings(lab), "found": [t.candidate.key for t in found]}
+    answer, why = decided(lab, before.errors, found, steps, cut=cut, wrong=wrong, blind=facts["blind"])
+    case = case_of(lab, before, after, rounds, answer, why, facts)
     if found and answer not in ("effect", "class"):  # nothing is named, and nothing added
         after, found, over = before, [], first.over
         steps = [replace(first, chosen=None, members=[])]
     stands = {"before": before, "after": after}
-    alone = {when: inference.mean_squares([s.fit.point], s.floor, plain=True)[0] for when, s in stands.items()}
-    own = intervals(inference, after.fit, after.floor, after.errors)
+    alone = {when: lab.mean_squares([s.fit.point], s.floor, plain=True)[0] for when, s in stands.items()}
+    own = intervals(lab, after.fit, after.floor, after.errors)
     declared = {}
     if problem.declared:
         stated = Fit(before.fit.point, tuple(p.name for p in problem.declared), 0.0, np.empty(0), 0, True)
-        declared = intervals(inference, stated, before.floor, before.errors)
-    scale, floor = inference.scale, after.floor
-    looked = [] if cut or not any(r.trials for r in rounds) else hidden(inference, after, rounds[-1], found)
-    amounts = {when: inference.amounts(s.fit.point, s.floor) for when, s in stands.items()}
-    final, errors, single = tested(inference, stands, amounts, alone)
+        declared = intervals(lab, stated, before.floor, before.errors)
+    scale, floor = lab.scale, after.floor
+    looked = [] if cut or not any(r.trials for r in rounds) else hidden(lab, after, rounds[-1], found)
+    amounts = {when: lab.amounts(s.fit.point, s.floor) for when, s in stands.items()}
+    final, errors, single = tested(search, stands, amounts, alone)
     return Diagnosis(
         problem,
         answer,
         steps,
         before.fit.point,
         after.fit.point,
-        inference.parts,
+        lab.parts,
         errors,
         single,
         amounts,
@@ -311,16 +317,16 @@ def conclude(inference: Inference, before: Stand, after: Stand, found: list[Tria
         },
         own,
         declared,
-        inference.setting,
-        inference.memo.work,
-        inference.deadline,
-        sealed=list(inference.sealed),
+        lab.setting,
+        lab.memo.work,
+        lab.deadline,
+        sealed=list(lab.sealed),
         leads=leads,
         why=why,
-        over={"floor": over, "noise": times_over(after.errors, inference.noise_squares)},
+        over={"floor": over, "noise": times_over(after.errors, lab.noise_squares)},
         hidden=looked,
-        unable=unable(inference),
-        noise_from={r.name: inference.noise_from(n) for n, r in enumerate(problem.recordings)},
+        unable=unable(lab),
+        noise_from={r.name: lab.noise_from(n) for n, r in enumerate(problem.recordings)},
         case=case,
     )
 
@@ -332,22 +338,24 @@ def leading(rounds: Sequence[Round]) -> list[Trial]:
 
 
 def tested(
-    inference: Inference, stands: Mapping[str, Stand], amounts: Mapping[str, np.ndarray], alone: Mapping[str, np.ndarray]
+    search: Search, stands: Mapping[str, Stand], amounts: Mapping[str, np.ndarray], alone: Mapping[str, np.ndarray]
 ) -> tuple[dict[str, Floor], dict[str, dict[str, float]], dict[str, dict[str, float]]]:
     """The floors, errors and errors under one setting, `before` and `after`, with those of the recordings that were sealed until now."""
+    lab = search.lab
     floors, errors, single = {}, {}, {}
     for when, stand in stands.items():
         floors[when], point = stand.floor, stand.fit.point
-        errors[when], single[when] = _by_recording(inference, stand.errors), _by_recording(inference, alone[when])
-        for part in inference.sealed:
-            there = inference.floor(point, of=[part.recording])
+        errors[when], single[when] = _by_recording(search, stand.errors), _by_recording(search, alone[when])
+        for part in lab.sealed:
+            there = discretisation.floor_at(lab, point, of=[part.recording])
             floors[when] = floors[when].joined(there)
-            residual = {part.recording: inference.residual(point, part.recording)}
+            residual = {part.recording: lab.residual(point, part.recording)}
             for out, own in ((errors, amounts[when]), (single, None)):
                 left = there.settle(residual[part.recording], part, own)
-                out[when][part.name] = inference.scale * math.sqrt(float(np.mean(left**2)))
+                out[when][part.name] = lab.scale * math.sqrt(float(np.mean(left**2)))
     return floors, errors, single
 
 
-def _by_recording(inference: Inference, squares: np.ndarray) -> dict[str, float]:
-    return {p.name: inference.scale * math.sqrt(float(v)) for p, v in zip(inference.parts, squares, strict=True)}
+def _by_recording(search: Search, squares: np.ndarray) -> dict[str, float]:
+    lab = search.lab
+    return {p.name: lab.scale * math.sqrt(float(v)) for p, v in zip(lab.parts, squares, strict=True)}

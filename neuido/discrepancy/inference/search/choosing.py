@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from neuido.discrepancy.inference import comparing, discretisation
+from neuido.discrepancy.inference.comparing import LEAST_GAIN
 from neuido.discrepancy.inference.floors import Round, Stand, score
-from neuido.discrepancy.inference.laboratory import LEAST_GAIN
+from neuido.discrepancy.inference.search import base_fits, judging, next_effect, refining
 from neuido.discrepancy.inference.search.judging import WITHIN
 from neuido.discrepancy.inference.search.pairs import WORSE, look_ahead
 from neuido.discrepancy.inference.search.refining import BEYOND
-from neuido.discrepancy.inference.search.rounds import Inference
+from neuido.discrepancy.inference.search.search_state import Search
 
 CLEARLY = 1.5
 """Times the error of another method's first fits at which those of the suggested one are refined first all the same."""
@@ -28,32 +30,33 @@ UNASKED = math.log(3.0)
 off there a false alarm gained 2.4, half of a pair 2.7, what was right or near 3.3 to 9."""
 
 
-def told_exactly(inference: Inference, start: Stand) -> bool:
+def told_exactly(search: Search, start: Stand) -> bool:
     """Whether a method names an effect with which one simulation leaves nothing but noise: no other one is asked then.
 
     Looked for where the residual is above the floor, and the first fits come down to noise; `first_rounds` takes the round that it took.
     Where every point costs, none grow before the other method was asked: by the wrong one all leave much.
     """
-    if inference.problem.settings == 1 or inference.over(start) < EARLY:
+    lab = search.lab
+    if lab.problem.settings == 1 or next_effect.over_floor(lab, start) < EARLY:
         return False
-    look = inference.look(start.fit, start.floor, until=LOOKS[0], grows=inference.problem.together)
-    if not look.least or not inference.is_noise(look.least[0]):
+    look = next_effect.first_look(search, start.fit, start.floor, until=LOOKS[0], grows=lab.problem.together)
+    if not look.least or not comparing.is_noise(lab, look.least[0]):
         return False
-    first = inference.round(start.fit, start.floor, [])
-    if first.chosen is None or inference.deadline.ends():
+    first = next_effect.find(search, start.fit, start.floor, [])
+    if first.chosen is None or lab.deadline.ends():
         return False
-    return inference.is_exact(replace(first.chosen, stand=inference.finished(first.chosen.stand)))
+    return judging.is_exact(search, replace(first.chosen, stand=base_fits.finished(lab, first.chosen.stand)))
 
 
-def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[int, dict[int, list[Round]]]:
+def first_rounds(tried: Sequence[Search], starts: Sequence[Stand]) -> tuple[int, dict[int, list[Round]]]:
     """Which of the methods goes on, and the first round of each that was asked, or two where it takes two effects to gain enough.
 
     The one whose declared model fits best begins. Where nothing but noise is left there is nothing to look for.
     """
-    settled = [i for i, start in enumerate(starts) if tried[i].is_noise(start.errors)]
+    settled = [i for i, start in enumerate(starts) if comparing.is_noise(tried[i].lab, start.errors)]
     if settled:
         chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
-        return chosen, {chosen: [unsearched(starts[chosen], tried[chosen].noise_squares)]}
+        return chosen, {chosen: [unsearched(starts[chosen], tried[chosen].lab.noise_squares)]}
     # another method must do clearly better before it takes the place of the suggested one
     handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
@@ -71,17 +74,17 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
         at_first = -math.inf if waits(tried[i]) else seen.get(i, -math.inf)
         if any(r.chosen and at_first > r.chosen.score + handicap[i] + 2.0 * math.log(BEYOND) for r in named):
             continue
-        if firsts and tried[i].deadline.skips("effects by the other method"):
+        if firsts and tried[i].lab.deadline.skips("effects by the other method"):
             unasked = True
             continue
-        first = tried[i].asked or tried[i].round(starts[i].fit, starts[i].floor, [], named[0] if named else None)
+        first = tried[i].asked or next_effect.find(tried[i], starts[i].fit, starts[i].floor, [], named[0] if named else None)
         least = min((t.score for t in first.trials), default=math.inf)
         beaten = any(r.chosen and r.chosen.score <= least for r in named)
         firsts[i] = [first] if beaten else look_ahead(tried[i], first)
         last = firsts[i][-1]
-        if last.trials and tried[i].is_noise(last.trials[0].errors):
+        if last.trials and comparing.is_noise(tried[i].lab, last.trials[0].errors):
             break
-        if last.chosen is not None and tried[i].is_noise(last.chosen.errors / AS_SURE**2):
+        if last.chosen is not None and comparing.is_noise(tried[i].lab, last.chosen.errors / AS_SURE**2):
             break
         if last.chosen is None and last.over < WITHIN:
             break
@@ -97,7 +100,7 @@ def first_rounds(tried: Sequence[Inference], starts: Sequence[Stand]) -> tuple[i
     chosen = min(firsts, key=lambda i: weighed[i])
     if bare not in firsts and firsts[chosen][0].chosen is not None and weighed[chosen] > base[bare]:
         start, there = starts[bare], tried[bare]  # it was not asked, and no effect does better than that
-        floors = there.floors(start.fit.point, there.problem.declared, start.floor)
+        floors = discretisation.floors(there.lab, start.fit.point, there.lab.problem.declared, start.floor)
         chosen, firsts[bare] = bare, [unsearched(start, floors)]
     first = firsts[chosen][0]
     if unasked and len(firsts[chosen]) == 1 and first.chosen is not None and first.chosen.gain < UNASKED:
@@ -112,19 +115,19 @@ def unsearched(start: Stand, floors: np.ndarray) -> Round:
     return Round(start.fit.point, start.errors, [], None, [], 1.0, start.floor, floors)
 
 
-def waits(inference: Inference) -> bool:
+def waits(search: Search) -> bool:
     """Whether most of the first fits by a method were put off: what the others leave says little of it."""
-    return inference.seen is not None and inference.seen.contest.put_off is not None
+    return search.seen is not None and search.seen.contest.put_off is not None
 
 
-def at_best(inference: Inference, start: Stand) -> float:
+def at_best(search: Search, start: Stand) -> float:
     """Score of what the declared model leaves, or the first fits of effects beside it, where these were made already and leave less."""
-    look = inference.seen
+    look = search.seen
     fits = look.least if look is not None and look.base is start.fit else []
     return min(score(squares) for squares in [start.errors, *fits])
 
 
-def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Sequence[int], handicap: Sequence[float]) -> dict[int, float]:
+def by_first_fits(tried: Sequence[Search], starts: Sequence[Stand], order: Sequence[int], handicap: Sequence[float]) -> dict[int, float]:
     """Score of what the first fits of effects leave by each method, its handicap included.
 
     Asked of another one where the first in the order promises an effect, or its residual is above the floor, and its fits leave more than
@@ -134,31 +137,34 @@ def by_first_fits(tried: Sequence[Inference], starts: Sequence[Stand], order: Se
     others while that leaves much.
     """
     first, *others = order
-    at_once = tried[first].problem.together
+    at_once = tried[first].lab.problem.together
     limit = score(starts[first].errors) + handicap[first] + 2.0 * math.log(WORSE)
     others = [i for i in others if at_best(tried[i], starts[i]) + handicap[i] <= limit]
     if not others:
         return {}
-    look = tried[first].look(starts[first].fit, starts[first].floor, until=LOOKS[0], grows=at_once)
+    look = next_effect.first_look(tried[first], starts[first].fit, starts[first].floor, until=LOOKS[0], grows=at_once)
     least = min([*look.least, starts[first].errors], key=score)
-    if tried[first].gain(starts[first].errors, least) < LEAST_GAIN and tried[first].over(starts[first]) < 1.0:
+    if (
+        comparing.gain(tried[first].lab, starts[first].errors, least) < LEAST_GAIN
+        and next_effect.over_floor(tried[first].lab, starts[first]) < 1.0
+    ):
         return {}
     left = {first: score(least) + handicap[first]}
 
     def least_by(i: int, **options: Any) -> list[np.ndarray]:
         """What a look by a method leaves at the least, which is put down."""
-        there = tried[i].look(starts[i].fit, starts[i].floor, until=LOOKS[1], **options).least
+        there = next_effect.first_look(tried[i], starts[i].fit, starts[i].floor, until=LOOKS[1], **options).least
         left[i] = score(there[0]) + handicap[i] if there else math.inf
         return there
 
-    if tried[first].may_be_noise(least):
+    if comparing.may_be_noise(tried[first].lab, least):
         return left
     for i in others:
-        if tried[i].deadline.skips("first fits by the other method", LOOKS[1]):
+        if tried[i].lab.deadline.skips("first fits by the other method", LOOKS[1]):
             break
         beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
         least_by(i, led=look.led, beyond=beyond, grows=at_once)
     for i in [] if at_once else sorted(left, key=lambda i: left[i]):
-        if not tried[i].leaves_much(least_by(i)):
+        if not refining.leaves_much(tried[i].lab, least_by(i)):
             break
     return left

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from neuido.discrepancy.inference.base_fits import BaseFits
+from neuido.discrepancy.inference import comparing
 from neuido.discrepancy.inference.floors import Floor, score
+from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit, Race
+from neuido.discrepancy.inference.search.search_state import Contest, PutOff, Start
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 
 SMALL = 2
@@ -29,9 +30,6 @@ TAKEN = (0.75, 0.55)
 """Times a declared parameter that a candidate takes from (`Candidate.takes`), at which larger sizes of it are tried too."""
 LED_FAR = 1.6
 """Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
-
-Start = tuple[Candidate, Point, np.ndarray | None]
-"""A candidate, where a fit of it begins, and about the slopes there, if they are known."""
 
 
 def _in_goes(places: Sequence[tuple[list[Start], list[Start]]], count: int) -> Iterator[list[tuple[list[Start], list[Start]]]]:
@@ -63,31 +61,6 @@ FEWER_DO = "an effect of fewer parameters leaves nothing but noise"
 OTHERS_DO = "another effect leaves nothing but noise, and its direction in the data promises little"
 
 
-class PutOff(NamedTuple):
-    """Candidates whose fits wait until another method was asked, and the fits that were made before them."""
-
-    ended: tuple[tuple[Candidate, Fit], ...]
-    starts: tuple[Start, ...]
-
-    @property
-    def keys(self) -> list[str]:
-        """Of the candidates that wait."""
-        return list(dict.fromkeys(c.key for c, *_ in self.starts))
-
-
-class Contest(NamedTuple):
-    """What fits of candidates came to; those that came close ended under the own setting, others may be quick ones (`Fit.setting`)."""
-
-    best: dict[str, tuple[Candidate, Fit]]
-    """Of each candidate, by its key."""
-    other: tuple[Candidate, Fit] | None
-    """The leading candidate's of the other sign."""
-    unfitted: dict[str, str]
-    """Why a candidate got no fit, by its key."""
-    put_off: PutOff | None = None
-    """What goes on later."""
-
-
 def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candidate, Fit]]) -> dict[str, tuple[Candidate, Fit]]:
     """The fit of least cost of each candidate, by its key, where it beats the one there is."""
     out: dict[str, tuple[Candidate, Fit]] = {}
@@ -98,276 +71,290 @@ def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candi
     return out
 
 
-class Contests(BaseFits):
-    """Where fits of candidates begin, and the fits side by side."""
+def first_slopes(
+    lab: Laboratory,
+    c: Candidate,
+    start: int,
+    free: Sequence[Parameter],
+    slopes: Mapping[int, np.ndarray],
+    columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
+    floor: Floor,
+) -> np.ndarray | None:
+    """What the screening says of the slopes of a candidate's fit; none where it probed only sizes, or they do not act in proportion."""
+    if not c.linear or c.size_parameters != c.parameters or any(p.log for p in c.parameters):
+        return None
+    coordinates = [p.coordinate(c.starts[start][p.name]) for p in c.parameters]
+    return whitened(lab, slopes, {n: columns[c.key, start][n] / coordinates for n in lab.fitted_recordings}, floor)
 
-    def first_slopes(
-        self,
-        c: Candidate,
-        start: int,
-        free: Sequence[Parameter],
-        slopes: Mapping[int, np.ndarray],
-        columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
-        floor: Floor,
-    ) -> np.ndarray | None:
-        """What the screening says of the slopes of a candidate's fit; none where it probed only sizes, or they do not act in proportion."""
-        if not c.linear or c.size_parameters != c.parameters or any(p.log for p in c.parameters):
-            return None
-        coordinates = [p.coordinate(c.starts[start][p.name]) for p in c.parameters]
-        return self.whitened(slopes, {n: columns[c.key, start][n] / coordinates for n in self.fitted_recordings}, floor)
 
-    def whitened(self, slopes: Mapping[int, np.ndarray], own: Mapping[int, np.ndarray], floor: Floor) -> np.ndarray | None:
-        """Slopes of the declared and of a candidate's parameters, {recording: (n, k)}, as fits take them; none where not all are finite."""
-        whiten = floor.whitener(self.parts)
-        J = np.concatenate([whiten(np.concatenate([slopes[n], own[n]], axis=1), n) for n in self.fitted_recordings])
-        return J if np.isfinite(J).all() else None
+def whitened(lab: Laboratory, slopes: Mapping[int, np.ndarray], own: Mapping[int, np.ndarray], floor: Floor) -> np.ndarray | None:
+    """Slopes of the declared and of a candidate's parameters, {recording: (n, k)}, as fits take them; none where not all are finite."""
+    whiten = floor.whitener(lab.parts)
+    J = np.concatenate([whiten(np.concatenate([slopes[n], own[n]], axis=1), n) for n in lab.fitted_recordings])
+    return J if np.isfinite(J).all() else None
 
-    def strong(self, c: Candidate, places: Sequence[Point], point: Point, floor: Floor) -> list[Point]:
-        """The best of some starts at full strength, of either sign, by what they leave as they are.
 
-        A part that is many times as stiff as the rest moves the body in another way than the direction of a little stiffness says, and a
-        fit that begins at a little comes down into the nearest valley.
-        """
-        begins = [{**point, **start, **self.along(c, point, {c.apart: size})} for size in (c.far, -c.far) for start in places]
-        if not begins:
-            return []
-        self.tell(f"{len(begins)} places of {c.key} at full strength")
-        costs = np.array(self.costs(begins, floor))
-        best = (min((i for i, b in enumerate(begins) if b[c.apart] * sign > 0), key=lambda i: costs[i]) for sign in (1, -1))
-        return [begins[i] for i in best if np.isfinite(costs[i])]
+def strong(lab: Laboratory, c: Candidate, places: Sequence[Point], point: Point, floor: Floor) -> list[Point]:
+    """The best of some starts at full strength, of either sign, by what they leave as they are.
 
-    def along(self, c: Candidate, point: Point, size: Mapping[str, float]) -> dict[str, float]:
-        """A size of a candidate, with the declared parameters that go with it (`Candidate.beside`) from what they are at a point."""
-        (value,) = size.values()
-        beside = [p for p in self.problem.declared if p.log and p.name in c.beside]
-        moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside[p.name] * value / p.scale) for p in beside}
-        return {**moved, **size}
+    A part that is many times as stiff as the rest moves the body in another way than the direction of a little stiffness says, and a
+    fit that begins at a little comes down into the nearest valley.
+    """
+    begins = [{**point, **start, **along(lab, c, point, {c.apart: size})} for size in (c.far, -c.far) for start in places]
+    if not begins:
+        return []
+    lab.tell(f"{len(begins)} places of {c.key} at full strength")
+    costs = np.array(lab.costs(begins, floor))
+    best = (min((i for i, b in enumerate(begins) if b[c.apart] * sign > 0), key=lambda i: costs[i]) for sign in (1, -1))
+    return [begins[i] for i in best if np.isfinite(costs[i])]
 
-    def secant(self, c: Candidate, point: Point, base: Point, slopes: Mapping[int, np.ndarray], floor: Floor) -> np.ndarray | None:
-        """About the slopes of a fit of a candidate of one size: those of the declared values at the base, and the secant from there.
 
-        None where the point has other declared values than the base, or shapes that are fitted too.
-        """
-        (p,) = c.size_parameters
-        same = all(point.get(name) == value for name, value in base.items())
-        if not same or len(c.parameters) > 1 or p.log or point[p.name] == p.value:
-            return None
-        step = p.coordinate(point[p.name]) - p.coordinate(p.value)
-        with self.memo.during("errors of fits"):
-            pairs = self.predicted([base, point], self.fitted_recordings)
-        return self.whitened(slopes, {n: (there - here)[:, None] / step for (n, _), (here, there) in pairs.items()}, floor)
+def along(lab: Laboratory, c: Candidate, point: Point, size: Mapping[str, float]) -> dict[str, float]:
+    """A size of a candidate, with the declared parameters that go with it (`Candidate.beside`) from what they are at a point."""
+    (value,) = size.values()
+    beside = [p for p in lab.problem.declared if p.log and p.name in c.beside]
+    moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside[p.name] * value / p.scale) for p in beside}
+    return {**moved, **size}
 
-    def sized(
-        self, starts: Sequence[Start], base: Fit, slopes: Mapping[int, np.ndarray], floor: Floor, *, until: float = 1.0
-    ) -> tuple[list[Start], dict[str, float]]:
-        """The best starts of each candidate, and the least share of the base fit's misfit that one leaves as it is, by key.
 
-        Candidates of few parameters and one size are tried at the sizes and in the shapes of `tried`, one simulation each. The best one is
-        kept, and of the others the best one with the base fit's, or with the declared, values. A direction has several valleys: of such
-        candidates the best start of each of some shapes is kept. Past the share `until` of the time the rest keep their starts.
-        """
-        led_far = self.moved(base.point) > LED_FAR
-        places: list[tuple[list[Start], list[Start]]] = []
-        for c in {c.key: c for c, *_ in starts}.values():
-            own = [start for start in starts if start[0] is c]
-            if len(c.size_parameters) > 1 or len(c.parameters) > SIZED or c.apart:
-                continue
-            places.append((own, own + (self.tried(own[0], base, led_far=led_far) if c.linear else self.each_as_declared(c, base.point))))
-        out = [start for start in starts if all(start[0] is not own[0][0] for own, _ in places)]
-        least: dict[str, float] = {}
-        self.tell(f"{sum(len(made) for _, made in places)} starts of {len(places)} effects")
-        for chunk in _in_goes(places, TRIED_AT_ONCE if self.problem.together else 1):
-            if self.deadline.ends(until):
-                out += [start for own, _ in chunk for start in own]
-                continue
-            before, *costs = self.costs([base.point, *(point for _, made in chunk for _, point, _ in made)], floor)
-            for _, own in chunk:
-                left, costs = costs[: len(own)], costs[len(own) :]
-                order = sorted(range(len(own)), key=lambda i: left[i])
-                c = own[0][0]
-                declared = [self.at_declared(begin) == begin for _, begin, _ in own]
-                least[c.key] = min(v / before / (BESIDE if d and led_far else 1.0) for v, d in zip(left, declared, strict=True))
-                other = [i for i in order if declared[i] != declared[order[0]] and left[i] < BESIDE * left[order[0]]]
-                by_shape = {c.shape(own[i][1]): i for i in reversed(order)} if len(c.parameters) > SMALL else {}
-                further = sorted(by_shape.values(), key=lambda i: left[i])[:SHAPES]
-                for i in dict.fromkeys([order[0], *other[:1], *further]):
-                    _, point, J = own[i]
-                    out.append((c, point, self.secant(c, point, base.point, slopes, floor) if J is None and c.linear else J))
-        return out, least
+def secant(lab: Laboratory, c: Candidate, point: Point, base: Point, slopes: Mapping[int, np.ndarray], floor: Floor) -> np.ndarray | None:
+    """About the slopes of a fit of a candidate of one size: those of the declared values at the base, and the secant from there.
 
-    def tried(self, start: Start, base: Fit, *, led_far: bool) -> list[Start]:
-        """Further starts of a candidate of one size: at larger sizes, and in the other shapes that it is screened in.
+    None where the point has other declared values than the base, or shapes that are fitted too.
+    """
+    (p,) = c.size_parameters
+    same = all(point.get(name) == value for name, value in base.items())
+    if not same or len(c.parameters) > 1 or p.log or point[p.name] == p.value:
+        return None
+    step = p.coordinate(point[p.name]) - p.coordinate(p.value)
+    with lab.memo.during("errors of fits"):
+        pairs = lab.predicted([base, point], lab.fitted_recordings)
+    return whitened(lab, slopes, {n: (there - here)[:, None] / step for (n, _), (here, there) in pairs.items()}, floor)
 
-        How a large effect acts is not what the slope at none says, and one that has shapes may be very large. Where the base fit has gone
-        far from the declared values (`led_far`) from these too and from between, for it may have made up for the effect; what stiffens a
-        body is tried with less of a modulus too, and what goes with a declared value along a valley (`Candidate.beside`) with that.
-        """
-        c, begun, _ = start
-        (p,) = c.size_parameters
-        size = abs(c.starts[0][p.name])
-        begin = {**begun, **{name: base.point.get(name, value) for name, value in self.as_declared.items()}}
-        near, middle, far, beyond = ([{p.name: p.within(sign * f * size)} for sign in p.signs] for f in (1.0, math.sqrt(FAR), FAR, FAR**2))
-        made = [{**begin, **value} for value in (far if begin == begun else near + far)]
-        if led_far:
-            made += [{**self.at_declared(begin), **value} for value in near + far]
-            made += [{**self.between(begin), **value} for value in far]
-        others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
-        made += [{**other, **value} for other in others for value in middle + far]
-        made += [{**place, **value} for place in [begin, *others] for value in beyond] if others else []
-        if c.beside:
-            made += [{**begin, **self.along(c, begin, value)} for value in near + middle + far]
-        if takes := [name for name in c.takes if name in self.as_declared]:
-            sizes = far[:1] if others else middle[:1] + far[:1]
-            less = [{name: factor * begin[name] for name in takes} for factor in TAKEN]
-            made += [{**place, **taken, **value} for taken in less for place in [begin, *others] for value in sizes]
-        return [(c, point, None) for point in made]
 
-    def each_as_declared(self, c: Candidate, point: Point) -> list[Start]:
-        """Every start of a candidate with the declared values: where one that does not act in proportion begins to act goes with these."""
-        return [(c, {**self.at_declared(point), **start}, None) for start in c.starts]
+def sized(
+    lab: Laboratory, starts: Sequence[Start], base: Fit, slopes: Mapping[int, np.ndarray], floor: Floor, *, until: float = 1.0
+) -> tuple[list[Start], dict[str, float]]:
+    """The best starts of each candidate, and the least share of the base fit's misfit that one leaves as it is, by key.
 
-    def at_declared(self, point: Point) -> Point:
-        """The point with the declared parameters, and the problem's own, as the model states them; the effects as they are."""
-        return {k: v for k, v in point.items() if "." in k} | self.as_declared
+    Candidates of few parameters and one size are tried at the sizes and in the shapes of `tried`, one simulation each. The best one is
+    kept, and of the others the best one with the base fit's, or with the declared, values. A direction has several valleys: of such
+    candidates the best start of each of some shapes is kept. Past the share `until` of the time the rest keep their starts.
+    """
+    led_far = comparing.moved(lab, base.point) > LED_FAR
+    places: list[tuple[list[Start], list[Start]]] = []
+    for c in {c.key: c for c, *_ in starts}.values():
+        own = [start for start in starts if start[0] is c]
+        if len(c.size_parameters) > 1 or len(c.parameters) > SIZED or c.apart:
+            continue
+        places.append((own, own + (tried(lab, own[0], base, led_far=led_far) if c.linear else each_as_declared(lab, c, base.point))))
+    out = [start for start in starts if all(start[0] is not own[0][0] for own, _ in places)]
+    least: dict[str, float] = {}
+    lab.tell(f"{sum(len(made) for _, made in places)} starts of {len(places)} effects")
+    for chunk in _in_goes(places, TRIED_AT_ONCE if lab.problem.together else 1):
+        if lab.deadline.ends(until):
+            out += [start for own, _ in chunk for start in own]
+            continue
+        before, *costs = lab.costs([base.point, *(point for _, made in chunk for _, point, _ in made)], floor)
+        for _, own in chunk:
+            left, costs = costs[: len(own)], costs[len(own) :]
+            order = sorted(range(len(own)), key=lambda i: left[i])
+            c = own[0][0]
+            declared = [at_declared(lab, begin) == begin for _, begin, _ in own]
+            least[c.key] = min(v / before / (BESIDE if d and led_far else 1.0) for v, d in zip(left, declared, strict=True))
+            other = [i for i in order if declared[i] != declared[order[0]] and left[i] < BESIDE * left[order[0]]]
+            by_shape = {c.shape(own[i][1]): i for i in reversed(order)} if len(c.parameters) > SMALL else {}
+            further = sorted(by_shape.values(), key=lambda i: left[i])[:SHAPES]
+            for i in dict.fromkeys([order[0], *other[:1], *further]):
+                _, point, J = own[i]
+                out.append((c, point, secant(lab, c, point, base.point, slopes, floor) if J is None and c.linear else J))
+    return out, least
 
-    def between(self, point: Point) -> Point:
-        """The point with the declared parameters half way from there to what the model states, in the coordinates that are fitted."""
-        half = {p.name: p.physical(0.5 * (p.coordinate(point.get(p.name, p.value)) + p.coordinate(p.value))) for p in self.problem.declared}
-        return {**point, **half}
 
-    def contest(
-        self,
-        free: Sequence[Parameter],
-        starts: Sequence[Start],
-        floor: Floor,
-        hopeful: Collection[str] | None = None,
-        then: Callable[[Sequence[tuple[Candidate, Fit]]], Sequence[Start]] = lambda led: (),
-        beyond: float = math.inf,
-        until: float = 1.0,
-        between: Callable[[np.ndarray], Iterable[tuple[Candidate, Fit]]] = lambda remains: (),
-        puts_off: bool = False,
-        before: Sequence[tuple[Candidate, Fit]] = (),
-    ) -> Contest:
-        """Fit the candidates side by side; fits that cannot catch up with the best one stop.
+def tried(lab: Laboratory, start: Start, base: Fit, *, led_far: bool) -> list[Start]:
+    """Further starts of a candidate of one size: at larger sizes, and in the other shapes that it is screened in.
 
-        Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all. Where the
-        first ones leave noise alone, those of the others that are not `hopeful` get no fit, and the rest one each.
+    How a large effect acts is not what the slope at none says, and one that has shapes may be very large. Where the base fit has gone
+    far from the declared values (`led_far`) from these too and from between, for it may have made up for the effect; what stiffens a
+    body is tried with less of a modulus too, and what goes with a declared value along a valley (`Candidate.beside`) with that.
+    """
+    c, begun, _ = start
+    (p,) = c.size_parameters
+    size = abs(c.starts[0][p.name])
+    begin = {**begun, **{name: base.point.get(name, value) for name, value in lab.as_declared.items()}}
+    near, middle, far, beyond = ([{p.name: p.within(sign * f * size)} for sign in p.signs] for f in (1.0, math.sqrt(FAR), FAR, FAR**2))
+    made = [{**begin, **value} for value in (far if begin == begun else near + far)]
+    if led_far:
+        made += [{**at_declared(lab, begin), **value} for value in near + far]
+        made += [{**between(lab, begin), **value} for value in far]
+    others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
+    made += [{**other, **value} for other in others for value in middle + far]
+    made += [{**place, **value} for place in [begin, *others] for value in beyond] if others else []
+    if c.beside:
+        made += [{**begin, **along(lab, c, begin, value)} for value in near + middle + far]
+    if takes := [name for name in c.takes if name in lab.as_declared]:
+        sizes = far[:1] if others else middle[:1] + far[:1]
+        less = [{name: factor * begin[name] for name in takes} for factor in TAKEN]
+        made += [{**place, **taken, **value} for taken in less for place in [begin, *others] for value in sizes]
+    return [(c, point, None) for point in made]
 
-        All of it quickly; what came close goes on under the own setting.
 
-        Args:
-            free: What is fitted beside a candidate's parameters.
-            starts: Of the fits.
-            floor: What weighs the residuals.
-            hopeful: Keys of candidates that could take something off by the screening; all where absent.
-            then: Further starts, given the best fit of each candidate in the order of their costs.
-            beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
-            until: Share of the time for the search at which fits end where they are and no others begin: the rest is for other steps.
-            between: Further fits after the first ones, given what the leading one of these leaves, where there are others to come.
-            puts_off: Whether the others wait where the first ones leave more than may be noise: it may be the wrong method.
-            before: Fits that were made before `starts` were put off (`PutOff.ended`).
-        """
-        ended = list(before)
-        best = better(ended, {})
-        unfitted: dict[str, str] = {}
-        race = Race(min((fit.cost for _, fit in ended), default=math.inf))
+def each_as_declared(lab: Laboratory, c: Candidate, point: Point) -> list[Start]:
+    """Every start of a candidate with the declared values: where one that does not act in proportion begins to act goes with these."""
+    return [(c, {**at_declared(lab, point), **start}, None) for start in c.starts]
 
-        def fitted(own: Sequence[Start]) -> None:
-            requests = []
-            for c, begin, J in own:
-                sizes = [p.name for p in c.size_parameters] if c.linear else []
-                requests.append(self.request((*free, *c.parameters), begin, until=until, race=race, slopes=J, sizes=sizes))
-            fits = list(zip((c for c, *_ in own), self.fits(requests, floor), strict=True))
-            ended.extend(fits)
-            best.update(better(fits, best))
 
-        def left() -> tuple[tuple[Candidate, Fit], np.ndarray]:
-            (leading,) = self.wholly(free, [min(best.values(), key=lambda entry: entry[1].cost)], floor, until)
-            with self.under(self.own):
-                return leading, self.mean_squares([leading[1].point], floor)[0]
+def at_declared(lab: Laboratory, point: Point) -> Point:
+    """The point with the declared parameters, and the problem's own, as the model states them; the effects as they are."""
+    return {k: v for k, v in point.items() if "." in k} | lab.as_declared
 
-        small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
-        first = list(dict.fromkeys(small))[:LEADERS] if not before else []
-        waves: list[list[Start]] = [[], [], []]
-        for entry in starts:
-            key = entry[0].key
-            waves[0 if (self.problem.together and beyond == math.inf) or key in first else 1 if key in small else 2].append(entry)
-        for i, own in enumerate(waves):
-            if best and own and self.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}", until):
-                unfitted |= {c.key: NO_TIME for wave in waves[i:] for c, *_ in wave}
+
+def between(lab: Laboratory, point: Point) -> Point:
+    """The point with the declared parameters half way from there to what the model states, in the coordinates that are fitted."""
+    half = {p.name: p.physical(0.5 * (p.coordinate(point.get(p.name, p.value)) + p.coordinate(p.value))) for p in lab.problem.declared}
+    return {**point, **half}
+
+
+def contest(
+    lab: Laboratory,
+    free: Sequence[Parameter],
+    starts: Sequence[Start],
+    floor: Floor,
+    hopeful: Collection[str] | None = None,
+    then: Callable[[Sequence[tuple[Candidate, Fit]]], Sequence[Start]] = lambda led: (),
+    beyond: float = math.inf,
+    until: float = 1.0,
+    between: Callable[[np.ndarray], Iterable[tuple[Candidate, Fit]]] = lambda remains: (),
+    puts_off: bool = False,
+    before: Sequence[tuple[Candidate, Fit]] = (),
+) -> Contest:
+    """Fit the candidates side by side; fits that cannot catch up with the best one stop.
+
+    Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all. Where the
+    first ones leave noise alone, those of the others that are not `hopeful` get no fit, and the rest one each.
+
+    All of it quickly; what came close goes on under the own setting.
+
+    Args:
+        free: What is fitted beside a candidate's parameters.
+        starts: Of the fits.
+        floor: What weighs the residuals.
+        hopeful: Keys of candidates that could take something off by the screening; all where absent.
+        then: Further starts, given the best fit of each candidate in the order of their costs.
+        beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
+        until: Share of the time for the search at which fits end where they are and no others begin: the rest is for other steps.
+        between: Further fits after the first ones, given what the leading one of these leaves, where there are others to come.
+        puts_off: Whether the others wait where the first ones leave more than may be noise: it may be the wrong method.
+        before: Fits that were made before `starts` were put off (`PutOff.ended`).
+    """
+    ended = list(before)
+    best = better(ended, {})
+    unfitted: dict[str, str] = {}
+    race = Race(min((fit.cost for _, fit in ended), default=math.inf))
+
+    def fitted(own: Sequence[Start]) -> None:
+        requests = []
+        for c, begin, J in own:
+            sizes = [p.name for p in c.size_parameters] if c.linear else []
+            requests.append(lab.request((*free, *c.parameters), begin, until=until, race=race, slopes=J, sizes=sizes))
+        fits = list(zip((c for c, *_ in own), lab.fits(requests, floor), strict=True))
+        ended.extend(fits)
+        best.update(better(fits, best))
+
+    def left() -> tuple[tuple[Candidate, Fit], np.ndarray]:
+        (leading,) = wholly(lab, free, [min(best.values(), key=lambda entry: entry[1].cost)], floor, until)
+        with lab.under(lab.own):
+            return leading, lab.mean_squares([leading[1].point], floor)[0]
+
+    small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
+    first = list(dict.fromkeys(small))[:LEADERS] if not before else []
+    waves: list[list[Start]] = [[], [], []]
+    for entry in starts:
+        key = entry[0].key
+        waves[0 if (lab.problem.together and beyond == math.inf) or key in first else 1 if key in small else 2].append(entry)
+    for i, own in enumerate(waves):
+        if best and own and lab.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}", until):
+            unfitted |= {c.key: NO_TIME for wave in waves[i:] for c, *_ in wave}
+            break
+        leading, remains = left() if own and best else (None, None)
+        if remains is not None and i == 1 and (further := better(between(remains), best)):
+            best |= further
+            race.best = min(race.best, *(fit.cost for _, fit in further.values()))
+            leading, remains = left()
+        if remains is not None and score(remains) > beyond:
+            unfitted = {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave}
+            return Contest(*closely(lab, free, best, None, floor, until), unfitted)
+        if puts_off and leading is not None and remains is not None and not comparing.may_be_noise(lab, remains):
+            waiting = tuple(start for wave in waves[i:] for start in wave)
+            unfitted = {c.key: NO_TIME for c, *_ in waiting}
+            return Contest({**best, leading[0].key: leading}, None, unfitted, PutOff(tuple(ended), waiting))
+        if remains is not None and comparing.is_noise(lab, remains):
+            if own is waves[2]:
+                unfitted |= {c.key: FEWER_DO for c, *_ in own}
                 break
-            leading, remains = left() if own and best else (None, None)
-            if remains is not None and i == 1 and (further := better(between(remains), best)):
-                best |= further
-                race.best = min(race.best, *(fit.cost for _, fit in further.values()))
-                leading, remains = left()
-            if remains is not None and score(remains) > beyond:
-                unfitted = {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave}
-                return Contest(*self.closely(free, best, None, floor, until), unfitted)
-            if puts_off and leading is not None and remains is not None and not self.may_be_noise(remains):
-                waiting = tuple(start for wave in waves[i:] for start in wave)
-                unfitted = {c.key: NO_TIME for c, *_ in waiting}
-                return Contest({**best, leading[0].key: leading}, None, unfitted, PutOff(tuple(ended), waiting))
-            if remains is not None and self.is_noise(remains):
-                if own is waves[2]:
-                    unfitted |= {c.key: FEWER_DO for c, *_ in own}
-                    break
-                if hopeful is not None:
-                    unfitted |= {c.key: OTHERS_DO for c, *_ in own if c.key not in hopeful}
-                    once = {entry[0].key: entry for entry in reversed(own) if entry[0].key in hopeful}
-                    own = [entry for entry in own if once.get(entry[0].key) is entry]
-            fitted(own)
-        if further := then(sorted(best.values(), key=lambda entry: entry[1].cost)):
-            fitted(further)
-        other = self.other_sign(free, best, ended, floor)
-        if other is not None and other[1].cost < best[other[0].key][1].cost:
-            best[other[0].key], other = other, best[other[0].key]
-        return Contest(*self.closely(free, best, other, floor, until), unfitted)
+            if hopeful is not None:
+                unfitted |= {c.key: OTHERS_DO for c, *_ in own if c.key not in hopeful}
+                once = {entry[0].key: entry for entry in reversed(own) if entry[0].key in hopeful}
+                own = [entry for entry in own if once.get(entry[0].key) is entry]
+        fitted(own)
+    if further := then(sorted(best.values(), key=lambda entry: entry[1].cost)):
+        fitted(further)
+    other = other_sign(lab, free, best, ended, floor)
+    if other is not None and other[1].cost < best[other[0].key][1].cost:
+        best[other[0].key], other = other, best[other[0].key]
+    return Contest(*closely(lab, free, best, other, floor, until), unfitted)
 
-    def closely(
-        self,
-        free: Sequence[Parameter],
-        best: Mapping[str, tuple[Candidate, Fit]],
-        other: tuple[Candidate, Fit] | None,
-        floor: Floor,
-        until: float,
-    ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
-        """Quick fits that came close once more under the own setting, from where they ended; the best first, and not all of many."""
-        fits = sorted(best.values(), key=lambda entry: entry[1].cost)
-        near = [entry for entry in fits if entry[1].cost < IN_REACH * fits[0][1].cost][:CLOSELY]
-        ended = self.wholly(free, near if other is None else [*near, other], floor, until)
-        again = None if other is None else ended.pop()
-        return {**best, **{c.key: (c, fit) for c, fit in ended}}, again
 
-    def wholly(
-        self, free: Sequence[Parameter], fits: Sequence[tuple[Candidate, Fit]], floor: Floor, until: float
-    ) -> list[tuple[Candidate, Fit]]:
-        """Quick fits once more under the own setting, from where they ended; as they are where nothing runs there.
+def closely(
+    lab: Laboratory,
+    free: Sequence[Parameter],
+    best: Mapping[str, tuple[Candidate, Fit]],
+    other: tuple[Candidate, Fit] | None,
+    floor: Floor,
+    until: float,
+) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
+    """Quick fits that came close once more under the own setting, from where they ended; the best first, and not all of many."""
+    fits = sorted(best.values(), key=lambda entry: entry[1].cost)
+    near = [entry for entry in fits if entry[1].cost < IN_REACH * fits[0][1].cost][:CLOSELY]
+    ended = wholly(lab, free, near if other is None else [*near, other], floor, until)
+    again = None if other is None else ended.pop()
+    return {**best, **{c.key: (c, fit) for c, fit in ended}}, again
 
-        Without a race: who is in a class is said by where they end.
-        """
-        if self.setting == self.own:
-            return list(fits)
-        with self.under(self.own):
-            options = {"until": until, "iterations": AT_MOST}
-            requests = [self.request((*free, *c.parameters), fit.point, slopes=fit.slopes, **options) for c, fit in fits]
-            ends = self.fits(requests, floor)
-        return [(c, end if np.isfinite(end.cost) else fit) for (c, fit), end in zip(fits, ends, strict=True)]
 
-    def other_sign(
-        self, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], ended: Sequence[tuple[Candidate, Fit]], floor: Floor
-    ) -> tuple[Candidate, Fit] | None:
-        """The leading candidate's best fit of the other sign, where its signs are apart.
+def wholly(
+    lab: Laboratory, free: Sequence[Parameter], fits: Sequence[tuple[Candidate, Fit]], floor: Floor, until: float
+) -> list[tuple[Candidate, Fit]]:
+    """Quick fits once more under the own setting, from where they ended; as they are where nothing runs there.
 
-        A stiff end of a body is much like a soft rest of it, and the one that comes down faster has the other given up: it goes on alone.
-        """
-        if not best:
-            return None
-        lead, first = min(best.values(), key=lambda entry: entry[1].cost)
-        beyond = [fit for c, fit in ended if lead.apart and c.key == lead.key and fit.point[lead.apart] * first.point[lead.apart] < 0]
-        if not beyond:
-            return None
-        fit = min(beyond, key=lambda fit: fit.cost)
-        if not fit.converged and np.isfinite(fit.cost):
-            (fit,) = self.fits([self.request((*free, *lead.parameters), fit.point)], floor)
-        return lead, fit
+    Without a race: who is in a class is said by where they end.
+    """
+    if lab.setting == lab.own:
+        return list(fits)
+    with lab.under(lab.own):
+        options = {"until": until, "iterations": AT_MOST}
+        requests = [lab.request((*free, *c.parameters), fit.point, slopes=fit.slopes, **options) for c, fit in fits]
+        ends = lab.fits(requests, floor)
+    return [(c, end if np.isfinite(end.cost) else fit) for (c, fit), end in zip(fits, ends, strict=True)]
+
+
+def other_sign(
+    lab: Laboratory,
+    free: Sequence[Parameter],
+    best: Mapping[str, tuple[Candidate, Fit]],
+    ended: Sequence[tuple[Candidate, Fit]],
+    floor: Floor,
+) -> tuple[Candidate, Fit] | None:
+    """The leading candidate's best fit of the other sign, where its signs are apart.
+
+    A stiff end of a body is much like a soft rest of it, and the one that comes down faster has the other given up: it goes on alone.
+    """
+    if not best:
+        return None
+    lead, first = min(best.values(), key=lambda entry: entry[1].cost)
+    beyond = [fit for c, fit in ended if lead.apart and c.key == lead.key and fit.point[lead.apart] * first.point[lead.apart] < 0]
+    if not beyond:
+        return None
+    fit = min(beyond, key=lambda fit: fit.cost)
+    if not fit.converged and np.isfinite(fit.cost):
+        (fit,) = lab.fits([lab.request((*free, *lead.parameters), fit.point)], floor)
+    return lead, fit

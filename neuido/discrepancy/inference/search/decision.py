@@ -8,14 +8,16 @@ import numpy as np
 
 from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, times_over
 from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, RoundRecord, as_candidate, described, place
+from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
+from neuido.discrepancy.inference.search import judging, next_effect
 from neuido.discrepancy.inference.search.judging import STANDS_OUT
-from neuido.discrepancy.inference.search.rounds import Inference
+from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 
 
 def decided(
-    inference: Inference,
+    lab: Laboratory,
     before: np.ndarray,
     found: Sequence[Trial],
     steps: Sequence[Round],
@@ -27,7 +29,7 @@ def decided(
     """Return the answer, and why the recordings say too little or what is wrong with them.
 
     Args:
-        inference: The method that the answer goes by.
+        lab: The method that the answer goes by.
         before: Mean squares of what the declared model leaves of each part.
         found: The effects that were named.
         steps: The rounds of the answer.
@@ -40,7 +42,7 @@ def decided(
         return "unfinished", []
     if wrong:
         return "insufficient", list(wrong)
-    missing = bool(found) or first.unsure or inference.is_unexplained(first)
+    missing = bool(found) or first.unsure or next_effect.is_unexplained(lab, first)
     if missing and blind:
         return "insufficient", ["no other setting of the simulation runs there, so that its own error is not known"]
     if found:
@@ -48,32 +50,32 @@ def decided(
         return "class" if several else "effect", []
     if missing:
         return "unknown", []
-    if not enough(inference):
+    if not enough(lab):
         return "insufficient", ["there are few data for the figures that are free"]
-    noisy = times_over(before, inference.noise_squares)
+    noisy = times_over(before, lab.noise_squares)
     if noisy > STANDS_OUT:
         return "insufficient", [f"what is left is {noisy:.0f} times the noise, and the discretisation alone may make as much"]
     return "none", []
 
 
-def enough(inference: Inference) -> bool:
+def enough(lab: Laboratory) -> bool:
     """Whether there are many more data than parameters in every part."""
-    return all(int(p.rows.sum()) > 3 * len(inference.problem.declared) + 10 for p in inference.parts)
+    return all(int(p.rows.sum()) > 3 * len(lab.problem.declared) + 10 for p in lab.parts)
 
 
 def case_of(
-    inference: Inference, before: Stand, after: Stand, rounds: Sequence[Round], answer: str, why: Sequence[str], facts: Mapping[str, Any]
+    lab: Laboratory, before: Stand, after: Stand, rounds: Sequence[Round], answer: str, why: Sequence[str], facts: Mapping[str, Any]
 ) -> CaseRecord:
     """Return all that the decision of a diagnosis rests on."""
-    problem, journal, parts = inference.problem, inference.journal, inference.parts
+    problem, journal, parts = lab.problem, lab.journal, lab.parts
     declared, candidates = described(problem)
-    stands = [journal.fit(inference.own, s.fit.point, None, s, parts) for s in (before, after)]
+    stands = [journal.fit(lab.own, s.fit.point, None, s, parts) for s in (before, after)]
     return CaseRecord(
         problem.name,
-        inference.own,
+        lab.own,
         problem.settings > 1,
         tuple((p.recording, bool(p.fitted), int(p.rows.sum()), p.name) for p in parts),
-        tuple((r.name, r.role, len(r.y), inference.noise_of(n), inference.noise_from(n)) for n, r in enumerate(problem.recordings)),
+        tuple((r.name, r.role, len(r.y), lab.noise_of(n), lab.noise_from(n)) for n, r in enumerate(problem.recordings)),
         declared,
         candidates,
         tuple(journal.bases),
@@ -84,7 +86,7 @@ def case_of(
         tuple(facts["found"]),
         tuple(why),
         dict(facts),
-        {step: asdict(w) for step, w in inference.memo.work.items()},
+        {step: asdict(w) for step, w in lab.memo.work.items()},
     )
 
 
@@ -102,80 +104,70 @@ class Decision:
     """Numbers of the judged rounds in which another effect, or another class, is named than when they were made."""
 
 
-class StoredProblem(Problem):
-    """A problem of which only what was stored is known; it predicts nothing."""
-
-    def __init__(self, case: CaseRecord) -> None:
-        """Take over the parameters, candidates and recordings of a case."""
-        declared = tuple(Parameter(**p) for p in case.declared)
-        recordings = tuple(
-            Recording(name, role, np.zeros(count), noise, np.zeros(count, int), np.linspace(0.0, 1.0, count), origin)
-            for name, role, count, noise, origin in case.recordings
-        )
-        settings = 2 if case.discretised else 1
-        super().__init__(case.name, "", "", declared, (), tuple(map(as_candidate, case.candidates)), recordings, settings)
-
-
-class StoredInference(Inference):
-    """The judgement of stored rounds: what it would simulate is looked up.
+class StoredEnds:
+    """`search_state.Ends` as a journal stored them for one judged round.
 
     Args:
-        case: What was stored.
-        method: The method whose rounds are judged.
+        lab: The method whose round it is.
+        candidates: All of the case, by key.
+        record: What was stored.
     """
 
-    def __init__(self, case: CaseRecord, method: int) -> None:
-        super().__init__(StoredProblem(case))
-        self.own = self.setting = method
-        self.parts = stored_parts(case)
-        self.fitted = [p.fitted for p in self.parts]
-        self.scored_recordings = list(dict.fromkeys(p.recording for p in self.parts))
-        self.fitted_recordings = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
-        self.noise_squares = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
-        self.by_key = {c.key: c for c in self.problem.candidates}
-        self._stands: list[Stand] = []
-        self._finished: list[tuple[Stand, Stand]] = []
-        self._alone: dict[tuple, np.ndarray] = {}
+    def __init__(self, lab: Laboratory, candidates: Mapping[str, Candidate], record: RoundRecord) -> None:
+        self.best: dict[str, tuple[Candidate, Fit]] = {}
+        self.stands: list[Stand] = []
+        self.ends: list[tuple[Stand, Stand]] = []
+        """Fits that went on to their ends, and these."""
+        self.left: dict[tuple, np.ndarray] = {}
+        """What one simulation leaves, by `journal.place`."""
+        self.lab = lab
+        for fit in record.fits:
+            c, stand = candidates[fit.effects[-1]], self._stand(fit)
+            self.best[c.key] = (c, stand.fit)
+            self.stands.append(stand)
+            if fit.finished is not None:
+                self.ends.append((stand, self._stand(fit.finished)))
 
-    def again(self, r: RoundRecord) -> Round:
-        """Judge a stored round."""
-        best: dict[str, tuple[Candidate, Fit]] = {}
-        self._stands, self._finished, self._alone = [], [], {}
-        for record in r.fits:
-            c, stand = self.by_key[record.effects[-1]], self.stand_of(record)
-            best[c.key] = (c, stand.fit)
-            self._stands.append(stand)
-            if record.finished is not None:
-                self._finished.append((stand, self.stand_of(record.finished)))
-        floor = self.floor_of(np.zeros(len(self.parts)))
-        empty = Round(
-            r.base, np.array(r.errors), [], None, [], 1.0, floor, np.array(r.floors), null=np.array(r.null), unfitted=dict(r.unfitted)
-        )
-        return self.judge(empty, best, _Drawn(np.array(r.exact_null)))
-
-    def stand_of(self, record: FitRecord) -> Stand:
-        """Return the stand of a record, without its arrays."""
-        fit = Fit(record.point, record.names, record.cost, np.empty(0), record.evaluations, record.converged, setting=record.setting)
-        stand = Stand(fit, self.floor_of(np.array(record.spread)), np.array(record.errors))
+    def _stand(self, record: FitRecord) -> Stand:
+        """Return the stand of a record, and note what one simulation leaves there."""
+        stand = stand_of(self.lab, record)
         if record.alone is not None:
-            self._alone[place(self.own, stand)] = np.array(record.alone)
+            self.left[place(self.lab.own, stand)] = np.array(record.alone)
         return stand
 
-    def floor_of(self, spread: np.ndarray) -> Floor:
-        """Return a floor of which the mean squares that the settings differ by are known."""
-        by_row = {n: np.zeros(len(self.problem.recordings[n].y)) for n in self.scored_recordings}
-        for part, square in zip(self.parts, spread, strict=True):
-            by_row[part.recording][part.rows] = np.sqrt(square)
-        return Floor({n: self.noise_of(n) for n in by_row}, {}, {}, by_row)
-
     def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor, *, every: bool = False) -> list[Stand]:
-        return self._stands
+        return self.stands
 
     def finished(self, named: Stand) -> Stand:
-        return next((end for begun, end in self._finished if begun is named), named)
+        return next((end for begun, end in self.ends if begun is named), named)
 
     def alone(self, stand: Stand) -> np.ndarray:
-        return self._alone.get(place(self.own, stand), np.full(len(self.parts), np.inf))
+        return self.left.get(place(self.lab.own, stand), np.full(len(self.lab.parts), np.inf))
+
+
+def stored_problem(case: CaseRecord) -> Problem:
+    """Return a problem of which only what was stored is known; it predicts nothing."""
+    declared = tuple(Parameter(**p) for p in case.declared)
+    recordings = tuple(
+        Recording(name, role, np.zeros(count), noise, np.zeros(count, int), np.linspace(0.0, 1.0, count), origin)
+        for name, role, count, noise, origin in case.recordings
+    )
+    settings = 2 if case.discretised else 1
+    return Problem(case.name, "", "", declared, (), tuple(map(as_candidate, case.candidates)), recordings, settings)
+
+
+def stand_of(lab: Laboratory, record: FitRecord) -> Stand:
+    """Return the stand of a record, without its arrays."""
+    fit = Fit(record.point, record.names, record.cost, np.empty(0), record.evaluations, record.converged, setting=record.setting)
+    return Stand(fit, floor_of(lab, np.array(record.spread)), np.array(record.errors))
+
+
+def floor_of(lab: Laboratory, spread: np.ndarray) -> Floor:
+    """Return a floor of which the mean squares that the settings differ by are known."""
+    by_row = {n: np.zeros(len(lab.problem.recordings[n].y)) for n in lab.scored_recordings}
+    for part, square in zip(lab.parts, spread, strict=True):
+        by_row[part.recording][part.rows] = np.sqrt(square)
+    return Floor({n: lab.noise_of(n) for n in by_row}, {}, {}, by_row)
 
 
 class _Drawn:
@@ -201,27 +193,39 @@ def stored_parts(case: CaseRecord) -> list[Part]:
     return parts
 
 
+def judged_again(lab: Laboratory, candidates: Mapping[str, Candidate], r: RoundRecord) -> Round:
+    """Return a stored round as the rules judge it now."""
+    ends = StoredEnds(lab, candidates, r)
+    floor = floor_of(lab, np.zeros(len(lab.parts)))
+    empty = Round(
+        r.base, np.array(r.errors), [], None, [], 1.0, floor, np.array(r.floors), null=np.array(r.null), unfitted=dict(r.unfitted)
+    )
+    return judging.judge(Search(lab, ends), empty, ends.best, _Drawn(np.array(r.exact_null)))
+
+
 def decide(case: CaseRecord) -> Decision:
     """Return what the rules say of stored fits, without a simulation.
 
     Every judged round is judged again. Where one comes out as it did, the steps of the answer are what the search made of it; where it does
     not, the step is the round as it comes out now, and no further step follows from it.
     """
-    methods = {m: StoredInference(case, m) for m in {case.method, *(r.method for r in case.judged)}}
-    again = [methods[r.method].again(r) for r in case.judged]
+    problem, parts = stored_problem(case), stored_parts(case)
+    candidates = {c.key: c for c in problem.candidates}
+    methods = {m: Laboratory(problem, setting=m, parts=parts) for m in {case.method, *(r.method for r in case.judged)}}
+    again = [judged_again(methods[r.method], candidates, r) for r in case.judged]
     differs = [
         i
         for i, (r, now) in enumerate(zip(case.judged, again, strict=True))
         if (now.chosen.candidate.key if now.chosen else None) != r.chosen or tuple(t.candidate.key for t in now.members) != r.members
     ]
-    inference = methods[case.method]
+    lab = methods[case.method]
     steps: list[Round] = []
     for step in case.steps:
-        floor = inference.floor_of(np.zeros(len(inference.parts)))
+        floor = floor_of(lab, np.zeros(len(lab.parts)))
         if step.judged in differs:
             steps.append(again[step.judged])
             break
-        named = {key: Trial(inference.by_key[key], inference.stand_of(case.after), 0.0) for key in (*step.members, step.chosen) if key}
+        named = {key: Trial(candidates[key], stand_of(lab, case.after), 0.0) for key in (*step.members, step.chosen) if key}
         made = Round(step.base, np.array(step.errors), list(named.values()), None, [], 1.0, floor, np.array(step.floors))
         chosen = named[step.chosen] if step.chosen else None
         steps.append(replace(made, chosen=chosen, members=[named[key] for key in step.members], unsure=step.unsure))
@@ -230,7 +234,7 @@ def decide(case: CaseRecord) -> Decision:
     found = [r.chosen for r in steps if r.chosen is not None and r.chosen.candidate.key in kept]
     steps = [r for r in steps if r.chosen is None or r.chosen.candidate.key in kept]
     cut, wrong, blind = (case.facts[key] for key in ("cut", "wrong", "blind"))
-    answer, why = decided(inference, np.array(case.before.errors), found, steps, cut=cut, wrong=wrong, blind=blind)
+    answer, why = decided(lab, np.array(case.before.errors), found, steps, cut=cut, wrong=wrong, blind=blind)
     if answer not in ("effect", "class"):
         return Decision(answer, tuple(why), (), (), tuple(differs))
     own = [r for r in steps if r.chosen is not None]

@@ -8,11 +8,12 @@ import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from neuido.discrepancy.inference.base_fits import BaseFits
+from neuido.discrepancy.inference import comparing, directions, discretisation
 from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial
+from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
+from neuido.discrepancy.inference.search import judging
 from neuido.discrepancy.inference.search.judging import IMPLAUSIBLE
-from neuido.discrepancy.inference.search.rounds import Inference
 from neuido.discrepancy.problems.problem import Parameter
 
 QUANTILE = 0.95
@@ -24,7 +25,7 @@ NEARBY = 0.02
 """Sum of squares of the amounts of the other settings up to which the data lie on the setting in use."""
 
 
-def intervals(laboratory: BaseFits, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
+def intervals(lab: Laboratory, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
     """90 % intervals of the parameters of a fit that leaves `errors`, mean squares of the parts.
 
     Noise, nuisances and the differences of the settings count to first order, as the fit has them. What no difference shows is estimated
@@ -33,12 +34,12 @@ def intervals(laboratory: BaseFits, fit: Fit, floor: Floor, errors: np.ndarray) 
     The residual is of the part where it is largest beside it: where a fit has taken the error of the solver into its parameters, only what
     was held out shows it. A parameter that does nothing may have any value.
     """
-    parameters = [laboratory.problem.parameter(name) for name in fit.names]
-    above = np.maximum(errors - laboratory.noise_squares, 0.0)
-    variances = _first_order(laboratory, parameters, fit, floor)
-    away = float(np.sum(laboratory.amounts(fit.point, floor) ** 2))
-    if parameters and (away > NEARBY or not laboratory.is_noise(errors)):
-        refits = laboratory.refits(fit.point, parameters, floor)
+    parameters = [lab.problem.parameter(name) for name in fit.names]
+    above = np.maximum(errors - lab.noise_squares, 0.0)
+    variances = _first_order(lab, parameters, fit, floor)
+    away = float(np.sum(lab.amounts(fit.point, floor) ** 2))
+    if parameters and (away > NEARBY or not comparing.is_noise(lab, errors)):
+        refits = discretisation.refits(lab, fit.point, parameters, floor)
         if refits:
             room = max(_room(above, np.mean([squares for _, squares in refits], axis=0)), min(away, ROOM))
             shifts = np.array([[p.coordinate(f.point[p.name]) - p.coordinate(fit.point[p.name]) for p in parameters] for f, _ in refits])
@@ -62,20 +63,20 @@ def _widened(count: int) -> float:
     return float(student.ppf(QUANTILE, count)) / NORMAL
 
 
-def _first_order(laboratory: BaseFits, parameters: Sequence[Parameter], fit: Fit, floor: Floor) -> np.ndarray:
+def _first_order(lab: Laboratory, parameters: Sequence[Parameter], fit: Fit, floor: Floor) -> np.ndarray:
     """Variances of the coordinates through the slopes, the nuisances and the amounts of the settings' differences marginalised.
 
     The size of the errors is that of the residual: the weights go by what the settings differ by, which the fit may have taken out.
     """
     if not parameters:
         return np.empty(0)
-    whiten, recordings = floor.whitener(laboratory.parts), laboratory.fitted_recordings
-    slopes = laboratory.slopes(parameters, fit.point, recordings, step=0.1)
+    whiten, recordings = floor.whitener(lab.parts), lab.fitted_recordings
+    slopes = directions.slopes(lab, parameters, fit.point, recordings, step=0.1)
     J = np.concatenate([whiten(slopes[n], n) for n in recordings])
     known = np.isfinite(J).all(axis=0)  # beside a point where the model just runs it may not: then nothing is known of the parameter
     gain = np.linalg.pinv(np.where(known, J, 0.0))
     gain[~(known & J.any(axis=0))] = np.inf
-    left = np.concatenate([whiten(laboratory.residual(fit.point, n), n) for n in recordings])
+    left = np.concatenate([whiten(lab.residual(fit.point, n), n) for n in recordings])
     return np.sum(gain**2, axis=1) * float(np.mean(left**2))
 
 
@@ -97,13 +98,13 @@ class Hidden(NamedTuple):
     """Size; none: any within the effect's range."""
 
 
-def findings(inference: Inference, at: Stand) -> list[str]:
+def findings(lab: Laboratory, at: Stand) -> list[str]:
     """Return what is wrong with fitted figures of the declared model, in words: those at a bound, and those far from what was declared.
 
     A figure counts where the data tell it: put back to what is plausible, the others as they are, the fit is worse by more than chance.
     """
     point, out = at.fit.point, []
-    for p in inference.problem.declared:
+    for p in lab.problem.declared:
         value = point.get(p.name, p.value)
         said = f"{p.name} would be {value:.3g} {p.unit} (declared: {p.value:.3g} {p.unit})"
         ends = [
@@ -113,7 +114,7 @@ def findings(inference: Inference, at: Stand) -> list[str]:
         if not ends and ratio <= IMPLAUSIBLE:
             continue
         back = {**point, p.name: min(max(value, p.value / IMPLAUSIBLE), p.value * IMPLAUSIBLE) if ratio > IMPLAUSIBLE else p.value}
-        if inference.costs([back], at.floor)[0] - inference.costs([point], at.floor)[0] < TOLD:
+        if lab.costs([back], at.floor)[0] - lab.costs([point], at.floor)[0] < TOLD:
             continue
         if ends:
             out.append(f"{said}, the {ends[0]} end of what is possible")
@@ -128,33 +129,33 @@ def _is_at(p: Parameter, value: float, side: str) -> bool:
     return abs(value - bound) <= AT_BOUND * max(abs(bound), 0.0 if p.log else p.scale)
 
 
-def hidden(inference: Inference, at: Stand, r: Round, found: Sequence[Trial] = ()) -> list[Hidden]:
+def hidden(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()) -> list[Hidden]:
     """The sizes up to which effects would not have been named where a model stands.
 
     To first order: an effect is seen where what the fitted figures do not make up for of its motion adds to the residual by as much as a
     named one must take away. Directions are those of the screening of a round, so that next to nothing is simulated anew.
 
     Args:
-        inference: What has looked.
+        lab: What has looked.
         at: Where the model stands.
         r: The round that looked last.
         found: The effects that the model has.
     """
-    problem, recordings = inference.problem, inference.fitted_recordings
+    problem, recordings = lab.problem, lab.fitted_recordings
     taken = {t.candidate.name for t in found}
     candidates = [c for c in problem.candidates if c.linear]
-    if not candidates or not inference.runs(at.fit.point):
+    if not candidates or not lab.runs(at.fit.point):
         return []
     own = {name.partition(".")[0] for name in r.base if "." in name}
     free = (*problem.declared, *(p for t in found if t.candidate.name in own for p in t.candidate.parameters))
-    with inference.quickly(r.base, r.floor):
-        slopes = inference.slopes(free, r.base, recordings)
-        columns = inference.columns(r.base, candidates, recordings)
+    with discretisation.quickly(lab, r.base, r.floor):
+        slopes = directions.slopes(lab, free, r.base, recordings)
+        columns = directions.candidate_columns(lab, r.base, candidates, recordings)
     beside = [columns[t.candidate.key, 0] for t in found if (t.candidate.key, 0) in columns and t.candidate.name not in own]
-    past = inference.past({n: np.concatenate([slopes[n], *(c[n] for c in beside)], axis=1) for n in recordings}, at.floor)
-    left = past({n: inference.residual(at.fit.point, n) for n in recordings})
+    past = directions.past_slopes(lab, {n: np.concatenate([slopes[n], *(c[n] for c in beside)], axis=1) for n in recordings}, at.floor)
+    left = past({n: lab.residual(at.fit.point, n) for n in recordings})
     size = max(math.sqrt(float(np.mean(left**2))), 1.0) * math.sqrt(len(left))
-    seen = math.sqrt(math.exp(2.0 * inference.usual_gain(r)) - 1.0) * size
+    seen = math.sqrt(math.exp(2.0 * judging.usual_gain(lab, r)) - 1.0) * size
     least: dict[tuple[str, str], Hidden] = {}
     for c in candidates:
         if c.name in taken:
@@ -181,13 +182,13 @@ def would_help(kind: str, *, discretised: bool) -> list[str]:
     return out
 
 
-def unable(inference: Inference) -> Mapping[str, list[str]]:
+def unable(lab: Laboratory) -> Mapping[str, list[str]]:
     """The names of the other settings that do not run where the model stands, by recording."""
-    problem = inference.problem
-    return {problem.recordings[n].name: [problem.setting_name(s) for s in own] for n, own in inference.unable.items() if own}
+    problem = lab.problem
+    return {problem.recordings[n].name: [problem.setting_name(s) for s in own] for n, own in lab.unable.items() if own}
 
 
-def blind_to_settings(inference: Inference) -> bool:
+def blind_to_settings(lab: Laboratory) -> bool:
     """Whether no other setting runs in some recording, so that its discretisation error is not known."""
-    others = inference.problem.others(inference.setting)
-    return bool(others) and any(len(own) == len(others) for own in inference.unable.values())
+    others = lab.problem.others(lab.setting)
+    return bool(others) and any(len(own) == len(others) for own in lab.unable.values())

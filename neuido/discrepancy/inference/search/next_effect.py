@@ -1,0 +1,288 @@
+"""One step of a diagnosis: screen every candidate, fit the best, and test the best one's gain against chance and floors.
+
+The order is that of protocols for model discrepancy: the base fit with its nuisances; the discretisation error from several settings;
+every candidate's direction in the data and its gain once the declared parameters are refitted; full fits of the best; the gain on
+recordings that were held out against a parametric bootstrap of the largest gain.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from neuido.discrepancy.inference import bootstrap, comparing, directions, discretisation
+from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, score, times_over
+from neuido.discrepancy.inference.laboratory import Laboratory
+from neuido.discrepancy.inference.least_squares import Fit
+from neuido.discrepancy.inference.search import contests, judging, prospects, refining, stand_ins
+from neuido.discrepancy.inference.search.contests import MANY, better
+from neuido.discrepancy.inference.search.judging import LED_AWAY, WITHIN
+from neuido.discrepancy.inference.search.refining import MEASURED, NEAR
+from neuido.discrepancy.inference.search.search_state import Look, Search
+from neuido.discrepancy.problems.problem import Candidate, Problem
+
+CONFIRMED = 0.8
+"""Share of the time for the search at which the first fits of a method end that is asked after another one named an effect: what is left is
+for a second one."""
+PLAIN, AS_WELL = 2, 1.2
+"""Places where fits with an effect ended at which the model is weighed without it, and times the error of the base fit in the fitted
+recordings up to which it stands there instead."""
+MEMBERS = 3
+"""Members of a class where whose fits ended the model is weighed without them."""
+UNEXPLAINED = 2.0
+"""Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
+UNEXPLAINED_EXACT = 3.0
+"""The same where nothing is discretised: the noise that a folder states is an estimate."""
+
+
+def new_search(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0, **options: Any) -> Search:
+    """Return a search that has looked at nothing yet; options of `Laboratory`, and `keep`, `draws` and `seed` of `Search`."""
+    lab = Laboratory(problem, **options)
+    return Search(lab, judging.SimulatedEnds(lab), keep, draws, seed)
+
+
+def unexplained(lab: Laboratory) -> float:
+    """Times its floor above which a residual that no effect explains is called unknown."""
+    unsure = max(lab.noise_uncertainty(n) for n in lab.scored_recordings)  # a residual of a noise that is not known may be noise
+    return (UNEXPLAINED if lab.problem.settings > 1 else UNEXPLAINED_EXACT) * (1.0 + 2.0 * unsure)
+
+
+def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival: Round | None = None, *, most: float = math.inf) -> Round:
+    """Look for one more effect beside those that were found.
+
+    Args:
+        base: Where the model stands.
+        floor: Noise and discretisation there, as `stand` gives them.
+        found: The effects so far.
+        rival: That of another solver which named an effect: what led there and the first of the screening get a fit.
+        most: Parameters that a candidate may have.
+    """
+    lab = search.lab
+    first = rival is None and not found
+    led, until = (None, 1.0) if rival is None else (rival.led, CONFIRMED)
+    look = first_look(search, base, floor, found, led, most=most, until=until)
+    candidates, free, slopes, columns, chosen, *_ = look.asked
+    best, other, errors = dict(look.contest.best), look.contest.other, lab.mean_squares([base.point], floor)[0]
+    if not lab.deadline.skips("refining the best fits"):
+        best |= stand_ins.limits(lab, free, best, candidates, floor)
+        best |= refining.polish(lab, free, best, base, floor, rival, other)
+        best |= stand_ins.alike(lab, free, best, candidates, chosen, columns, slopes, floor)
+        best |= refining.widened(lab, free, best, floor)
+        if not found:
+            best |= stand_ins.instead(lab, free, best, candidates, base, floor)
+    floors = discretisation.floors(lab, base.point, free, floor)
+    model = linear_model(search, base.point, floor, floors - lab.noise_squares, slopes, columns, chosen, candidates)
+    null, unfitted = model.null(errors, search.draws), look.contest.unfitted
+    empty = Round(base.point, errors, [], None, [], 1.0, floor, floors, null=null, unfitted=unfitted)
+    every = lab.problem.together
+
+    def judged(step: Round) -> Round:
+        result = judging.judge(search, step, best, model, every=every)
+        lab.tell(judging.verdict(lab, result))
+        if result.trials:
+            lead = result.chosen or result.trials[0]
+            comparing.tell_lead(lab, lead.candidate.key, lead.errors, result.errors)
+        return result
+
+    result = judged(empty)
+    promising = result.over > WITHIN and any(t.gain > judging.by_chance(lab, result) for t in result.trials)
+    again = first and result.chosen is None and (promising or result.over > 1.0)
+    if again and not lab.deadline.skips("fits from elsewhere"):
+        best |= refining.elsewhere(lab, base, best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
+        result = judged(empty)
+    if again and result.chosen is None and not every and not lab.deadline.skips("measuring every fit where it ends"):
+        every = True
+        result = judged(empty)
+    missed = again and result.chosen is None and not look.grown and is_led_away(lab, base, result)
+    if missed and not lab.deadline.skips("growing fits"):
+        with discretisation.quickly(lab, base.point, floor):
+            grown = list(refining.growing(search, base, floor, candidates).values())
+        best |= refining.ahead(lab, grown, best, floor)
+        result = judged(empty)
+    plain = without_effect(lab, result, base, floor)
+    if plain is not None:
+        if not found:
+            lab.journal.bases.append(lab.journal.fit(lab.own, {}, None, plain, lab.parts))
+        result = judged(replace(empty, base=plain.fit.point, errors=plain.errors, plain=plain))
+    if not found:
+        search.asked = result
+    return result
+
+
+def without_effect(lab: Laboratory, result: Round, base: Fit, floor: Floor) -> Stand | None:
+    """The model without the effect of a round, where fits with one ended, if it does better there than where it was fitted.
+
+    Where the settings' differences can do much, the fitted recordings say little of a modulus, and each fit with an effect ends at
+    another one: what that alone does to the held-out recordings is no effect's. It must fit the fitted ones about as well. Where no
+    effect explains what is left, it is fitted from there: the base may stand in a side valley. Where those that are named ended it is
+    weighed with the floor there: the differences of the settings at the base may have led the base fit, and hide what is better.
+    """
+    if lab.problem.settings == 1 or not result.trials:
+        return None
+    lost = result.chosen is None
+    if lost and not is_unexplained(lab, result):
+        return None
+    limit = (result.chosen or result.trials[0]).score + 2.0 * math.log(NEAR)
+    places = [t.candidate.without(t.fit.point) for t in result.trials if t.score < limit][:MEASURED]
+    left = [score(squares) for squares in lab.mean_squares(places, floor)]
+    here, as_well = score(result.errors), comparing.fitted_score(lab, result.errors) + 2.0 * math.log(AS_WELL)
+    wanted = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < (math.inf if lost else here)]
+    if result.chosen is not None:  # by the floor of the base alone it may look worse there than it is
+        own = [t.candidate.without(t.fit.point) for t in result.members[:MEMBERS]]
+        wanted = own + [place for place in wanted if place not in own][: max(PLAIN - len(own), 0)]
+    if not wanted:
+        return None
+    discretisation.foresee(lab, wanted)
+    stands = [Stand(replace(base, point=place), *discretisation.stand(lab, place, like=floor)) for place in wanted]
+    if lost and not lab.deadline.skips("the declared model again from where effects were fitted"):
+        free = [lab.problem.parameter(name) for name in base.names]
+        able = [(s.fit.point, s.floor) for s, runs in zip(stands, lab.which_run(wanted), strict=True) if runs]
+        fits = lab.fits([lab.request(free, point) for point, _ in able], [own for _, own in able])
+        ends = [fit.point for fit in fits]
+        stands += [Stand(f, *discretisation.stand(lab, f.point, like=floor)) for f, ok in zip(fits, lab.which_run(ends), strict=True) if ok]
+    found = [s for s in stands if score(s.errors) < here and comparing.fitted_score(lab, s.errors) < as_well]
+    return min(found, key=lambda s: score(s.errors), default=None)
+
+
+def is_led_away(lab: Laboratory, base: Fit, r: Round) -> bool:
+    """Whether the base fit of a motion leaves more than noise of what is fitted, at declared values far from those stated."""
+    far = lab.problem.settings > 1 and comparing.moved(lab, base.point) > LED_AWAY
+    return far and not comparing.is_noise(lab, r.errors[lab.fitted], fitted=True)
+
+
+def is_unexplained(lab: Laboratory, r: Round) -> bool:
+    """Whether the residual of a round's base is above what noise and discretisation would leave, by so much that it is not none."""
+    held_out = r.held_out_over(lab.fitted) if lab.problem.settings > 1 else 0.0
+    return r.over > unexplained(lab) or held_out > UNEXPLAINED
+
+
+def first_look(
+    search: Search,
+    base: Fit,
+    floor: Floor,
+    found: Sequence[Trial] = (),
+    led: Led | None = None,
+    *,
+    most: float = math.inf,
+    beyond: float = math.inf,
+    until: float = 1.0,
+    grows: bool = True,
+) -> Look:
+    """Screen the candidates, and fit the best; arguments as those of `round`. A base that was looked at last is not looked at again.
+
+    `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
+    which there are no others; `until`: share of the search's time past which there are none; `grows`: whether fits grow where these
+    leave much, in a base that was looked at without as well.
+    """
+    lab = search.lab
+    if not found and search.seen is not None and search.seen.base is base:
+        if grows:
+            search.seen = grown_on(search, whole(search, search.seen, floor, until), floor, found, until)
+        return search.seen
+    with discretisation.quickly(lab, base.point, floor):
+        asked = prospects.promising(search, base, floor, found, led, most=most, until=until)
+        candidates, free, *_, starts, _ = asked
+        lab.tell(f"fitting {', '.join(dict.fromkeys(c.key for c, *_ in starts))}")
+        without = partial(prospects.without_own, search, base.point, starts, found)
+        grown: list[tuple[Candidate, Fit]] = []
+
+        def between(remains: np.ndarray) -> Sequence[tuple[Candidate, Fit]]:
+            astray = grows and not found and refining.is_astray(search, base, floor) and refining.leaves_much(lab, [remains])
+            if astray and not lab.deadline.skips("growing fits", until):
+                grown.extend(refining.growing(search, base, floor, candidates, until=until).values())
+            return grown
+
+        options = {"beyond": beyond, "until": until, "between": between, "puts_off": not grows}
+        contest = contests.contest(lab, free, starts, floor, asked.hopeful, without, **options)
+        left = left_by(lab, contest.best, floor)
+    look = Look(base, asked, contest, left[:1], bool(grown))
+    if grows and len(found) < 2:
+        look = grown_on(search, look, floor, found, until)
+    if not found:
+        search.seen = look
+    return look
+
+
+def whole(search: Search, look: Look, floor: Floor, until: float) -> Look:
+    """A look for a first effect with the fits that were put off."""
+    lab = search.lab
+    begun = look.contest.put_off
+    if begun is None or lab.deadline.skips(f"fits of {', '.join(begun.keys)}", until):
+        return look
+    asked, point = look.asked, look.base.point
+    without = partial(prospects.without_own, search, point, asked.starts, ())
+    with discretisation.quickly(lab, point, floor):
+        contest = contests.contest(lab, asked.free, begun.starts, floor, asked.hopeful, without, until=until, before=begun.ended)
+        left = left_by(lab, contest.best, floor)
+    return look._replace(contest=contest, least=left[:1])
+
+
+def grown_on(search: Search, look: Look, floor: Floor, found: Sequence[Trial], until: float) -> Look:
+    """A look with fits that grow, once more under the own setting, where none did and its own leave much."""
+    lab = search.lab
+    if look.grown or not refining.leaves_much(lab, look.least) or lab.deadline.skips("growing fits", until):
+        return look
+    with discretisation.quickly(lab, look.base.point, floor):
+        further = list(refining.growing(search, look.base, floor, look.asked.candidates, found, until=until).values())
+        whole = contests.wholly(lab, look.asked.free, further, floor, until)
+        best = {**look.contest.best, **better(whole, look.contest.best)}
+        left = left_by(lab, best, floor)
+    return look._replace(contest=look.contest._replace(best=best), least=left[:1], grown=True)
+
+
+def left_by(lab: Laboratory, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[np.ndarray]:
+    """What the fits under the own setting leave, mean squares of the parts, the least first."""
+    ends = [fit.point for _, fit in best.values() if fit.setting == lab.own]
+    with lab.under(lab.own):
+        return sorted(lab.mean_squares(ends, floor), key=score)
+
+
+def over_floor(lab: Laboratory, at: Stand) -> float:
+    """How far the residual there is above what noise and discretisation would leave after a refit: a ratio of errors."""
+    free = [lab.problem.parameter(name) for name in at.fit.names]
+    return times_over(at.errors, discretisation.floors(lab, at.fit.point, free, at.floor))
+
+
+def promised(search: Search, at: Stand, beside: Trial) -> float:
+    """The least share of the misfit there that an effect of few parameters would leave, predicted or by one simulation."""
+    with discretisation.quickly(search.lab, at.fit.point, at.floor):
+        return min(prospects.promising(search, at.fit, at.floor, [beside], most=MANY).promise.values(), default=1.0)
+
+
+def linear_model(search: Search, point, floor, left, slopes, columns, chosen, candidates) -> bootstrap.LinearModel:
+    """The linear model of the fits; `left` is what the discretisation leaves after a refit, mean squares of the parts.
+
+    Of all candidates, or once the time for the search is over of those that got a fit.
+    """
+    lab = search.lab
+    held = [p.recording for p in lab.parts if not p.fitted]
+    by_key = {c.key: c for c in candidates}
+    best = dict(chosen) if chosen and lab.deadline.ends() else {c.key: 0 for c in candidates} | chosen
+    one = [replace(by_key[key], starts=(by_key[key].starts[i],)) for key, i in best.items()]
+    new = [n for n in held if n not in lab.fitted_recordings]
+    with discretisation.quickly(lab, point, floor):
+        there = directions.candidate_columns(lab, point, one, new) if new else {}
+    nuisances = floor.nuisances or {n: np.empty((len(lab.problem.recordings[n].y), 0)) for n in lab.scored_recordings}
+    made = []
+    for part, square in zip(lab.parts, left, strict=True):
+        n, rows = part.recording, part.rows
+        own = {}
+        for key, i in best.items():
+            c = columns[key, i][n] if n in columns[key, i] else there[key, 0][n]
+            if np.isfinite(c).all():
+                own[key] = c[rows]
+        over_time = floor.spread[n][rows]
+        scale = over_time * math.sqrt(square / max(float(np.mean(over_time**2)), 1e-300))
+        smooth = scale[:, None] * lab.problem.directions(n)[rows]
+        settings = floor.differences[n][rows]
+        made.append(bootstrap.Columns(floor.weight[n][rows], floor.noise[n], slopes[n][rows], nuisances[n][rows], settings, smooth, own))
+    common = set.intersection(*(set(c.candidates) for c in made))
+    made = [replace(c, candidates={k: v for k, v in c.candidates.items() if k in common}) for c in made]
+    return bootstrap.LinearModel(
+        [c for c, p in zip(made, lab.parts, strict=True) if p.fitted],
+        [c for c, p in zip(made, lab.parts, strict=True) if not p.fitted],
+        seed=search.seed,
+    )
