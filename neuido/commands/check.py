@@ -1,4 +1,4 @@
-"""The `check` command: whether measured data are plausible."""
+"""The `check` command: whether measured data are plausible, and whether a recording of images is good enough to learn from."""
 
 import warnings
 from pathlib import Path
@@ -9,14 +9,18 @@ KINDS = ("experiment.yaml", "test.yaml", "track.yaml")
 
 
 def check(folder: str) -> None:
-    """Read measured data and say whether they are plausible: units, signs, times, order, markers.
+    """Read measured data or a recording of images and say whether they are plausible: units, times, markers; views, blur, masks.
 
     Args:
-        folder: A folder with experiment.yaml, test.yaml or track.yaml.
+        folder: A folder with experiment.yaml, test.yaml or track.yaml, or a recording of images.
 
     Raises:
         UserError: What is wrong, with the file and the key to change.
     """
+    given = Path(folder).expanduser()
+    if given.is_dir() and not any((given / name).is_file() for name in KINDS):
+        check_capture(given)
+        return
     with warnings.catch_warnings(record=True) as odd:
         warnings.simplefilter("always", PlausibilityWarning)
         lines = contents(folder)
@@ -26,6 +30,27 @@ def check(folder: str) -> None:
     if odd:
         print(f"{len(odd)} odd {'thing' if len(odd) == 1 else 'things'}, otherwise", end=" ")
     print(f"plausible: `neuido diagnose {folder} --out FOLDER` goes on with it")
+
+
+def check_capture(folder: Path) -> None:
+    """Print what is wrong with a recording of images and what could be better, before any training.
+
+    Raises:
+        UserError: The recording cannot be read, or something must be mended.
+    """
+    from neuido.data.scenes.capture_quality import capture_findings
+    from neuido.data.scenes.readers import MARKS, read
+
+    if not any((folder / mark).exists() for marks in MARKS.values() for mark in marks):
+        raise UserError(f"{folder} has none of {', '.join(KINDS)} and is no recording of images: `neuido import` makes such a folder")
+    found = read(folder)
+    print(f"{found.format} recording {found.name}, {len(found.views)} views, {len(found.times)} frames")
+    findings = capture_findings(found)
+    for finding in findings:
+        print(f"  {finding}")
+    if wrong := sum(finding.wrong for finding in findings):
+        raise UserError(f"{folder} has {wrong} thing{'s' * (wrong > 1)} to mend before training: see the capture guide")
+    print(f"good enough: `neuido reconstruct {folder}` goes on with it")
 
 
 def contents(folder: str) -> list[str]:

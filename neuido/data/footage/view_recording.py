@@ -18,6 +18,7 @@ from neuido.data.footage.video_frames import Clip, read_clip
 from neuido.data.formats import nerfstudio
 from neuido.data.scenes.filmed_scene import Motion, write_motion
 from neuido.data.scenes.multiview import UP
+from neuido.data.scenes.view_geometry import mean_misfit, triangulate
 from neuido.errors import UserError
 from neuido.types import Cameras
 
@@ -87,17 +88,20 @@ def write_views(
             nerfstudio.write_image(folder / f"images/{v}_{t:03d}.png", rgba, size=size)
         if not whole[v].any():
             raise UserError(f"{clip.path}: nothing whole moves in front of the background: give an image of the empty scene (--background)")
-    x, error = _triangulated(centres, whole, cameras)
+    x = triangulate(centres, whole, cameras)
+    if (met := int(np.isfinite(x).all(axis=1).sum())) < 3:
+        raise UserError(f"two cameras see the object whole in {met} frames, at least 3 are needed: film wider views")
     if first := int(np.isfinite(x).all(axis=1).argmax()):
         moment = clips[0].times[frames[0][first]] - clips[0].times[0]
         raise UserError(
             f"two cameras see the object from {moment:.3g} s of {clips[0].path.name} on: give --start {np.ceil(1e3 * moment) / 1e3:g}"
         )
+    misfit = mean_misfit(x, centres, whole, cameras)
     shift, motion = _placed(x, times, floor if floor is not None else 0.0 if filming.cameras == "board" and up == "z" else None)
     cameras = convert.move(cameras, shift=(shift[0], shift[1], shift[2]))
     nerfstudio.write_transforms(folder, cameras, torch.from_numpy(times), held_out=held_out)
     write_motion(motion, folder)
-    notes.append(f"centres of the views meet within {error:.2g} px (root mean square): it holds errors of cameras, clocks and masks")
+    notes.append(f"centres of the views meet within {misfit:.2g} px (root mean square): it holds errors of cameras, clocks and masks")
     notes.append("velocity at the start {:.3g}, {:.3g}, {:.3g} m/s in motion.yaml".format(*motion.velocity))
     reach = float(np.nanmax(np.ptp(x[np.isfinite(x).all(axis=1)], axis=0)))
     if reach > 0.8:
@@ -158,26 +162,6 @@ def _straight(rgba: np.ndarray, centre: np.ndarray, view: View) -> tuple[np.ndar
     lens, K = np.array(view.distortion), view.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     point = cv2.undistortPoints((centre - 0.5).reshape(1, 1, 2), K, lens, P=K).ravel() + 0.5 if np.isfinite(centre).all() else centre
     return cv2.undistort(rgba, K, lens), point
-
-
-def _triangulated(centres: np.ndarray, whole: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, float]:
-    """Return the point of each frame (T, 3) nearest to the rays through the centres (V, T, 2), and its distance to the centres [px]."""
-    P = (cameras.Ks.double() @ cameras.viewmats.double()[:, :3]).numpy()
-    x = np.full((centres.shape[1], 3), np.nan)
-    left = []
-    for t in range(len(x)):
-        seen = np.flatnonzero(whole[:, t])
-        if len(seen) < 2:
-            continue
-        rows = np.concatenate([centres[v, t][:, None] * P[v, 2] - P[v, :2] for v in seen])
-        rows /= np.linalg.norm(rows[:, :3], axis=1, keepdims=True)
-        x[t] = np.linalg.lstsq(rows[:, :3], -rows[:, 3], rcond=None)[0]
-        for v in seen:
-            h = P[v] @ [*x[t], 1.0]
-            left.append(h[:2] / h[2] - centres[v, t])
-    if (met := int(np.isfinite(x).all(axis=1).sum())) < 3:
-        raise UserError(f"two cameras see the object whole in {met} frames, at least 3 are needed: film wider views")
-    return x, float(np.sqrt(np.mean(np.sum(np.square(left), axis=1))))
 
 
 def _placed(x: np.ndarray, times: np.ndarray, floor: float | None) -> tuple[np.ndarray, Motion]:
