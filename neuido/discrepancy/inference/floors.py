@@ -116,6 +116,13 @@ class Floor:
         return r - N @ _bounded(A.T @ A / w**2 + np.eye(A.shape[1]), A.T @ b / w**2, BOUND)
 
 
+def patterns(problem: Problem, floor: Floor, part: Part, square: float) -> np.ndarray:
+    """Return smooth patterns of a part that together have this mean square, spread over time as the settings differ, (rows, k)."""
+    over_time = floor.spread[part.recording][part.rows]
+    scale = over_time * math.sqrt(max(square, 0.0) / max(float(np.mean(over_time**2)), 1e-300))
+    return scale[:, None] * problem.directions(part.recording)[part.rows]
+
+
 def past_nuisances(N: np.ndarray, noise: float) -> Callable[[np.ndarray], np.ndarray]:
     """What nuisances N (n, k), columns of one prior standard deviation each, leave of columns of data of that noise."""
     back = np.linalg.solve(N.T @ N / noise**2 + np.eye(N.shape[1]), N.T / noise**2)

@@ -8,6 +8,7 @@ import numpy as np
 
 import neuido
 from neuido.discrepancy.inference.floors import Part, Round, Trial
+from neuido.discrepancy.inference.power import Compatible
 from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.discrepancy.inference.search.intervals import would_help
 from neuido.discrepancy.inference.search.judging import ALPHA
@@ -63,7 +64,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         },
         "models": [model for step, r in enumerate(d.rounds, 1) for model in _models(d, r, step)],
         "chance": [_chance(r, step) for step, r in enumerate(d.rounds, 1) if r.trials],
-        "power": [_power(d, h) for h in d.hidden],
+        "power": [_power(d, one) for one in d.power],
         "rejected": rejected(d),
         "recordings": recordings_of(d.problem),
         "stages": {name: [_series(s) for s in own] for name, own in series.items()},
@@ -162,10 +163,10 @@ def _chance(r: Round, step: int) -> dict[str, Any]:
     return {"step": step, "p_value": r.p_value, "error_ratio95": math.exp(min(r.by_chance(ALPHA), 700.0)), "of": P_VALUE}
 
 
-def _power(d: Diagnosis, h: Any) -> dict[str, Any]:
-    """The largest size that an effect may have unseen, and the end of its range."""
-    p = d.problem.parameter(f"{h.name}.{h.parameter}")
-    return {"name": h.name, "parameter": h.parameter, "unit": h.unit, "up_to": h.up_to, "largest": max(abs(p.lower), abs(p.upper))}
+def _power(d: Diagnosis, one: Compatible) -> dict[str, Any]:
+    """The largest compatible size of an effect, and the end of its range."""
+    p = d.problem.parameter(f"{one.name}.{one.parameter}")
+    return {**one._asdict(), "largest": max(abs(p.lower), abs(p.upper))}
 
 
 def _series(s: residual.Series) -> dict[str, Any]:

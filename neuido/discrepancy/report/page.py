@@ -186,7 +186,7 @@ def _section(c: Mapping[str, Any], motion: Motion, units: Units, figures: list[d
 
 
 WEAK = "What is missing, by the weak residual, which differentiates no measured position; grey: what noise alone makes of it."
-SIZES = "The largest size that each other effect could have without having been named here, to first order."
+SIZES = "The size that each other effect is smaller than with a probability of 90 %, to first order, given the fitted recordings."
 
 
 def _places(c: Mapping[str, Any], units: Units) -> str:

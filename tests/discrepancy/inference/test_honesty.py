@@ -8,11 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from scipy.stats import norm
 
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.discrepancy import store
-from neuido.discrepancy.inference import directions, discretisation
+from neuido.discrepancy.inference import directions, discretisation, power
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import levenberg_marquardt, run
 from neuido.discrepancy.inference.search.attribution import diagnose
@@ -97,15 +98,48 @@ def test_a_recording_is_sealed_until_the_answer_is_there(tmp_path):
     assert single["test"] is None and single["validation"] == single["held_out"]
 
 
-def test_what_could_hide_is_told(tmp_path):
-    """The size that would not have been seen is about that at which an effect is just named."""
-    found = diagnose(Line({"young": 1.5, "drag_linear.k": 0.02}), draws=39)
-    assert found.answer == "none" and found.hidden == []  # it is noise: nothing was looked for
-    told = content(diagnose(Line({"young": 1.5}, beside=0.02), draws=39), tmp_path)
+def test_the_largest_compatible_size_is_told(tmp_path):
+    """Also where nothing but noise is left, and nothing was looked for; of an effect that is there, no smaller than it."""
+    told = content(diagnose(Line({"young": 1.5}), draws=39), tmp_path)
     (size,) = told["power"]
-    assert (size["name"], size["parameter"], size["unit"]) == ("drag_linear", "k", "1/s")
-    assert diagnose(Line({"young": 1.5, "drag_linear.k": 3.0 * size["up_to"]}, beside=0.02), draws=39).effects
-    assert not diagnose(Line({"young": 1.5, "drag_linear.k": 0.3 * size["up_to"]}, beside=0.02), draws=39).effects
+    assert (size["name"], size["parameter"], size["unit"], size["largest"]) == ("drag_linear", "k", "1/s", 20.0)
+    t = np.concatenate([(1 + i) * T for i in range(2)])
+    bend = np.concatenate([(1 + i) * T**2 for i in range(2)])
+    alone = bend - t * (t @ bend) / (t @ t)
+    deviation = SIGMA / np.linalg.norm(alone)  # of the size that a straight line does not make up for
+    assert deviation < size["up_to"] < 4.0 * deviation
+    there = diagnose(Line({"young": 1.5, "drag_linear.k": 0.02}), draws=39)
+    assert there.answer == "none" and there.power[0].up_to > 0.02
+    ripple = diagnose(Line({"young": 1.5}, beside=0.02), draws=39)
+    assert ripple.power[0].up_to > size["up_to"]  # what is left above the noise is no smaller an uncertainty
+
+
+def test_a_compatible_size_is_exceeded_in_one_of_ten():
+    rng = np.random.default_rng(3)
+    n, reps = 30, 1000
+    B, S = np.cos(3 * np.linspace(0, 1, n))[:, None], 0.5 * np.sin(5 * np.linspace(0, 1, n))[:, None]
+    both, one = Parameter("a.b", "m", 0.0, 1.0, -9.0, 9.0), Parameter("a.b", "m", 0.0, 1.0, 0.0, 9.0)
+    means, deviations = [], []
+    for _ in range(reps):
+        (mean,), (deviation,) = power.amounts(B, S[:, 0] * rng.normal() + rng.normal(size=n), S)
+        means.append(mean)
+        deviations.append(deviation)
+    assert np.std(means) == pytest.approx(deviations[0], rel=0.05)
+    for p in (both, one):
+        assert power.bound(p, 0.0, 2.0) == pytest.approx(2.0 * norm.ppf(0.95))
+        assert power.bound(p, 50.0, 2.0) == pytest.approx(50.0 + 2.0 * norm.ppf(0.9), rel=1e-3)
+    assert 0.0 < power.bound(one, -5.0, 1.0) < power.bound(one, 0.0, 1.0) < power.bound(both, -5.0, 1.0)
+    assert power.bound(one, 0.0, math.inf) == math.inf
+    draws = rng.normal(size=(300, 2))  # a size of either sign, and a measurement of it
+    inside = [abs(50.0 * a) < power.bound(both, 50.0 * a + e, 1.0) for a, e in draws]
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.05)
+
+
+def test_sizes_that_do_the_same_have_no_limit():
+    t = np.linspace(0.0, 1.0, 30)
+    _, deviations = power.amounts(np.stack([t, 2.0 * t, t**2], axis=1), 0.0 * t, np.empty((30, 0)))
+    assert min(deviations[:2]) > 1e3 * deviations[2]
+    assert power.amounts(np.stack([t, 0.0 * t], axis=1), 0.0 * t, np.empty((30, 0)))[1][1] == math.inf
 
 
 def test_a_residual_within_a_large_floor_is_not_nothing(monkeypatch):

@@ -12,10 +12,11 @@ from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial
 from neuido.discrepancy.inference.journal import CaseRecord, Journal
 from neuido.discrepancy.inference.laboratory import Tell
 from neuido.discrepancy.inference.least_squares import Fit, NotFinite
+from neuido.discrepancy.inference.power import Compatible, compatible
 from neuido.discrepancy.inference.search import base_fits, judging, next_effect
 from neuido.discrepancy.inference.search.choosing import first_rounds, told_exactly
 from neuido.discrepancy.inference.search.decision import case_of, decided
-from neuido.discrepancy.inference.search.intervals import Hidden, blind_to_settings, findings, hidden, intervals, unable
+from neuido.discrepancy.inference.search.intervals import blind_to_settings, findings, intervals, unable
 from neuido.discrepancy.inference.search.judging import CLASS_RATIO
 from neuido.discrepancy.inference.search.pairs import by_growing, neighbours, simpler, two_effects
 from neuido.discrepancy.inference.search.search_state import Search
@@ -139,8 +140,8 @@ class Diagnosis:
     """Why the recordings say too little, or what is wrong with them."""
     over: dict[str, float] = field(default_factory=dict)
     """How far what is left after is above the `floor` and above the `noise`: ratios of errors."""
-    hidden: list[Hidden] = field(default_factory=list)
-    """Sizes up to which the other effects would not have been seen."""
+    power: list[Compatible] = field(default_factory=list)
+    """The largest size of each other effect that the data are compatible with."""
     unable: Mapping[str, list[str]] = field(default_factory=dict)
     """The other settings that did not run, by recording."""
     noise_from: dict[str, str] = field(default_factory=dict)
@@ -297,7 +298,7 @@ def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], ro
         stated = Fit(before.fit.point, tuple(p.name for p in problem.declared), 0.0, np.empty(0), 0, True)
         declared = intervals(lab, stated, before.floor, before.errors)
     scale, floor = lab.scale, after.floor
-    looked = [] if cut or not any(r.trials for r in rounds) else hidden(lab, after, rounds[-1], found)
+    power = [] if cut or lab.deadline.over else compatible(lab, after, rounds[-1], found)
     amounts = {when: lab.amounts(s.fit.point, s.floor) for when, s in stands.items()}
     final, errors, single = tested(search, stands, amounts, alone)
     return Diagnosis(
@@ -324,7 +325,7 @@ def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], ro
         leads=leads,
         why=why,
         over={"floor": over, "noise": times_over(after.errors, lab.noise_squares)},
-        hidden=looked,
+        power=power,
         unable=unable(lab),
         noise_from={r.name: lab.noise_from(n) for n, r in enumerate(problem.recordings)},
         case=case,

@@ -1,18 +1,16 @@
-"""How sure the fitted parameters are, what the recordings could not have shown, and what forbids an answer."""
+"""How sure the fitted parameters are, and what forbids an answer."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student
 
 from neuido.discrepancy.inference import comparing, directions, discretisation
-from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial
+from neuido.discrepancy.inference.floors import Floor, Stand
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
-from neuido.discrepancy.inference.search import judging
 from neuido.discrepancy.inference.search.judging import IMPLAUSIBLE
 from neuido.discrepancy.problems.problem import Parameter
 
@@ -88,16 +86,6 @@ FREE_AT = {"poisson": "upper"}
 """Bounds that are no sign of a fault: an incompressible body is one."""
 
 
-class Hidden(NamedTuple):
-    """How large an effect may be without having been seen."""
-
-    name: str
-    parameter: str
-    unit: str
-    up_to: float | None
-    """Size; none: any within the effect's range."""
-
-
 def findings(lab: Laboratory, at: Stand) -> list[str]:
     """Return what is wrong with fitted figures of the declared model, in words: those at a bound, and those far from what was declared.
 
@@ -127,49 +115,6 @@ def _is_at(p: Parameter, value: float, side: str) -> bool:
     """Whether a value stands at the `lower` or the `upper` bound of a parameter."""
     bound = getattr(p, side)
     return abs(value - bound) <= AT_BOUND * max(abs(bound), 0.0 if p.log else p.scale)
-
-
-def hidden(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()) -> list[Hidden]:
-    """The sizes up to which effects would not have been named where a model stands.
-
-    To first order: an effect is seen where what the fitted figures do not make up for of its motion adds to the residual by as much as a
-    named one must take away. Directions are those of the screening of a round, so that next to nothing is simulated anew.
-
-    Args:
-        lab: What has looked.
-        at: Where the model stands.
-        r: The round that looked last.
-        found: The effects that the model has.
-    """
-    problem, recordings = lab.problem, lab.fitted_recordings
-    taken = {t.candidate.name for t in found}
-    candidates = [c for c in problem.candidates if c.linear]
-    if not candidates or not lab.runs(at.fit.point):
-        return []
-    own = {name.partition(".")[0] for name in r.base if "." in name}
-    free = (*problem.declared, *(p for t in found if t.candidate.name in own for p in t.candidate.parameters))
-    with discretisation.quickly(lab, r.base, r.floor):
-        slopes = directions.slopes(lab, free, r.base, recordings)
-        columns = directions.candidate_columns(lab, r.base, candidates, recordings)
-    beside = [columns[t.candidate.key, 0] for t in found if (t.candidate.key, 0) in columns and t.candidate.name not in own]
-    past = directions.past_slopes(lab, {n: np.concatenate([slopes[n], *(c[n] for c in beside)], axis=1) for n in recordings}, at.floor)
-    left = past({n: lab.residual(at.fit.point, n) for n in recordings})
-    size = max(math.sqrt(float(np.mean(left**2))), 1.0) * math.sqrt(len(left))
-    seen = math.sqrt(math.exp(2.0 * judging.usual_gain(lab, r)) - 1.0) * size
-    least: dict[tuple[str, str], Hidden] = {}
-    for c in candidates:
-        if c.name in taken:
-            continue
-        for i, start in enumerate(c.starts):
-            B = past(columns[c.key, i])
-            for k, p in enumerate(c.size_parameters):
-                moved = float(np.linalg.norm(B[:, k]))
-                up_to = abs(start[p.name]) * seen / moved if math.isfinite(moved) and moved > 0 else math.inf
-                one = Hidden(c.name, p.name.partition(".")[2], p.unit, up_to if up_to < max(abs(p.lower), abs(p.upper)) else None)
-                before = least.get((c.name, one.parameter))
-                if before is None or before.up_to is None or (one.up_to is not None and one.up_to < before.up_to):
-                    least[c.name, one.parameter] = one
-    return list(least.values())
 
 
 def would_help(kind: str, *, discretised: bool) -> list[str]:

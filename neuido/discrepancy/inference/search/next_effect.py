@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from neuido.discrepancy.inference import bootstrap, comparing, directions, discretisation
-from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, score, times_over
+from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, patterns, score, times_over
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
 from neuido.discrepancy.inference.search import contests, judging, prospects, refining, stand_ins
@@ -274,9 +274,7 @@ def linear_model(search: Search, point, floor, left, slopes, columns, chosen, ca
             c = columns[key, i][n] if n in columns[key, i] else there[key, 0][n]
             if np.isfinite(c).all():
                 own[key] = c[rows]
-        over_time = floor.spread[n][rows]
-        scale = over_time * math.sqrt(square / max(float(np.mean(over_time**2)), 1e-300))
-        smooth = scale[:, None] * lab.problem.directions(n)[rows]
+        smooth = patterns(lab.problem, floor, part, square)
         settings = floor.differences[n][rows]
         made.append(bootstrap.Columns(floor.weight[n][rows], floor.noise[n], slopes[n][rows], nuisances[n][rows], settings, smooth, own))
     common = set.intersection(*(set(c.candidates) for c in made))
