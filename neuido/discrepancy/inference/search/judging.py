@@ -205,15 +205,6 @@ def least_gain(lab: Laboratory, r: Round, t: Trial) -> float:
     return min(at_least, GAIN_TO_NOISE) if (away and r.over > 1.0) or stands_alone(r, t) else at_least
 
 
-def usual_gain(lab: Laboratory, r: Round) -> float:
-    """The gain that an effect must bring where nothing else is known of it, by the residual over the floor."""
-    if lab.problem.settings == 1:
-        return max(LEAST_GAIN_EXACT, r.by_chance(ALPHA))
-    if comparing.is_noise(lab, r.errors):
-        return GAIN_TO_NOISE
-    return gain_over_floor(r.over)
-
-
 def is_told_by_fit(lab: Laboratory, r: Round, t: Trial) -> bool:
     """Whether an effect of few parameters, and no other one by far, brings the fitted recordings from far above the noise down to it.
 
