@@ -49,7 +49,7 @@ def import_data(
     Prints what was understood. What a file does not say is asked for, by the name of its option.
 
     Args:
-        files: Files, one a recording; text of any dialect, xlsx, xls, trc, c3d, or video (mp4, mov, avi, mkv). A table of several
+        files: Files, one a recording; text of any dialect, xlsx, xls, trc, c3d, h5 or video (mp4, mov, avi, mkv). A table of several
             specimens is several tests.
         out: Folder to write, which must not be there.
         kind: auto, material (a testing machine), track (a body as one point) or body (points on a deforming body).
@@ -108,6 +108,8 @@ def import_data(
         raise UserError("give --out FOLDER, or --dry_run true")
     if out is not None and not dry_run:
         check_writable(Path(out).expanduser())
+    if picture is not None:
+        check_writable(Path(picture).expanduser().parent, "picture")
     lines = import_file(
         files,
         None if dry_run else out,

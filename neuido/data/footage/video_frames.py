@@ -14,6 +14,8 @@ from neuido.physics.runtime.limits import check_limit
 
 SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".mts")
 """Endings by which a file counts as a video."""
+CONTAINERS = ("mov", "mp4", "m4a", "3gp", "3g2", "mj2", "matroska", "webm", "avi", "mpeg", "mpegts", "asf")
+"""Formats that are read. Playlists and scripts, which name other files, are none of them."""
 
 
 class Clip(NamedTuple):
@@ -111,7 +113,8 @@ def _opened(path: Path) -> Iterator[Any]:
     av = import_extra("av", path.name, extra="video")
     if not path.is_file():
         raise UserError(f"{path} is missing" if not path.exists() else f"{path} is not a file")
-    with parser_errors(path, "video"), av.open(str(path.resolve()), options={"protocol_whitelist": "file"}) as container:
+    options = {"protocol_whitelist": "file", "format_whitelist": ",".join(CONTAINERS)}
+    with parser_errors(path, "video"), av.open(f"file:{path.resolve()}", options=options) as container:
         yield container
 
 

@@ -169,7 +169,7 @@ def _contact_sheet(contact: "Sheet | None", filming: Filming) -> list[str]:
 
 def _kind(path: Path, columns: Mapping[str, str]) -> str:
     """Detect what a file contains; return `material`, `track` or `body`."""
-    if path.suffix.lower() in (".c3d", ".trc"):
+    if path.suffix.lower() in (".c3d", ".trc", ".h5", ".hdf5"):
         return "track"
     rows, _ = read_cells(path)
     first = rows[0][0].lower() if rows and rows[0] else ""

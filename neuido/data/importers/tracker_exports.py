@@ -9,6 +9,7 @@ import numpy as np
 
 from neuido.data.files.delimited import is_number
 from neuido.data.files.parsing import parser_errors
+from neuido.data.importers.pandas_hdf5 import read_frame
 from neuido.data.importers.tables.titled_tables import read_cells, read_titled
 from neuido.data.importers.tables.titles import find_columns
 from neuido.data.importers.tables.units import conversion_factor
@@ -48,6 +49,8 @@ def read_motion(path: Path, columns: dict[str, str]) -> Motion:
     """
     if path.suffix.lower() == ".c3d":
         return _c3d(path)
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        return _deeplabcut_hdf5(path)
     rows, notes = read_cells(path)
     first = [cell.lower() for cell in rows[0]] if rows else []
     if "format version" in first:
@@ -111,18 +114,25 @@ def _vicon(path: Path, rows: list[list[str]]) -> Motion:
 
 def _deeplabcut(path: Path, rows: list[list[str]]) -> Motion:
     first, data = _numbers_from(path, rows, 3)
-    parts, kinds = rows[1], rows[2]
+    return _poses(data[:, 0], rows[1][1:], rows[2][1:], data[:, 1:])
+
+
+def _deeplabcut_hdf5(path: Path) -> Motion:
+    names, frames, data = read_frame(path)
+    if any(len(name) < 3 for name in names):
+        raise UserError(f"{path}: its columns have no scorer, body part and coordinate: is it of DeepLabCut?")
+    order = np.argsort(frames, kind="stable")
+    return _poses(frames[order], ["-".join(name[1:-1]) for name in names], [name[-1] for name in names], data[order])
+
+
+def _poses(frames: np.ndarray, parts: list[str], kinds: list[str], data: np.ndarray) -> Motion:
+    """Return the points of body parts from columns x, y, likelihood each."""
     points = {}
-    for j in range(1, len(kinds) - 2):
+    for j in range(min(len(kinds), data.shape[1]) - 2):
         if [kind.lower() for kind in kinds[j : j + 3]] == ["x", "y", "likelihood"]:
             points[parts[j]] = np.where(data[:, j + 2 : j + 3] < MIN_LIKELIHOOD, np.nan, data[:, j : j + 2])
-    return Motion(
-        data[:, 0],
-        points,
-        "pixel",
-        True,
-        [f"DeepLabCut, {len(points)} body parts, points of likelihood below {MIN_LIKELIHOOD} count as not seen"],
-    )
+    notes = [f"DeepLabCut, {len(points)} body parts, points of likelihood below {MIN_LIKELIHOOD} count as not seen"]
+    return Motion(frames, points, "pixel", True, notes)
 
 
 def _c3d(path: Path) -> Motion:
