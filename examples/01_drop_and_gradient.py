@@ -2,7 +2,7 @@
 A drop, and its gradient
 ========================
 
-A soft cube falls on a floor. One backward pass tells how its height depends on Young's modulus.
+A soft cube falls on a floor. One backward pass gives the derivative of its mean height with respect to Young's modulus.
 Run it with ``python examples/01_drop_and_gradient.py``.
 """
 
@@ -17,7 +17,7 @@ young = torch.tensor([1e5], requires_grad=True)  # Pa
 frames = simulator.rollout(200, laws.FixedCorotated(young, 0.3), every=10)
 
 # %%
-# ``frames.x`` holds 21 frames of 512 particles. The mean height after 0.1 s is a number that torch can differentiate.
+# ``frames.x`` has the positions of 512 particles in 21 frames. Their mean height after 0.1 s is a number that torch differentiates.
 height = frames.x[-1, :, 1].mean()
 height.backward()
 print(f"mean height {height.item():.4f} m, d height / d modulus {young.grad.item():.3g} m/Pa")

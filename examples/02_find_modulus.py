@@ -2,7 +2,7 @@
 A modulus from a trajectory
 ===========================
 
-A recorded bounce is given, the modulus is not. Gradient descent through the simulator finds it.
+The motion of a bouncing ball is known, its modulus is not. Gradient descent through the simulator finds the modulus.
 Run it with ``python examples/02_find_modulus.py``.
 """
 
@@ -17,7 +17,7 @@ with torch.no_grad():
     recorded = simulator.rollout(120, laws.FixedCorotated(6e4, 0.3), every=10).x
 
 # %%
-# The logarithm of the modulus is fitted, so that it stays positive and a step means the same everywhere.
+# The fit is for the logarithm of the modulus: the modulus stays positive, and a step changes it by a factor.
 log_young = torch.tensor([2e5]).log().requires_grad_()
 optimiser = torch.optim.Adam([log_young], lr=0.1, betas=(0.5, 0.9))
 moduli, errors = [], []

@@ -2,7 +2,7 @@
 A law of your own
 =================
 
-Any torch function of the deformation gradient is a law. It runs in the same rollout and has gradients.
+A law of your own is a torch function of the deformation gradient. It runs in the same rollout as the others and has gradients.
 Run it with ``python examples/03_own_law.py``.
 """
 
@@ -22,7 +22,7 @@ body = shapes.box(lower=(0.35, 0.02, 0.4), upper=(0.65, 0.3, 0.6), spacing=0.05,
 simulator = Simulator(Scene(cells=20, dt=1e-3), body, device="cpu")
 
 # %%
-# ``modulus`` is the P-wave modulus at rest; it bounds the time step.
+# ``modulus`` is the P-wave modulus of the undeformed body. It sets the longest stable time step.
 stiffness = torch.tensor([4e4], requires_grad=True)
 own = laws.AutogradElastic(stress, [stiffness], modulus=2 * 4e4)
 frames = simulator.rollout(100, own, every=5)

@@ -16,7 +16,7 @@ simulator = Simulator(Scene(cells=16, dt=1e-3, walls=None, lower=(0.0, -1.0, 0.0
 law = laws.FixedCorotated(5e4, 0.3)
 
 # %%
-# One throw under three effects, each by its own parameter.
+# The same throw three times: with no effect, with drag, with wind.
 throws = {
     "nothing": {},
     "linear drag, 2 /s": {"drag_linear": 2.0},
@@ -34,9 +34,9 @@ plt.tight_layout()
 plt.savefig("effects.png")
 
 # %%
-# Gradients reach them too. This one asks, at a drag of zero, how far a little drag would move the landing point.
+# Effects have gradients too. This one says how far a small drag would move the landing point, although the drag is zero here.
 drag = torch.zeros(1, requires_grad=True)
 landing = simulator.rollout(400, law, every=400, effects=effects.Effects(drag_linear=drag)).x[-1, :, 0].mean()
 landing.backward()
-print(f"{landing.item():.2f} m; {drag.grad.item():.2f} m for each 1/s of drag")
-print("the library knows", ", ".join(entry.name for entry in effects.LIBRARY))
+print(f"lands at {landing.item():.2f} m; {drag.grad.item():.2f} m for each 1/s of drag")
+print("effects of the library:", ", ".join(entry.name for entry in effects.LIBRARY))

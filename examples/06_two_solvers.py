@@ -2,7 +2,7 @@
 Finite elements beside MPM
 ==========================
 
-The same scene, body and law run by two methods. Where they disagree, neither may be taken for the truth.
+Two methods simulate the same scene, body and law. Where they disagree, the difference is an error of at least one of them.
 Run it with ``python examples/06_two_solvers.py``.
 """
 
@@ -21,7 +21,7 @@ with torch.no_grad():
     fem = FiniteElements(scene, body, device="cpu").rollout(300, law, every=20)
 
 # %%
-# A free spin loses no energy in nature. What a method loses is its own.
+# A body that spins freely loses no energy. A loss in the simulation is an error of the method.
 times = 20 * scene.dt * torch.arange(len(mpm.x))
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 3))
 for name, frames in (("material points", mpm), ("finite elements", fem)):

@@ -2,8 +2,8 @@
 A rubber test
 =============
 
-A CSV file of a tensile test and a short YAML file are enough to ask which effect a neo-Hookean model lacks. The file here is made
-by a Gent solid with noise, so that the answer is known: strain stiffening.
+Which effect does a neo-Hookean model of rubber lack? The diagnosis needs a CSV file of a tensile test and a short YAML file. This
+example writes both itself, from a Gent solid with noise. So the right answer is known: strain stiffening.
 Run it with ``python examples/07_rubber_test.py``.
 """
 
@@ -36,7 +36,7 @@ tests:
 """)
 
 # %%
-# The rows below a stretch of 2.5 are fitted, those above are only predicted.
+# The model is fitted to the rows up to a stretch of 2.5. It must predict those above.
 diagnosis = diagnose(folder, out="rubber-diagnosis", effects="strain_stiffening,second_invariant,yield", draws=39, device="cpu")
 print(diagnosis.summary())
 

@@ -2,8 +2,8 @@
 The track of a ball
 ===================
 
-A tracker gives time and place of a ball. Does gravity alone explain its flight? The two throws here are made with a quadratic drag and
-2 mm of noise, so that the answer is known. Run it with ``python examples/08_ball_track.py``.
+A tracker gives the position of a ball over time. Does gravity alone explain its flight? The two throws here are simulated with a
+quadratic drag and 2 mm of noise, so the right answer is known. Run it with ``python examples/08_ball_track.py``.
 """
 
 from pathlib import Path

@@ -2,7 +2,7 @@
 Gaussians that move with the body
 =================================
 
-Each particle carries a Gaussian. All frames and all views are drawn in one call, with gradients to the motion.
+Each particle carries a Gaussian. One call renders all frames and views; its gradients reach the motion.
 Run it with ``python examples/09_gaussians.py``.
 """
 
@@ -18,7 +18,7 @@ velocity = simulator.state.v.clone().requires_grad_()
 frames = simulator.rollout(100, laws.FixedCorotated(4e4, 0.3), every=20, state=simulator.state._replace(v=velocity))
 
 # %%
-# The colour of a Gaussian is where it sits in the resting body.
+# The colour of a Gaussian shows its place in the body at rest.
 rest = body.x.float()
 colours = (rest - rest.min(0).values) / (rest.max(0).values - rest.min(0).values)
 gaussians = attach_gaussians(rest, body.volume.float(), colours)
@@ -26,7 +26,7 @@ images, alphas = render(deform(gaussians, frames.F, frames.x), cameras.orbit(2, 
 print(images.shape, "frames, views, height, width, RGB")
 
 # %%
-# A loss on the images reaches the start of the motion.
+# The gradient of a loss on the images reaches the initial velocity.
 images.mean().backward()
 print(f"d brightness / d velocity: {velocity.grad.sum(0).tolist()}")
 seen = images.detach() + 1 - alphas.detach()[..., None]

@@ -2,8 +2,8 @@
 What does the model of a thrown block lack?
 ===========================================
 
-Two throws of a soft block are measured at 60 points. A drag acts that the model does not mention, and its modulus is declared a third
-too high. Run it with ``python examples/11_diagnose_a_throw.py``.
+Two throws of a soft block are measured at 60 points. The model of the block lacks the air drag, and its modulus is a third too high. Run
+it with ``python examples/11_diagnose_a_throw.py``.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ from neuido import Scene, Simulator, diagnose, effects, laws, shapes
 
 folder, random = Path("throws"), np.random.default_rng(1)
 throws = {"throw": ((0.35, 0.5, 0.5), (1.2, 1.0, 0.3), (0, 0, 5.0)), "toss": ((0.68, 0.42, 0.5), (-2.4, 2.0, -0.8), (0, 0, -4.0))}
-for name, (centre, velocity, spin) in throws.items():  # what a motion capture system would write
+for name, (centre, velocity, spin) in throws.items():  # write what a motion capture system records
     body = shapes.cube(length=0.3, centre=centre, particles_per_side=5, velocity=velocity, angular_velocity=spin)
     with torch.no_grad():
         x = (
@@ -40,7 +40,7 @@ recordings:
 """)
 
 # %%
-# Three suspects are asked here; without ``effects`` all that can act on such a body are.
+# This example tries three effects. Without ``effects`` a diagnosis tries all that can act on such a body.
 suspects = "drag_linear,viscosity_shear,uniform_acceleration"
 diagnosis = diagnose(folder, out="throws-diagnosis", effects=suspects, solver="material_points", draws=39, device="cpu")
 print(diagnosis.summary())

@@ -2,7 +2,8 @@
 A learned law in a new scene
 ============================
 
-The operator that comes with neuido turns a latent into a law. Here its plasticine and its jelly fall on a slope that no training saw.
+The operator that comes with neuido turns a latent vector into a law. Here a jelly and a plasticine that it learned fall on a slope,
+which was in no training scene.
 Run it with ``python examples/12_learned_law.py``.
 """
 

@@ -1,4 +1,4 @@
-"""Film a small ball from eight sides, and read its law from the video in one pass."""
+"""Film a small ball from eight sides, and read its material law from the video in one pass."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Drop a jelly cube, and differentiate where it lands by its stiffness."""
+"""Drop a jelly cube, and differentiate its final height with respect to its stiffness."""
 
 import torch
 

@@ -14,9 +14,9 @@
 # %% [markdown]
 # # The closed loop
 #
-# The input is measured motion. The declared model is fitted, its residual is attributed to an effect that the model lacks, the effect is
-# added, and the error on held-out recordings is compared before and after. The first example is a simulated body whose truth is known;
-# the second is the rubber that Treloar stretched in 1944.
+# A diagnosis starts from measured motion and a declared model. It fits the model, finds the effect that explains what is left, and adds
+# this effect. It then compares the error on held-out recordings before and after. The first example is a simulated block, whose truth is
+# known. The second is the rubber that Treloar stretched in 1944.
 #
 # Open this file with jupytext (`pip install 'neuido[notebook]'`), or run it: `python notebooks/closed_loop.py`. `NEUIDO_NOTEBOOK_OUT` is
 # the output folder, `NEUIDO_NOTEBOOK_SMALL=1` shortens the run, and `NEUIDO_DATA` is the folder of the measured data.
@@ -39,22 +39,22 @@ out.mkdir(parents=True, exist_ok=True)
 
 
 def plot_ranking(diagnosis, axes) -> None:
-    """Plot the gain of each candidate effect in the first round; the effects of the answer are highlighted."""
+    """Plot how much each effect reduces the error when it alone is added; the effects of the answer are in blue."""
+    words = {entry.name: entry.title for entry in effects.LIBRARY}
     first, *_ = json.loads((diagnosis.folder / "trace.json").read_text())["rounds"]
     trials = sorted(first["trials"], key=lambda t: t["gain"])[-10:]
-    named = {name for effect in diagnosis.effects for name in (effect.name, *effect.alternatives)}
-    axes.barh(
-        [t["key"] for t in trials], [np.exp(t["gain"]) for t in trials], color=["C0" if t["name"] in named else "0.8" for t in trials]
-    )
+    answer = {name for effect in diagnosis.effects for name in (effect.name, *effect.alternatives)}
+    labels = [f"{words[t['name']]}\n({t['key']})" for t in trials]
+    axes.barh(labels, [np.exp(t["gain"]) for t in trials], color=["C0" if t["name"] in answer else "0.8" for t in trials])
+    axes.tick_params(axis="y", labelsize=6)
     axes.set(xscale="log", xlabel="error before over error after")
 
 
 # %% [markdown]
 # ## A simulated block
 #
-# A block of jelly is thrown twice. A drag acts on it that its model lacks, and its declared modulus is a third too high. One throw is
-# fitted, the other is held out. The folder holds what a motion-capture experiment provides: tracked points, the declared scene and the
-# declared law.
+# A block of jelly is thrown twice. Its model lacks the air drag, and the declared modulus is a third too high. One throw is fitted, the
+# other is held out. The folder holds what a motion-capture experiment provides: tracked points, the declared scene and the declared law.
 
 # %%
 measured = out / "block"
@@ -88,8 +88,8 @@ for r in read_experiment(measured).recordings:
     print(f"{r.name} ({r.role}): {r.x.shape[1]} points, {len(r.t)} frames, noise {1e3 * r.noise:.1f} mm")
 
 # %% [markdown]
-# On the command line this is `neuido diagnose runs/.../block --out DIR`. Without `effects`, every effect that could act on such a body is
-# tried; there are more than twenty.
+# On the command line this is `neuido diagnose runs/.../block --out DIR`. Without `effects`, it tries every effect that could act on such a
+# body: more than twenty.
 
 # %%
 suspects = ["drag_linear", "drag_quadratic", "viscosity_shear"] if small else None
@@ -101,8 +101,7 @@ for effect in block.effects:
         print(f"{effect.name}.{name} = {quantity.value:.3g} {quantity.unit} (90 %: {low:.3g} to {high:.3g}; truth: 3)")
 
 # %% [markdown]
-# The held-out error falls to the noise. The residual before has a pattern in time that no error of the clock, the scale or the launch
-# explains.
+# The held-out error falls to the noise. Before, the residual grows in a way that no error of the clock, the scale or the launch explains.
 
 # %%
 with np.load(out / "block-diagnosis" / "predicted" / "toss.npz") as archive:
@@ -118,7 +117,7 @@ plot_ranking(block, right)
 figure.savefig(out / "block.png", dpi=120)
 
 # %% [markdown]
-# The loop closes: a second pass, which starts from the resulting model, finds nothing more.
+# The loop closes: a second diagnosis, of the model with the drag added, finds nothing more.
 
 # %%
 again = diagnose(measured, out=out / "block-again", model=block.model_after, effects=suspects, draws=39, device="cpu")
@@ -128,8 +127,8 @@ assert again.answer == "none"
 # %% [markdown]
 # ## Vulcanised rubber
 #
-# The data are Treloar's uniaxial tension of 1944, digitised. The declared law is neo-Hookean. It is fitted at stretches up to 6.7 and has
-# to predict the stress up to 7.5.
+# The data are Treloar's tensile test of 1944, digitised. The declared law is neo-Hookean. It is fitted at stretches up to 6.7 and must
+# predict the stress up to 7.5.
 
 # %%
 root = os.environ.get("NEUIDO_DATA")
@@ -160,5 +159,5 @@ else:
     figure.savefig(out / "rubber.png", dpi=120)
 
 # %% [markdown]
-# Each diagnosis writes `report.html`: an animation of the motion, a map of the residual over the body, the reasons why the other effects
-# were rejected, and the most informative next experiment.
+# Each diagnosis writes `report.html`. It shows the motion, where on the body the model is wrong, why the other effects were rejected, and
+# which experiment would tell most next.

@@ -14,9 +14,9 @@
 # %% [markdown]
 # # Between two latents
 #
-# Does a point between two latents stand for a material between the two materials? A ball falls onto a floor under each of the laws on the
-# line from the softest to the stiffest elastic latent; all laws run in one launch. The command `neuido latents` runs the drop test and
-# writes tables, which this notebook reads.
+# Is a law halfway between two latents also halfway in stiffness? The test: a ball falls onto a floor under each law on the line from the
+# softest to the stiffest elastic latent. The command `neuido latents` simulates these drops in one launch and writes tables, which this
+# notebook reads.
 #
 # Open this file with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/interpolation.py`.
 # `NEUIDO_NOTEBOOK_OUT` is the folder of the tables, which are computed if they are missing. `NEUIDO_NOTEBOOK_SMALL=1` uses fewer laws,
@@ -57,7 +57,7 @@ if not (out / "interpolation.csv").is_file():  # neuido latents --config configs
 # %% [markdown]
 # ## The motion
 #
-# Each column is one law and each row one time; the ball is seen from the front.
+# Each column is a law, each row a time. The ball is seen from the front.
 
 # %%
 with np.load(out / "interpolation.npz") as archive:
@@ -76,8 +76,8 @@ figure.savefig(out / "motion.png", dpi=120)
 # %% [markdown]
 # ## Apparent stiffness
 #
-# There are three measures: the small-strain modulus of the law, the greatest compression, and the contact time with the floor. The rank
-# correlation of a measure with the share is one if the measure is monotone.
+# Three numbers measure the stiffness: the modulus of the law at small strain, the greatest compression of the ball, and how long it touches
+# the floor. If a number only rises along the line, or only falls, its rank correlation with the share is 1 or -1.
 
 # %%
 rows = read_rows(out / "interpolation.csv")
@@ -95,7 +95,7 @@ assert steady["modulus"]["spearman"] > 0.9
 # %% [markdown]
 # ## All pairs
 #
-# The two ends above are the farthest apart. Between two arbitrary latents of a family the modulus is monotone in most cases, not in all.
+# The two laws above are the farthest apart. Between two arbitrary latents of a family the modulus rises steadily in most cases, not in all.
 
 # %%
 for row in read_rows(out / "pairs.csv"):

@@ -14,8 +14,8 @@
 # %% [markdown]
 # # The latent space
 #
-# Stage I learns a latent z for each of its 90 trajectories. Do the latents of a family form a cluster? The command `neuido latents`
-# measures this and writes tables, which this notebook reads.
+# Stage I learns a latent vector z for each of its 90 trajectories. Each trajectory belongs to a family of materials. Do the latents of a
+# family form a cluster? The command `neuido latents` measures this and writes tables, which this notebook reads.
 #
 # Open this file with jupytext (`pip install 'neuido[notebook]' scikit-learn`), or run it: `python notebooks/latent_space.py`.
 # `NEUIDO_NOTEBOOK_OUT` is the folder of the tables, which are computed if they are missing. `NEUIDO_OPERATOR` selects another operator.
@@ -54,7 +54,8 @@ if not (out / "silhouettes.csv").is_file():  # neuido latents --config configs/e
 # %% [markdown]
 # ## t-SNE
 #
-# The families are separate in the t-SNE plane. Within a family the latents are ordered by stiffness, although no label gave it.
+# t-SNE draws the latents in a plane. The families are separate there. Within a family the latents are ordered by stiffness, although the
+# training was never told the stiffness.
 
 # %%
 points = read_rows(out / "embedding.csv")
@@ -73,10 +74,10 @@ figure.savefig(out / "tsne.png", dpi=120)
 # %% [markdown]
 # ## Silhouettes
 #
-# t-SNE can show clusters where distances are not clustered. The silhouette of a latent compares its mean distance to its own family with
-# its mean distance to the nearest other family: one means separate, zero means mixed. The operator `pretrained-family` was fitted with a
-# prior that pulls each latent towards the mean of its family, so its raw latents have a high silhouette. The responses of the laws to the
-# same deformations have a high silhouette with and without the prior.
+# t-SNE can show clusters that the distances do not have, so the clusters need a number. The silhouette of a latent compares its mean
+# distance to its own family with that to the nearest other family: one means separate, zero means mixed. The operator `pretrained-family`
+# was trained with a prior that pulls each latent towards the mean of its family, so its latents have a high silhouette. The stresses of
+# the laws at the same deformations have a high silhouette with and without this prior.
 
 # %%
 rows = {row["space"]: row for row in read_rows(out / "silhouettes.csv")}
@@ -88,9 +89,9 @@ assert rows["laws"]["silhouette"] > 0.3
 # %% [markdown]
 # ## Directions that the laws depend on
 #
-# A latent starts as noise in 128 dimensions, and the laws depend on few of them. Without the prior, the noise along the other directions
-# remains and widens every family: the silhouette is then 0.08 (`NEUIDO_OPERATOR=pretrained`). The figure shows how much a law changes if
-# only the directions with the largest influence are kept, and how much of the variance lies along them.
+# A latent starts as noise in 128 dimensions, and the laws depend on few of them. Without the prior the noise in the other dimensions stays
+# and mixes the families: the silhouette is then 0.08 (`NEUIDO_OPERATOR=pretrained`). The figure keeps only the directions with the largest
+# influence. It shows how much a law changes without the others, and how much of the variance lies along those kept.
 
 # %%
 directions = read_rows(out / "directions.csv")

@@ -34,7 +34,7 @@ def content(path) -> dict:
 def command_of(path) -> str | None:
     """The command that a configuration is for, by its keys."""
     keys = set(content(path))
-    if "most" in keys and keys <= set(inspect.signature(diagnose).parameters):
+    if "max_effects" in keys and keys <= set(inspect.signature(diagnose).parameters):
         return "diagnose"
     if "model" in keys:
         return "fit"

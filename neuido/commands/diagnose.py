@@ -1,6 +1,9 @@
 """The `diagnose` command: its options, and what it prints."""
 
+from neuido.data.files.renamed_options import renamed_arguments
 
+
+@renamed_arguments(most="max_effects")
 def diagnose(
     folder: str,
     *,
@@ -12,7 +15,7 @@ def diagnose(
     solver: str = "both",
     draws: int = 199,
     seed: int = 0,
-    most: int = 3,
+    max_effects: int = 3,
     minutes: float = 15.0,
     device: str = "auto",
     resume: bool = True,
@@ -33,7 +36,7 @@ def diagnose(
         solver: What may predict the motion of a body: material_points, finite_elements, or both, so that the data choose.
         draws: Draws of the parametric bootstrap; p-values come in steps of 1 / (draws + 1).
         seed: Seed of the draws.
-        most: Effects that may be added, 1 to 3.
+        max_effects: Largest number of effects that may be added, 1 to 3.
         minutes: Time limit of the search for each body; 0: none. What was left out is reported, and the same command with more minutes
             continues from there.
         device: auto, cpu or cuda.
@@ -55,7 +58,7 @@ def diagnose(
         solver=solver,
         draws=draws,
         seed=seed,
-        most=most,
+        max_effects=max_effects,
         minutes=minutes,
         device=device,
         resume=resume,

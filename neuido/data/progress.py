@@ -72,7 +72,11 @@ class Progress:
             self._bar.write(line, file=sys.stderr)
 
     def print(self, line: str) -> None:
-        """Print a line of results to stdout, above the bar where there is one."""
+        """Print a line to stdout without damaging the progress bar.
+
+        Args:
+            line: A result of the work, which belongs on stdout; `note` is for remarks about its progress.
+        """
         if self._bar is not None:
             self._bar.write(line)
         else:

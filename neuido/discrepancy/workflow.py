@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuido.data.files.output_folder import held_folder
+from neuido.data.files.renamed_options import renamed_arguments
 from neuido.data.files.writing import check_writable, made_folder, make_real_folder
 from neuido.data.progress import Progress, duration
 from neuido.discrepancy.report.diagnosis import Diagnosis
@@ -32,6 +33,7 @@ SOLVERS = ("both", "material_points", "finite_elements")
 KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}
 
 
+@renamed_arguments(most="max_effects")
 def diagnose(
     source: "str | os.PathLike | Experiment | MaterialTests | Tracks | Mapping[str, Mapping[str, Any]]",
     *,
@@ -45,7 +47,7 @@ def diagnose(
     solver: str = "both",
     draws: int = 199,
     seed: int = 0,
-    most: int = 3,
+    max_effects: int = 3,
     minutes: float = 15.0,
     device: str = "auto",
     resume: bool = True,
@@ -68,7 +70,7 @@ def diagnose(
         solver: What may predict the motion of a body: material_points, finite_elements, or both, so that the data choose.
         draws: Draws of the parametric bootstrap, at least 19; p-values come in steps of 1 / (draws + 1).
         seed: Seed of the draws.
-        most: Effects that may be added, 1 to 3.
+        max_effects: Largest number of effects that may be added, 1 to 3.
         minutes: Time limit of the search for each body [min]; 0: none. A search that ends early names what it left out.
         device: auto, cpu, cuda or cuda:N.
         resume: Continue from the predictions that an interrupted run left in `out`/.work. Folders only.
@@ -84,8 +86,8 @@ def diagnose(
     begun = time.monotonic()
     if draws < 19:
         raise UserError(f"draws = {draws} is too few for a level of 5 %: give at least 19")
-    if not 1 <= most <= 3:
-        raise UserError(f"most = {most} must be 1, 2 or 3")
+    if not 1 <= max_effects <= 3:
+        raise UserError(f"max_effects = {max_effects} must be 1, 2 or 3")
     if not minutes >= 0:
         raise UserError(f"minutes = {minutes} must not be negative; 0 sets no limit")
     arrays = isinstance(source, Mapping)
@@ -120,8 +122,8 @@ def diagnose(
     temporary = tempfile.TemporaryDirectory(prefix="neuido-diagnosis-") if out is None else None
     target = Path(temporary.name if temporary else out or "").expanduser()
     given = {"model": _content(model), "law": _content(law)}
-    options = {"effects": names, "draws": draws, "seed": seed, "most": most, "device": chosen, "version": store.code_digest(), "data": data}
-    options |= given | {"solver": solver}
+    options = {"effects": names, "draws": draws, "seed": seed, "max_effects": max_effects, "device": chosen, "data": data}
+    options |= given | {"solver": solver, "version": store.code_digest()}
     plan = "read-data" if folder is None else store.plan_of(place, options, out=target)
     untouched = not target.is_dir() or not any(target.iterdir())
     with made_folder(target), held_folder(target):
@@ -141,7 +143,7 @@ def diagnose(
                 log.begin(problem.name if len(problems) > 1 else "", seconds)
                 log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
                 try:
-                    own = infer(cached, draws=draws, seed=seed, most=most, tell=log, seconds=seconds, statistics=statistics)
+                    own = infer(cached, draws=draws, seed=seed, most=max_effects, tell=log, seconds=seconds, statistics=statistics)
                 except UserError:
                     if untouched:
                         _forget(target)

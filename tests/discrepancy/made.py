@@ -74,8 +74,8 @@ def experiment(
                 track=pick,
             )
         )
-    believed = {**MODEL, "elasticity": {**MODEL["elasticity"], "young": 7e4}}
-    made = Experiment("block", folder, scene, believed, ("young",), tuple(recordings))
+    given = {**MODEL, "elasticity": {**MODEL["elasticity"], "young": 7e4}}
+    made = Experiment("block", folder, scene, given, ("young",), tuple(recordings))
     write_experiment(made, folder)
     return made
 
@@ -106,8 +106,8 @@ def filmed(
         nerfstudio.write(own, cameras, times, shot)
         given = {"x": out.x[:, :1], "body": b, "t": times, "track": torch.zeros(1, dtype=torch.int64)} if particles else {}
         recordings.append(Recording(name=name, role=role, scene=scene, frame_interval=0.02, video=nerfstudio.read(own), **given))
-    believed = {**MODEL, "elasticity": {**MODEL["elasticity"], "young": 7e4}}
-    made = Experiment("block", folder, scene, believed, ("young",), tuple(recordings))
+    given = {**MODEL, "elasticity": {**MODEL["elasticity"], "young": 7e4}}
+    made = Experiment("block", folder, scene, given, ("young",), tuple(recordings))
     write_experiment(made, folder)
     return made
 

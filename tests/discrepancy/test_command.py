@@ -178,7 +178,7 @@ def test_wrong_folder_is_one_line(name, folders, tmp_path, capsys):
     ("more", "word"),
     [
         (["--draws", "3"], "draws"),
-        (["--most", "9"], "most"),
+        (["--max_effects", "9"], "max_effects"),
         (["--device", "abacus"], "abacus"),
         (["--effects", "jelly"], "jelly"),
         (["--effects", "yield"], "drag_linear"),
@@ -361,12 +361,12 @@ def test_declared_effects_are_simulated_and_are_the_candidates_start(folders):
         {"time_force.y0": 3.0, "time_force.y4": -3.0},
     ):
         model = {**plain.model, "free": ["young"], "effects": effects}
-        believed = body_problem(read_experiment(folders["experiment"], model=model))
-        (with_it,) = believed.predict([{"young": 6e4}], 0)
+        declared = body_problem(read_experiment(folders["experiment"], model=model))
+        (with_it,) = declared.predict([{"young": 6e4}], 0)
         (asked,) = body_problem(plain).predict([{"young": 6e4, **effects}], 0)
         (without,) = body_problem(plain).predict([{"young": 6e4}], 0)
         np.testing.assert_allclose(with_it, asked, atol=1e-6)
         assert np.abs(with_it - without).max() > 1e-3
         for name, value in effects.items():
-            assert value in [p.value for c in believed.candidates for p in c.parameters if p.name == name]
-            assert believed.model_after({"young": 6e4}, [])["effects"][name] == value
+            assert value in [p.value for c in declared.candidates for p in c.parameters if p.name == name]
+            assert declared.model_after({"young": 6e4}, [])["effects"][name] == value

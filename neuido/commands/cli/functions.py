@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, get_origin
 
-from neuido.commands.cli.config_files import config_paths, expanded
+from neuido.commands.cli.config_files import config_paths, expanded, given_configs, in_place, inline, is_content
 from neuido.commands.cli.signatures import signature
 from neuido.commands.cli.wrong_values import explained, placed
+from neuido.data.files.renamed_options import rename
 from neuido.data.files.yaml_files import Keys, places, read_configuration
 from neuido.errors import UserError, condensed, suggest
 
@@ -31,6 +32,7 @@ def run_function(name: str, module: str, function: str, args: list[str]) -> int:
         args = [f"--{first.name}", json.dumps(alone), *args[len(alone) :]]
     elif alone:
         args = [f"--{first.name}", *args]
+    args = _under_new_names(name, component, args)
     _check(name, component, args)
     try:
         status = auto_cli(component, args=expanded(args), as_positional=False, prog=f"neuido {name}", exit_on_error=False)
@@ -39,6 +41,22 @@ def run_function(name: str, module: str, function: str, args: list[str]) -> int:
     except UserError as error:
         raise UserError(placed(str(error), args)) from error
     return status if isinstance(status, int) else 0
+
+
+def _under_new_names(command: str, component: Callable[..., Any], args: list[str]) -> list[str]:
+    """Return the arguments with the options that the function renamed under their new names, with a warning for each."""
+    names: dict[str, str] = getattr(component, "former_names", {})
+    out = list(args)
+    for i, word in enumerate(args):
+        option, equals, value = word.removeprefix("--").partition("=")
+        if word.startswith("--") and option in names:
+            out[i] = f"--{next(iter(rename({option: value}, names, command)))}{equals}{value}"
+    for i, given in given_configs(args):
+        if names and not is_content(given) and Path(given).is_file():
+            content = read_configuration(given)
+            if names.keys() & content.keys():
+                out[i] = in_place(args[i], inline(rename(content, names, command)))
+    return out
 
 
 def options_of(component: Callable[..., Any]) -> dict[str, dict[str, Any]]:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 UNDECLARED = {"drag_linear.k": 3.0}
 """What the demonstration's body feels and its model does not say [1/s]."""
-TRUE_YOUNG, BELIEVED_YOUNG = 6e4, 8e4
+TRUE_YOUNG, DECLARED_YOUNG = 6e4, 8e4
 ELASTIC: dict[str, Any] = {
     "density": 1000.0,
     "elasticity": {"law": "fixed_corotated", "young": TRUE_YOUNG, "poisson": 0.3},
@@ -74,23 +74,29 @@ class LoopResult(NamedTuple):
     @property
     def words(self) -> str:
         """The answer with its effects."""
-        names = " and ".join("|".join(names) for names in self.effects)
+        from neuido.discrepancy.report.wording import named
+
+        names = " and ".join(" or ".join(map(named, names)) for names in self.effects)
         return f"{self.answer}: {names}" if names else self.answer
 
 
 def demo_loop(
     out: str = "runs/demo/loop", *, effects: str | None = None, draws: int = DRAWS, second_pass: bool = True, progress: bool = True
 ) -> LoopResult:
-    """Throw a jelly block twice with a drag that its model lacks, find the drag, and repeat with the model that comes out.
+    """Simulate two throws of a block with air drag, and diagnose a model of the block that has none.
 
-    The folder is diagnosed by `neuido diagnose`, with every effect that makes sense for it unless `effects` names some.
+    Runs `neuido diagnose` on the simulated recordings, prints its answer beside the truth, and draws the result. With `second_pass` it
+    diagnoses the resulting model too, which should lack nothing.
 
     Args:
         out: Folder for the experiment, the diagnosis and the picture.
-        effects: Names of the effects to consider, with commas.
-        draws: Of the parametric bootstrap.
-        second_pass: Whether the model that comes out is diagnosed again.
-        progress: Show a line of progress.
+        effects: Names of the effects to consider, separated by commas. None: all that can act on such a body.
+        draws: Draws of the parametric bootstrap.
+        second_pass: Whether to diagnose the resulting model too.
+        progress: Whether to show progress.
+
+    Returns:
+        The answer, the errors before and after [m], the truth, and the paths of picture and report.
     """
     from neuido.commands.diagnose import diagnose
 
@@ -134,7 +140,7 @@ def demo_loop(
 
 
 def figures(values: Mapping[str, float]) -> str:
-    """Names and values as one line."""
+    """Return names and values as one line: "drag_linear.k = 3, gravity.g = 0.1"."""
     return ", ".join(f"{name} = {value:.3g}" for name, value in values.items())
 
 
@@ -144,7 +150,7 @@ def record(
     *,
     launches: Sequence[Launch] = LAUNCHES,
     model: Mapping[str, Any] = ELASTIC,
-    believed: Mapping[str, float] | None = None,
+    declared: Mapping[str, float] | None = None,
     scene: "Scene | None" = None,
     side: int = 5,
     frames: int = 16,
@@ -152,20 +158,20 @@ def record(
     noise: float = 4e-4,
     seed: int = 1,
 ) -> "Experiment":
-    """Simulate a block of particles, and write what was seen of it as an experiment folder.
+    """Simulate a block of particles, and write its tracked points and the declared model as an experiment folder.
 
     Args:
-        folder: To write; one that is there with the same files is written again.
-        effects: Flat names and values of what acts and is not declared.
+        folder: Folder to write; an earlier experiment there is replaced.
+        effects: Effects that act and are not declared, by flat names.
         launches: The recordings.
         model: The true law: density, elasticity, plasticity.
-        believed: Declared values in place of true ones; `young` too high by a third where absent.
-        scene: Grid, step and surroundings, for the truth and as declared; 14 cells, steps of 1 ms and no collider where absent.
+        declared: Values of the declared model that differ from the true ones. None: `young` is a third too high.
+        scene: Grid, step and surroundings, in truth and as declared. None: 14 cells, steps of 1 ms and no collider.
         side: Particles along each edge of the block of 0.3 m.
-        frames: Recorded, the start included.
+        frames: Number of recorded frames, the start included.
         every: Substeps between frames.
-        noise: Of each coordinate [m].
-        seed: Of the noise and of which 60 particles are seen.
+        noise: Standard deviation of the noise of each coordinate [m].
+        seed: Seed of the noise and of the choice of the 60 tracked particles.
 
     Raises:
         UserError: The folder holds something else.
@@ -208,9 +214,9 @@ def record(
                 track=pick,
             )
         )
-    given = {"young": BELIEVED_YOUNG} if believed is None else believed
-    declared = {part: {key: given.get(key, value) for key, value in model[part].items()} for part in ("elasticity", "plasticity")}
-    made = Experiment(folder.name, folder, scene, {"density": model["density"], **declared}, tuple(given) or ("young",), tuple(recordings))
+    given = {"young": DECLARED_YOUNG} if declared is None else declared
+    laws = {part: {key: given.get(key, value) for key, value in model[part].items()} for part in ("elasticity", "plasticity")}
+    made = Experiment(folder.name, folder, scene, {"density": model["density"], **laws}, tuple(given) or ("young",), tuple(recordings))
     write_experiment(made, folder)
     return made
 
@@ -239,6 +245,8 @@ def draw(diagnosis: Path, path: Path) -> None:
     import numpy as np
     from matplotlib.figure import Figure
 
+    from neuido.discrepancy.report.wording import named, title
+
     content = json.loads((diagnosis / "diagnosis.json").read_text())
     trials = json.loads((diagnosis / "trace.json").read_text())["rounds"][0]["trials"]
     error = content["error"]
@@ -247,7 +255,7 @@ def draw(diagnosis: Path, path: Path) -> None:
     for name in names:
         with np.load(diagnosis / "predicted" / f"{name}.npz") as archive:
             motions[name] = {key: archive[key] for key in ("t", "measured", "before", "after")}
-    found = " and ".join(" or ".join(e["class"]) for e in content["effects"])
+    found = " and ".join(" or ".join(map(named, e["class"])) for e in content["effects"])
     figure = Figure(figsize=(12.5, 3.1 * len(names) + 0.4), layout="constrained")
     figure.suptitle(f"{content['answer']}{': ' if found else ''}{found}", fontsize=11)
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(2.6, 1.0))[0]
@@ -281,11 +289,11 @@ def draw(diagnosis: Path, path: Path) -> None:
     if trials:
         trials = sorted(trials, key=lambda t: t["gain"])[-12:]
         kept = {name for e in content["effects"] for name in e["class"]}
-        ranks.barh([t["key"] for t in trials], [np.exp(t["gain"]) for t in trials],
+        ranks.barh([f"{title(t['name'])}\n({t['key']})" for t in trials], [np.exp(t["gain"]) for t in trials],
                    color=[AFTER if t["name"] in kept else "0.75" for t in trials])  # fmt: skip
         ranks.axvline(1.0, color="0.3", linewidth=0.8)
         ranks.set_xlabel("error before over error after", fontsize=8)
     else:
         ranks.axis("off")
-    ranks.tick_params(labelsize=7)
+    ranks.tick_params(labelsize=6)
     write_figure(path, figure, dpi=130)

@@ -49,15 +49,19 @@ class VideoResult(NamedTuple):
 def demo_video(
     out: str = "runs/demo/video", *, epochs: int = 8, init_from: str | None = "pretrained-small", adaptation_steps: int = 25
 ) -> VideoResult:
-    """Film three small bodies, train Stage II on two of them, read the law of the third from its video in one pass, and adapt it.
+    """Train the video encoder on two filmed bodies, and read the law of a third from its video.
 
-    Takes minutes on a CPU core; scenes and reconstructions that are there are used again.
+    Films three small bodies, trains Stage II on two of them, predicts the law of the third in one pass, and then adapts this law to the
+    images of the third. Takes minutes on a CPU core. Scenes and reconstructions in the folder are used again.
 
     Args:
-        out: Folder for scenes, run and results.
-        epochs: Of Stage II, two steps each.
-        init_from: Encoder to start from; none: a new projector.
-        adaptation_steps: Of the adaptation to the third.
+        out: Folder for scenes, training run and results.
+        epochs: Epochs of Stage II, two steps each.
+        init_from: Weights of the encoder at the start. None: the projector starts untrained.
+        adaptation_steps: Steps of the adaptation to the third body.
+
+    Returns:
+        The scores and pictures of each scene, and the losses of the training.
     """
     import yaml
 

@@ -1,4 +1,4 @@
-"""Renamed options: constructors, configuration files and command lines accept an old name and warn with the new one."""
+"""Renamed options: constructors, functions, configuration files and command lines accept an old name and warn with the new one."""
 
 import functools
 import re
@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from neuido.errors import UserError
 
 C = TypeVar("C", bound=type)
+F = TypeVar("F", bound=Callable[..., Any])
 
 RENAMED: dict[str, dict[str, str]] = {}
 """New name of an option, by import path of its class and old name."""
@@ -33,6 +34,26 @@ def renamed_options(**names: str) -> Callable[[C], C]:
 
         owner.__init__ = wrapper
         return owner
+
+    return decorate
+
+
+def renamed_arguments(**names: str) -> Callable[[F], F]:
+    """Let a function accept keyword arguments under their old names too: `@renamed_arguments(old="new")`.
+
+    The signature of the function, and so the help of its command, shows the new names only.
+
+    Args:
+        names: New name of each argument, by old name.
+    """
+
+    def decorate(function: F) -> F:
+        @functools.wraps(function)
+        def wrapper(*args: Any, **options: Any) -> Any:
+            return function(*args, **rename(options, names, function.__name__))
+
+        wrapper.former_names = names  # type: ignore[attr-defined]
+        return wrapper  # type: ignore[return-value]
 
     return decorate
 

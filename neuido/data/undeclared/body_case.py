@@ -109,7 +109,14 @@ class BodyCase:
         turned = not any(e.directed for e in entries) and rng.random() < 0.6
         floor = self.scene.colliders[0].point[1]
         self.launches = bodies.draw_launches(
-            rng, self.points, floor, self.seconds, turned=turned, sliding=bool(set(self.kinds) & {"friction", "stick"}), hard=hard
+            rng,
+            self.points,
+            floor,
+            self.seconds,
+            turned=turned,
+            sliding=bool(set(self.kinds) & {"friction", "stick"}),
+            hard=hard,
+            spinning="spin_decay" in self.kinds,
         )
         self.declared = [bodies.launched_body(self.points, self.volume, launch) for launch in self.launches]
         self.markers = Markers(rng, self.points, min(int(rng.integers(300, 451)), len(self.points)))

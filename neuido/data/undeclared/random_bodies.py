@@ -83,7 +83,15 @@ def draw_body(rng: np.random.Generator, count: int) -> tuple[str, np.ndarray, fl
 
 
 def draw_launches(
-    rng: np.random.Generator, points: np.ndarray, floor: float, seconds: float, *, turned: bool, sliding: bool, hard: bool
+    rng: np.random.Generator,
+    points: np.ndarray,
+    floor: float,
+    seconds: float,
+    *,
+    turned: bool,
+    sliding: bool,
+    hard: bool,
+    spinning: bool = False,
 ) -> list[Launch]:
     """Draw two launches of a body above a floor, in opposite directions and with different spins.
 
@@ -95,6 +103,7 @@ def draw_launches(
         turned: Whether the second launch may have another orientation, which an anisotropic material excludes.
         sliding: Whether both launches have a large horizontal speed.
         hard: Whether both launches cause large strains.
+        spinning: Whether both launches spin fast.
     """
     side = rng.choice([-1.0, 1.0])
     first = rotation(rng, rng.uniform(0.0, 0.5) if rng.random() < 0.5 else 0.0)
@@ -109,7 +118,7 @@ def draw_launches(
         elif rng.random() < 0.2:
             down = rng.uniform(0.2, 0.7)
         spin = rng.normal(size=3) * (1.0 if i else [0.2, 0.2, 1.0])
-        spin *= rng.uniform(0.5, 3.2) / np.linalg.norm(spin)
+        spin *= (3.0 if spinning else 1.0) * rng.uniform(0.5, 3.2) / np.linalg.norm(spin)
         gradient = np.array([[0, -spin[2], spin[1]], [spin[2], 0, -spin[0]], [-spin[1], spin[0], 0]])
         if rng.random() < (0.6 if hard else 0.35):
             stretch = rng.normal(size=(3, 3))

@@ -15,7 +15,7 @@ from neuido.data.files.parsing import read_arrays
 from neuido.data.files.writing import copy_file
 from neuido.discrepancy.report import diagnosis_format
 from neuido.discrepancy.report.reader_units import Units, axis_of
-from neuido.discrepancy.report.wording import LEADING, MORE, Words, scored_by, words_of
+from neuido.discrepancy.report.wording import LEADING, MORE, Words, named, scored_by, words_of
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
@@ -207,10 +207,10 @@ class Diagnosis:
         if "bodies" in self._content:
             return "\n".join(f"{body}: {own.line}" for body, own in self.bodies.items())
         error = self.error
-        names = " and ".join("|".join((e.name, *e.alternatives)) for e in self.effects)
+        names = " and ".join(" or ".join(map(named, (e.name, *e.alternatives))) for e in self.effects)
         out = f"{self.answer}: {names}" if names else self.answer
         out += MORE_LEFT if self.leaves_more else ""
-        out += f" (in the lead so far: {' and '.join(self.leads)})" if self.leads else ""
+        out += f" (in the lead so far: {' and '.join(map(named, self.leads))})" if self.leads else ""
         out += "".join(f": {why}" for why in self.why[:1])
         scored = "held-out" if error.held_out else "fitted"
         out += f"; {scored} error {error.before:.3g} -> {error.after:.3g} {error.unit} (floor {error.floor:.2g})"

@@ -65,6 +65,11 @@ def title(name: str) -> str:
     return titles().get(name, name.replace("_", " "))
 
 
+def named(name: str) -> str:
+    """Return the words for an effect with its identifier beside, which options and files take: "linear air drag (drag_linear)"."""
+    return f"{title(name)} ({name})"
+
+
 FIGURES = {
     "young": "Young's modulus",
     "poisson": "Poisson's ratio",

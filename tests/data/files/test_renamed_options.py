@@ -5,7 +5,7 @@ import inspect
 import pytest
 import yaml
 
-from neuido.data.files.renamed_options import RENAMED, rename_in_arguments, rename_in_configuration, renamed_options
+from neuido.data.files.renamed_options import RENAMED, rename_in_arguments, rename_in_configuration, renamed_arguments, renamed_options
 from neuido.errors import UserError
 from neuido.models import KnownLaw, RandomLatent, ReconstructModule, SpringMass
 from tests.command import run
@@ -97,3 +97,24 @@ def test_a_run_takes_an_old_configuration_and_an_old_option(tmp_path, capsys):
     assert status == 0, err
     found = yaml.safe_load(out)["model"]["init_args"]["method"]["init_args"]
     assert (found["stiffness_per"], found["full_stiffness_neighbours"], found["anchors"]) == ("body", 4, 8)
+
+
+def test_an_argument_of_a_function():
+    @renamed_arguments(most="max_effects")
+    def count(folder: str, *, max_effects: int = 3) -> int:
+        return max_effects
+
+    assert (count("a"), count("a", max_effects=2)) == (3, 2)
+    assert list(inspect.signature(count).parameters) == ["folder", "max_effects"]
+    with pytest.warns(FutureWarning, match=r"count\.most is now called count\.max_effects"):
+        assert count("a", most=1) == 1
+
+
+@pytest.mark.parametrize("written", ["--most", "--most=", "file"])
+def test_an_option_of_a_function_command(written, tmp_path, capsys):
+    """The old name reaches the command, which refuses the value under the new one."""
+    (tmp_path / "old.yaml").write_text("most: 9\nseed: 0\n")
+    given = {"--most": ["--most", "9"], "--most=": ["--most=9"], "file": ["--config", str(tmp_path / "old.yaml")]}[written]
+    with pytest.warns(FutureWarning, match=r"diagnose\.most is now called diagnose\.max_effects"):
+        status, _, err = run(capsys, "diagnose", str(tmp_path), "--out", str(tmp_path / "out"), *given)
+    assert status == 2 and "max_effects = 9 must be 1, 2 or 3" in err

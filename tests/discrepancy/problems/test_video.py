@@ -198,7 +198,7 @@ def test_command_writes_the_silhouettes(folders, tmp_path, capsys):
         off = {when: np.abs(archive["masks"].astype(float) - archive[f"drawn_{when}"]).mean() for when in ("before", "after")}
         assert off["after"] < off["before"]
     status, out, err = run(
-        capsys, folder, "--out", tmp_path / "second", *options, "--model", tmp_path / "out" / "model_after.yaml", "--most", "1"
+        capsys, folder, "--out", tmp_path / "second", *options, "--model", tmp_path / "out" / "model_after.yaml", "--max_effects", "1"
     )
     assert status == 0, err
     assert out.startswith("Nothing is missing")
