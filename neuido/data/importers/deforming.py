@@ -8,11 +8,16 @@ import numpy as np
 import yaml
 
 from neuido.data.files.writing import write_arrays, write_text
+from neuido.data.importers.rest_body import rest_body
 from neuido.data.importers.tables.checked_folder import write_checked
 from neuido.errors import UserError
 
 VELOCITY_FRAMES = 4
 """Number of frames from which the initial velocities are estimated."""
+CELL, CELLS = 1.5, (12, 64)
+"""Size of a cell in spacings of the particles: three or four of these fill one, and no gap opens between them; and range of the cells."""
+SCATTER = 2.0
+"""Variance of velocities about a linear field, relative to what the noise of the points explains, at which the field is taken."""
 
 
 def write_deforming_body(
@@ -45,7 +50,7 @@ def write_deforming_body(
 
     if density is None or young is None:
         raise UserError("a deforming body needs a declared material: give --density (kg/m^3) and --young (Pa); rough values are enough")
-    arrays, summary, low, high = {}, [], [], []
+    arrays, summary, low, high, spacings = {}, [], [], [], []
     for name, (t, points) in takes.items():
         if any(x.shape[1] != 3 for x in points.values()):
             raise UserError(f"{name}: a deforming body needs three coordinates: give --columns.x, --columns.y and --columns.z")
@@ -56,20 +61,23 @@ def write_deforming_body(
                 f"{name}: {x.shape[1]} points are seen in the first frame; at least 8 are needed: cut the recording, or give --kind track"
             )
         x[~np.isfinite(x).all(axis=2)] = np.nan
-        velocity = _velocity(t, x)
-        total = volume or _hull(x[0], name)
-        origin = "" if volume else " (convex hull of the first frame; --volume replaces it)"
-        summary.append(f"{name}: {x.shape[1]} points, {len(t)} frames, volume {total:.4g} m^3{origin}")
+        velocity, kind = start_velocity(t, x)
+        body = rest_body(x[0], velocity, volume, name)
+        speed = np.linalg.norm(velocity.mean(axis=0))
+        summary.append(f"{name}: starts at {speed:.3g} m/s by the first {min(VELOCITY_FRAMES, len(t))} frames, {kind}")
+        summary.append(f"{name}: {x.shape[1]} points, {len(t)} frames, volume {body.volume:.4g} m^3 ({body.note})")
+        places = {"anchor": x[0].astype(np.float32)} if body.filled else {"track": np.arange(x.shape[1], dtype=np.int32)}
         arrays[name] = {
             "x": x.astype(np.float32),
             "t": t,
-            "x0": x[0].astype(np.float32),
-            "v0": velocity.astype(np.float32),
-            "volume": np.full(x.shape[1], total / x.shape[1], np.float32),
-            "track": np.arange(x.shape[1], dtype=np.int32),
+            "x0": body.x0.astype(np.float32),
+            "v0": body.v0.astype(np.float32),
+            "volume": np.full(len(body.x0), body.volume / len(body.x0), np.float32),
+            **places,
         }
-        low.append(np.nanmin(x, axis=(0, 1)))
-        high.append(np.nanmax(x, axis=(0, 1)))
+        spacings.append(body.spacing)
+        low.append(np.minimum(np.nanmin(x, axis=(0, 1)), body.x0.min(axis=0)))
+        high.append(np.maximum(np.nanmax(x, axis=(0, 1)), body.x0.max(axis=0)))
     lower, upper = np.min(low, axis=0), np.max(high, axis=0)
     size = float((upper - lower).max())
     lower, upper = lower - 0.15 * size, upper + 0.15 * size
@@ -79,15 +87,17 @@ def write_deforming_body(
         colliders = [
             {"type": "plane", "point": [0.0, float(floor), 0.0], "normal": [0.0, 1.0, 0.0], "contact": "separate", "friction": 0.0}
         ]
-    speed = np.sqrt(young / density)
-    dt = float(f"{min(0.2 * size * 1.3 / 32 / speed, 1e-3):.1g}")
+    longest = float((upper - lower).max())
+    cells = int(np.clip(round(longest / (CELL * float(np.median(spacings)))), *CELLS))
+    wave = np.sqrt(young / density)
+    dt = float(f"{min(0.2 * longest / cells / wave, 1e-3):.1g}")
     elasticity = {"law": "fixed_corotated", "young": float(young), "poisson": 0.3 if poisson is None else poisson}
     content = {
         "format": "neuido-experiment/1",
         "name": next(iter(takes)),
         "scene": {"domain": [lower.tolist(), upper.tolist()], "gravity": [0.0, -9.81, 0.0], "colliders": colliders},
         "model": {"density": float(density), "elasticity": elasticity, "plasticity": {"law": "identity"}, "free": ["young"]},
-        "discretisation": {"grid": 32, "dt": dt},
+        "discretisation": {"grid": cells, "dt": dt},
         "recordings": [
             {"name": name, "role": roles[name], "frame_interval": float(np.median(np.diff(take["t"])))} for name, take in arrays.items()
         ],
@@ -102,26 +112,38 @@ def write_deforming_body(
     return summary + write_checked(out, fill, read_experiment)
 
 
-def _velocity(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Estimate the initial velocities (N, 3) [m/s] from a parabola fitted to the first frames.
+def start_velocity(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, str]:
+    """Estimate the velocities of points at the start from their first frames.
 
-    A point that is not seen in all of these frames gets the mean velocity.
+    A parabola is fitted to each point. Where the velocities scatter about a linear field by no more than the noise of the points explains,
+    the field is taken: the error of each is then that of all together. A point that is not seen in all of these frames gets the field.
+
+    Args:
+        t: Times [s], (T,), from 0.
+        x: Positions [m], (T, N, 3); NaN where a point was not seen.
+
+    Returns:
+        Velocities (N, 3) [m/s], and what they are, for the summary.
+
+    Raises:
+        UserError: No point is seen in all of the first frames.
     """
     count = min(VELOCITY_FRAMES, len(t))
     basis = np.stack([t[:count] ** power for power in range(min(3, count))], 1)
-    out = np.einsum("f,fna->na", np.linalg.pinv(basis)[1], x[:count])
-    lost = ~np.isfinite(out).all(axis=1)
-    if lost.all():
+    inverse = np.linalg.pinv(basis)
+    out = np.einsum("f,fna->na", inverse[1], x[:count])
+    seen = np.isfinite(out).all(axis=1)
+    if not seen.any():
         raise UserError(f"no point is seen in all of the first {count} frames: cut the start of the recording")
-    out[lost] = out[~lost].mean(axis=0)
-    return out
-
-
-def _hull(x: np.ndarray, name: str) -> float:
-    """Return the volume [m^3] of the convex hull of points x (N, 3) [m]."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        return float(ConvexHull(x).volume)
-    except QhullError as error:
-        raise UserError(f"{name}: the points of the first frame lie in a plane and enclose no volume: give --volume (m^3)") from error
+    field = np.column_stack([np.ones(x.shape[1]), x[0] - x[0].mean(axis=0)])
+    if seen.sum() < 2 * field.shape[1] or count <= basis.shape[1]:
+        out[~seen] = out[seen].mean(axis=0)
+        return out, "of each point"
+    linear = field @ np.linalg.lstsq(field[seen], out[seen], rcond=None)[0]
+    left = x[:count, seen] - np.einsum("fg,gna->fna", basis @ inverse, x[:count, seen])
+    noise = float(np.sum(left**2)) / (left[0].size * (count - basis.shape[1]))
+    scatter = float(np.sum((out[seen] - linear[seen]) ** 2)) / (3 * (seen.sum() - field.shape[1]))
+    if scatter < SCATTER * noise * float(inverse[1] @ inverse[1]):
+        return linear, "a linear field, about which single points scatter as their noise does"
+    out[~seen] = linear[~seen]
+    return out, "of each point"

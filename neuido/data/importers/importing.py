@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuido.data.files.parsing import naming
+from neuido.data.files.values import number
 from neuido.data.footage.filming import Filming
 from neuido.data.footage.video_frames import is_video
 from neuido.data.importers.machines.loading_path import Preparation
@@ -73,6 +74,9 @@ def import_file(
         raise UserError(f"--kind {kind} is unknown: choose from {', '.join(KINDS)}")
     if up not in ("y", "z") and not (filming and filming.cameras):
         raise UserError(f"--up {up} must be y or z")
+    for option, value in (("density", density), ("young", young), ("mass", mass), ("diameter", diameter), ("volume", volume)):
+        if value is not None:
+            number(value, f"--{option}", above=0.0)
     if out is not None and Path(out).expanduser().exists():
         raise UserError(f"--out {out} exists already: give another folder")
     for path in paths:
@@ -116,6 +120,16 @@ def import_file(
 
     with naming(paths[0]):
         chosen = "track" if films else _kind(paths[0], columns) if kind == "auto" else kind
+    if not films:
+        motion_options = {"scale": scale, "y_down": y_down, "frame_rate": frame_rate, "point": point, "mass": mass, "diameter": diameter,
+                          "volume": volume, "floor": floor}  # fmt: skip
+        test_options = {"step": step, "sheet": sheet, "compression": compression, "mode": None if mode == "uniaxial" else mode,
+                        **(specimen or Specimen())._asdict(), **(preparation or Preparation()).changed()}  # fmt: skip
+        foreign = motion_options if chosen == "material" else test_options
+        if wrong := [option for option, value in foreign.items() if value not in (None, False)]:
+            what, other = ("a material test", "a motion") if chosen == "material" else ("a motion", "a material test")
+            given = "section_diameter" if chosen != "material" and wrong[0] == "diameter" else wrong[0]
+            raise UserError(f"--{given} is for {other}, and {paths[0].name} is {what}: leave it out, or give --kind")
     if chosen == "material":
         summary = write_material_tests(
             files_by_name,

@@ -95,6 +95,8 @@ def _optitrack(path: Path, rows: list[list[str]]) -> Motion:
 
 
 def _trc(path: Path, rows: list[list[str]]) -> Motion:
+    if len(rows) < 5:
+        raise UserError(f"{path}: a TRC file has five rows of titles, and this one has {len(rows)} rows: export it again")
     info = dict(zip([cell.lower() for cell in rows[1]], rows[2]))
     first, data = _numbers_from(path, rows, 4)
     names = [cell for cell in rows[3][2:] if cell]

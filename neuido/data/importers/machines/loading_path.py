@@ -34,6 +34,10 @@ class Preparation(NamedTuple):
     cycles: str = "together"
     """`together`: one history. `split`: each loading and unloading is a test of its own."""
 
+    def changed(self) -> dict[str, object]:
+        """Return the options that differ from those of no preparation."""
+        return {name: value for name, value in self._asdict().items() if value != getattr(Preparation(), name)}
+
 
 class Part(NamedTuple):
     """A half-open range of rows of a path in which it is loaded or unloaded."""
