@@ -5,6 +5,7 @@
 
 import collections
 import contextlib
+import gc
 import os
 import random
 import resource
@@ -90,6 +91,7 @@ def watched(folder: Path) -> Iterator[list[str]]:
     if not getattr(sys, "_neuido_watch", False):
         sys.addaudithook(_watch)  # for good: a hook cannot be removed
         sys._neuido_watch = True  # type: ignore[attr-defined]
+    gc.collect()  # what was left to be collected removes its folders now, not while it is watched
     found: list[str] = []
     before = tempfile.tempdir
     tempfile.tempdir = str(folder)

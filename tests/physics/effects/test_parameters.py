@@ -263,7 +263,7 @@ def test_a_uniform_stiffness_is_another_young_s_modulus(plastic):
 def test_a_relative_density_is_a_body_of_other_volumes(plastic):
     scene, body = busy_scenes()[0][0], busy_scenes()[1][0]
     laws = FixedCorotated(5e4, 0.3), VonMises(2e3, 5e4, 0.3) if plastic else None
-    factor = 0.3 + 2 * torch.rand(len(body.x), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    factor = 0.3 + 2 * torch.rand(len(body.x), generator=torch.Generator().manual_seed(3), dtype=torch.float64).to(body.volume.device)
     other = Simulator(scene, body._replace(volume=body.volume * factor), dtype=torch.float64, device=DEVICE)
     expected = other.rollout(60, *laws, every=60)
     sim = Simulator(scene, body, dtype=torch.float64, device=DEVICE)

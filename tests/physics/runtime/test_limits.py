@@ -108,7 +108,7 @@ def test_free_memory():
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["simulate", "bouncy-ball", "--steps", "1000000000000"], "steps is 1000000000000, more than the limit"),
+        (["simulate", "nclaw-cube", "--steps", "1000000000000"], "steps is 1000000000000, more than the limit"),
         (["trajectories", "--setup.particles_per_side", "100000"], "NEUIDO_MAX_PARTICLES"),
         (["trajectories", "--setup.steps", "1000000000000"], "NEUIDO_MAX_STEPS"),
         (["trajectories", "--instances", "1000000000000"], "NEUIDO_MAX_TRAJECTORIES"),
