@@ -51,6 +51,7 @@ LIFTING = (
     "added_mass",
     "stiffness_gradient",
     "stiffness_change",
+    "swelling",
 )
 """Effects that may add energy, or that change what a strain stores."""
 GROWTH, DRIFT, PRECISION = 0.05, 2e-4, 0.02

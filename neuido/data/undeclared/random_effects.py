@@ -200,7 +200,7 @@ KINDS: dict[str, Kind] = {
     "stick": Kind(_scalar("rate", lambda s: 0.1 / s.dt, 50.0), SOLID, "contact", ("stick",), "velocity at the floor decays", grid=True),
     "restitution": Kind(_scalar("rate", lambda s: 0.5 / s.dt, 30.0), SOLID, "contact", ("restitution",), "its normal part alone",
                         grid=True),
-    "swelling": Kind(_scalar("rate", lambda s: 0.1 / s.duration, 6.0, negative=0.4, low=0.8), SOLID, "material", ("swelling",),
+    "swelling": Kind(_scalar("rate", lambda s: 0.1 / s.duration, 6.0, negative=0.4, low=0.5), SOLID, "material", ("swelling",),
                      "the stress-free size grows as 1 + rate t"),
     "spin_decay": Kind(_scalar("k", lambda s: 0.4 / s.duration, 12.0), ANY, "flight", ("spin_decay",), "torque -k L about the centre"),
     "cohesion": Kind(_scalar("c", lambda s: 0.3 * s.density * 9.8 * s.length, 10.0), (GRAINS,), "material", ("cohesion",), "Coulomb's c"),

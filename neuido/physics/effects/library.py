@@ -320,7 +320,7 @@ LIBRARY = (
         "swelling",
         "swelling or drying",
         "F_e = F/g(t), g = 1 + rate t",
-        (Parameter("rate", "swelling", "1/s", -1.0, 1.0, True),),
+        (Parameter("rate", "swelling", "1/s", -1.0, 2.0, True),),
         "rest",
         ("time_force", "viscosity_bulk", "stiffness_change"),
         "Rodriguez, Hoger and McCulloch 1994, isotropic growth at constant mass",

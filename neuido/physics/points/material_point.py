@@ -96,6 +96,8 @@ def stress_along(
         raise UserError(f"{timed[0]} depends on the rate: give the times of the path")
     if specimen.incompressible and specimen.effects.swelling is not None:
         raise UserError("swelling changes the volume: leave it out, or declare the specimen as compressible")
+    if time is not None:
+        specimen.effects.stress_free_size((time[-1:] - time[0]).double().expand(specimen.points), 1)  # refuses one that vanishes
     if not step > 0:
         raise UserError(f"step = {step} must be positive")
     with torch.no_grad():

@@ -106,6 +106,9 @@ def test_a_specimen_that_swells_relaxes_to_its_new_size():
 def test_a_body_cannot_shrink_to_nothing():
     with pytest.raises(UserError, match=r"swelling is -10 1/s; the body would vanish within 0\.2 s"):
         solver("points", body()).rollout(200, SOFT, effects=Effects(swelling=-10.0))
+    t = torch.linspace(0.1, 1.0, 10, dtype=torch.float64)
+    with pytest.raises(UserError, match="the body would vanish"):
+        stress_along(Specimen(SOFT, None, Effects(swelling=-2.0), 1), "uniaxial", torch.ones(10, 1, dtype=torch.float64), time=t)
 
 
 # Spin decay.
