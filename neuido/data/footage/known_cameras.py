@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from neuido.data.files.writing import write_png
 from neuido.data.footage.filming import Filming, View, chosen_frames
 from neuido.data.footage.video_frames import Clip, images
 from neuido.data.formats import colmap
@@ -42,7 +43,7 @@ def reconstructed_cameras(clips: Sequence[Clip], filming: Filming) -> tuple[list
         (folder / "images").mkdir()
         for clip in clips:
             image = next(images(clip, chosen_frames(clip, filming)[:1]))
-            cv2.imwrite(str(folder / "images" / f"{clip.path.stem}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+            write_png(folder / "images" / f"{clip.path.stem}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
         pycolmap.extract_features(folder / "database.db", folder / "images", camera_mode=pycolmap.CameraMode.PER_IMAGE)
         pycolmap.match_exhaustive(folder / "database.db")
