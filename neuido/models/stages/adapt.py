@@ -51,6 +51,8 @@ class AdaptModule(ImageModule):
         fit_frames: Number of initial frames to fit; 0: all. Scores of the remaining frames are reported separately, as `later_...`.
         curriculum: Successive rollout lengths, as shares of the fitted frames. Each takes an equal part of `curriculum_share` of the steps.
         curriculum_share: Share of the steps that the curriculum takes; the steps after it roll out all fitted frames.
+        image_loss: `relative`: squared error relative to that of a still first frame, equal in all scenes; `mse`: the squared error itself
+            (paper).
         image_weight: Weight of the squared error of the images; 0: only silhouettes.
         silhouette_weight: Weight of the squared error of the silhouettes.
         estimate_velocity: Estimate a rigid velocity at t = 0, which is added to the known velocity of the body.
@@ -88,6 +90,7 @@ class AdaptModule(ImageModule):
         fit_frames: int = 0,
         curriculum: list[float] = [0.25, 0.5],  # noqa: B006 (read only)
         curriculum_share: float = 0.3,
+        image_loss: Literal["relative", "mse"] = "relative",
         image_weight: float = 1.0,
         silhouette_weight: float = 0.1,
         estimate_velocity: bool = False,
@@ -230,7 +233,7 @@ class AdaptModule(ImageModule):
         if motion is None:
             return fit.method.recovery_loss()
         views = sample_views(self._training_views(prepared), self.hparams.views_per_step, step)
-        loss, silhouette = image_losses(prepared, motion, views)
+        loss, silhouette = image_losses(prepared, motion, views, self.hparams.image_loss)
         regular = fit.regulariser(self.hparams.density_weight)
         self._log({"train/loss": loss, "train/silhouette": silhouette, "train/regulariser": regular, "train/frames": float(frames)})
         return self._weighted(loss, silhouette) + regular
@@ -308,7 +311,7 @@ class AdaptModule(ImageModule):
         if motion is None:
             return
         views = prepared.training_views[-1:] if self.hparams.stop_on == "view" else prepared.training_views
-        value = float(self._weighted(*image_losses(prepared, motion, views)))
+        value = float(self._weighted(*image_losses(prepared, motion, views, self.hparams.image_loss)))
         self._log({"train/looked": value})
         progress.record_loss(value, fit, self.hparams.patience)
 

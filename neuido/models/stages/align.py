@@ -36,7 +36,7 @@ class AlignModule(ImageModule):
 
     The loss of a scene is the squared error of the images over all training views, relative to that of a still first frame. A value of one
     means that none of the motion is explained, whatever the size of the body. (AdamW is invariant to this constant factor of a scene, but
-    gradient clipping is not.) The paper's Stage II is `silhouette_weight: 0`, `curriculum: [1.0]`, `init_from: null`.
+    gradient clipping is not.) The paper's Stage II is `configs/paper/stage2.yaml`.
 
     The data module is a `VisualDataModule`.
 
@@ -54,6 +54,8 @@ class AlignModule(ImageModule):
             of the run rolls out all frames. Short rollouts come first because the gradient of a long one through several contacts is
             uninformative while the law is far off.
         curriculum_share: Share of the run that the curriculum takes.
+        image_loss: `relative`: squared error relative to that of a still first frame, equal in all scenes; `mse`: the squared error itself
+            (paper).
         silhouette_weight: Weight of the squared error of the silhouettes, normalised like the images. It guides where colours mislead.
         prior_weight: Weight of the squared distance of z from its value at the start of training, mean over the components of z; 0: none.
         plausibility_weight: Weight of the penalty on elastic laws that a rollout would not survive (`law_properties.implausibility`);
@@ -89,6 +91,7 @@ class AlignModule(ImageModule):
         encoder_views: int = 0,
         curriculum: list[float] = [0.25, 0.5],  # noqa: B006 (read only)
         curriculum_share: float = 0.4,
+        image_loss: Literal["relative", "mse"] = "relative",
         silhouette_weight: float = 0.1,
         prior_weight: float = 0.0,
         plausibility_weight: float = 1.0,
@@ -152,7 +155,7 @@ class AlignModule(ImageModule):
             self._log({"train/failed": 1.0})
             return (z - self._mean_latent(z)).square().mean()
         views = sample_views(prepared.training_views, self.hparams.views_per_step, self.global_step)
-        loss, silhouette = image_losses(prepared, motion, views)
+        loss, silhouette = image_losses(prepared, motion, views, self.hparams.image_loss)
         total = loss + self.hparams.silhouette_weight * silhouette + self.hparams.prior_weight * (z - start).square().mean()
         if self.hparams.plausibility_weight:
             implausible = implausibility(self.operator, z)

@@ -67,11 +67,13 @@ def sample_views(views: list[int], count: int, step: int) -> list[int]:
     return [views[i] for i in order[:count].tolist()]
 
 
-def image_losses(prepared: PreparedScene, motion: ParticleState, views: list[int]) -> tuple[Tensor, Tensor]:
-    """Return the squared errors of images and silhouettes, each relative to the error of a still first frame."""
+def image_losses(prepared: PreparedScene, motion: ParticleState, views: list[int], loss: str = "relative") -> tuple[Tensor, Tensor]:
+    """Return the squared errors of images and silhouettes: as they are (`mse`), or relative to the error of a still first frame."""
     frames = len(motion.x)
     images, alphas = render_motion(prepared, motion, views)
     recorded, masks = prepared.recorded(views, frames), prepared.silhouettes(views, frames)
+    if loss == "mse":
+        return (images - recorded).square().mean(), (alphas - masks).square().mean()
     still = (recorded - recorded[:1]).square().mean(), (masks - masks[:1]).square().mean()
     floors = (STILL_IMAGE, STILL_MASK)
     return tuple(  # type: ignore[return-value]

@@ -359,6 +359,9 @@ def test_uneven_frames_and_segments(tmp_path, segment):
     assert torch.allclose(motion.x, whole.x[[0, 17, 28, 45]], atol=1e-6)
     image_losses(prepared, motion, [0])[0].backward()
     assert float(method.z.grad.abs().max()) > 0
+    relative, plain = (image_losses(prepared, motion, [0], loss) for loss in ("relative", "mse"))
+    recorded = prepared.recorded([0], 4)
+    assert float(plain[0]) == pytest.approx(float(relative[0]) * (float((recorded - recorded[:1]).square().mean()) + 1e-6), rel=1e-5)
 
 
 @pytest.mark.parametrize(
