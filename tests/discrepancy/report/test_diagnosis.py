@@ -154,7 +154,7 @@ def test_temporary_folder_goes_with_the_diagnosis(tmp_path):
     tests = read_material_tests(tmp_path / "test")
     found = diagnose(tests, effects="strain_stiffening", draws=39)
     place = found.folder
-    assert "strain_stiffening" in found.line
+    assert "strain stiffening (strain_stiffening)" in found.line
     assert len(found.plot().axes) == 3
     del found
     assert not place.exists()

@@ -52,6 +52,14 @@ def figures(text: str) -> list:
     return json.loads(re.search(r'<script type="application/json" id="figures">(.*?)</script>', text, re.S).group(1))
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "title"),
+    [("experiment", "thrown block", "the experiment thrown block"), ("experiment", "experiment", "the experiment"), ("", "balls", "balls")],
+)
+def test_the_title_says_kind_and_name_once(kind, name, title):
+    assert f"<h1>Diagnosis of {title}</h1>" in page.page([content()], [motion()], kind=kind, name=name)
+
+
 def test_the_page_opens_with_the_answer_and_needs_nothing_else():
     text = page.page([content()], [motion()], kind="experiment", name="thrown block")
     reader = read(text)
