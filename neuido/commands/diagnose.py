@@ -16,6 +16,7 @@ def diagnose(
     draws: int = 199,
     seed: int = 0,
     max_effects: int = 3,
+    effort: str = "normal",
     minutes: float = 15.0,
     device: str = "auto",
     resume: bool = True,
@@ -24,7 +25,7 @@ def diagnose(
     """Find the physical effect that a declared model lacks, from measured motion; add it and report the error before and after.
 
     The answer, in plain words, is an effect, a class of effects that the data cannot tell apart, none, unknown, insufficient, or unfinished
-    where the time was up. The same command given again continues an interrupted run.
+    where the search ended early. The same command given again continues an interrupted run.
 
     Args:
         folder: Measured data: a folder with experiment.yaml, test.yaml or track.yaml.
@@ -37,8 +38,9 @@ def diagnose(
         draws: Draws of the parametric bootstrap; p-values come in steps of 1 / (draws + 1).
         seed: Seed of the draws.
         max_effects: Largest number of effects that may be added, 1 to 3.
-        minutes: Time limit of the search for each body; 0: none. What was left out is reported, and the same command with more minutes
-            continues from there.
+        effort: Work of the search for each body: quick, normal or thorough. What was left out is reported, and the same command with more
+            effort continues from there. The answer goes by this work, not by how fast the machine is.
+        minutes: Time after which the search of each body is stopped; 0: none. The same command with more minutes continues from there.
         device: auto, cpu or cuda.
         resume: Continue from the predictions that an interrupted run left in OUT/.work.
         progress: Show progress: one line on a terminal, otherwise a line every half minute.
@@ -59,6 +61,7 @@ def diagnose(
         draws=draws,
         seed=seed,
         max_effects=max_effects,
+        effort=effort,
         minutes=minutes,
         device=device,
         resume=resume,

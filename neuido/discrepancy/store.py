@@ -1,4 +1,4 @@
-"""Predictions kept in memory and on disk, what each step ran, and when a diagnosis has to come to its end."""
+"""Predictions kept in memory and on disk, what each step ran, and the work and the time that a diagnosis may take."""
 
 import contextlib
 import functools
@@ -66,6 +66,11 @@ class Memo:
     def simulations(self) -> int:
         """Points times recordings that were run so far."""
         return sum(w.simulations for w in self.work.values())
+
+    @property
+    def effort(self) -> float:
+        """Work so far, in the unit of `Problem.effort`."""
+        return sum(w.effort for w in self.work.values())
 
     @property
     def pace(self) -> float:
@@ -314,33 +319,47 @@ def clear(out: Path) -> None:
 
 
 SEARCH = 0.8
-"""Share of the time for the search at the most; the rest is for the last fit, the intervals and the report."""
+"""Share of the time at which a search is stopped, at the most; the rest is for the last fit, the intervals and the report."""
 LEAST_SEARCH = 0.6
 """The same at the least."""
 AFTER = 200
 """Simulations that follow it: what was begun is weighed, the best is fitted to its end, and its intervals are taken."""
 
 
-class Deadline:
-    """The time that a diagnosis may take.
+class Budget:
+    """The work that a search may take, and the time after which it is stopped.
+
+    Its work decides what a search does, and is the same on a fast machine and a slow one. The time decides nothing but that a search is cut
+    off. What follows the search (the last fit, intervals) is little and is no part of the work.
 
     Args:
+        work: Of the search, in the unit of `spent`; infinite: as much as it takes.
+        spent: The work so far.
         seconds: From now on; infinite: as long as it takes.
         clock: Seconds on a clock that never goes back.
-        pace: Seconds that a simulation has taken so far; where one is slow the search ends earlier.
+        pace: Seconds that a simulation has taken so far; where one is slow the search is stopped earlier.
 
     Attributes:
         left_out: What the search has not done, in words.
-        cut: Whether a step or a fit ended early for lack of time, so that more time could change the answer.
+        cut: Whether a step or a fit ended early, so that more work could change the answer.
+        ended_by: What ended it: `effort`, `time`, or empty where nothing did.
     """
 
     def __init__(
-        self, seconds: float = math.inf, *, clock: Callable[[], float] = time.monotonic, pace: Callable[[], float] = lambda: 0.0
+        self,
+        work: float = math.inf,
+        *,
+        spent: Callable[[], float] = lambda: 0.0,
+        seconds: float = math.inf,
+        clock: Callable[[], float] = time.monotonic,
+        pace: Callable[[], float] = lambda: 0.0,
     ) -> None:
+        self.work, self.spent = work, spent
         self.clock, self.begun, self.seconds, self.pace = clock, clock(), seconds, pace
         self.concluding = False
         self.left_out: list[str] = []
         self.cut = False
+        self.ended_by = ""
 
     @property
     def share(self) -> float:
@@ -351,20 +370,28 @@ class Deadline:
 
     @property
     def over(self) -> bool:
-        """Whether the time for the search is up, or all of it once the diagnosis concludes; nothing is noted."""
-        return self._is_past(1.0)
+        """Whether the work of the search is done or the time is up; nothing is noted."""
+        return bool(self._end(1.0))
 
     def ends(self, share: float = 1.0) -> bool:
-        """Whether something ends here because this share of the time that counts is over; the search counts as cut off then."""
-        past = self._is_past(share)
-        self.cut = self.cut or past
-        return past
+        """Whether something ends here, since this share of the work is done or the time is up; the search counts as cut off then.
 
-    def _is_past(self, share: float) -> bool:
-        return self.clock() - self.begun > share * self.share * self.seconds
+        An infinite share never ends.
+        """
+        end = self._end(share)
+        if end:
+            self.cut, self.ended_by = True, "time" if "time" in (end, self.ended_by) else end
+        return bool(end)
+
+    def _end(self, share: float) -> str:
+        if math.isinf(share):
+            return ""
+        if self.clock() - self.begun > self.share * self.seconds:
+            return "time"
+        return "effort" if not self.concluding and self.spent() > share * self.work else ""
 
     def skips(self, what: str, until: float = 1.0) -> bool:
-        """Whether there is no time left for a step, or it is past this share of it; which is noted then."""
+        """Whether there is nothing left for a step, or it is past this share of the work; which is noted then."""
         if not self.ends(until):
             return False
         if what not in self.left_out:
@@ -372,5 +399,5 @@ class Deadline:
         return True
 
     def conclude(self) -> None:
-        """From here on the whole time counts."""
+        """End the search: from here on the whole time counts, and no work."""
         self.concluding = True

@@ -5,8 +5,8 @@ import time
 
 import numpy as np
 
+from neuido.discrepancy.diagnosis_log import Log
 from neuido.discrepancy.inference.search.attribution import diagnose
-from neuido.discrepancy.workflow import Log
 from tests.discrepancy.report.test_answer import Curve
 
 
@@ -34,6 +34,8 @@ def test_a_plain_line_says_what_is_tried_what_leads_and_what_is_left(tmp_path):
 def test_the_search_tells_what_leads(tmp_path):
     with Log(tmp_path / "log.csv", shown=False, begun=time.monotonic()) as log:
         log.begin("", 600.0)
-        diagnose(Curve({"young": 1.5, "drag_linear.k": 0.8}), draws=39, tell=log)
+        found = diagnose(Curve({"young": 1.5, "drag_linear.k": 0.8}), draws=39, tell=log, passes=1e4)
+        share = found.budget.spent() / found.budget.work
+        assert 0 < share < 1 and f"; {share:.0%} of the effort; " in log.progress.line(time.monotonic())
         assert log.progress.leads.startswith("in the lead: linear air drag, which leaves ")
     assert any("in the lead: linear air drag" in row[2] for row in rows(tmp_path / "log.csv"))

@@ -13,7 +13,7 @@ from neuido.discrepancy.inference.journal import Journal
 from neuido.discrepancy.inference.least_squares import Fit, Request, levenberg_marquardt, residuals, run
 from neuido.discrepancy.problems import noise as noises
 from neuido.discrepancy.problems.problem import Parameter, Point, Problem, Recording
-from neuido.discrepancy.store import Deadline, Memo
+from neuido.discrepancy.store import Budget, Memo
 
 Tell = Callable[[str], None]
 
@@ -26,7 +26,7 @@ class Laboratory:
         setting: Setting of the discretisation that predicts; the others tell its error.
         tell: Called with a line of progress.
         memo: Predictions that are shared with those of other settings.
-        deadline: When fits end where they are.
+        budget: When fits end where they are.
         journal: What was judged, shared too.
         parts: What is fitted and what validates; None: as the roles of the recordings have it.
     """
@@ -38,12 +38,12 @@ class Laboratory:
         setting: int = 0,
         tell: Tell | None = None,
         memo: Memo | None = None,
-        deadline: Deadline | None = None,
+        budget: Budget | None = None,
         journal: Journal | None = None,
         parts: Sequence[Part] | None = None,
     ) -> None:
         self.journal = journal if journal is not None else Journal()
-        self.problem, self.own, self.setting, self.deadline = problem, setting, setting, deadline or Deadline()
+        self.problem, self.own, self.setting, self.budget = problem, setting, setting, budget or Budget()
         self.tell = tell or (lambda line: None)
         self.memo = memo or Memo(problem)
         self.parts = split(problem) if parts is None else list(parts)
@@ -177,13 +177,13 @@ class Laboratory:
         return self.noises[n][1]
 
     def request(self, parameters: Sequence[Parameter], start: Point, *, until: float = 1.0, **options: Any) -> Request:
-        """A fit, which ends where it is when this share of the time for the search is over; options of `levenberg_marquardt`.
+        """A fit, which ends where it is when this share of the search's work is done; options of `levenberg_marquardt`.
 
-        `until`: infinite for a fit that the clock never ends.
+        `until`: infinite for a fit that nothing ends early.
         """
         margin = functools.partial(self.problem.margin, setting=self.setting)
         together = self.problem.together
-        return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.deadline.ends(until), **options)
+        return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.budget.ends(until), **options)
 
     def runs(self, point: Point) -> bool:
         """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""

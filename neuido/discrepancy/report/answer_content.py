@@ -180,7 +180,8 @@ def _work(d: Diagnosis) -> dict[str, Any]:
     unit = "particle-substeps" if d.problem.settings > 1 else "data"
     sums = {key: sum(getattr(w, key) for w in d.work.values()) for key in ("simulations", "reused", "effort")}
     steps = {step: {"simulations": w.simulations, "effort": w.effort} for step, w in d.work.items()}
-    return sums | {"effort_unit": unit, "by_step": steps}
+    limit = d.budget.work if math.isfinite(d.budget.work) else None
+    return sums | {"effort_unit": unit, "limit": limit, "ended_by": d.budget.ended_by, "by_step": steps}
 
 
 def _settings(d: Diagnosis) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from neuido.data.files.parsing import read_arrays
 from neuido.data.files.writing import copy_file
 from neuido.discrepancy.report import diagnosis_format
 from neuido.discrepancy.report.reader_units import Units, axis_of
-from neuido.discrepancy.report.wording import LEADING, MORE, Words, named, scored_by, words_of
+from neuido.discrepancy.report.wording import LEADING, MORE, Words, more, named, scored_by, words_of
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ class Diagnosis:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Steps for which there was no time."""
+        """Steps that the search has not done."""
         if "bodies" in self._content:
             return tuple(step for own in self.bodies.values() for step in own.left_out)
         return tuple(self._content.get("left_out", ()))
@@ -214,7 +214,7 @@ class Diagnosis:
         out += "".join(f": {why}" for why in self.why[:1])
         scored = "held-out" if error.held_out else "fitted"
         out += f"; {scored} error {error.before:.3g} -> {error.after:.3g} {error.unit} (floor {error.floor:.2g})"
-        return out + (f"; no time for {', '.join(self.left_out)}: give more minutes" if self.left_out else "")
+        return out + (f"; not done: {', '.join(self.left_out)}: give {more(self._content)}" if self.left_out else "")
 
     @property
     def words(self) -> Words:

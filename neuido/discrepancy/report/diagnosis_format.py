@@ -102,7 +102,11 @@ def schema() -> Schema:
             "effort": NUMBER,
             "effort_unit": TEXT,
         },
-        {"by_step": mapping(record({"simulations": NUMBER, "effort": NUMBER}))},
+        {
+            "limit": MAYBE,
+            "ended_by": {"enum": ["effort", "time", ""]},
+            "by_step": mapping(record({"simulations": NUMBER, "effort": NUMBER})),
+        },
     )
     change = record({"change": TEXT, "expected_log_odds": NUMBER})
     following = record(

@@ -55,7 +55,7 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
         catalogue = _tracks(inner)
     first = []
     for name, problem, sigma in catalogue:
-        if d.deadline.skips("the next experiment"):
+        if d.budget.skips("the next experiment"):
             return None
         rows = problem.predict([r.point for r in rivals], 0, setting)
         if np.isfinite(rows).all():
@@ -63,7 +63,7 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
     first.sort(key=lambda entry: -entry[0])
     final = []
     for _, _, name, problem, sigma, rows in first[:FINALISTS]:
-        if d.deadline.skips("the next experiment"):
+        if d.budget.skips("the next experiment"):
             return None
         slopes = [_slopes(d, problem, rival, setting) for rival in rivals]
         odds, pair = _nearest(rows, slopes, sigma(rows))

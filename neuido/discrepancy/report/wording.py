@@ -46,11 +46,16 @@ def words_of(c: Content, units: Units | None = None) -> Words:
     """Return the words of one part of diagnosis.json."""
     units = units or Units.of([c])
     notes = (
-        f"There was no time for {listed([worded(step) for step in c['left_out']])}: the same command with more minutes goes on."
+        f"The search ended before {listed([worded(step) for step in c['left_out']])}: the same command with {more(c)} goes on."
         if c["left_out"]
         else ""
     )
     return Words(_finding(c, units), _error(c, units), _sure(c), _not_excluded(c, units), _next(c), notes)
+
+
+def more(c: Mapping[str, Any]) -> str:
+    """Return what lets a search that was cut off go on."""
+    return "more effort" if c.get("work", {}).get("ended_by") == "effort" else "more minutes"
 
 
 def titles() -> dict[str, str]:

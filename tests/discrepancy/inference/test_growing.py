@@ -176,7 +176,7 @@ def test_growing_fits_end_with_the_time(over, horizons, monkeypatch):
     search = next_effect.new_search(problem)
     base = base_fits.base_fit(search)
     asked, fits = [], search.lab.fits
-    monkeypatch.setattr(type(search.lab.deadline), "ends", lambda self, share=1.0: over)
+    monkeypatch.setattr(type(search.lab.budget), "ends", lambda self, share=1.0: over)
     monkeypatch.setattr(Laboratory, "fits", lambda self, *args, **options: asked.append(1) or fits(*args, **options))
     grown = refining.growing(search, base.fit, base.floor, problem.candidates)
     assert len(asked) == horizons

@@ -33,7 +33,7 @@ from neuido.discrepancy.inference.search.search_state import Look, Promising
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.report.answer import trace
 from neuido.discrepancy.report.answer_content import rejected
-from neuido.discrepancy.store import Deadline
+from neuido.discrepancy.store import Budget
 
 T = np.linspace(0.0, 1.0, 120)
 NOISE = 0.01
@@ -93,7 +93,7 @@ class Method:
     problem = SimpleNamespace(together=True)
 
     def __init__(self, result=None):
-        self.result, self.deadline, self.asked, self.seen, self.lab = result, Deadline(), None, None, self
+        self.result, self.budget, self.asked, self.seen, self.lab = result, Budget(), None, None, self
 
     def is_noise(self, errors):
         return False
@@ -850,7 +850,7 @@ def test_past_its_share_of_the_time_a_method_halts_its_fits_where_another_one_na
     alone = next_effect.find(search, start.fit, start.floor, [])
     search.seen = None
     late = next_effect.CONFIRMED + 0.01
-    monkeypatch.setattr(search.lab.deadline, "ends", lambda share=1.0: late > share)
+    monkeypatch.setattr(search.lab.budget, "ends", lambda share=1.0: late > share)
     again = next_effect.find(search, start.fit, start.floor, [], alone if asked_after else None)
     assert any(why == contests.NO_TIME for why in again.unfitted.values()) is asked_after
 
@@ -1267,7 +1267,7 @@ def test_an_effect_leaves_less_than_a_method_that_was_not_asked_does_without_any
     monkeypatch.setattr(choosing, "by_first_fits", lambda *_: {0: 0.0})
     asked, late = Method(first_round(left, named=True)), Method()
     asked.result.chosen.gain = np.log(10.0)
-    late.deadline, late.problem = Deadline(0.0), SimpleNamespace(declared=())
+    late.budget, late.problem = Budget(0.0, spent=lambda: 1.0), SimpleNamespace(declared=())
     chosen, firsts = choosing.first_rounds([asked, late], [stood(1.0), stood(0.4)])
     assert (firsts[chosen][0].chosen is not None) is answered
     assert firsts[chosen][0].errors[0] == pytest.approx(1.0 if answered else 0.16)
@@ -1280,11 +1280,11 @@ def test_an_effect_gains_much_where_there_was_no_time_for_another_method(gain, l
     first = first_round(0.2, named=True)
     first.chosen.gain = np.log(gain)
     other = Method(first_round(1.0, named=False))
-    other.deadline = Deadline(0.0 if late else np.inf)
+    other.budget = Budget(0.0 if late else np.inf, spent=lambda: 1.0)
     chosen, firsts = choosing.first_rounds([Method(first), other], [stood(1.0), stood(1.1)])
     assert chosen == 0 and (firsts[0][0].chosen is not None) is named and firsts[0][0].unsure is not named
     assert bool(first.trials[0].reason) is not named
-    assert named or "no time for the other method" in first.trials[0].reason
+    assert named or "the search ended before the other method" in first.trials[0].reason
 
 
 def test_what_there_was_no_time_to_be_sure_of_is_unknown_and_not_none(monkeypatch):
@@ -1577,7 +1577,7 @@ def test_a_look_that_was_put_off_goes_on_when_it_is_asked_again(monkeypatch):
     assert whole.contest.put_off is None and set(whole.contest.best) == {lead, *waiting}
     assert next_effect.first_look(search, base.fit, base.floor) is whole
     search.seen, told = first, []
-    monkeypatch.setattr(search.lab.deadline, "skips", lambda what, until=1.0: told.append(what) or True)
+    monkeypatch.setattr(search.lab.budget, "skips", lambda what, until=1.0: told.append(what) or True)
     assert next_effect.first_look(search, base.fit, base.floor) is first
     assert told == [f"fits of {', '.join(waiting)}"]
 
@@ -1816,8 +1816,8 @@ def test_what_does_not_act_in_proportion_is_tried_as_declared_too():
 def test_what_got_no_fit_for_want_of_time_is_said_to(monkeypatch):
     """Past its share of the time a look tries no sizes, and ends the fits that it begins."""
     clock = [0.0]
-    deadline = Deadline(100.0, clock=lambda: clock[0])
-    search = next_effect.new_search(Line(lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t), wiggle=0.0), deadline=deadline)
+    budget = Budget(100.0, spent=lambda: clock[0])
+    search = next_effect.new_search(Line(lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t), wiggle=0.0), budget=budget)
     base = base_fits.base_fit(search)
     clock[0] = 60.0
     monkeypatch.setattr(contests, "sized", None)
@@ -1888,7 +1888,7 @@ def test_a_look_that_is_late_tries_no_further_sizes(together, monkeypatch):
     """A batch may take long; what was not tried keeps its starts, and says nothing of what it leaves."""
     monkeypatch.setattr(contests, "TRIED_AT_ONCE", 1)
     clock = [0.0]
-    search = next_effect.new_search(Line(clipped, together=together), deadline=Deadline(100.0, clock=lambda: clock[0]))
+    search = next_effect.new_search(Line(clipped, together=together), budget=Budget(100.0, spent=lambda: clock[0]))
     base = base_fits.base_fit(search)
     by_key = {c.key: c for c in search.lab.problem.candidates}
     slopes = directions.slopes(search.lab, search.lab.problem.declared, base.fit.point, search.lab.scored_recordings)

@@ -22,7 +22,7 @@ from neuido.discrepancy.inference.search.pairs import by_growing, neighbours, si
 from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.inference.statistics import statistics_of
 from neuido.discrepancy.problems.problem import Point, Problem
-from neuido.discrepancy.store import Deadline, Memo, Work
+from neuido.discrepancy.store import Budget, Memo, Work
 from neuido.errors import UserError
 
 MOST = 3
@@ -130,8 +130,8 @@ class Diagnosis:
     setting: int
     work: Mapping[str, Work]
     """What each step ran."""
-    deadline: Deadline = field(default_factory=Deadline)
-    """When it has to come to its end."""
+    budget: Budget = field(default_factory=Budget)
+    """What it may take, and what ended it."""
     sealed: list[Part] = field(default_factory=list)
     """Recordings that took no part in the search: theirs is a test error."""
     leads: list[Trial] = field(default_factory=list)
@@ -153,8 +153,8 @@ class Diagnosis:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """What there was no time for."""
-        return tuple(self.deadline.left_out)
+        """What the search has not done."""
+        return tuple(self.budget.left_out)
 
     @property
     def evaluations(self) -> int:
@@ -174,6 +174,7 @@ def diagnose(
     seed: int = 0,
     most: int = MOST,
     tell: Tell | None = None,
+    passes: float = math.inf,
     seconds: float = math.inf,
     statistics: bool = False,
 ) -> Diagnosis:
@@ -186,14 +187,17 @@ def diagnose(
         seed: Of the draws.
         most: Effects that may be added.
         tell: Called with a line of progress.
-        seconds: After which it comes to its end; see `Deadline`.
+        passes: Work of the search, in runs of the declared model through all recordings under the suggested setting.
+        seconds: After which it is stopped; see `Budget`.
         statistics: Keep what a likelihood needs of the best fits, which takes further simulations.
 
     Raises:
         UserError: No method can predict the declared model; the line of its simulator.
     """
     memo, journal = Memo(problem), Journal()
-    deadline = Deadline(seconds, pace=lambda: memo.pace)
+    budget = budget_of(problem, memo, passes, seconds)
+    if (watch := getattr(tell, "watch", None)) is not None:
+        watch(budget)
     tried: list[Search] = []
     starts: list[Stand] = []
     for n in problem.solvers:
@@ -201,9 +205,9 @@ def diagnose(
             if starts:
                 continue
             raise UserError(problem.refusal(n))
-        shared = {"tell": tell, "memo": memo, "deadline": deadline, "journal": journal}
+        shared = {"tell": tell, "memo": memo, "budget": budget, "journal": journal}
         search = next_effect.new_search(problem, setting=n, keep=keep, draws=draws, seed=seed, **shared)
-        if starts and (comparing.is_settled(tried[-1].lab, starts[-1].errors) or deadline.skips(problem.setting_name(n))):
+        if starts and (comparing.is_settled(tried[-1].lab, starts[-1].errors) or budget.skips(problem.setting_name(n))):
             continue
         if len(starts) == 1 and told_exactly(tried[0], starts[0]):
             break
@@ -231,11 +235,11 @@ def diagnose(
         found.append(step)
         # near the noise too: what leaves that alone in one simulation is told by it, however little it gains
         settled = len(found) == most or comparing.is_noise(search.lab, step.errors)
-        hurried = deadline.over
+        hurried = budget.over
         if hurried and not settled:
-            deadline.skips("a further effect")
-        if hurried:  # what is left of the time is for the last fit
-            deadline.conclude()
+            budget.skips("a further effect")
+        if hurried:  # nothing but the last fit follows
+            budget.conclude()
         at = base_fits.finished(search.lab, step.stand)
         if settled or hurried or comparing.is_noise(search.lab, at.errors):
             break
@@ -248,7 +252,7 @@ def diagnose(
     if not hurried and (not found or (len(found) == 1 and not problem.together)):
         grown = by_growing(search, rounds[0], at, others)
     if hurried and 0 < len(found) < MOST and not comparing.is_settled(search.lab, at.errors):
-        deadline.skips("two effects at once")
+        budget.skips("two effects at once")
     if grown or (0 < len(found) < 3 and not hurried):
         by, pair = grown or two_effects(search, rounds, found, at, others)
         if by is not search:
@@ -259,7 +263,7 @@ def diagnose(
             at = base_fits.finished(search.lab, found[-1].stand)
     if len(found) == 1:
         widen(search, rounds[0], at, others.values())
-    deadline.conclude()
+    budget.conclude()
     if len(found) > 1:
         floor = discretisation.floor_at(search.lab, at.fit.point)
         fit, found = drop(search, at.fit, floor, found)
@@ -271,11 +275,17 @@ def diagnose(
     return made
 
 
+def budget_of(problem: Problem, memo: Memo, passes: float, seconds: float) -> Budget:
+    """Return the budget of a search in the unit of the problem's effort: of a body particle-substeps, so that it goes with its size."""
+    one = sum(problem.effort(n, problem.solvers[0]) for n in range(len(problem.recordings)))
+    return Budget(passes * one, spent=lambda: memo.effort, seconds=seconds, pace=lambda: memo.pace)
+
+
 def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], rounds: list[Round]) -> Diagnosis:
     """The answer and its figures, each stand with the floor that its effects were weighed with."""
     lab = search.lab
     first, problem = rounds[0], lab.problem
-    cut = lab.deadline.cut and (bool(found) or not comparing.is_noise(lab, before.errors))
+    cut = lab.budget.cut and (bool(found) or not comparing.is_noise(lab, before.errors))
     kept = {t.candidate.key for t in found}
     steps = [r for r in rounds if r.chosen is None or r.chosen.candidate.key in kept]
     leads = leading(rounds) if cut else []
@@ -298,7 +308,7 @@ def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], ro
         stated = Fit(before.fit.point, tuple(p.name for p in problem.declared), 0.0, np.empty(0), 0, True)
         declared = intervals(lab, stated, before.floor, before.errors)
     scale, floor = lab.scale, after.floor
-    power = [] if cut or lab.deadline.over else compatible(lab, after, rounds[-1], found)
+    power = [] if cut or lab.budget.over else compatible(lab, after, rounds[-1], found)
     amounts = {when: lab.amounts(s.fit.point, s.floor) for when, s in stands.items()}
     final, errors, single = tested(search, stands, amounts, alone)
     return Diagnosis(
@@ -320,7 +330,7 @@ def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], ro
         declared,
         lab.setting,
         lab.memo.work,
-        lab.deadline,
+        lab.budget,
         sealed=list(lab.sealed),
         leads=leads,
         why=why,

@@ -67,13 +67,13 @@ def grown(
 
     What a body does after it has bounced has many valleys, and what it does before has few: each horizon begins where the one before
     it ended, near enough for the next bounce. What costs more than `reach` times the least at a horizon is given up, and all but the
-    `most` that cost least; past the share `until` of the time they are where they are. Each with its place among the entries, the least
+    `most` that cost least; past the share `until` of the work they are where they are. Each with its place among the entries, the least
     cost first. `sizes`: of each entry, what begins smaller where its point does not run.
     """
     ended: list[tuple[int, Fit]] = []
     live = [(i, point) for i, (_, point) in enumerate(entries)]
     for share in (*HORIZONS[1:], 1.0):
-        if not live or (ended and lab.deadline.ends(until)):
+        if not live or (ended and lab.budget.ends(until)):
             break
         options = {} if share == 1.0 else {"iterations": stepwise(lab)}
         requests = [lab.request(entries[i][0], point, until=until, sizes=sizes[i] if sizes else (), **options) for i, point in live]
@@ -120,7 +120,7 @@ def base_fit(search: Search, near: Point | None = None) -> Stand | None:
         begin = lab.recentred(fit.point, floor) if turn else fit.point
         if turn >= AGAIN and begin == fit.point:
             break
-        if turn and lab.deadline.skips("the declared model again"):
+        if turn and lab.budget.skips("the declared model again"):
             break
         begins = [begin]
         if begin != fit.point and not asked:  # a modulus may have made up for where the floor is
@@ -144,7 +144,7 @@ def begun_anew(search: Search, made: Sequence[Stand]) -> list[Stand]:
     lab = search.lab
     best = min(made, key=lambda stand: comparing.fitted_score(lab, stand.errors))
     free = lab.problem.declared
-    if comparing.is_noise(lab, best.errors[lab.fitted], fitted=True) or not free or lab.deadline.ends():
+    if comparing.is_noise(lab, best.errors[lab.fitted], fitted=True) or not free or lab.budget.ends():
         return []
     with discretisation.quickly(lab):
         first = search.begun = first_part(lab, free, dict(lab.as_declared), best.floor)

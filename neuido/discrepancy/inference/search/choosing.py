@@ -19,15 +19,15 @@ from neuido.discrepancy.inference.search.search_state import Search
 CLEARLY = 1.5
 """Times the error of another method's first fits at which those of the suggested one are refined first all the same."""
 LOOKS = (0.5, 0.8)
-"""Shares of the time for the search at which the first fits by the first method end, and those by others: the rest is for refining."""
+"""Shares of the search's work at which the first fits by the first method end, and those by others: the rest is for refining."""
 AS_SURE = 2.0
 """Times the noise up to which what a named effect leaves is no reason to ask another method: in five blind seeds none of eight that were
 asked there took its place, of three that left 2.3 to 2.4 times as much all."""
 EARLY = 1.5
 """Times its floor above which what the suggested method leaves is searched before another method has its declared model fitted."""
 UNASKED = math.log(3.0)
-"""Gain from which an effect is named although there was no time to refine by another method: of the searches of a blind seed that were cut
-off there a false alarm gained 2.4, half of a pair 2.7, what was right or near 3.3 to 9."""
+"""Gain from which an effect is named although the search ended before it was refined by another method: of the searches of a blind seed
+that were cut off there a false alarm gained 2.4, half of a pair 2.7, what was right or near 3.3 to 9."""
 
 
 def told_exactly(search: Search, start: Stand) -> bool:
@@ -43,7 +43,7 @@ def told_exactly(search: Search, start: Stand) -> bool:
     if not look.least or not comparing.is_noise(lab, look.least[0]):
         return False
     first = next_effect.find(search, start.fit, start.floor, [])
-    if first.chosen is None or lab.deadline.ends():
+    if first.chosen is None or lab.budget.ends():
         return False
     return judging.is_exact(search, replace(first.chosen, stand=base_fits.finished(lab, first.chosen.stand)))
 
@@ -74,7 +74,7 @@ def first_rounds(tried: Sequence[Search], starts: Sequence[Stand]) -> tuple[int,
         at_first = -math.inf if waits(tried[i]) else seen.get(i, -math.inf)
         if any(r.chosen and at_first > r.chosen.score + handicap[i] + 2.0 * math.log(BEYOND) for r in named):
             continue
-        if firsts and tried[i].lab.deadline.skips("effects by the other method"):
+        if firsts and tried[i].lab.budget.skips("effects by the other method"):
             unasked = True
             continue
         first = tried[i].asked or next_effect.find(tried[i], starts[i].fit, starts[i].floor, [], named[0] if named else None)
@@ -105,7 +105,7 @@ def first_rounds(tried: Sequence[Search], starts: Sequence[Stand]) -> tuple[int,
     first = firsts[chosen][0]
     if unasked and len(firsts[chosen]) == 1 and first.chosen is not None and first.chosen.gain < UNASKED:
         for t in first.members:
-            t.reason = t.too_little(UNASKED, "with no time for the other method")
+            t.reason = t.too_little(UNASKED, "as the search ended before the other method")
         firsts[chosen] = [replace(first, chosen=None, members=[], unsure=True)]
     return chosen, firsts
 
@@ -160,7 +160,7 @@ def by_first_fits(tried: Sequence[Search], starts: Sequence[Stand], order: Seque
     if comparing.may_be_noise(tried[first].lab, least):
         return left
     for i in others:
-        if tried[i].lab.deadline.skips("first fits by the other method", LOOKS[1]):
+        if tried[i].lab.budget.skips("first fits by the other method", LOOKS[1]):
             break
         beyond = left[first] - handicap[i] + 2.0 * math.log(WORSE)
         least_by(i, led=look.led, beyond=beyond, grows=at_once)

@@ -18,7 +18,7 @@ yield stress or a lossy floor does once it acts."""
 SIZED = 3
 """Parameters up to which a candidate of one size is tried at several sizes before it is fitted."""
 TRIED_AT_ONCE = 48
-"""Starts, at the least, that are tried in one go where points run together: between two goes the time is looked at."""
+"""Starts, at the least, that are tried in one go where points run together: between two goes the budget is looked at."""
 SHAPES = 4
 """Shapes of a candidate of more than `SMALL` parameters that are fitted: from 17 degrees beside a fibre a fit comes to it, from 47 not."""
 FAR = 6.0
@@ -55,7 +55,7 @@ CLOSELY = 8
 AT_MOST = 6
 """Iterations of these."""
 
-NO_TIME = "there was no time for its fit"
+NO_TIME = "the search ended before its fit"
 FAR_BEHIND = "by the method that fits best it was not fitted, by the other one the first few fits leave far more"
 FEWER_DO = "an effect of fewer parameters leaves nothing but noise"
 OTHERS_DO = "another effect leaves nothing but noise, and its direction in the data promises little"
@@ -139,7 +139,7 @@ def sized(
 
     Candidates of few parameters and one size are tried at the sizes and in the shapes of `tried`, one simulation each. The best one is
     kept, and of the others the best one with the base fit's, or with the declared, values. A direction has several valleys: of such
-    candidates the best start of each of some shapes is kept. Past the share `until` of the time the rest keep their starts.
+    candidates the best start of each of some shapes is kept. Past the share `until` of the work the rest keep their starts.
     """
     led_far = comparing.moved(lab, base.point) > LED_FAR
     places: list[tuple[list[Start], list[Start]]] = []
@@ -152,7 +152,7 @@ def sized(
     least: dict[str, float] = {}
     lab.tell(f"{sum(len(made) for _, made in places)} starts of {len(places)} effects")
     for chunk in _in_goes(places, TRIED_AT_ONCE if lab.problem.together else 1):
-        if lab.deadline.ends(until):
+        if lab.budget.ends(until):
             out += [start for own, _ in chunk for start in own]
             continue
         before, *costs = lab.costs([base.point, *(point for _, made in chunk for _, point, _ in made)], floor)
@@ -242,7 +242,7 @@ def contest(
         hopeful: Keys of candidates that could take something off by the screening; all where absent.
         then: Further starts, given the best fit of each candidate in the order of their costs.
         beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
-        until: Share of the time for the search at which fits end where they are and no others begin: the rest is for other steps.
+        until: Share of the search's work at which fits end where they are and no others begin: the rest is for other steps.
         between: Further fits after the first ones, given what the leading one of these leaves, where there are others to come.
         puts_off: Whether the others wait where the first ones leave more than may be noise: it may be the wrong method.
         before: Fits that were made before `starts` were put off (`PutOff.ended`).
@@ -273,7 +273,7 @@ def contest(
         key = entry[0].key
         waves[0 if (lab.problem.together and beyond == math.inf) or key in first else 1 if key in small else 2].append(entry)
     for i, own in enumerate(waves):
-        if best and own and lab.deadline.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}", until):
+        if best and own and lab.budget.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}", until):
             unfitted |= {c.key: NO_TIME for wave in waves[i:] for c, *_ in wave}
             break
         leading, remains = left() if own and best else (None, None)

@@ -33,7 +33,7 @@ def decided(
         before: Mean squares of what the declared model leaves of each part.
         found: The effects that were named.
         steps: The rounds of the answer.
-        cut: Whether the search ended for lack of time.
+        cut: Whether the search ended early.
         wrong: What is wrong with fitted figures of the declared model.
         blind: Whether no other setting of the simulation runs.
     """

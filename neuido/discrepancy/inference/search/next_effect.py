@@ -25,7 +25,7 @@ from neuido.discrepancy.inference.search.search_state import Look, Search
 from neuido.discrepancy.problems.problem import Candidate, Problem
 
 CONFIRMED = 0.8
-"""Share of the time for the search at which the first fits of a method end that is asked after another one named an effect: what is left is
+"""Share of the search's work at which the first fits of a method end that is asked after another one named an effect: what is left is
 for a second one."""
 PLAIN, AS_WELL = 2, 1.2
 """Places where fits with an effect ended at which the model is weighed without it, and times the error of the base fit in the fitted
@@ -66,7 +66,7 @@ def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival:
     look = first_look(search, base, floor, found, led, most=most, until=until)
     candidates, free, slopes, columns, chosen, *_ = look.asked
     best, other, errors = dict(look.contest.best), look.contest.other, lab.mean_squares([base.point], floor)[0]
-    if not lab.deadline.skips("refining the best fits"):
+    if not lab.budget.skips("refining the best fits"):
         best |= stand_ins.limits(lab, free, best, candidates, floor)
         best |= refining.polish(lab, free, best, base, floor, rival, other)
         best |= stand_ins.alike(lab, free, best, candidates, chosen, columns, slopes, floor)
@@ -90,14 +90,14 @@ def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival:
     result = judged(empty)
     promising = result.over > WITHIN and any(t.gain > judging.by_chance(lab, result) for t in result.trials)
     again = first and result.chosen is None and (promising or result.over > 1.0)
-    if again and not lab.deadline.skips("fits from elsewhere"):
+    if again and not lab.budget.skips("fits from elsewhere"):
         best |= refining.elsewhere(lab, base, best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
         result = judged(empty)
-    if again and result.chosen is None and not every and not lab.deadline.skips("measuring every fit where it ends"):
+    if again and result.chosen is None and not every and not lab.budget.skips("measuring every fit where it ends"):
         every = True
         result = judged(empty)
     missed = again and result.chosen is None and not look.grown and is_led_away(lab, base, result)
-    if missed and not lab.deadline.skips("growing fits"):
+    if missed and not lab.budget.skips("growing fits"):
         with discretisation.quickly(lab, base.point, floor):
             grown = list(refining.growing(search, base, floor, candidates).values())
         best |= refining.ahead(lab, grown, best, floor)
@@ -137,7 +137,7 @@ def without_effect(lab: Laboratory, result: Round, base: Fit, floor: Floor) -> S
         return None
     discretisation.foresee(lab, wanted)
     stands = [Stand(replace(base, point=place), *discretisation.stand(lab, place, like=floor)) for place in wanted]
-    if lost and not lab.deadline.skips("the declared model again from where effects were fitted"):
+    if lost and not lab.budget.skips("the declared model again from where effects were fitted"):
         free = [lab.problem.parameter(name) for name in base.names]
         able = [(s.fit.point, s.floor) for s, runs in zip(stands, lab.which_run(wanted), strict=True) if runs]
         fits = lab.fits([lab.request(free, point) for point, _ in able], [own for _, own in able])
@@ -174,7 +174,7 @@ def first_look(
     """Screen the candidates, and fit the best; arguments as those of `round`. A base that was looked at last is not looked at again.
 
     `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
-    which there are no others; `until`: share of the search's time past which there are none; `grows`: whether fits grow where these
+    which there are no others; `until`: share of the search's work past which there are none; `grows`: whether fits grow where these
     leave much, in a base that was looked at without as well.
     """
     lab = search.lab
@@ -191,7 +191,7 @@ def first_look(
 
         def between(remains: np.ndarray) -> Sequence[tuple[Candidate, Fit]]:
             astray = grows and not found and refining.is_astray(search, base, floor) and refining.leaves_much(lab, [remains])
-            if astray and not lab.deadline.skips("growing fits", until):
+            if astray and not lab.budget.skips("growing fits", until):
                 grown.extend(refining.growing(search, base, floor, candidates, until=until).values())
             return grown
 
@@ -210,7 +210,7 @@ def whole(search: Search, look: Look, floor: Floor, until: float) -> Look:
     """A look for a first effect with the fits that were put off."""
     lab = search.lab
     begun = look.contest.put_off
-    if begun is None or lab.deadline.skips(f"fits of {', '.join(begun.keys)}", until):
+    if begun is None or lab.budget.skips(f"fits of {', '.join(begun.keys)}", until):
         return look
     asked, point = look.asked, look.base.point
     without = partial(prospects.without_own, search, point, asked.starts, ())
@@ -223,7 +223,7 @@ def whole(search: Search, look: Look, floor: Floor, until: float) -> Look:
 def grown_on(search: Search, look: Look, floor: Floor, found: Sequence[Trial], until: float) -> Look:
     """A look with fits that grow, once more under the own setting, where none did and its own leave much."""
     lab = search.lab
-    if look.grown or not refining.leaves_much(lab, look.least) or lab.deadline.skips("growing fits", until):
+    if look.grown or not refining.leaves_much(lab, look.least) or lab.budget.skips("growing fits", until):
         return look
     with discretisation.quickly(lab, look.base.point, floor):
         further = list(refining.growing(search, look.base, floor, look.asked.candidates, found, until=until).values())
@@ -255,12 +255,12 @@ def promised(search: Search, at: Stand, beside: Trial) -> float:
 def linear_model(search: Search, point, floor, left, slopes, columns, chosen, candidates) -> bootstrap.LinearModel:
     """The linear model of the fits; `left` is what the discretisation leaves after a refit, mean squares of the parts.
 
-    Of all candidates, or once the time for the search is over of those that got a fit.
+    Of all candidates, or once the search is over of those that got a fit.
     """
     lab = search.lab
     held = [p.recording for p in lab.parts if not p.fitted]
     by_key = {c.key: c for c in candidates}
-    best = dict(chosen) if chosen and lab.deadline.ends() else {c.key: 0 for c in candidates} | chosen
+    best = dict(chosen) if chosen and lab.budget.ends() else {c.key: 0 for c in candidates} | chosen
     one = [replace(by_key[key], starts=(by_key[key].starts[i],)) for key, i in best.items()]
     new = [n for n in held if n not in lab.fitted_recordings]
     with discretisation.quickly(lab, point, floor):

@@ -31,7 +31,7 @@ BESIDE = 3
 GROWN = 3
 """Pairs that grew together whose ends are weighed."""
 IN_TIME = 0.6
-"""Share of the search's time past which no pairs grow where every point costs: what is left is for what takes less."""
+"""Share of the search's work past which no pairs grow where every point costs: what is left is for what takes less."""
 IN_PLACE = 5
 """Effects that are fitted in the place of a first one beside the best that was tried beside it."""
 CLOSE = 2.5
@@ -54,7 +54,7 @@ def look_ahead(search: Search, first: Round) -> list[Round]:
     bases = sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]
     blind = fits_alone(lab, first, bases)
     for t in (*bases, *blind):
-        if lab.deadline.skips(f"a second effect beside {t.candidate.key}"):
+        if lab.budget.skips(f"a second effect beside {t.candidate.key}"):
             break
         here = at_its_end(lab, t)
         second = next_effect.find(search, here.fit, here.floor, [t], most=MANY)
@@ -131,7 +131,7 @@ def by_growing(search: Search, first: Round, at: Stand, others: Mapping[Search, 
     least, until = LEAST_GAIN if named else 2.0 * LEAST_GAIN, 1.0 if lab.problem.together else IN_TIME
     made: list[tuple[Search, list[Round]]] = []
     for method, own in sorted({search: first, **others}.items(), key=lambda entry: entry[0].lab.own):
-        if method.lab.deadline.skips("two effects that grow together", until):
+        if method.lab.budget.skips("two effects that grow together", until):
             break
         with discretisation.quickly(method.lab, own.base, own.floor):
             pairs = refining.growing_pairs(method, own.base, own.floor)[:GROWN]
@@ -239,7 +239,7 @@ def by_another_method(
             lead = next((t for t in first.trials if t.candidate.key == found[0].candidate.key and np.isfinite(t.score)), None)
         if lead is None or lead.score > alone + 2.0 * math.log(WORSE):
             continue
-        if search.lab.deadline.skips("two effects by the other method"):
+        if search.lab.budget.skips("two effects by the other method"):
             break
         here = from_there(other.lab, lead, at.fit.point)
         own = first if lead is first.chosen else replace(first, chosen=lead, members=[lead])
@@ -285,7 +285,7 @@ def second_beside(
     lab = search.lab
     pairs: list[list[Round]] = []
     for t in sorted(members, key=lambda t: t.penalised)[:BESIDE]:
-        if lab.deadline.skips(f"a second effect beside {t.candidate.key}"):
+        if lab.budget.skips(f"a second effect beside {t.candidate.key}"):
             break
         here = at if at is not None and t is first.chosen else at_its_end(lab, t)
         if t is not sure and next_effect.promised(search, here, t) > PROMISED:
@@ -316,7 +316,7 @@ def in_its_place(search: Search, first: Round, second: Round, errors: np.ndarray
         return []
     instead = [t for t in few(others(first)) if t.candidate.name != lead.candidate.name]
     instead = sorted((t for t in instead if np.isfinite(t.score)), key=lambda t: t.penalised)[:IN_PLACE]
-    if not instead or lab.deadline.skips(f"effects in the place of {first.chosen.candidate.key}"):
+    if not instead or lab.budget.skips(f"effects in the place of {first.chosen.candidate.key}"):
         return []
     lab.tell(f"beside {lead.candidate.key}, in the place of {first.chosen.candidate.key}: {', '.join(t.candidate.key for t in instead)}")
     floor, free = discretisation.stand(lab, lead.fit.point)[0], lab.problem.declared

@@ -43,7 +43,7 @@ def promising(
     ends = led.ends if led is not None else {}
     first = not found and (led is None or led.chosen is not None)
     candidates, free, slopes, ranked, columns = screened(lab, base.point, floor, found, most, led)
-    hurried = lab.deadline.ends(until)
+    hurried = lab.budget.ends(until)
     chosen, begun = first_starts(search, base, floor, found, led, candidates, free, slopes, ranked, columns, hurried=hurried)
     led_here = [c for c in candidates if c.key in chosen and c.key in ends]
     starts = [(c, with_effect(lab, base.point, c, ends[c.key], found), None) for c in led_here] + begun

@@ -105,7 +105,7 @@ def growing(
     lab.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
     entries = [((*free, *c.parameters), point) for c, point in live]
     ended = [(live[i][0], fit) for i, fit in base_fits.grown(lab, entries, floor, until=until, reach=IN_REACH)]
-    costs = lab.costs([fit.point for _, fit in ended], floor) if ended else []  # the time may have ended them at an earlier horizon
+    costs = lab.costs([fit.point for _, fit in ended], floor) if ended else []  # they may have ended at an earlier horizon
     return {c.key: (c, replace(fit, cost=cost)) for (c, fit), cost in zip(ended, costs, strict=True) if np.isfinite(cost)}
 
 
@@ -223,7 +223,7 @@ def widened(
     if lab.problem.settings == 1 or not ranked or ranked[0][1].cost >= BY_FAR * few or len(ranked[0][0].parameters) <= MANY:
         return {}
     lead, fit = ranked[0]
-    if not lab.runs(fit.point) or lab.deadline.skips(f"refining {lead.key}"):
+    if not lab.runs(fit.point) or lab.budget.skips(f"refining {lead.key}"):
         return {}
     lab.tell(f"refining {lead.key}")
     ((found, own),) = onward(lab, [((*free, *lead.parameters), fit, [fit.point])], floor)
@@ -241,7 +241,7 @@ def onward(lab: Laboratory, entries: Sequence[Onset], floor: Floor) -> list[tupl
     ends = from_here(lab, entries, floor)
     going = list(range(len(ends)))
     for _ in range(ONWARD):
-        if lab.deadline.ends():
+        if lab.budget.ends():
             break
         run = lab.which_run([ends[i][0].point for i in going])
         left = {i: lab.mean_squares([ends[i][0].point], ends[i][1], fitted=True)[0] for i in going}
@@ -340,7 +340,7 @@ def ahead(
     the truth stays behind.
     """
     ended = [entry for entry in ended if np.isfinite(entry[1].cost)]
-    if lab.problem.settings == 1 or not ended or lab.deadline.ends():
+    if lab.problem.settings == 1 or not ended or lab.budget.ends():
         return {}
 
     def left_there(fit: Fit, there: Floor) -> float:

@@ -143,7 +143,7 @@ def instead(
     ):
         return {}
     begin = lead.without(fit.point)
-    if not lab.runs(begin) or lab.deadline.skips(f"effects in the place of {lead.key}"):
+    if not lab.runs(begin) or lab.budget.skips(f"effects in the place of {lead.key}"):
         return {}
     most = MANY if lab.problem.together else SMALL
     behind = [c for c in candidates if c.name != lead.name and len(c.parameters) <= most and is_behind(c, best, fit)]
