@@ -21,6 +21,8 @@ def import_data(
     cycles: str = "together",
     step: str | None = None,
     sheet: str | None = None,
+    forces: str | None = None,
+    region: list[float] | None = None,
     density: float | None = None,
     young: float | None = None,
     poisson: float | None = None,
@@ -52,7 +54,8 @@ def import_data(
         files: Files, one a recording; text of any dialect, xlsx, xls, trc, c3d, h5 or video (mp4, mov, avi, mkv). A table of several
             specimens is several tests.
         out: Folder to write, which must not be there.
-        kind: auto, material (a testing machine), track (a body as one point) or body (points on a deforming body).
+        kind: auto, material (a testing machine), track (a body as one point), body (points on a deforming body) or
+            field (displacements by digital image correlation).
         mode: Of a material test: uniaxial, compression, equibiaxial, pure_shear, biaxial or simple_shear.
         columns: Quantity and title, where titles do not say it: --columns.force "Channel 2".
         units: Quantity and unit, where the table gives none: --units.force kN.
@@ -69,6 +72,8 @@ def import_data(
         cycles: together: one history. split: each loading and unloading is a test, of the same specimen.
         step: Step of shear that a relaxation modulus belongs to, as 0.01 or "1 %".
         sheet: Of a spreadsheet the only sheet to read.
+        forces: Of a full field, a table with the force at each image.
+        region: Of a full field, the part to use: smallest and largest x, smallest and largest y, in the unit of the files.
         density: kg/m^3.
         young: A guess of Young's modulus, in Pa.
         poisson: Poisson's ratio; a material test without it is incompressible.
@@ -123,6 +128,8 @@ def import_data(
         preparation=Preparation(rows, average, zero, cycles),
         step=step,
         sheet=sheet,
+        forces=forces,
+        region=region,
         density=density,
         young=young,
         poisson=poisson,

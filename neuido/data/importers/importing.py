@@ -9,6 +9,7 @@ from neuido.data.files.parsing import naming
 from neuido.data.files.values import number
 from neuido.data.footage.filming import Filming
 from neuido.data.footage.video_frames import is_video
+from neuido.data.importers.fields.field_exports import BINARY, layout_of
 from neuido.data.importers.machines.loading_path import Preparation
 from neuido.data.importers.machines.material_folder import Material, write_material_tests
 from neuido.data.importers.machines.testing_machine import Specimen
@@ -22,7 +23,7 @@ from neuido.errors import UserError
 if TYPE_CHECKING:
     from neuido.data.footage.contact_sheet import Sheet
 
-KINDS = ("auto", "material", "track", "body")
+KINDS = ("auto", "material", "track", "body", "field")
 
 
 def import_file(
@@ -39,6 +40,8 @@ def import_file(
     preparation: Preparation | None = None,
     step: str | None = None,
     sheet: str | None = None,
+    forces: str | None = None,
+    region: Sequence[float] | None = None,
     density: float | None = None,
     young: float | None = None,
     poisson: float | None = None,
@@ -145,6 +148,19 @@ def import_file(
             sheet=sheet,
             material=Material(density, young, poisson),
         )
+    elif chosen == "field":
+        from neuido.data.importers.fields.field_folder import write_field_test
+
+        summary = write_field_test(
+            files_by_name,
+            out,
+            forces=forces,
+            region=region,
+            columns=columns,
+            units=units,
+            specimen=specimen or Specimen(),
+            material=Material(density, young, poisson),
+        )
     elif chosen == "track":
         summary = write_tracks(files_by_name, read, out, held_out=held_out, point=point, mass=mass, diameter=diameter)
     else:
@@ -182,14 +198,19 @@ def _contact_sheet(contact: "Sheet | None", filming: Filming) -> list[str]:
 
 
 def _kind(path: Path, columns: Mapping[str, str]) -> str:
-    """Detect what a file contains; return `material`, `track` or `body`."""
+    """Detect what a file contains; return `material`, `track`, `body` or `field`."""
+    if path.suffix.lower() in BINARY:
+        return "field"
     if path.suffix.lower() in (".c3d", ".trc", ".h5", ".hdf5"):
         return "track"
     rows, _ = read_cells(path)
     first = rows[0][0].lower() if rows and rows[0] else ""
     if first in ("scorer", "trajectories", "format version") or first.startswith("pathfiletype"):
         return "track"
-    found = find_columns(read_titled(path).titles, dict(columns))
+    titles = read_titled(path).titles
+    if layout_of(titles) is not None:
+        return "field"
+    found = find_columns(titles, dict(columns))
     if {"time", "frame"} & set(found):
         if {"x", "y", "z"} & set(found):
             return "body" if "id" in found else "track"

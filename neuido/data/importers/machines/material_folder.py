@@ -102,11 +102,24 @@ def write_material_tests(
     tests = [test | {"role": roles[test["name"]]} for test in tests]
     if len(tests) > 1:
         summary.append(f"held out: {', '.join(name for name, role in roles.items() if role == 'held_out') or 'none'} (--held_out NAMES)")
+    model, words = declared_model(material, secants)
+    summary += words
+    content = {"format": "neuido-material-test/1", "name": next(iter(files)), "model": model, "tests": tests}
+    return summary + write_tables(out, "test.yaml", content, tables, read_material_tests)
+
+
+def declared_model(material: Material, secants: Sequence[float]) -> tuple[dict[str, Any], list[str]]:
+    """Return the declared model of material tests, and the lines of the summary that say what was assumed.
+
+    Args:
+        material: What the user declares.
+        secants: A modulus of each test [Pa], from which the fit starts.
+    """
     guess = material.young or float(f"{np.median(secants):.2g}")
-    summary.append(
+    summary = [
         f"model: neo-Hooke, Young's modulus {guess:g} Pa {'as given' if material.young else 'from the first rows'}, fitted; density "
         f"{material.density or 1000.0:g} kg/m^3{'' if material.density else ' (assumed: --density)'}"
-    )
+    ]
     model = {
         "density": material.density or 1000.0,
         "elasticity": {"law": "neo_hookean", "young": guess, "poisson": 0.499 if material.poisson is None else material.poisson},
@@ -116,8 +129,7 @@ def write_material_tests(
     if material.poisson is None:
         model["incompressible"] = True
         summary.append("incompressible (else give --poisson)")
-    content = {"format": "neuido-material-test/1", "name": next(iter(files)), "model": model, "tests": tests}
-    return summary + write_tables(out, "test.yaml", content, tables, read_material_tests)
+    return model, summary
 
 
 def modulus(columns: Mapping[str, np.ndarray]) -> float:
