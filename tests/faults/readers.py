@@ -52,7 +52,10 @@ from neuido.models.render.gaussians import attach_gaussians, load_ply, save_ply
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import FlowVAE
 from tests.data import samples
+from tests.data.footage import drawn
 from tests.data.importers import test_importing as exports
+from tests.data.importers import test_pandas_hdf5 as hdf5
+from tests.data.importers.fields import test_fields as fields
 from tests.faults.fuzzing import Reader
 
 SAMPLE = samples.Sample()
@@ -200,6 +203,37 @@ def _body(folder: Path) -> None:
     grid = np.stack(np.meshgrid(*[np.linspace(0.4, 0.6, 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
     lines = [f"{t},{i},{x},{y - 4.905 * t * t},{z}" for t in exports.T[:5] for i, (x, y, z) in enumerate(grid)]
     exports.write(folder / "particles.csv", ["t,id,x,y,z", *lines])
+
+
+def _hdf5(folder: Path) -> None:
+    hdf5.table(folder / "dlc.h5")
+
+
+def _forces(folder: Path) -> None:
+    fields.rows(folder / "forces.csv", ["Time (s)", "Force (N)"], np.arange(7) + 2.0, fields.STRESS * 20e-6)
+
+
+def _field(folder: Path) -> None:
+    fields.vic2d(folder)
+    _forces(folder)
+
+
+def _ncorr(folder: Path) -> None:
+    fields.ncorr(folder)
+    _forces(folder)
+
+
+def _read_field(folder: Path) -> object:
+    files = sorted(folder.glob("strip*")) or [folder / "strip.mat"]
+    return import_file(files, None, kind="field", specimen=fields.SPECIMEN, forces=str(folder / "forces.csv"))
+
+
+def _throw(folder: Path) -> None:
+    drawn.throw(folder / "throw.mp4", count=6, size=(64, 48), x0=(1.0, 1.0))
+
+
+def _read_throw(folder: Path) -> object:
+    return import_file(folder / "throw.mp4", None, scale=drawn.SCALE)
 
 
 def _trajectories(folder: Path) -> None:
@@ -419,6 +453,10 @@ GROUPS = {
         _importer("trc", exports.trc, "ball.trc"),
         _importer("deeplabcut", _deeplabcut, "dlc.csv", scale=0.005, y_down=True, frame_rate=30.0),
         _importer("c3d", exports.c3d, "ball.c3d"),
+        _importer("deeplabcut-hdf5", _hdf5, "dlc.h5", 2_000, point="ball", scale=0.005, frame_rate=30.0),
+        Reader("import-field", _field, "strip-1_0.csv", _read_field, 400, 10),
+        Reader("import-ncorr", _ncorr, "strip.mat", _read_field, 2_000),
+        Reader("import-film", _throw, "throw.mp4", _read_throw, 300, 8),
         _importer("body", _body, "particles.csv", density=1000.0, young=5e4, floor=0.0),
     ),
     "results": (

@@ -74,11 +74,14 @@ def pixels(x: np.ndarray, size=SIZE, scale: float = SCALE) -> np.ndarray:
     return np.stack([x[:, 0] / scale, size[1] - x[:, 1] / scale], 1)
 
 
-def throw(path: Path, *, count: int = 50, rate: int = 60, seed: int = 0, change: Callable = lambda i, image: image, **motion) -> np.ndarray:
-    """Film a throw; return the true positions [m] (T, 2)."""
+def throw(
+    path: Path, *, count: int = 50, rate: int = 60, seed: int = 0, change: Callable = lambda i, image: image, size=SIZE, **motion
+) -> np.ndarray:
+    """Film a throw; return the true positions [m] (T, 2). In a small picture the ball has the same share of the width."""
     x = flight(np.arange(count) / rate, **motion)
-    background = scenery(seed)
-    film(path, (change(i, ball(background, centre)) for i, centre in enumerate(pixels(x))), rate=rate)
+    background, ratio = scenery(seed, size), size[0] / SIZE[0]
+    centres = ratio * pixels(x)
+    film(path, (change(i, ball(background, centre, max(ratio * RADIUS, 4.0))) for i, centre in enumerate(centres)), rate=rate)
     return x
 
 

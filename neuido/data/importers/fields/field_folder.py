@@ -53,14 +53,20 @@ def write_field_test(
     from neuido.data.measured.material_test import read_material_tests
 
     fields: list[Field] = []
+    found = []
+    sources: list[Path] = []
     for path in sorted(files.values(), key=lambda path: natural_key(path.name)):
         with naming(path):
-            fields += [_within(field, region) for field in read_fields(path)]
-    gradients = np.array([_affine(field)[0] for field in fields])
+            own = [_within(field, region) for field in read_fields(path)]
+            found += [_affine(field)[0] for field in own]
+        fields += own
+        sources += [path] * len(own)
+    gradients = np.array(found)
     strain = gradients - np.eye(2)
     last = int(np.argmax(np.abs(strain).max(axis=(1, 2))))
     axis = int(np.argmax(np.abs(np.diagonal(strain[last]))))
-    _check_uniform(fields[last], gradients[last], axis)
+    with naming(sources[last]):
+        _check_uniform(fields[last], gradients[last], axis)
     stretch = np.linalg.norm(gradients[:, :, axis], axis=1)
     across = np.linalg.norm(gradients[:, :, 1 - axis], axis=1)
     count = np.median([len(field.x) for field in fields])
@@ -87,10 +93,8 @@ def _within(field: Field, region: Sequence[float] | None) -> Field:
         raise UserError(f"--region {list(region)} must be the smallest x, largest x, smallest y and largest y")
     kept = (field.x[:, 0] >= region[0]) & (field.x[:, 0] <= region[1]) & (field.x[:, 1] >= region[2]) & (field.x[:, 1] <= region[3])
     if kept.sum() < 4:
-        low, high = field.x.min(axis=0), field.x.max(axis=0)
-        raise UserError(
-            f"--region {list(region)} has {kept.sum()} points; they lie in x {low[0]:g} to {high[0]:g} and y {low[1]:g} to {high[1]:g}"
-        )
+        (left, low), (right, high) = field.x[:, :2].min(axis=0), field.x[:, :2].max(axis=0)
+        raise UserError(f"--region {list(region)} has {kept.sum()} points; they lie in x {left:g} to {right:g} and y {low:g} to {high:g}")
     return field._replace(x=field.x[kept], u=field.u[kept])
 
 
@@ -111,8 +115,8 @@ def _check_uniform(field: Field, gradient: np.ndarray, axis: int) -> None:
         raise UserError("no image shows a strain: are these displacements, and not strains or coordinates?")
     if left > UNIFORM * elongation:
         raise UserError(
-            f"the strain is not uniform: displacements differ from it by {left / elongation:.0%} of the elongation, more than {UNIFORM:.0%}; "
-            "fields with gradients (a hole, a notch) cannot be fitted yet: choose a uniform part of the specimen (--region)"
+            f"the strain is not uniform: displacements differ from it by {left / elongation:.0%} of the elongation, more than "
+            f"{UNIFORM:.0%}; fields with gradients (a hole, a notch) cannot be fitted yet: choose a uniform part of the specimen (--region)"
         )
     strain = (gradient + gradient.T) / 2 - np.eye(2)
     shear = abs(strain[0, 1] / strain[axis, axis])
