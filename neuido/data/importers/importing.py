@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from neuido.data.footage.contact_sheet import Sheet
 
 KINDS = ("auto", "material", "track", "body", "field")
+WHAT = {"material": "a material test", "track": "a motion", "body": "a motion", "field": "a full field", "film": "a video"}
+"""What the data of each kind are called in messages."""
 
 
 def import_file(
@@ -123,16 +125,18 @@ def import_file(
 
     with naming(paths[0]):
         chosen = "track" if films else _kind(paths[0], columns) if kind == "auto" else kind
-    if not films:
-        motion_options = {"scale": scale, "y_down": y_down, "frame_rate": frame_rate, "point": point, "mass": mass, "diameter": diameter,
-                          "volume": volume, "floor": floor}  # fmt: skip
-        test_options = {"step": step, "sheet": sheet, "compression": compression, "mode": None if mode == "uniaxial" else mode,
-                        **(specimen or Specimen())._asdict(), **(preparation or Preparation()).changed()}  # fmt: skip
-        foreign = motion_options if chosen == "material" else test_options
-        if wrong := [option for option, value in foreign.items() if value not in (None, False)]:
-            what, other = ("a material test", "a motion") if chosen == "material" else ("a motion", "a material test")
-            given = "section_diameter" if chosen != "material" and wrong[0] == "diameter" else wrong[0]
-            raise UserError(f"--{given} is for {other}, and {paths[0].name} is {what}: leave it out, or give --kind")
+    dimensions = {"section_diameter" if key == "diameter" else key: value for key, value in (specimen or Specimen())._asdict().items()}
+    _check_options(
+        paths[0].name,
+        "film" if films else chosen,
+        (("film", "track", "body"), {"scale": scale, "y_down": y_down, "frame_rate": frame_rate, "point": point, "mass": mass,
+                                     "diameter": diameter, "volume": volume, "floor": floor}),
+        (("material",), {"step": step, "sheet": sheet, "compression": compression, "mode": None if mode == "uniaxial" else mode,
+                         **(preparation or Preparation()).changed()}),
+        (("material", "field"), dimensions),
+        (("field",), {"forces": forces, "region": region}),
+        (("film",), {key: None if value == "none" else value for key, value in filming._asdict().items()}),
+    )  # fmt: skip
     if chosen == "material":
         summary = write_material_tests(
             files_by_name,
@@ -187,6 +191,21 @@ def import_file(
     if out is not None:
         summary.append(f"next: neuido check {out}; neuido diagnose {out} --out {out}-answer")
     return summary
+
+
+def _check_options(name: str, chosen: str, *groups: tuple[tuple[str, ...], Mapping[str, object]]) -> None:
+    """Raise UserError if an option is given that is not for this kind of data.
+
+    Args:
+        name: Name of the first file.
+        chosen: Kind of the data, a key of `WHAT`.
+        groups: Kinds of data, and the options that are for these alone.
+    """
+    for kinds, options in groups:
+        wrong = next((option for option, value in options.items() if value not in (None, False)), None)
+        if wrong is not None and chosen not in kinds:
+            others = " or ".join(dict.fromkeys(WHAT[kind] for kind in kinds))
+            raise UserError(f"--{wrong} is for {others}, and {name} is {WHAT[chosen]}: leave it out, or give --kind")
 
 
 def _contact_sheet(contact: "Sheet | None", filming: Filming) -> list[str]:
