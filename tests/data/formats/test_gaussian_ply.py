@@ -94,3 +94,33 @@ def test_damaged_files_end_in_one_line(tmp_path, cut, noise, text):
         except UserError as error:
             message = str(error)
     assert str(path) in message and "\n" not in message
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    rest=st.sampled_from([0, 9, 24, 45]),
+    normals=st.booleans(),
+    order=st.randoms(use_true_random=False),
+    form=st.sampled_from(["text", "little", "big"]),
+    kind=st.sampled_from(["f4", "f8"]),
+    bad=st.dictionaries(st.integers(0, 4), st.sampled_from([np.nan, np.inf, -np.inf]), max_size=4),
+    comment=st.text(st.characters(min_codepoint=32, exclude_categories=["Cs", "Cc", "Zl", "Zp"]), max_size=12),
+)
+def test_any_kind_of_gaussians_is_read_as_it_was_written(tmp_path, rest, normals, order, form, kind, bad, comment):
+    names = [name for name in column_names(rest) if normals or not name.startswith("n")]
+    column = order.choice([name for name in names if not name.startswith("n")])
+    order.shuffle(names)
+    vertices = np.zeros(5, [(name, kind) for name in names])
+    for i, name in enumerate(names):
+        vertices[name] = np.arange(5) + 0.25 * i
+    for row, value in bad.items():
+        vertices[column][row] = value
+    path = tmp_path / "a.ply"
+    byte_order = ">" if form == "big" else "<"
+    PlyData([PlyElement.describe(vertices, "vertex")], text=form == "text", byte_order=byte_order).write(str(path))
+    path.write_bytes(path.read_bytes().replace(b"end_header", f"comment {comment}\nend_header".encode(), 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        read = read_gaussian_vertices(path)
+    kept = [row for row in range(5) if row not in bad]
+    assert all(np.allclose(read[name], vertices[name][kept]) for name in names)

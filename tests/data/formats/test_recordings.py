@@ -231,3 +231,35 @@ def test_colmap_text_keeps_poses(tmp_path_factory, q, t):
     (image,) = colmap.read_images(path)
     assert image.name == "a name with spaces.jpg"
     assert torch.allclose(image.viewmat, convert.from_quaternion(torch.tensor(q).double(), torch.tensor(t).double()))
+
+
+LENS = st.fixed_dictionaries({"fl_x": st.floats(10, 500), "fl_y": st.floats(10, 500), "cx": st.floats(1, 30), "cy": st.floats(1, 19)},
+                             optional={key: st.floats(-0.5, 0.5) for key in ("k1", "k2", "p1", "p2", "k3")})  # fmt: skip
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    lens=LENS,
+    frame=st.booleans(),
+    rows=st.sampled_from([3, 4]),
+    scale=st.floats(0.3, 3),
+    separator=st.sampled_from(["/", "\\"]),
+    mark=st.booleans(),
+)
+def test_any_lens_and_pose_is_read_as_it_was_written(tmp_path, lens, frame, rows, scale, separator, mark):
+    path = folder(tmp_path, root={} if frame else lens, each=lambda v, t: lens if frame else {})
+    file = path / "transforms.json"
+    content = json.loads(file.read_text())
+    poses = [np.array(entry["transform_matrix"]) for entry in content["frames"]]
+    for entry, pose in zip(content["frames"], poses):
+        pose = pose.copy()
+        pose[:3, :3] *= scale  # a scaled rotation shows the same image
+        entry["transform_matrix"] = pose[:rows].tolist()
+        entry["file_path"] = entry["file_path"].replace("/", separator)
+    file.write_bytes((b"\xef\xbb\xbf" if mark else b"") + json.dumps(content).encode())
+    found = nerfstudio.read(path)
+    K = [[lens["fl_x"], 0, lens["cx"]], [0, lens["fl_y"], lens["cy"]], [0, 0, 1]]
+    assert torch.allclose(found.cameras.Ks[1], torch.tensor(K), rtol=1e-5)
+    given_lens = [lens.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+    assert (found.distortion is None and not any(given_lens)) or found.distortion[2].tolist() == given_lens
+    assert np.allclose(convert.to_opengl(found.cameras.viewmats.double()).numpy(), poses, atol=1e-5)
