@@ -5,41 +5,43 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[2] / "neuido" / "discrepancy" / "inference"
 
-LEVEL, NULLS, CASES, ONE, CHOSEN = "level", "nulls", "cases", "one seed", "judgement"
+LEVEL, DERIVED, ROUNDING, NULLS, CASES, ONE, CHOSEN = "level", "derived", "rounding", "nulls", "cases", "one seed", "judgement"
 BEHIND = {
     LEVEL: "a level or a quantile that is stated: no measurement is behind it, and none is needed",
+    DERIVED: "follows from another figure of this page",
+    ROUNDING: "allows for rounding: any small value gives the same answers",
     NULLS: "gains of blind nulls",
     CASES: "blind cases of several seeds, named or not",
     ONE: "cases of one blind seed, or a single case",
     CHOSEN: "chosen by hand, without a distribution",
 }
+STATED = (LEVEL, DERIVED, ROUNDING)
+"""Kinds that are not set by hand."""
 DECIDES = {  # of the present decision: module -> constant -> what is behind it
     "judging": {
-        "ALPHA": LEVEL, "LED_AWAY": CASES, "CLASS_RATIO": CHOSEN, "CLASS_RATIO_ABOVE": CHOSEN, "CLASS_RATIO_EXACT": CHOSEN,
-        "LEAST_GAIN_EXACT": CHOSEN, "GAIN_AT_FLOOR": NULLS, "GAIN_IN_FLOOR": NULLS, "EXACT": CHOSEN, "BROUGHT_BACK": CASES,
-        "BACK_GAIN": CASES,
-        "GAIN_TO_NOISE": NULLS, "FIT_GAIN": ONE, "FIT_LEAD": ONE, "FEW": ONE, "FORETELLS": ONE, "SEEN": CHOSEN, "IMPLAUSIBLE": CHOSEN,
-        "STANDS_OUT": CHOSEN, "WITHIN": CHOSEN, "LIKE_A_GRID": CASES,
+        "ALPHA": LEVEL, "LED_AWAY": CASES, "CLASS_RATIO": CHOSEN, "CLASS_RATIO_ABOVE": CASES, "CLASS_RATIO_EXACT": CHOSEN,
+        "LEAST_GAIN_EXACT": DERIVED, "RIVAL": CASES, "WITHIN": CHOSEN, "ABOVE": DERIVED, "CLEAR": CASES, "GAIN_IN_FLOOR": NULLS,
+        "GAIN_AT_FLOOR": NULLS, "GAIN_TO_NOISE": DERIVED, "EXACT": CHOSEN, "BROUGHT_BACK": CASES, "BACK_GAIN": DERIVED, "FEW": ONE,
+        "FORETELLS": DERIVED, "SEEN": CHOSEN, "IMPLAUSIBLE": CHOSEN, "STANDS_OUT": CHOSEN, "LIKE_A_GRID": DERIVED,
     },
     "comparing": {"LEAST_GAIN": ONE},
     "discretisation": {"UNSEEN": CHOSEN},
     "bootstrap": {"NOISE_ALONE": CHOSEN},
     "floors": {"BOUND": CHOSEN, "REACH": CHOSEN, "PARSIMONY": CHOSEN},
-    "next_effect": {"UNEXPLAINED": CHOSEN, "UNEXPLAINED_EXACT": CHOSEN},
-    "choosing": {"UNASKED": ONE},
-    "intervals": {"TOLD": LEVEL, "AT_BOUND": CHOSEN},
+    "next_effect": {"UNEXPLAINED_EXACT": CHOSEN, "UNSURE": LEVEL},
+    "choosing": {"HANDICAP": CHOSEN, "UNASKED": DERIVED},
+    "intervals": {"TOLD": LEVEL, "AT_BOUND": ROUNDING},
     "attribution": {"MOST": CHOSEN},
+    "decision": {"ENOUGH": CHOSEN},
 }  # fmt: skip
-UNNAMED = [  # figures of the present decision that stand in its code: module, function, value, what it does
-    ("judging", "gain_over_floor", "log(1.5)", "how far above its floor a residual is where the least gain is enough"),
-    ("judging", "as_good", "3 and -0.1", "further parameters with which a rival must be better, and by how much in its score"),
-    ("judging", "is_rival", "0.4", "share of the best gain that a member of a class needs"),
-    ("choosing", "first_rounds", "log(1.2)", "what another method must do better by, to take the place of the suggested one"),
-    ("choosing", "first_rounds", "2 LEAST_GAIN", "the same for an effect by a method whose declared model is not the best one"),
-    ("attribution", "drop", "LEAST_GAIN / 2", "what an effect must foretell beside the others, to be kept"),
-    ("pairs", "look_ahead", "2 LEAST_GAIN", "what two effects must gain of which none gains enough alone"),
-    ("next_effect", "unexplained", "2", "deviations of an estimated noise that widen the limit of what is unknown"),
-    ("decision", "enough", "3 and 10", "data for each free figure, and beside them"),
+UNNAMED = [  # what follows from those figures in the code of the present decision: module, function, value, what it does
+    (
+        "choosing",
+        "first_rounds",
+        "2 LEAST_GAIN",
+        "what an effect must leave less, by a method whose declared model is not the best one: LEAST_GAIN, of squares",
+    ),
+    ("pairs", "look_ahead", "2 LEAST_GAIN", "what two effects must gain of which none gains enough alone: LEAST_GAIN for each"),
 ]
 SHADOW = {  # of the decision by evidence, which is reported beside it: see `neuido.discrepancy.inference.evidence`
     "evidence": {"KINDS": LEVEL, "WIDE": CHOSEN, "LEAST": CHOSEN},
@@ -63,9 +65,8 @@ SEARCHES = {  # constants of the same files that steer the search, or only what 
     "discretisation": {"ROUGH", "ALIKE"},
     "floors": {"LED"},
     "next_effect": {"CONFIRMED", "PLAIN", "AS_WELL", "MEMBERS"},
-    "choosing": {"CLEARLY", "LOOKS", "AS_SURE", "EARLY"},
+    "choosing": {"CLEARLY", "LOOKS", "AS_SURE"},
     "intervals": {"QUANTILE", "NORMAL", "ROOM", "NEARBY", "FREE_AT"},
-    "attribution": {"FURTHER"},
     "likelihood": {"SCALES"},
     "calibration": {"TABLE"},
 }  # fmt: skip
@@ -93,9 +94,9 @@ def constants(module: str) -> dict[str, tuple[str, str]]:
 
 
 def counts() -> tuple[int, int]:
-    """Return how many figures are set by hand in the present decision, and in the one by evidence; levels are stated, not set."""
-    present = sum(kind != LEVEL for own in DECIDES.values() for kind in own.values()) + len(UNNAMED)
-    return present, sum(kind != LEVEL for own in SHADOW.values() for kind in own.values())
+    """Return how many figures are set by hand in the present decision, and in the one by evidence; see `STATED`."""
+    present = sum(kind not in STATED for own in DECIDES.values() for kind in own.values())
+    return present, sum(kind not in STATED for own in SHADOW.values() for kind in own.values())
 
 
 def constant_page() -> str:
@@ -105,7 +106,8 @@ def constant_page() -> str:
         "# Constants of the decision",
         "",
         f"What a diagnosis answers, given its fits, depends on **{present} figures that are set by hand**, beside the levels that are",
-        f"stated. The goal is five. The decision by evidence, which is computed beside it and names nothing yet, has **{shadow}**.",
+        "stated and what follows from these figures. The goal is five. The decision by evidence, which is computed beside it and names",
+        f"nothing yet, has **{shadow}**.",
         "How the rules work together is under [how a diagnosis decides](../explanation/diagnosis.md).",
         "",
         "What is behind a figure:",
@@ -120,5 +122,5 @@ def constant_page() -> str:
                 value, said = known[name]
                 lines.append(f"| `{module}.{name}` | `{value}` | {kind} | {said.replace('|', chr(92) + '|')} |")
         if chosen is DECIDES:
-            lines += [f"| in `{module}.{function}` | {value} | {CHOSEN} | {text} |" for module, function, value, text in UNNAMED]
+            lines += [f"| in `{module}.{function}` | {value} | {DERIVED} | {text} |" for module, function, value, text in UNNAMED]
     return "\n".join(lines) + "\n"

@@ -28,6 +28,6 @@ def test_unnamed_figures_stand_where_they_are_said_to():
 
 def test_no_figure_is_added():
     present, shadow = listed.counts()
-    assert present <= 40 and shadow <= 5
+    assert present <= 25 and shadow <= 2
     page = listed.constant_page()
     assert f"**{present} figures" in page and "| `judging.GAIN_IN_FLOOR` | `math.log(4.0)` | nulls |" in page

@@ -63,7 +63,7 @@ def both(problem: Problem, effects: str, folder: Path, monkeypatch, most: int) -
     cached = CachedProblem(restricted(problem, effects), folder)
     sound = attribution.diagnose(cached, draws=39, most=most)
     smallest_error(monkeypatch)
-    monkeypatch.setattr(attribution, "FURTHER", 0.0)
+    monkeypatch.setattr(attribution, "CLEAR", 0.0)
     monkeypatch.setattr(attribution, "two_effects", lambda search, *rest: (search, []))
     monkeypatch.setattr(attribution, "drop", lambda search, at, floor, found: (at, found))
     monkeypatch.setattr(attribution, "narrow", lambda search, at, floor, found, rounds: (at, found))

@@ -27,8 +27,7 @@ from neuido.discrepancy.inference.search import (
 )
 from neuido.discrepancy.inference.search.attribution import diagnose, drop
 from neuido.discrepancy.inference.search.intervals import intervals
-from neuido.discrepancy.inference.search.judging import BACK_GAIN, FORETELLS, GAIN_AT_FLOOR, GAIN_IN_FLOOR, GAIN_TO_NOISE, WITHIN
-from neuido.discrepancy.inference.search.next_effect import UNEXPLAINED
+from neuido.discrepancy.inference.search.judging import ABOVE, BACK_GAIN, FORETELLS, GAIN_AT_FLOOR, GAIN_IN_FLOOR, GAIN_TO_NOISE, WITHIN
 from neuido.discrepancy.inference.search.search_state import Look, Promising
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.report.answer import trace
@@ -324,7 +323,7 @@ def test_what_lies_within_the_floor_is_not_asked_of_another_method():
     assert rounds_of_fits == 1
     found, rounds_of_fits = fitted(lambda t: 3.0 * t + 0.3 * np.sin(33 * t))
     assert found.answer == "unknown"
-    assert found.rounds[0].over > UNEXPLAINED
+    assert found.rounds[0].over > ABOVE
     assert rounds_of_fits == 2
 
 
@@ -336,7 +335,7 @@ def test_a_held_out_recording_far_above_its_floor_is_unknown():
         problem.__dict__["recordings"] = (problem.recordings[0], strange)
         found = diagnose(problem)
         assert found.answer == answer
-        assert found.rounds[0].over < UNEXPLAINED  # the fitted recording lies at the noise
+        assert found.rounds[0].over < ABOVE  # the fitted recording lies at the noise
 
 
 @pytest.mark.parametrize(("left", "looks"), [(0.3, [0]), (0.05, [0, 1])])
@@ -807,7 +806,7 @@ def test_what_an_effect_leaves_within_the_floor_is_searched_only_where_another_o
     monkeypatch.setattr(discretisation, "floors", lambda lab, point, free, floor: np.full(2, 0.15**2))
     assert searches(lambda t: low(t) + 0.25 * np.sin(90 * t)) == (["low"], 1)
     assert searches(lambda t: low(t) + 0.25 * np.sin(62 * t)) == (["high", "low"], 2)  # unless one promises much
-    monkeypatch.setattr("neuido.discrepancy.inference.search.attribution.FURTHER", 0.0)
+    monkeypatch.setattr("neuido.discrepancy.inference.search.attribution.CLEAR", 0.0)
     assert searches(lambda t: low(t) + 0.25 * np.sin(90 * t))[1] == 2
 
 

@@ -151,7 +151,7 @@ class Exact(Hurried):
 def test_no_other_method_is_begun_where_one_simulation_leaves_the_noise(law, asked, monkeypatch):
     begun, real = [], base_fits.base_fit
     monkeypatch.setattr(base_fits, "base_fit", lambda search, near=None: begun.append(search.lab.setting) or real(search, near))
-    monkeypatch.setattr(choosing, "EARLY", 0.0)
+    monkeypatch.setattr(choosing, "CLEAR", 0.0)
     diagnose(Exact(law), keep=3)
     assert begun == ([0, 1] if asked else [0])
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from neuido.discrepancy.inference import comparing, discretisation
-from neuido.discrepancy.inference.comparing import LEAST_GAIN
 from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, score, times_over
 from neuido.discrepancy.inference.journal import CaseRecord, Journal
 from neuido.discrepancy.inference.laboratory import Tell
@@ -17,7 +16,7 @@ from neuido.discrepancy.inference.search import base_fits, judging, next_effect
 from neuido.discrepancy.inference.search.choosing import first_rounds, told_exactly
 from neuido.discrepancy.inference.search.decision import case_of, decided
 from neuido.discrepancy.inference.search.intervals import blind_to_settings, findings, intervals, unable
-from neuido.discrepancy.inference.search.judging import CLASS_RATIO
+from neuido.discrepancy.inference.search.judging import CLASS_RATIO, CLEAR, FORETELLS
 from neuido.discrepancy.inference.search.pairs import by_growing, neighbours, simpler, two_effects
 from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.inference.statistics import statistics_of
@@ -27,8 +26,6 @@ from neuido.errors import UserError
 
 MOST = 3
 """Effects that a growth may add."""
-FURTHER = 1.5
-"""Times its floor above which what an effect leaves is searched for another one: eight searches below it found none."""
 
 
 def widen(search: Search, r: Round, at: Stand, others: Iterable[Round]) -> None:
@@ -100,7 +97,7 @@ def drop(search: Search, base: Fit, floor: Floor, found: list[Trial]) -> tuple[F
         with_all, *squares = lab.mean_squares([base.point, *(fit.point for fit in fits)], floor)
         lost = [comparing.foretold(lab, without, with_all) for without in squares]
         least = min(range(len(found)), key=lambda i: lost[i])
-        if lost[least] > LEAST_GAIN / 2:
+        if lost[least] > FORETELLS:
             break
         base, found = fits[least], rests[least]
     return base, found
@@ -245,7 +242,7 @@ def diagnose(
             break
         if problem.together and len(found) == 1 and (grown := by_growing(search, rounds[0], at, others)):
             break
-        if problem.settings > 1 and not comparing.is_settled(search.lab, at.errors) and next_effect.over_floor(search.lab, at) < FURTHER:
+        if problem.settings > 1 and not comparing.is_settled(search.lab, at.errors) and next_effect.over_floor(search.lab, at) < CLEAR:
             break
         rounds.append(next_effect.find(search, at.fit, at.floor, found))
     # where every point costs pairs grow after what takes less, and where nothing was named last of all

@@ -11,7 +11,7 @@ from neuido.discrepancy.inference import comparing, discretisation
 from neuido.discrepancy.inference.comparing import LEAST_GAIN
 from neuido.discrepancy.inference.floors import Round, Stand, score
 from neuido.discrepancy.inference.search import base_fits, judging, next_effect, refining
-from neuido.discrepancy.inference.search.judging import WITHIN
+from neuido.discrepancy.inference.search.judging import CLEAR, WITHIN
 from neuido.discrepancy.inference.search.pairs import WORSE, look_ahead
 from neuido.discrepancy.inference.search.refining import BEYOND
 from neuido.discrepancy.inference.search.search_state import Search
@@ -23,11 +23,11 @@ LOOKS = (0.5, 0.8)
 AS_SURE = 2.0
 """Times the noise up to which what a named effect leaves is no reason to ask another method: in five blind seeds none of eight that were
 asked there took its place, of three that left 2.3 to 2.4 times as much all."""
-EARLY = 1.5
-"""Times its floor above which what the suggested method leaves is searched before another method has its declared model fitted."""
-UNASKED = math.log(3.0)
-"""Gain from which an effect is named although the search ended before it was refined by another method: of the searches of a blind seed
-that were cut off there a false alarm gained 2.4, half of a pair 2.7, what was right or near 3.3 to 9."""
+HANDICAP = math.log(1.2)
+"""Mean logarithm of the errors' squares that another method must do better by, to take the place of the suggested one."""
+UNASKED = 2.0 * LEAST_GAIN
+"""Gain from which an effect is named although the search ended before it was refined by another method, twice the usual one: of the
+searches of a blind seed that were cut off there a false alarm gained log 2.4, half of a pair log 2.7, what was right log 3.3 to log 9."""
 
 
 def told_exactly(search: Search, start: Stand) -> bool:
@@ -37,7 +37,7 @@ def told_exactly(search: Search, start: Stand) -> bool:
     Where every point costs, none grow before the other method was asked: by the wrong one all leave much.
     """
     lab = search.lab
-    if lab.problem.settings == 1 or next_effect.over_floor(lab, start) < EARLY:
+    if lab.problem.settings == 1 or next_effect.over_floor(lab, start) < CLEAR:
         return False
     look = next_effect.first_look(search, start.fit, start.floor, until=LOOKS[0], grows=lab.problem.together)
     if not look.least or not comparing.is_noise(lab, look.least[0]):
@@ -57,8 +57,7 @@ def first_rounds(tried: Sequence[Search], starts: Sequence[Stand]) -> tuple[int,
     if settled:
         chosen = min(settled, key=lambda i: float(np.mean(starts[i].errors)))
         return chosen, {chosen: [unsearched(starts[chosen], tried[chosen].lab.noise_squares)]}
-    # another method must do clearly better before it takes the place of the suggested one
-    handicap = [0.0 if i == 0 else math.log(1.2) for i in range(len(tried))]
+    handicap = [0.0 if i == 0 else HANDICAP for i in range(len(tried))]
     base = [score(start.errors) + h for start, h in zip(starts, handicap, strict=True)]
     order = sorted(range(len(tried)), key=lambda i: base[i])
     # what is left of the declared model says little of the methods where an effect is missing: unless it is far worse, the suggested one

@@ -15,6 +15,9 @@ from neuido.discrepancy.inference.search.judging import STANDS_OUT
 from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 
+ENOUGH = 3, 10
+"""Data that each part needs for each figure of the declared model, and beside them, to say that nothing is missing."""
+
 
 def decided(
     lab: Laboratory,
@@ -60,7 +63,8 @@ def decided(
 
 def enough(lab: Laboratory) -> bool:
     """Whether there are many more data than parameters in every part."""
-    return all(int(p.rows.sum()) > 3 * len(lab.problem.declared) + 10 for p in lab.parts)
+    each, beside = ENOUGH
+    return all(int(p.rows.sum()) > each * len(lab.problem.declared) + beside for p in lab.parts)
 
 
 def case_of(

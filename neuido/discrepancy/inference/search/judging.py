@@ -8,7 +8,7 @@ import numpy as np
 
 from neuido.discrepancy.inference import bootstrap, comparing
 from neuido.discrepancy.inference.comparing import LEAST_GAIN
-from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial, times_over, unphysical
+from neuido.discrepancy.inference.floors import PARSIMONY, Floor, Round, Stand, Trial, times_over, unphysical
 from neuido.discrepancy.inference.journal import place
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
@@ -24,15 +24,32 @@ LED_AWAY = 2.5
 
 ALPHA = 0.05
 """Family-wise level of a named effect."""
-CLASS_RATIO, CLASS_RATIO_ABOVE, CLASS_RATIO_EXACT = 1.4, 1.8, 1.15
-"""Candidates whose errors are within this factor of the best one's are not told from it; the larger one where that is above the noise, for
-then the errors are those of the discretisation; the smallest one where these have no part (`EXACT`)."""
-LEAST_GAIN_EXACT = math.log(1.15)
-"""`LEAST_GAIN` where nothing is discretised."""
-GAIN_AT_FLOOR = math.log(2.5)
-"""What it takes where the residual is as large as the floor; the best candidates of 55 blind nulls gained up to 1.9 times there."""
+CLASS_RATIO, CLASS_RATIO_EXACT = 1.4, 1.15
+"""Candidates whose errors are within this factor of the best one's are not told from it; the smaller one where the discretisation has no
+part in them (`EXACT`)."""
+CLASS_RATIO_ABOVE = 1.8
+"""The same where the best one leaves more than noise, for then the errors are those of the discretisation. With 1.7 one of 30 blind cases
+loses a member of its class, with 1.96 another one gets a wrong leader."""
+RIVAL = 0.4
+"""Share of the best gain that a member of a class needs, so that what gains next to nothing is none. With 0.5 one of 30 blind cases loses a
+member."""
+LEAST_GAIN_EXACT = math.log(CLASS_RATIO_EXACT)
+"""`LEAST_GAIN` where nothing is discretised: what two effects are told apart by."""
+WITHIN = 0.5
+"""Share of the floor within which a residual that no effect explains is no reason to look further; as far above it is `ABOVE`."""
+ABOVE = 1.0 / WITHIN
+"""Times its floor from which a residual that no effect explains is unknown."""
+CLEAR = 1.5
+"""Times its floor from which a residual is clearly above it: the least gain is enough, and what an effect leaves is searched for another
+one; eight searches below it found none. Above it what the suggested method leaves is searched before another one is asked."""
 GAIN_IN_FLOOR = math.log(4.0)
-"""What it takes well within the floor, where they gained up to 3.3 times: only an effect that the data show far below it."""
+"""What it takes well within the floor, where the best candidates of blind nulls gained up to 3.3 times: only an effect that the data show
+far below it."""
+GAIN_AT_FLOOR = math.log(2.5)
+"""What it takes where the residual is as large as the floor; those of 55 blind nulls gained up to 1.9 times there."""
+GAIN_TO_NOISE = 0.5 * GAIN_IN_FLOOR
+"""What it takes where noise alone is left, for a candidate can take the place of what the grid does; of one that `stands_alone`; and above
+the floor where the base fit is led away, as none of 40 nulls' was. Twofold."""
 EXACT = 1.05
 """Mean squares up to so many times those of the noise, and three deviations of their own, that one simulation alone leaves where no other
 grid has a part in the data."""
@@ -40,25 +57,21 @@ BROUGHT_BACK = 1.5
 """Ratio of a declared parameter to what the model states up to which it is as stated: what brings a base fit back there that is led away
 (`LED_AWAY`) need gain no more than `LEAST_GAIN`, and `BACK_GAIN` above the floor. Of 344 blind cases, 119 nulls among them, the first
 changed one answer, to a right one. Well within the floor it needs what all need there: grids led one null's base fit 36-fold away."""
-BACK_GAIN = math.log(1.4)
-"""What such an effect must gain above the floor."""
-GAIN_TO_NOISE = math.log(2.0)
-"""What it takes where noise alone is left, for a candidate can take the place of what the grid does; of one that `stands_alone`; and above
-the floor where the base fit is led away, as none of 40 nulls' was."""
-FIT_GAIN, FIT_LEAD, FEW = math.log(4.0), math.log(2.0), 3
-"""An effect is told by the fitted recordings where it leaves noise alone there, gains the first, leads every other by the second and has
-no more parameters than the third. In a blind seed ten of eleven like that were named, all rightly, and none came up on its twenty nulls."""
-FORETELLS = math.log(1.3)
-"""What such a one must gain in what is held out."""
+BACK_GAIN = math.log(CLASS_RATIO)
+"""What such an effect must gain above the floor: what effects are told apart by."""
+FEW = 3
+"""Parameters up to which an effect is told by the fitted recordings, where it leaves noise alone there, gains `GAIN_IN_FLOOR` and leads
+every other by `GAIN_TO_NOISE`. In a blind seed ten of eleven like that were named, all rightly, and none came up on its twenty nulls. With
+as many parameters more than the best one a rival must be better."""
+FORETELLS = 0.5 * LEAST_GAIN
+"""What such a one must gain in what is held out, and what each of several must add to the others there: half of what one alone must."""
 SEEN = 0.1
 """Share of the noise, mean squares, that counts as above it where less is left."""
 IMPLAUSIBLE = 30.0
 """Ratio of a fitted figure to the declared one from which the data are not those of the declared units or material."""
 STANDS_OUT = 5.0
 """Times the noise above which a residual within its floor is no reason to say that nothing is missing: too much could hide there."""
-WITHIN = 0.5
-"""Share of the floor within which a residual that no effect explains is no reason to look further."""
-LIKE_A_GRID = 0.5, 2.5
+LIKE_A_GRID = WITHIN, math.exp(GAIN_AT_FLOOR)
 """Times what another grid does, without a refit, in the held-out recordings: an effect that leaves more than the first where less than the
 second was to be explained is not named. Of 223 named in eight blind seeds one was like that, a wrong one."""
 
@@ -75,8 +88,7 @@ def stands_alone(r: Round, t: Trial) -> bool:
 
 def gain_over_floor(over: float) -> float:
     """Return the gain that an effect must bring by how far the residual is above its floor, a ratio of errors."""
-    steps = [math.log(WITHIN), 0.0, math.log(1.5)]
-    return float(np.interp(math.log(over), steps, [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
+    return float(np.interp(math.log(over), [math.log(WITHIN), 0.0, math.log(CLEAR)], [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
 
 
 class SimulatedEnds:
@@ -214,7 +226,7 @@ def is_told_by_fit(lab: Laboratory, r: Round, t: Trial) -> bool:
         return False
     fitted = np.array(lab.fitted)
     leads = [bootstrap.ratio(o.errors, t.errors, fitted) for o in r.trials if o.candidate.name != t.candidate.name]
-    return min(leads, default=math.inf) > FIT_LEAD and bootstrap.ratio(r.errors, t.errors, fitted) > FIT_GAIN
+    return min(leads, default=math.inf) > GAIN_TO_NOISE and bootstrap.ratio(r.errors, t.errors, fitted) > GAIN_IN_FLOOR
 
 
 def above_noise(lab: Laboratory, before: np.ndarray, t: Trial) -> float:
@@ -235,18 +247,18 @@ def by_chance(lab: Laboratory, r: Round) -> float:
 
 
 def as_good(search: Search, t: Trial, top: Trial) -> bool:
-    """Whether a fit comes near the errors of the best one; with three parameters more it must be better."""
+    """Whether a fit comes near the errors of the best one; with `FEW` parameters more it must be better, by `PARSIMONY` for each."""
     lab = search.lab
     more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
     ratio = CLASS_RATIO if lab.problem.settings == 1 or comparing.is_noise(lab, top.errors) else CLASS_RATIO_ABOVE
     if is_exact(search, top):
         ratio = CLASS_RATIO_EXACT
-    return t.score - top.score < (-0.1 if more >= 3 else 2.0 * math.log(ratio))
+    return t.score - top.score < (-PARSIMONY * more if more >= FEW else 2.0 * math.log(ratio))
 
 
 def is_rival(search: Search, t: Trial, top: Trial) -> bool:
     """Whether the data cannot tell `t` from the best one: about its errors, a gain of its own, and not by many more parameters."""
-    return t is top or (as_good(search, t, top) and t.gain > 0.4 * top.gain) or is_behind_by_a_grid(search.lab, t, top)
+    return t is top or (as_good(search, t, top) and t.gain > RIVAL * top.gain) or is_behind_by_a_grid(search.lab, t, top)
 
 
 def is_behind_by_a_grid(lab: Laboratory, t: Trial, top: Trial) -> bool:

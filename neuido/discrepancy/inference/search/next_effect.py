@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
 
 from neuido.discrepancy.inference import bootstrap, comparing, directions, discretisation
 from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, patterns, score, times_over
@@ -19,7 +20,7 @@ from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
 from neuido.discrepancy.inference.search import contests, judging, prospects, refining, stand_ins
 from neuido.discrepancy.inference.search.contests import MANY, better
-from neuido.discrepancy.inference.search.judging import LED_AWAY, WITHIN
+from neuido.discrepancy.inference.search.judging import ABOVE, ALPHA, LED_AWAY, WITHIN
 from neuido.discrepancy.inference.search.refining import MEASURED, NEAR
 from neuido.discrepancy.inference.search.search_state import Look, Search
 from neuido.discrepancy.problems.problem import Candidate, Problem
@@ -32,10 +33,10 @@ PLAIN, AS_WELL = 2, 1.2
 recordings up to which it stands there instead."""
 MEMBERS = 3
 """Members of a class where whose fits ended the model is weighed without them."""
-UNEXPLAINED = 2.0
-"""Times what noise and discretisation leave after a refit: a residual above it that no effect explains is called unknown."""
 UNEXPLAINED_EXACT = 3.0
-"""The same where nothing is discretised: the noise that a folder states is an estimate."""
+"""`ABOVE` where nothing is discretised: the noise that a folder states is an estimate."""
+UNSURE = float(norm.ppf(1.0 - 0.5 * ALPHA))
+"""Deviations of an estimated noise that widen the limit of what is unknown."""
 
 
 def new_search(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0, **options: Any) -> Search:
@@ -47,7 +48,7 @@ def new_search(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int =
 def unexplained(lab: Laboratory) -> float:
     """Times its floor above which a residual that no effect explains is called unknown."""
     unsure = max(lab.noise_uncertainty(n) for n in lab.scored_recordings)  # a residual of a noise that is not known may be noise
-    return (UNEXPLAINED if lab.problem.settings > 1 else UNEXPLAINED_EXACT) * (1.0 + 2.0 * unsure)
+    return (ABOVE if lab.problem.settings > 1 else UNEXPLAINED_EXACT) * (1.0 + UNSURE * unsure)
 
 
 def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival: Round | None = None, *, most: float = math.inf) -> Round:
@@ -156,7 +157,7 @@ def is_led_away(lab: Laboratory, base: Fit, r: Round) -> bool:
 def is_unexplained(lab: Laboratory, r: Round) -> bool:
     """Whether the residual of a round's base is above what noise and discretisation would leave, by so much that it is not none."""
     held_out = r.held_out_over(lab.fitted) if lab.problem.settings > 1 else 0.0
-    return r.over > unexplained(lab) or held_out > UNEXPLAINED
+    return r.over > unexplained(lab) or held_out > ABOVE
 
 
 def first_look(
