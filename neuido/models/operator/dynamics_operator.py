@@ -28,6 +28,7 @@ FORMAT = "neuido-operator/1"
 PRETRAINED = {
     "pretrained": Path(__file__).parents[1] / "weights" / "stage1.safetensors",
     "pretrained-family": Path(__file__).parents[1] / "weights" / "stage1_family.safetensors",
+    "pretrained-bounded": Path(__file__).parents[1] / "weights" / "stage1_bounded.safetensors",
 }
 ElasticNetwork = RawElastic | ObjectiveElastic
 PlasticNetwork = RawPlastic | ObjectivePlastic
@@ -220,7 +221,7 @@ class IntrinsicDynamicsOperator(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "pretrained") -> Self:
-        """Load an operator that ships with neuido (`pretrained`, `pretrained-family`), or a file of `save`.
+        """Load an operator that ships with neuido (`pretrained`, `pretrained-family`, `pretrained-bounded`), or a file of `save`.
 
         Raises:
             UserError: As in `load`.
@@ -231,7 +232,8 @@ class IntrinsicDynamicsOperator(nn.Module):
     def load(cls, path: str | Path = "pretrained") -> Self:
         """Load a file of `save`, or an operator that ships with the package.
 
-        The encoders are trained for `pretrained`. `pretrained-family` was trained with a prior that pulls the latents of a family together.
+        The encoders are trained for `pretrained`. `pretrained-family` was trained with a prior that pulls the latents of a family together;
+        the elastic law of `pretrained-bounded` has the right sign at every deformation.
 
         Raises:
             UserError: The file is missing, or it is not an operator.

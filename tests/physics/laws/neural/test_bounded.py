@@ -65,6 +65,21 @@ def test_every_random_law_has_the_right_signs_on_the_whole_grid():
         assert (tau - tau.mT).abs().max() <= 1e-6 * tau.abs().max()
 
 
+def test_every_shipped_law_has_the_right_signs_on_the_whole_grid():
+    s, F, Q = grid()
+    operator = IntrinsicDynamicsOperator.load("pretrained-bounded")
+    assert len(operator.latents) == 90
+    with torch.no_grad():
+        t = principal(operator.elastic(operator.latents, F.float().expand(90, *F.shape)).double(), Q)
+        inverted = F @ torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=F.dtype))
+        tau = operator.elastic(operator.latents, inverted.float().expand(90, *F.shape)).double()
+    strain = s.log()
+    assert ((t * strain).sum(-1) > 0).all()
+    assert (t[:, (strain <= 1e-9).all(1)] <= 2e-6 * t.abs().max()).all() and (t[:, (strain >= -1e-9).all(1)] >= -2e-6 * t.abs().max()).all()
+    back = torch.linalg.solve(inverted, torch.linalg.solve(inverted, tau).mT).diagonal(dim1=-2, dim2=-1).sum(-1)  # tr(F^-1 tau F^-T)
+    assert (back > 0).all()
+
+
 def test_the_work_of_every_random_law_grows_without_bound():
     """Along each ray of strain the stress does at least the work of the softest modulus, linear in the logarithm of the stretch."""
     way = torch.randn(40, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
