@@ -456,7 +456,7 @@ GROUPS = {
         _importer("deeplabcut-hdf5", _hdf5, "dlc.h5", 2_000, point="ball", scale=0.005, frame_rate=30.0),
         Reader("import-field", _field, "strip-1_0.csv", _read_field, 400, 10),
         Reader("import-ncorr", _ncorr, "strip.mat", _read_field, 2_000),
-        Reader("import-film", _throw, "throw.mp4", _read_throw, 300, 8),
+        Reader("import-film", _throw, "throw.mp4", _read_throw, 300, 3),
         _importer("body", _body, "particles.csv", density=1000.0, young=5e4, floor=0.0),
     ),
     "results": (

@@ -8,6 +8,7 @@ import yaml
 import neuido
 from neuido.data.footage.filming import Filming
 from neuido.errors import UserError
+from tests.command import run
 from tests.data.footage import drawn
 
 PIXEL = drawn.SCALE
@@ -42,9 +43,11 @@ def test_the_diameter_gives_the_scale(throw, tmp_path):
     assert abs(found) < given < 0.06
 
 
-def test_slow_motion_and_a_part_of_the_clip(throw, tmp_path):
+def test_slow_motion_and_a_part_of_the_clip_by_the_command(throw, tmp_path, capsys):
     path, _ = throw
-    neuido.import_file(path, tmp_path / "out", scale=PIXEL, frame_rate=240.0, filming=Filming(start=0.025, end=0.075))
+    part = ["--scale", PIXEL, "--frame_rate", 240, "--start", 0.025, "--end", 0.075, "--picture", tmp_path / "sheet.png"]
+    status, out, err = run(capsys, "import", path, *part, "--out", tmp_path / "out")
+    assert (status, err) == (0, "") and "240 frames/s as given" in out and (tmp_path / "sheet.png").is_file()
     np.testing.assert_allclose(track_of(tmp_path / "out").t, np.arange(13) / 240, atol=1e-6)
 
 
