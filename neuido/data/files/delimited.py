@@ -14,6 +14,8 @@ DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", 
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")  # each digit is matched in one way: no time grows with the square
 _COMMA = re.compile(r"[+-]?(\d+|\d*,\d+)([eE][+-]?\d+)?")
 _GROUPED = {".": re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d+)?"), ",": re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d+)?")}
+CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?)(?::(\d\d))?")
+"""Time as hours:minutes:seconds, with a date before it or hundredths of a second after it."""
 _SAMPLE = 400
 """Number of lines from which the dialect is detected."""
 
@@ -111,7 +113,7 @@ def _dialect(lines: list[str]) -> tuple[str, str]:
                 cells = [cell for cell in _split(line, separator) if cell]
             except csv.Error:
                 continue
-            numbers = sum(_in_dialect(cell, decimal) for cell in cells)
+            numbers = sum(_in_dialect(cell, decimal) or CLOCK.fullmatch(cell) is not None for cell in cells)
             score += numbers - 2 * (len(cells) - numbers) if numbers else 0
         if score > best:
             best, chosen = score, (separator, decimal)

@@ -14,8 +14,9 @@ from neuido.errors import PlausibilityWarning, UserError
 
 SENTINELS = (0.0, -9999.0, 9999.0, -999999.0)
 """Values that trackers write into the coordinates of a marker that they did not see."""
-LOST = 10.0
-"""Usual steps from frame to frame by which a position of exactly zero is away from its neighbours where the point was not seen."""
+LOST = 4.0
+"""Usual steps from frame to frame by which a position of exactly zero is away from the nearest one where the point was not
+seen; a body that passes the origin is rarely faster than that."""
 MAX_LEFT = 0.03
 """Share of its range that a parabola leaves of a flight, at the most."""
 FASTEST, SLOWEST = 30.0, 3e-3
@@ -86,7 +87,8 @@ def lost_positions(x: np.ndarray) -> np.ndarray:
     for i in np.flatnonzero(zero):
         j = int(np.searchsorted(good, i))
         near = [good[k] for k in (j - 1, j) if 0 <= k < len(good)]
-        out[i] = all(np.linalg.norm(x[k]) > LOST * max(usual, 1e-12) * abs(int(k) - int(i)) for k in near)
+        gap = min(abs(int(k) - int(i)) for k in near)
+        out[i] = all(np.linalg.norm(x[k]) > LOST * max(usual, 1e-12) * gap for k in near if abs(int(k) - int(i)) == gap)
     return out
 
 

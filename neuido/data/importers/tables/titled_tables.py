@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neuido.data.files.delimited import is_number, read_delimited
+from neuido.data.files.delimited import CLOCK, is_number, read_delimited
 from neuido.data.importers.tables.spreadsheets import is_spreadsheet, read_spreadsheet
 from neuido.data.importers.tables.titles import SPECIMEN, UNIT_IN_TITLE, bare_title, find_columns
 from neuido.data.importers.tables.units import is_unit
@@ -18,11 +18,10 @@ LONGEST_TITLE = 200
 """Characters of a title that are looked at."""
 LEAST_ROWS = 3
 """Rows of numbers that make a table, at the least."""
+MISSING = ("", "-", "--", "nan", "na", "n/a", "null", "none", "inf", "-inf")
+"""Words for a number that is missing."""
 MOST_TABLES = 200
 """Tables of one file, at the most."""
-
-_CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?)(?::(\d\d))?")
-"""Time as hours:minutes:seconds, with a date before it or hundredths of a second after it."""
 
 
 class Table(NamedTuple):
@@ -120,9 +119,28 @@ def _stacked(rows: list[list[str]], path: Path, notes: list[str], numbered: bool
 
 
 def _first_block(rows: list[list[str]], start: int) -> int | None:
-    """Return the first row from which three rows of numbers follow."""
-    numeric = [_numeric(row) for row in rows[start:]]
-    return next((start + i for i in range(len(numeric) - LEAST_ROWS + 1) if all(numeric[i : i + LEAST_ROWS])), None)
+    """Return the first row of three rows of numbers; rows with gaps may lie between them, and before them."""
+    first = next((i for i in range(start, len(rows)) if _numeric(rows[i]) and _goes_on(rows, i)), None)
+    while first is not None and first > start and _has_gaps(rows[first - 1]):
+        first -= 1
+    return first
+
+
+def _goes_on(rows: list[list[str]], first: int) -> bool:
+    """Whether three rows of numbers follow, before any row that has a word."""
+    count = 0
+    for row in rows[first:]:
+        if not _numeric(row) and not _has_gaps(row):
+            return False
+        count += _numeric(row)
+        if count >= LEAST_ROWS:
+            return True
+    return False
+
+
+def _has_gaps(row: list[str]) -> bool:
+    """Whether a row has a number, and else nothing or the word for a missing one."""
+    return any(map(_is_value, row)) and all(_is_value(cell) or cell.lower() in MISSING for cell in row)
 
 
 def _extent(rows: list[list[str]], start: int, path: Path) -> tuple[int, int]:
@@ -230,7 +248,7 @@ def _value(cell: str) -> float:
     """Return a cell as a number, a time of day or date and time in seconds; NaN for anything else."""
     if is_number(cell):
         return float(cell)
-    found = _CLOCK.fullmatch(cell)
+    found = CLOCK.fullmatch(cell)
     if found is None:
         return math.nan
     hours, minutes, seconds, hundredths = (float((part or "0").replace(",", ".")) for part in found.groups()[1:])
@@ -246,4 +264,9 @@ def _value(cell: str) -> float:
 def _numeric(row: list[str]) -> bool:
     """Whether more than half of the filled cells of a row are numbers."""
     filled = [cell for cell in row if cell]
-    return len(filled) > 1 and sum(is_number(cell) or _CLOCK.fullmatch(cell) is not None for cell in filled) > 0.5 * len(filled)
+    return len(filled) > 1 and sum(map(_is_value, filled)) > 0.5 * len(filled)
+
+
+def _is_value(cell: str) -> bool:
+    """Whether a cell is a number or a time."""
+    return is_number(cell) or CLOCK.fullmatch(cell) is not None
