@@ -7,12 +7,13 @@ PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
 CONSTRAINTS ?= constraints.txt
 TORCH ?= $(shell grep '^torch==' constraints.txt)
 VENV ?= .venv
+TOOLS ?= $(VENV)-tools
 
 pin := $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
 bin := $(VENV)/bin
 installed := $(VENV)/.installed
 
-.PHONY: help venv demo docs test test-all test-slow test-gpu lint format types clean
+.PHONY: help venv demo docs test test-all test-slow test-gpu lint format types sbom audit clean
 .DEFAULT_GOAL := help
 
 help:
@@ -20,6 +21,8 @@ help:
 	@echo 'make test      run the fast tests: minutes on two cores'
 	@echo 'make test-all  run every test that needs no GPU'
 	@echo 'make docs      build the documentation: docs/_build/html/index.html'
+	@echo 'make sbom      list what is installed, with licences: sbom.cdx.json, licences.csv'
+	@echo 'make audit     look for known vulnerabilities of the pinned dependencies'
 	@echo 'make test-slow, test-gpu, lint, format, types, venv, clean'
 
 venv: $(installed)
@@ -77,6 +80,19 @@ format: $(installed)
 types: $(installed)
 	$(bin)/pyright
 
+# The tools live in an environment of their own, so that they are not among what they list.
+$(TOOLS)/.installed:
+	$(PYTHON) -m venv $(TOOLS)
+	$(TOOLS)/bin/python -m pip install 'cyclonedx-bom>=7' 'pip-licenses>=5' 'pip-audit>=2.9'
+	@touch $@
+
+sbom: $(installed) $(TOOLS)/.installed
+	$(TOOLS)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible -o sbom.cdx.json $(bin)/python
+	$(TOOLS)/bin/pip-licenses --python $(bin)/python --format csv --with-urls --output-file licences.csv
+
+audit: $(TOOLS)/.installed
+	$(TOOLS)/bin/pip-audit -r constraints.txt --no-deps --disable-pip --progress-spinner off
+
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(TOOLS) sbom.cdx.json licences.csv build dist .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +

@@ -73,8 +73,12 @@ def _line_of(error: BaseException) -> str | None:
             return str(cause)
         seen.append(cause)
         cause = cause.__cause__
-    if isinstance(error, argparse.ArgumentError):
+    if isinstance(error, argparse.ArgumentError) or str(error).startswith("Does not validate against any of the Union subtypes"):
         return condensed(error)
+    if isinstance(error, ValueError) and "embedded null" in str(error):
+        return "a path holds a null character, which no name of a file may have: check the names in the options and files that were given"
+    if isinstance(error, UnicodeEncodeError):
+        return f"a text that was given holds characters that cannot be written as {error.encoding}: {error.object[error.start : error.end]!r}"
     if isinstance(error, OSError) and error.strerror is not None:
         own = [f"'{name}'" for name in (error.filename, error.filename2) if name is not None]
         what = f"{error.strerror}: {', '.join(own)}" if own else error.strerror
@@ -99,7 +103,7 @@ _NOISE = re.compile(  # lines of jsonargparse's messages without information for
 )
 
 
-def condensed(error: argparse.ArgumentError) -> str:
+def condensed(error: Exception) -> str:
     """Return jsonargparse's indented message as one line: the key, the fault and the value."""
     lines = [line.strip().removeprefix("- ") for line in str(error).splitlines()]
     text = ": ".join(dict.fromkeys(line.rstrip(":") for line in lines if not _NOISE.match(line)))

@@ -9,6 +9,7 @@ its traceback, and exit status 70. `NEUIDO_TRACEBACK=1` shows the traceback inst
 """
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -62,8 +63,7 @@ def main(args: Sequence[str] | None = None) -> None:
     status: Any = FAULT
     with interruption.watched():
         try:
-            status = _dispatch(list(sys.argv[1:] if args is None else args))
-            _flush()
+            status = _run(list(sys.argv[1:] if args is None else args))
         except KeyboardInterrupt:
             status = 128 + (interruption.received() or signal.SIGINT)
         except BrokenPipeError:  # as of `neuido ... | head`
@@ -83,6 +83,20 @@ def main(args: Sequence[str] | None = None) -> None:
         number = number or signal.SIGINT
         _fail("interrupted" + (f" by {signal.Signals(number).name}" if number != signal.SIGINT else ""), 128 + number)
     sys.exit(status)
+
+
+def _run(args: list[str]) -> int:
+    """Run a command and write what it printed; a character that the terminal's encoding lacks is shown as a question mark."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    try:
+        status = _dispatch(args)
+    except SystemExit:  # of --help and --print_config
+        _flush()
+        raise
+    _flush()
+    return status
 
 
 def _flush() -> None:

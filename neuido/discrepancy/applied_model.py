@@ -14,11 +14,12 @@ from neuido.models.fewshot.scene_fit import EffectSource
 from neuido.models.inference.prepared_scene import PreparedScene
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.events import Event
 
 
 def replay(
     folder: str, out: str | os.PathLike, *, model: str | None = None, device: str = "auto", progress: bool = True
-) -> dict[str, float | None]:
+) -> tuple[dict[str, float | None], dict[str, list[Event]]]:
     """Simulate the recordings of an experiment under a model, and write them as an experiment's folder without noise.
 
     The tracked points are those of the experiment; of a video, whose points nobody tracked, they are all particles.
@@ -31,7 +32,8 @@ def replay(
         progress: Show a progress bar.
 
     Returns:
-        The RMS distance of each recording's points from the measured ones [m]; none where no points were tracked.
+        The RMS distance of each recording's points from the measured ones [m], none where no points were tracked; and what makes the
+        motion of a recording doubtful, where there is anything.
 
     Raises:
         UserError: What readers and rollouts refuse, or a folder that is there already.
@@ -40,15 +42,17 @@ def replay(
     check_unused(target)
     experiment = read_experiment(folder, model=None if model is None else read_model_file(model))
     problem = experiment_problem(experiment, "auto", choose_device(device))
-    recordings = []
+    recordings, doubtful = [], dict[str, list[Event]]()
     with new_folder(target) as hidden:
         with Progress("recordings", len(problem.measured), shown=progress) as work:
             for n in range(len(problem.measured)):
                 recordings.append(problem.simulated(n))
+                if events := problem.doubts({}, n):
+                    doubtful[recordings[-1].name] = events
                 work.update()
         write_experiment(replace(experiment, model=beside(hidden, experiment.model), recordings=tuple(recordings)), hidden)
         read_experiment(hidden)  # what cannot be read again is not published
-    return {r.name: _distance(r, experiment[r.name]) for r in recordings}
+    return {r.name: _distance(r, experiment[r.name]) for r in recordings}, doubtful
 
 
 def _distance(simulated: Recording, measured: Recording) -> float | None:

@@ -1,6 +1,7 @@
 """The command line: help without torch, and one line with status 2 for whatever the user can mend."""
 
 import functools
+import io
 import os
 import subprocess
 import sys
@@ -179,8 +180,9 @@ def test_step_above_the_stability_limit(capsys, tmp_path):
     assert_one_line(capsys, [*args, "--setup.particles_per_side", "3", "--progress", "false", "--device", "cpu"], "dt", "0.1")
 
 
+@pytest.mark.parametrize("words", [["--help"], ["trajectories", "--out", "out", "--print_config"]])
 @pytest.mark.parametrize(("stream", "status"), [("/dev/full", 2), (None, 128 + 13)])
-def test_stdout_that_cannot_be_written_is_one_line_and_stderr_may_be_gone(stream, status):
+def test_stdout_that_cannot_be_written_is_one_line_and_stderr_may_be_gone(stream, status, words):
     """In a fork, whose own stdout is full or closed, and stderr closed."""
     child = os.fork()
     if child == 0:
@@ -193,12 +195,34 @@ def test_stdout_that_cannot_be_written_is_one_line_and_stderr_may_be_gone(stream
                 os.close(reads)
                 os.dup2(writes, number)
             sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))
-            main(["--help"])
+            main(words)
         except SystemExit as stop:
             code = stop.code
         finally:
             os._exit(int(str(code)))
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == status
+
+
+@pytest.mark.parametrize(
+    ("error", "word"),
+    [
+        (ValueError("embedded null byte"), "null character"),
+        (UnicodeEncodeError("utf-8", "a\ud800", 1, 2, "surrogates not allowed"), "cannot be written as utf-8"),
+        (ValueError("Does not validate against any of the Union subtypes\nSubtypes: [x]\nErrors:\n  - root is null\n"), "root is null"),
+    ],
+)
+def test_names_and_values_that_no_reader_expects_are_one_line(error, word):
+    line = one_line(error)
+    assert line is not None and word in line and "\n" not in line and "Subtypes" not in line
+
+
+def test_output_in_an_encoding_that_lacks_a_character(monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    monkeypatch.setattr(cli, "_help", lambda: "5 m² … done")
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0 and written.getvalue() == b"5 m? ? done\n"
 
 
 def test_interrupt(capsys, monkeypatch):

@@ -46,9 +46,12 @@ STOP = 20.0
 """Seconds of a processor after which work that was accepted is ended by SIGTERM."""
 GRACE = 60.0
 """Seconds that it may then take to end."""
+WAIT = 900.0
+"""Seconds of the clock after which a command that waits for something is killed, on however busy a machine."""
 KINDS = ("file", "value", "words", "configuration", "out", "surroundings", "signal", "file")
 """What an input attacks; damaged files count twice."""
-INTERRUPTED = (128 + signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGHUP)
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+INTERRUPTED = tuple(128 + number for number in SIGNALS)
 
 
 class Attack(NamedTuple):
@@ -102,7 +105,7 @@ def run_attack(target: Target, kind: str, number: int, sample: Path, root: Path)
         what = rng.choice(list(SURROUNDINGS))
         prepare = SURROUNDINGS[what](rng)
     elif kind == "signal":
-        delay, number_of = rng.choice((0.0, 0.01, 0.05, 0.1, 0.2, 0.4, 0.8)), rng.choice((signal.SIGTERM, signal.SIGINT, signal.SIGHUP))
+        delay, number_of = rng.choice((0.0, 0.01, 0.05, 0.1, 0.2, 0.4, 0.8)), rng.choice(SIGNALS)
         what = f"{signal.Signals(number_of).name} after {delay:g} s"
     before = {"in": _tree(box / "in"), "out": _tree(box), "beside": _tree(beside)}
     status, seconds, err, notes = _forked(words, box, root, prepare, None if delay is None else (delay, number_of))
@@ -235,11 +238,13 @@ def _forked(
 ) -> tuple[int | None, float, str, list[str]]:
     """Run the words in a fork; return exit status (None: it had to be killed), seconds of a processor, stderr, what it did outside."""
     pipes = [os.pipe() for _ in ("stdout", "stderr", "notes")]  # what limits the size of files does not limit these
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # a signal waits until the child is one
     child = os.fork()
     if child == 0:
         for reads, _ in pipes:
             os.close(reads)
         _child(words, box, root, prepare, [writes for _, writes in pipes])
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     for reads, writes in pipes:
         os.close(writes)
         os.set_blocking(reads, False)
@@ -254,7 +259,7 @@ def _forked(
     if interrupt is not None:
         time.sleep(interrupt[0])
         os.kill(child, interrupt[1])
-    told, end = 0.0, None
+    told, end, last = 0.0, None, time.monotonic() + WAIT
     while True:
         drain()
         done, code, usage = os.wait4(child, os.WNOHANG)
@@ -265,6 +270,8 @@ def _forked(
         if end is None and used > STOP:
             os.kill(child, signal.SIGTERM)
             told, end = used, time.monotonic() + 4 * GRACE
+        elif time.monotonic() > last:
+            os.kill(child, signal.SIGKILL)
         elif end is not None and (used > told + GRACE or time.monotonic() > end):
             os.kill(child, signal.SIGKILL)
         time.sleep(0.005)
@@ -286,7 +293,10 @@ def _processor_seconds(pid: int) -> float:
 def _child(words: list[str], box: Path, root: Path, prepare: Callable[[], None], pipes: list[int]) -> None:
     """Be the command, and end the process; the pipes take stdout, stderr and what was done outside."""
     status: Any = 99
+    seen: list[str] = []
     try:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         os.chdir(box)
         os.environ |= LIMITS | {"TMPDIR": str(root / "tmp")}
         os.dup2(pipes[0], 1)
@@ -296,18 +306,20 @@ def _child(words: list[str], box: Path, root: Path, prepare: Callable[[], None],
         sys.argv = ["neuido", *words]
         now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (now + BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        prepare()
         with watched(root) as outside:
-            prepare()
             try:
                 main(words)
             except SystemExit as stop:
                 status = stop.code
-        os.write(pipes[2], json.dumps(outside[:5]).encode())
+        seen += outside[:5]
         sys.stdout.flush()
-        sys.stderr.flush()
+        with contextlib.suppress(OSError):
+            sys.stderr.flush()
     except BaseException as error:
-        os.write(pipes[2], json.dumps([f"the harness sees {type(error).__name__}: {error}"]).encode())
+        seen.append(f"the harness sees {type(error).__name__}: {error}")
     finally:
+        os.write(pipes[2], json.dumps(seen).encode())
         os._exit(status if isinstance(status, int) else 0 if status is None else 1)
 
 
@@ -317,7 +329,7 @@ def _fault(target: Target, kind: str, what: str, status: int | None, seconds: fl
         return "does not end"
     if "Traceback (most recent call last)" in err:
         return "traceback: " + " ".join(err.strip().splitlines()[-2:])[:300]
-    stopped = status in INTERRUPTED
+    stopped = status in INTERRUPTED or (kind == "signal" and -status in SIGNALS)  # before the command could take it
     if stopped and kind != "signal" and seconds < STOP:
         return f"status {status}"
     if status not in (0, 1, 2) and not stopped and not (status == 128 + signal.SIGPIPE and "stdout" in what):
@@ -333,13 +345,18 @@ def _fault(target: Target, kind: str, what: str, status: int | None, seconds: fl
             return f"refused after {seconds:.0f} s"
         if "not enough memory" in own[0] and "memory" not in what:
             return f"takes the memory and is refused: {own[0][:200]}"
-    notes = [n for n in notes if not (target.acts and not n.startswith(("open", "os."))) and not (kind == "out" and "/proc/." in n)]
+    notes = [
+        n
+        for n in notes
+        if "harness" in n or (not (target.acts and not n.startswith(("open", "os."))) and not (kind == "out" and "/proc/." in n))
+    ]
     return f"acts outside: {notes[:2]}"[:400] if notes else ""
 
 
 def _traces(box: Path, beside: Path, before: dict[str, dict[str, str]], status: int | None, what: str) -> str:
     """Return what is wrong with the files after a command."""
-    if (now := _tree(beside)) != before["beside"]:
+    now = _tree(beside)
+    if now != before["beside"] and not (what == "a link to a folder in use" and before["beside"].items() <= now.items()):
         return f"changes what lies beside: {_difference(before['beside'], now)}"
     now = _tree(box / "in")
     if now != before["in"] and not (what == "the input" and before["in"].items() <= now.items()):
@@ -347,6 +364,8 @@ def _traces(box: Path, beside: Path, before: dict[str, dict[str, str]], status: 
     now = _tree(box)
     if left := [path for path in now if ".tmp" in Path(path).name and path not in before["out"]]:
         return f"leaves temporary files: {left[:2]}"
+    if what == "full disk":  # work that a full disk ends goes on where it was, when there is space again
+        now = {path: content for path, content in now.items() if not path.startswith("out/.work") and path not in ("out", "out/log.csv")}
     if status == 2 and now != before["out"] and what != "full stdout":
         return f"is refused and leaves traces: {_difference(before['out'], now)}"
     for path in now:

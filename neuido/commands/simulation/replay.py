@@ -23,7 +23,10 @@ def replay(folder: str, *, out: str, model: str | None = None, device: str = "au
     check_writable(Path(out))
     from neuido.discrepancy.applied_model import replay
 
-    apart = replay(folder, out, model=model, device=device, progress=progress)
+    apart, doubtful = replay(folder, out, model=model, device=device, progress=progress)
     for name, distance in apart.items():
         print(f"{name}: {'no points were tracked' if distance is None else f'{1e3 * distance:.3g} mm RMS from the measured points'}")
+    for name, events in doubtful.items():
+        for event in events:
+            print(f"note: {name}: {event.words}")
     print(f"results in {out}: `neuido diagnose {out} --out FOLDER` reads it")

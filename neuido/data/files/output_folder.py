@@ -16,7 +16,7 @@ from typing import Any
 
 from neuido.data.files.lock import OwnedLock
 from neuido.data.files.sweep_run import RUN_FILES
-from neuido.data.files.writing import check_writable, write_text
+from neuido.data.files.writing import check_writable, made_folder, write_text
 from neuido.errors import UserError
 
 PLAN = "plan.json"
@@ -57,8 +57,7 @@ def claimed_folder(
     check_writable(path, option)
     text = json.dumps(plan, indent=1, default=list) + "\n"
     _check_use(path, text, held, file, compared, option, keeps)
-    path.mkdir(parents=True, exist_ok=True)
-    with held_folder(path, option=option, shard=shard, shards=shards):
+    with made_folder(path), held_folder(path, option=option, shard=shard, shards=shards):
         _check_use(path, text, held, file, compared, option, keeps)  # another process may have come first
         if not (path / file).exists():
             write_text(path / file, text)

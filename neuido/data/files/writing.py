@@ -1,6 +1,7 @@
 """Atomic writing: files and folders get their final name only when complete. Links are never followed."""
 
 import contextlib
+import hashlib
 import json
 import os
 import shutil
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @contextlib.contextmanager
-def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False, digest: bool = False) -> Iterator[Path]:
     """Write a file atomically: yield a temporary path, and rename it to `path` when the block ends.
 
     The data are synchronised to disk before the renaming; inside of a `new_folder`, when that ends. If the block raises, as on a full
@@ -27,21 +28,47 @@ def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False) -> Itera
     Args:
         path: The file; its folder is created if it does not exist.
         keep_suffix: Whether the temporary path has the suffix of `path`, for writers that depend on it.
+        digest: Whether a hidden file beside it notes the SHA-256 of what was written, for `is_as_written`.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    hidden = temporary_path(path, path.suffix if keep_suffix else "")
-    try:
-        yield hidden
-        durable = not _in_new_folder(path)
+    with made_folder(path.parent):
+        hidden = temporary_path(path, path.suffix if keep_suffix else "")
+        try:
+            yield hidden
+            durable = not _in_new_folder(path)
+            if durable:
+                _sync(hidden)
+            if digest:
+                write_text(_noted_digest(path), f"{sha256_of(hidden)}\n")
+            os.replace(hidden, path)
+        except BaseException:
+            remove(hidden)
+            raise
         if durable:
-            _sync(hidden)
-        os.replace(hidden, path)
-    except BaseException:
-        remove(hidden)
-        raise
-    if durable:
-        _sync(path.parent)
+            _sync(path.parent)
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file's content."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def is_as_written(path: Path, *, unnoted: bool = False) -> bool:
+    """Return whether a file has the content that `atomic_write(..., digest=True)` noted.
+
+    Args:
+        path: The file.
+        unnoted: What is returned where nothing is noted, as of files of earlier versions.
+    """
+    noted = _noted_digest(path)
+    if not noted.is_file():
+        return unnoted
+    return path.is_file() and noted.read_text().strip() == sha256_of(path)
+
+
+def _noted_digest(path: Path) -> Path:
+    return path.with_name(f".{path.name}.sha256")
 
 
 def _in_new_folder(path: Path) -> bool:
@@ -60,11 +87,11 @@ def write_bytes(path: Path, content: bytes) -> None:
         hidden.write_bytes(content)
 
 
-def write_arrays(path: Path, arrays: Mapping[str, "np.ndarray"], *, compressed: bool = True) -> None:
-    """Write NumPy arrays as one .npz file all at once."""
+def write_arrays(path: Path, arrays: Mapping[str, "np.ndarray"], *, compressed: bool = True, digest: bool = False) -> None:
+    """Write NumPy arrays as one .npz file all at once; `digest` is that of `atomic_write`."""
     import numpy as np
 
-    with atomic_write(path) as hidden, hidden.open("wb") as stream:
+    with atomic_write(path, digest=digest) as hidden, hidden.open("wb") as stream:
         (np.savez_compressed if compressed else np.savez)(stream, **arrays)  # type: ignore[arg-type]
 
 
@@ -141,8 +168,8 @@ def new_folder(path: str | os.PathLike) -> Iterator[Path]:
 def made_folder(path: Path) -> Iterator[None]:
     """Create a folder and those above it; when the block ends, those that were created and are empty are removed."""
     made = [each for each in (path, *path.parents) if not each.exists()]
-    path.mkdir(parents=True, exist_ok=True)
     try:
+        path.mkdir(parents=True, exist_ok=True)
         yield
     finally:
         for each in made:

@@ -35,6 +35,7 @@ from neuido.errors import UserError
 from neuido.physics.laws.classical import material
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.device import choose_device
+from neuido.physics.runtime.frames import Frames
 from neuido.types import Body, Cameras, ParticleState, Scene
 
 FORMAT = "neuido-scenes/1"
@@ -186,7 +187,7 @@ def make_scenes(
                 work.say(plan.name)
                 try:
                     with new_folder(path) as hidden:
-                        make_scene(plan, film, hidden, draw=draw, device=chosen, advance=work.update)
+                        make_scene(plan, film, hidden, draw=draw, device=chosen, advance=work.update, note=work.print)
                 except UserError as error:
                     raise UserError(f"scenes: {plan.name}: {error}") from error
         index = [{"name": p.name, "split": p.split, "law": p.law, "particles": len(p.body.x), "substeps": p.substeps} for p in plans]
@@ -195,10 +196,19 @@ def make_scenes(
 
 
 def make_scene(
-    plan: Plan, film: Film, folder: Path, *, draw: Draw, device: torch.device, advance: Callable[[int], Any] = lambda images: None
+    plan: Plan,
+    film: Film,
+    folder: Path,
+    *,
+    draw: Draw,
+    device: torch.device,
+    advance: Callable[[int], Any] = lambda images: None,
+    note: Callable[[str], Any] = lambda line: None,
 ) -> None:
-    """Simulate, film and write one scene; call `advance` with the number of images written."""
+    """Simulate, film and write one scene; call `advance` with the number of images written, and `note` with what makes it doubtful."""
     frames = simulate_motion(plan, film, device)
+    for event in frames.events:
+        note(f"note: {plan.name}: {event.words}")
     times = torch.arange(film.frames, dtype=torch.float64) * plan.substeps * plan.scene.dt
     cameras = film_cameras(film)
     recording = folder / RECORDING
@@ -221,11 +231,11 @@ def make_scene(
     read_experiment(folder)  # raises if the written files cannot be read
 
 
-def simulate_motion(plan: Plan, film: Film, device: torch.device) -> ParticleState:
+def simulate_motion(plan: Plan, film: Film, device: torch.device) -> Frames:
     """Simulate the true motion of a scene; return its frames, with x (T, P, 3) and F (T, P, 3, 3)."""
     simulator = Simulator(plan.scene, plan.body, density=plan.law["density"], device=device)
     if film.frames == 1:
-        return ParticleState(*(part[None] for part in simulator.state))
+        return Frames(*(part[None] for part in simulator.state))
     laws = material(plan.law["elasticity"], plan.law["plasticity"])
     with torch.no_grad():
         return simulator.rollout((film.frames - 1) * plan.substeps, *laws, every=plan.substeps)

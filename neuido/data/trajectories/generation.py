@@ -16,13 +16,14 @@ from torch import Tensor
 from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, evaluate, laws
 from neuido.data.bodies.shapes import cube
 from neuido.data.files.output_folder import claimed_folder
-from neuido.data.files.writing import atomic_write, write_json
+from neuido.data.files.writing import atomic_write, is_as_written, sha256_of, write_json
 from neuido.data.progress import Progress
 from neuido.data.trajectories.trajectory_files import COLUMNS, FORMAT, is_complete
 from neuido.errors import UserError
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.device import choose_device
+from neuido.physics.runtime.events import OUTSIDE, Event
 from neuido.physics.runtime.limits import check_limit, check_memory
 from neuido.types import Body, ParticleState, Scene, Vector, Walls
 
@@ -142,17 +143,26 @@ def generate(
         files = {instance.name: folder / f"{instance.name}.npy" for instance in instances}
 
         in_shard = [instance for i, instance in enumerate(instances) if i % shards == shard]
-        missing = [instance for instance in in_shard if not is_complete(files[instance.name], setup.shape)]
+        published = (folder / "index.json").is_file()  # by an earlier version, maybe, which noted no digests
+
+        def whole(path: Path) -> bool:
+            return is_complete(path, setup.shape) and is_as_written(path, unnoted=published)
+
+        missing = [instance for instance in in_shard if not whole(files[instance.name])]
         with Progress("trajectories", len(in_shard), done=len(in_shard) - len(missing), shown=progress) as work:
             for family in PARAMETERS:
                 in_family = [instance for instance in missing if instance.family == family]
                 for start in range(0, len(in_family), size):
                     group = in_family[start : start + size]
-                    _simulate(setup, group, [files[instance.name] for instance in group], chosen)
+                    for path in (files[instance.name] for instance in group):
+                        if path.exists():
+                            work.print(f"{path.name} is not as it was written: it is simulated again")
+                    for event in _simulate(setup, group, [files[instance.name] for instance in group], chosen):
+                        work.print(f"note: {group[event.scene].name}: {event.words}")
                     work.update(len(group))
 
         if missing or not (folder / "index.json").exists():
-            if all(is_complete(path, setup.shape) for path in files.values()):
+            if all(whole(path) for path in files.values()):
                 _write_index(folder, setup, instances)
 
 
@@ -180,8 +190,13 @@ def _segment(setup: Setup) -> int:
     return max(setup.record_every, SEGMENT // setup.record_every * setup.record_every)
 
 
-def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: torch.device) -> None:
-    """Simulate instances of one family in one launch; write their files one segment of substeps at a time."""
+def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: torch.device) -> list[Event]:
+    """Simulate instances of one family in one launch; write their files one segment of substeps at a time.
+
+    Returns:
+        What makes trajectories doubtful; the scene of an event is the place in the group, and its particle is counted in the trajectory.
+    """
+    noted: dict[tuple[int, str], Event] = {}
     frames, count, _ = setup.shape
     body = _body(setup)
     elastic, plastic = laws(group[0].family, [instance.parameters for instance in group])
@@ -193,7 +208,7 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
         simulator = Simulator([setup.scene] * len(group), [body] * len(group), density=setup.density, device=device)
         state = simulator.state
         with torch.no_grad(), contextlib.ExitStack() as stack:
-            hidden = [stack.enter_context(atomic_write(path)) for path in paths]
+            hidden = [stack.enter_context(atomic_write(path, digest=True)) for path in paths]
             files = [stack.enter_context(path.open("wb")) for path in hidden]
             for file in files:
                 np.lib.format.write_array_header_1_0(file, header)
@@ -201,6 +216,8 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
                 steps = min(segment, frames * setup.record_every - start)
                 out = simulator.rollout(steps, elastic, plastic, state=state)
                 state = ParticleState(*(part[-1].clone() for part in out))
+                for event in out.events:
+                    _merge(noted, event._replace(first=event.first - event.scene * count), start, setup.dt)
                 for k, file in enumerate(files):
                     own = slice(k * count, (k + 1) * count)
                     file.write(_samples(setup, out.F[:, own], out.C[:, own], *exact[k]).cpu().numpy().tobytes())
@@ -208,6 +225,14 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
         raise UserError(f"{names}: {error}") from error
     except OSError as error:
         raise UserError(f"{names}: cannot write to {paths[0].parent}: {str(error.strerror).lower()}: give another out") from error
+    return list(noted.values())
+
+
+def _merge(noted: dict[tuple[int, str], Event], event: Event, start: int, dt: float) -> None:
+    """Add an event of a segment that begins at a substep to those of the segments before."""
+    earlier = noted.setdefault((event.scene, event.kind), event._replace(step=event.step + start, time=event.time + start * dt))
+    worst = (max if event.kind == OUTSIDE else min)(earlier.extreme, event.extreme)
+    noted[event.scene, event.kind] = earlier._replace(count=max(earlier.count, event.count), extreme=worst)
 
 
 def _samples(setup: Setup, F: Tensor, C: Tensor, elastic: ElasticLaw, plastic: PlasticLaw) -> Tensor:
@@ -234,7 +259,8 @@ def _instance(setup: Setup, family: str, number: int, split: str) -> Instance:
 def _write_index(folder: Path, setup: Setup, instances: list[Instance]) -> None:
     from neuido import __version__
 
-    entries = [{**asdict(instance), **_statistics(folder / f"{instance.name}.npy")} for instance in instances]
+    files = {instance.name: folder / f"{instance.name}.npy" for instance in instances}
+    entries = [{**asdict(i), **_statistics(files[i.name]), "sha256": sha256_of(files[i.name])} for i in instances]
     write_json(folder / "index.json", {"format": FORMAT, "version": __version__, "setup": asdict(setup), "trajectories": entries})
 
 

@@ -26,6 +26,8 @@ from neuido.physics.effects.parameters import Effects
 from neuido.physics.fem.finite_elements import FiniteElements
 from neuido.physics.fem.meshing import Mesh, mesh_body
 from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.events import Event
+from neuido.physics.runtime.frames import Frames
 from neuido.types import ParticleState
 
 SEGMENT = 200
@@ -116,10 +118,17 @@ class BodyRollouts(Problem):
         (frames,) = self._move([([point], recording)], setting)
         return frames
 
-    def _move(self, runs: Sequence[Motions], setting: int, finer: int = 0) -> list[ParticleState]:
+    def doubts(self, point: Point, recording: int, setting: int = 0) -> list[Event]:
+        """What makes one motion doubtful: matter that turned inside out or collapsed, strains beyond what a law has learned."""
+        noted: list[Event] = []
+        self._move([([point], recording)], setting, noted=noted)
+        return noted
+
+    def _move(self, runs: Sequence[Motions], setting: int, finer: int = 0, noted: list[Event] | None = None) -> list[ParticleState]:
         """The frames of each recording under each of its points, (T, S, P, ...); of several motions those that fail are NaN.
 
-        All move in the same launches: their frames are the same substeps (`substeps`). `finer`: which of `FINER`.
+        All move in the same launches: their frames are the same substeps (`substeps`). `finer`: which of `FINER`. `noted`: takes the
+        events of the first motion.
         """
         size = most = max(len(points) for points, _ in runs)
         if self.device != "cpu":
@@ -141,6 +150,8 @@ class BodyRollouts(Problem):
             else:
                 more = {"inner_factor": FINER[finer]} if elements else {}
                 out = simulator.rollout(steps, elasticity, plasticity, nan_on_failure=len(full) > 1 or finer > 0, **given, **more)
+        if noted is not None:
+            noted += [event for event in out.events if event.scene == 0]
         if lifts.any():
             out = out._replace(x=out.x + _of_particles(lifts, simulator))
         moved, offsets = [], simulator.particles.offsets[::size]
@@ -344,7 +355,7 @@ def _finer(point: Point) -> tuple[int, ...]:
     return FINER if any(point.get(name, 0.0) > 0.0 for name in STIFFENING) else FINER[:2]
 
 
-def _finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -> ParticleState:
+def _finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -> Frames:
     """A rollout of one scene, with finer inner steps where the motion is not finite.
 
     Raises:

@@ -37,6 +37,7 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
     tell("motion before and after")
     motion, failed = motions(d)
     series = {name: _stages(d, name, arrays) for name, arrays in motion.items() if "positions" in arrays}
+    doubtful = doubts(d)
     tell("ceiling")
     ceilings = {when: ceiling.of(d, when, seed=seed) for when in ("before", "after")}
     tell("next experiment")
@@ -81,6 +82,8 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
     }
     if failed:
         content["not_predicted"] = failed
+    if doubtful:
+        content["doubts"] = doubtful
     if "body" in d.problem.labels:
         content["body"] = d.problem.labels["body"]
     drawn = d.problem.silhouettes(d) if hasattr(d.problem, "silhouettes") else {}
@@ -326,6 +329,22 @@ def _declared(d: Diagnosis, point: Mapping[str, float], intervals: Mapping[str, 
     for p in d.problem.declared:
         value = point.get(p.name, p.value)
         out[p.name] = {"value": value, "unit": p.unit, "interval90": list(intervals.get(p.name, (value, value)))}
+    return out
+
+
+def doubts(d: Diagnosis) -> dict[str, list[str]]:
+    """Return for each recording what makes its motion before or after doubtful, as matter that turned inside out or collapsed."""
+    problem, out = inner(d.problem), dict[str, list[str]]()
+    if not hasattr(problem, "doubts"):
+        return out
+    for n, recording in enumerate(problem.recordings):
+        for when, point in (("before", d.before), ("after", d.after)):
+            try:
+                events = problem.doubts(point, n, d.setting)
+            except UserError:  # `motions` tells why it does not move
+                continue
+            if events:
+                out.setdefault(recording.name, []).extend(f"{when}: {event.words}" for event in events)
     return out
 
 

@@ -146,6 +146,7 @@ def schema() -> Schema:
             "solver": TEXT,
             "reach": NUMBER,
             "not_predicted": mapping(ANY_TEXT),
+            "doubts": mapping(listing(TEXT)),
             "silhouettes": {"type": "object"},
         },
     )

@@ -34,7 +34,7 @@ class Words(NamedTuple):
     next: str
     """What to measure next."""
     notes: str
-    """What was left out."""
+    """What was left out, and what makes a motion doubtful."""
 
     @property
     def paragraphs(self) -> tuple[str, ...]:
@@ -45,12 +45,16 @@ class Words(NamedTuple):
 def words_of(c: Content, units: Units | None = None) -> Words:
     """Return the words of one part of diagnosis.json."""
     units = units or Units.of([c])
-    notes = (
-        f"The search ended before {listed([worded(step) for step in c['left_out']])}: the same command with {more(c)} goes on."
-        if c["left_out"]
-        else ""
-    )
-    return Words(_finding(c, units), _error(c, units), _sure(c), _not_excluded(c, units), _next(c), notes)
+    return Words(_finding(c, units), _error(c, units), _sure(c), _not_excluded(c, units), _next(c), _notes(c))
+
+
+def _notes(c: Content) -> str:
+    """Return what was left out, and what makes a motion doubtful."""
+    out = []
+    if c["left_out"]:
+        out.append(f"The search ended before {listed([worded(step) for step in c['left_out']])}: the same command with {more(c)} goes on.")
+    out += [f"The predicted motion of {name} is doubtful, {'; '.join(events)}." for name, events in c.get("doubts", {}).items()]
+    return " ".join(out)
 
 
 def more(c: Mapping[str, Any]) -> str:

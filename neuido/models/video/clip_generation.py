@@ -20,7 +20,7 @@ from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
 from neuido.data.clips import FORMAT, is_complete
 from neuido.data.files.output_folder import claimed_folder
-from neuido.data.files.writing import write_arrays, write_json
+from neuido.data.files.writing import is_as_written, sha256_of, write_arrays, write_json
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
@@ -98,7 +98,12 @@ def generate_clips(
 
 def _generate_shard(plan: ClipPlan, folder: Path, chosen: torch.device, batch: int, own: range, shards: int, progress: bool) -> None:
     names = [f"clip-{i:05d}" for i in range(plan.count)]
-    missing = [i for i in own if not is_complete(folder / f"{names[i]}.npz")]
+    published = (folder / "index.json").is_file()  # by an earlier version, maybe, which noted no digests
+
+    def whole(name: str) -> bool:
+        return is_complete(folder / f"{name}.npz") and is_as_written(folder / f"{name}.npz", unnoted=published)
+
+    missing = [i for i in own if not whole(names[i])]
     size = batch or (16 if chosen.type == "cuda" else 1)
     kinds, workers = list(plan.families), max(1, (os.cpu_count() or 1) // shards)
     with Progress("clips", len(own), done=len(own) - len(missing), shown=progress) as work:
@@ -110,11 +115,12 @@ def _generate_shard(plan: ClipPlan, folder: Path, chosen: torch.device, batch: i
                     filmed = film_clips(plan, group, chosen)
                     list(pool.map(lambda pair: _write_clip(plan, folder, *pair), zip(group, filmed)))
                 work.update(len(group))
-    if (missing or not (folder / "index.json").exists()) and all(is_complete(folder / f"{name}.npz") for name in names):
+    if (missing or not (folder / "index.json").exists()) and all(whole(name) for name in names):
         entries = []
         for i, name in enumerate(names):
             family, parameters = _material(plan, np.random.default_rng([plan.seed, i]), i)
-            entries.append({"name": name, "family": family, "parameters": parameters})
+            digest = sha256_of(folder / f"{name}.npz")
+            entries.append({"name": name, "family": family, "parameters": parameters, "sha256": digest})
         write_json(folder / "index.json", {"format": FORMAT, "plan": asdict(plan), "clips": entries})
 
 
@@ -185,7 +191,7 @@ def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str,
     options = {"size": plan.flow_size, "preset": plan.flow_preset}
     seen = measure_velocities(filmed.pop("images"), filmed.pop("masks"), times, clip.cameras, clip.body.x.mean(0), **options)
     content = {"flow": seen.flow.half(), "cell": seen.cell, "frame_interval": torch.tensor(seen.frame_interval), **filmed}
-    write_arrays(folder / f"{clip.name}.npz", {name: t.numpy() for name, t in content.items()}, compressed=False)
+    write_arrays(folder / f"{clip.name}.npz", {name: t.numpy() for name, t in content.items()}, compressed=False, digest=True)
 
 
 def _samples(motion: ParticleState, clip: ClipSetup, count: int, seed: int) -> dict[str, Tensor]:

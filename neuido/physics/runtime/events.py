@@ -47,15 +47,20 @@ class Event(NamedTuple):
     what: str = "particles"
     """What `count`, `total` and `first` refer to: `particles` or `elements`."""
 
-    def __str__(self) -> str:
+    @property
+    def words(self) -> str:
+        """What happened, without the scene."""
         plain = {
             INVERTED: "turned inside out",
             CRUSHED: f"collapsed (det F below {COLLAPSED:g})",
             OUTSIDE: "strained beyond the law's training",
         }
         least = f"largest logarithmic stretch {self.extreme:.3g}" if self.kind == OUTSIDE else f"smallest det F {self.extreme:.3g}"
-        return (f"scene {self.scene}: {self.count} of {self.total} {self.what} {plain[self.kind]}, "
+        return (f"{self.count} of {self.total} {self.what} {plain[self.kind]}, "
                 f"the first ({self.what[:-1]} {self.first}) at {self.time:.4g} s; {least}")  # fmt: skip
+
+    def __str__(self) -> str:
+        return f"scene {self.scene}: {self.words}"
 
 
 class Marks(NamedTuple):

@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 
 from neuido.data.files.values import file_name
-from neuido.data.files.writing import atomic_write, check_writable, make_real_folder, new_folder, remove, write_text
+from neuido.data.files.writing import (
+    atomic_write,
+    check_writable,
+    is_as_written,
+    make_real_folder,
+    new_folder,
+    remove,
+    write_arrays,
+    write_text,
+)
 from neuido.discrepancy import store
 from neuido.errors import UserError, one_line
 
@@ -23,6 +32,22 @@ def test_a_writer_that_fails_leaves_what_was_there(tmp_path):
         hidden.write_text("half")
         raise OSError(errno.ENOSPC, "No space left on device")
     assert path.read_text() == "before" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_writer_that_fails_leaves_no_folder_that_it_made(tmp_path):
+    with pytest.raises(OSError), atomic_write(tmp_path / "new" / "newer" / "a.txt"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert not list(tmp_path.iterdir())
+
+
+def test_digest_of_what_was_written(tmp_path):
+    path = tmp_path / "a.npz"
+    write_arrays(path, {"x": np.ones(9)}, digest=True)
+    assert is_as_written(path) and is_as_written(path, unnoted=True)
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    assert not is_as_written(path, unnoted=True)
+    write_text(tmp_path / "b.txt", "x")
+    assert not is_as_written(tmp_path / "b.txt") and is_as_written(tmp_path / "b.txt", unnoted=True)
 
 
 def test_a_full_disk_leaves_nothing_that_is_cut(tmp_path):

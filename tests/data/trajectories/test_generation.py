@@ -1,3 +1,4 @@
+import hashlib
 import json
 import multiprocessing
 import os
@@ -112,6 +113,32 @@ def test_restart_makes_only_what_is_missing_or_cut_short(folder, tmp_path):
     assert files(copy) == files(folder)
     after = {path.name: path.stat().st_mtime_ns for path in copy.glob("*.npy")}
     assert {name for name in after if after[name] != before.get(name)} == {"sand-001.npy", "jelly.npy", "plasticine.npy"}
+
+
+def test_what_its_writer_did_not_leave_is_not_published(folder, tmp_path, capsys):
+    """A file of the right size with zeros, as two processes in one folder once left; one without a digest; a digest of another file."""
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    (copy / "index.json").unlink()
+    content = (copy / "sand.npy").read_bytes()
+    (copy / "sand.npy").write_bytes(content[:2000] + bytes(len(content) - 2000))
+    (copy / ".jelly.npy.sha256").unlink()
+    shutil.copy(copy / ".sand-001.npy.sha256", copy / ".sand-002.npy.sha256")
+    make_trajectories(str(copy), **TINY)
+    assert files(copy) == files(folder)
+    told = [line.split()[0] for line in capsys.readouterr().out.splitlines() if "is not as it was written" in line]
+    assert sorted(told) == ["jelly.npy", "sand-002.npy", "sand.npy"]
+    for entry in index(copy)["trajectories"]:
+        assert entry["sha256"] == hashlib.sha256((copy / f"{entry['name']}.npy").read_bytes()).hexdigest()
+
+
+def test_published_trajectories_of_earlier_versions_are_kept(folder, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    for path in copy.glob(".*.sha256"):
+        path.unlink()
+    make_trajectories(str(copy), **TINY)
+    assert not list(copy.glob(".*.sha256")) and "again" not in capsys.readouterr().out
 
 
 def test_segments_do_not_show(folder, tmp_path, monkeypatch):
