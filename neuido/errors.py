@@ -78,7 +78,9 @@ def _line_of(error: BaseException) -> str | None:
     if isinstance(error, ValueError) and "embedded null" in str(error):
         return "a path holds a null character, which no name of a file may have: check the names in the options and files that were given"
     if isinstance(error, UnicodeEncodeError):
-        return f"a text that was given holds characters that cannot be written as {error.encoding}: {error.object[error.start : error.end]!r}"
+        return (
+            f"a text that was given holds characters that cannot be written as {error.encoding}: {error.object[error.start : error.end]!r}"
+        )
     if isinstance(error, OSError) and error.strerror is not None:
         own = [f"'{name}'" for name in (error.filename, error.filename2) if name is not None]
         what = f"{error.strerror}: {', '.join(own)}" if own else error.strerror

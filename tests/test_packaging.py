@@ -116,3 +116,10 @@ def test_wheel_alone_imports_and_runs(built, tmp_path):
     assert run("-m", "neuido", "--version").strip() == f"neuido {neuido.__version__}"
     assert "--minutes" in run("-m", "neuido", "diagnose", "--help")
     assert "solver: both" in run("-m", "neuido", "diagnose", "--config", "diagnose", "--folder", "a", "--out", "b", "--print_config")
+
+
+def test_every_dependency_is_listed_with_its_licence():
+    rows = re.findall(r"^\| ([\w-]+) \| (.+) \| (.+) \|$", (ROOT / "docs" / "reference" / "dependencies.md").read_text(), re.MULTILINE)
+    listed = {name for name, what, licence in rows if what.strip() and licence.strip()}
+    needed = {re.split(r"[^\w-]", each)[0] for each in PROJECT["dependencies"]}
+    assert listed - {"package", "---"} == needed

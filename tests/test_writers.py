@@ -15,7 +15,7 @@ WHOLE = {"atomic_write", "whole_file", "BytesIO", "StringIO", "NamedTemporaryFil
 """What gives a temporary path or memory to write to."""
 EXCEPT = {  # why a file is written directly
     ("neuido.data.files.lock", "_note"): "a temporary name of its own, renamed",
-    ("neuido.discrepancy.workflow", "__init__"): "a log that grows line by line",
+    ("neuido.discrepancy.diagnosis_log", "__init__"): "a log that grows line by line",
     ("neuido.commands.sweep", "_execute"): "the output of a run while it runs",
     ("neuido.data.trajectories.generation", "_simulate"): "several files at once, under temporary names of `atomic_write`",
 }

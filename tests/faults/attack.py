@@ -421,9 +421,11 @@ def warm(target: Target, folder: Path) -> Path:
     return sample / "in"
 
 
-def attacks(numbers: Iterable[int], folder: Path, targets: tuple[Target, ...] = TARGETS) -> Iterable[Attack]:
-    """Run inputs by their numbers."""
-    samples: dict[str, Path] = {}
+def attacks(
+    numbers: Iterable[int], folder: Path, targets: tuple[Target, ...] = TARGETS, samples: dict[str, Path] | None = None
+) -> Iterable[Attack]:
+    """Run inputs by their numbers; `samples` are those that were written before, and takes further ones."""
+    samples = {} if samples is None else samples
     for number in numbers:
         place, kind = kind_of(number, len(targets))
         target = targets[place]

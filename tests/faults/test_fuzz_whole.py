@@ -1,5 +1,6 @@
 """The readers with many more damaged files than the fast tier: up to `Reader.count` each, as many as a quarter of a minute allows."""
 
+import os
 import time
 
 import pytest
@@ -7,8 +8,8 @@ import pytest
 from tests.faults.fuzzing import fuzz, summary
 from tests.faults.readers import READERS
 
-SECONDS = 14.0
-"""For one reader: all of them take some six minutes of two processes."""
+SECONDS = float(os.environ.get("NEUIDO_FUZZ_SECONDS", "14"))
+"""For one reader: all of them take some six minutes of two processes. With NEUIDO_FUZZ_SECONDS=3000 each has its 10,000 inputs."""
 
 
 @pytest.mark.slow

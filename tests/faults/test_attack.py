@@ -1,0 +1,38 @@
+"""Attacks on the command line: the work is done or refused in one line, and nothing else is left."""
+
+import time
+
+import pytest
+
+from tests.faults.attack import KINDS, attacks
+from tests.faults.targets import TARGETS
+
+QUICK = tuple(target for target in TARGETS if target.quick)
+SECONDS = 600.0
+"""Of the slow tier; the whole list takes some twenty minutes of a core."""
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory):
+    return {}, tmp_path_factory.mktemp("attacks")
+
+
+@pytest.mark.parametrize("kind", dict.fromkeys(KINDS))
+def test_quick_commands(kind, samples):
+    """One input for each command."""
+    known, folder = samples
+    first = KINDS.index(kind) * len(QUICK)
+    found = list(attacks(range(first, first + len(QUICK)), folder, QUICK, known))
+    assert len(found) == len(QUICK) and {each.kind for each in found} == {kind}
+    assert not [each for each in found if each.fault]
+
+
+@pytest.mark.slow
+def test_all_commands(tmp_path):
+    stop, tried, faults = time.monotonic() + SECONDS, 0, []
+    for found in attacks(range(len(KINDS) * len(TARGETS), 1680), tmp_path):
+        tried += 1
+        faults += [found] if found.fault else []
+        if time.monotonic() > stop:
+            break
+    assert tried and not faults
