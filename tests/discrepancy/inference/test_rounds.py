@@ -1153,7 +1153,7 @@ def test_the_method_may_change_where_there_are_two_effects(monkeypatch):
 
     def other_one(tried, starts):
         chosen, firsts = real(tried, starts)
-        assert [tried[i].setting for i in (chosen, *(i for i in firsts if i != chosen))] == [0, 1]
+        assert [tried[i].lab.setting for i in (chosen, *(i for i in firsts if i != chosen))] == [0, 1]
         return 1 - chosen, firsts
 
     asked, beside = [], pairs.beside_members
