@@ -37,7 +37,7 @@ def latents(
     (monotonicity.csv), for these two and for all pairs of each family (pairs.csv). Needs scikit-learn for `space`.
 
     Args:
-        operator: File of the operator (`save_to` of Stage I), `pretrained`, or `pretrained-family`.
+        operator: File of the operator (`save_to` of Stage I), `pretrained`, `pretrained-family` or `pretrained-bounded`.
         out: Folder to write.
         parts: Which of the two.
         ends: Names of the two latents; the softest and the stiffest of `family` where absent.

@@ -16,12 +16,6 @@ from neuido.types import TrajectoryBatch
 RESIDUAL_FLOOR = 1e-5
 """Minimum epsilon of a relative plastic error [-], for elastic trajectories, whose residual is zero."""
 
-MIXING = 1.2
-"""Largest weight of the second latent in a mixture [-]; 1 would end at it."""
-
-LEAST_WORK = 0.1
-"""Least cosine of the angle between a teacher's stress and the strain that counts as a law [-]."""
-
 
 class OperatorResponse(NamedTuple):
     """Response of an operator to a batch of M trajectories with n samples each."""
@@ -65,46 +59,6 @@ def evaluate_operator(
     else:
         plastic_error = relative_errors(returned, corrected)
     return OperatorResponse(predicted, returned, stress_error, plastic_error, residual_epsilon)
-
-
-class Lesson(NamedTuple):
-    """Laws of a teacher between its latents, for M trajectories with n samples each."""
-
-    z: Tensor
-    """Latents, (M, d)."""
-    stress: Tensor
-    """The teacher's Kirchhoff stress [Pa], (M, n, 3, 3)."""
-    epsilon: Tensor
-    """Floor of the stress norm of each latent [Pa], (M, 1)."""
-    counts: Tensor
-    """Whether the sample counts: the teacher's stress does not oppose the strain, (M, n)."""
-
-    def errors(self, stress: Tensor) -> Tensor:
-        """Return the relative error of a stress (M, n, 3, 3), zero where the sample does not count, (M, n)."""
-        return torch.where(self.counts, relative_errors(stress, self.stress, self.epsilon), 0.0)
-
-
-@torch.no_grad()
-def lesson_between(teacher: IntrinsicDynamicsOperator, latents: Tensor, F: Tensor, relative_epsilon: float) -> Lesson:
-    """Evaluate a teacher at random latents between and about those of the trajectories.
-
-    Each trajectory's latent is mixed with another one, or with a draw from a normal distribution that is up to as wide as the latents.
-
-    Args:
-        teacher: The operator that is to be followed.
-        latents: Latents of the M trajectories, (M, d).
-        F: Deformation gradients [-], (M, n, 3, 3).
-        relative_epsilon: Floor of the relative error, as a fraction of the RMS of the teacher's stress over the samples of a latent.
-    """
-    width = torch.rand(len(latents), 1, device=latents.device)
-    drawn = latents.mean(0) + width * latents.std(0) * torch.randn_like(latents)
-    other = torch.where(torch.rand_like(width) < 0.5, latents[torch.randperm(len(latents), device=latents.device)], drawn)
-    z = torch.lerp(latents, other, MIXING * torch.rand_like(width))
-    stress = teacher.elastic(z, F)
-    strain = F @ F.mT - torch.eye(3, dtype=F.dtype, device=F.device)
-    norms = stress.flatten(-2).norm(dim=-1)
-    counts = (stress * strain).sum((-2, -1)) > LEAST_WORK * norms * strain.flatten(-2).norm(dim=-1)
-    return Lesson(z, stress, relative_epsilon * norms.square().mean(1, keepdim=True).sqrt(), counts)
 
 
 def fit_latents(

@@ -9,20 +9,9 @@ from torch import Tensor, nn
 
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.scoring.losses import relative_errors
-from neuido.models.stages.operator_scores import (
-    RESIDUAL_FLOOR,
-    ConstitutiveMetrics,
-    OperatorResponse,
-    evaluate_operator,
-    fit_latents,
-    lesson_between,
-)
+from neuido.models.stages.operator_scores import RESIDUAL_FLOOR, ConstitutiveMetrics, OperatorResponse, evaluate_operator, fit_latents
 from neuido.models.stages.training import optimiser_steps, validation_scores
 from neuido.types import TrajectoryBatch
-
-BETWEEN_WEIGHT = 0.1
-"""Weight of the loss between latents that a teacher gives; with 1 the stress at the latents was 1.6 times worse than the teacher's."""
 
 
 class PretrainModule(LightningModule):
@@ -53,8 +42,6 @@ class PretrainModule(LightningModule):
         instance_samples: Samples of each instance in each of these steps.
         save_to: File for the operator at the end of a fit (safetensors); without one, only Lightning writes checkpoints.
         init_from: Operator to start from: a file of `IntrinsicDynamicsOperator.save` of the same sizes, or `pretrained`.
-        latents_from: Operator of another trunk whose latents and plastic law are kept unchanged. The elastic trunk and head alone are
-            trained, to the data and, between the latents, to that operator's stress, so that its encoders fit the new one too.
         compile: Compile the trunks with torch.compile.
     """
 
@@ -79,7 +66,6 @@ class PretrainModule(LightningModule):
         instance_samples: int = 128,
         save_to: str | None = None,
         init_from: str | None = None,
-        latents_from: str | None = None,
         compile: bool = False,
     ):
         super().__init__()
@@ -103,9 +89,6 @@ class PretrainModule(LightningModule):
         self.latents = nn.Parameter(latent_std * torch.randn(trajectory_count, latent_dim))
         if init_from is not None:
             self._start_from(init_from)
-        self.teacher: IntrinsicDynamicsOperator | None = None
-        if latents_from is not None:
-            self._keep_latents(latents_from)
         if compile:
             for each in (self.operator.elastic_trunk, self.operator.plastic_trunk):
                 each.hidden = torch.compile(each.hidden)  # type: ignore[method-assign]
@@ -122,22 +105,6 @@ class PretrainModule(LightningModule):
         if len(loaded.latents) == len(self.latents):
             self.latents.data.copy_(loaded.latents)
 
-    def _keep_latents(self, latents_from: str) -> None:
-        """Take over latents, plastic trunk and plastic head, which training leaves alone."""
-        self.teacher = IntrinsicDynamicsOperator.load(latents_from).requires_grad_(False)
-        mine, theirs = self.operator.config | {"trunk": None}, self.teacher.config | {"trunk": None}
-        if mine != theirs or self.teacher.trunk == "raw" or self.operator.trunk == "raw":
-            raise UserError(
-                f"model.latents_from = {latents_from} has {self.teacher.config}; the sizes must be those of this model, no trunk raw"
-            )
-        if self.teacher.latents.shape != self.latents.shape:
-            raise UserError(f"model.latents_from = {latents_from} has {len(self.teacher.latents)} latents; needed {len(self.latents)}")
-        self.latents.data.copy_(self.teacher.latents)
-        self.latents.requires_grad_(False)
-        for part in ("plastic_trunk", "plastic_head"):
-            getattr(self.operator, part).load_state_dict(getattr(self.teacher, part).state_dict())
-            getattr(self.operator, part).requires_grad_(False)
-
     # Fitting.
 
     def setup(self, stage: str) -> None:
@@ -145,8 +112,6 @@ class PretrainModule(LightningModule):
         count = self.hparams.trajectory_count
         if data.trajectory_count != count:
             raise UserError(f"model.trajectory_count = {count}, but the data have {data.trajectory_count} trajectories")
-        if self.teacher is not None and list(data.names) != self.teacher.latent_names:
-            raise UserError(f"model.latents_from = {self.hparams.latents_from}: its latents are of other trajectories than the data")
         self.stress_epsilon.copy_(self.hparams.relative_epsilon * data.stress_rms)
         self.residual_epsilon.copy_(self._residual_epsilon(data.residual_rms))
         alike = torch.tensor([[a == b for b in data.families] for a in data.families], dtype=torch.float32, device=self.device)
@@ -174,24 +139,12 @@ class PretrainModule(LightningModule):
                 self.latents.lerp_(self.family_mean @ self.latents, rate)
 
     def training_step(self, batch: TrajectoryBatch, batch_idx: int) -> Tensor:
-        if self.teacher is None:
-            answers = self._evaluate(batch, self.hparams.plastic_target)
-            losses = {"stress": answers.stress_error.mean(), "plastic": answers.plastic_error.mean()}
-        else:
-            losses = self._taught_losses(self.teacher, batch)
+        answers = self._evaluate(batch, self.hparams.plastic_target)
+        stress, plastic = answers.stress_error.mean(), answers.plastic_error.mean()
         if self.global_step % self.trainer.log_every_n_steps == 0:
-            self.log_dict({f"train/{name}_loss": value.detach() for name, value in losses.items()}, prog_bar=True)
-        return torch.stack(list(losses.values())).sum()
-
-    def _taught_losses(self, teacher: IntrinsicDynamicsOperator, batch: TrajectoryBatch) -> dict[str, Tensor]:
-        """Return the losses of the stress at the latents, from the data, and between them, from the teacher."""
-        F, stress = (t.view(len(self.latents), -1, 3, 3) for t in (batch.corrected, batch.stress))
-        lesson = lesson_between(teacher, self.latents, F, self.hparams.relative_epsilon)
-        known, between = self.operator.elastic(torch.cat([self.latents, lesson.z]), torch.cat([F, F])).chunk(2)
-        return {
-            "stress": relative_errors(known, stress, self.stress_epsilon[:, None]).mean(),
-            "between": BETWEEN_WEIGHT * lesson.errors(between).mean(),
-        }
+            values = {"train/stress_loss": stress.detach(), "train/plastic_loss": plastic.detach()}
+            self.log_dict(values, prog_bar=True)
+        return stress + plastic
 
     def _evaluate(self, batch: TrajectoryBatch, target: str = "residual") -> OperatorResponse:
         """Evaluate a batch of training trajectories; scores always compare residuals, whatever the loss compares."""
@@ -221,11 +174,6 @@ class PretrainModule(LightningModule):
 
     def validation_step(self, batch: TrajectoryBatch, batch_idx: int) -> None:
         self.metrics.update(self._evaluate(batch), batch)
-        if self.teacher is not None:
-            F = batch.corrected.view(len(self.latents), -1, 3, 3)
-            lesson = lesson_between(self.teacher, self.latents, F, self.hparams.relative_epsilon)
-            errors = lesson.errors(self.operator.elastic(lesson.z, F))[lesson.counts]
-            self.log_dict({"val/between_error": errors.median(), "val/between_count": lesson.counts.float().mean()})
 
     def on_validation_epoch_end(self) -> None:
         self.log_dict(self.metrics.compute())

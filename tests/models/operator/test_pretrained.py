@@ -30,7 +30,8 @@ def test_file(operator, name_of_file):
     assert PRETRAINED[name_of_file].stat().st_size < 4e6
     assert set(FAMILY_OF) <= set(operator.latent_names)
     assert len(operator.latents) == 90
-    assert operator.config["trunk"] == "objective" and operator.config["latent_dim"] == 128
+    assert operator.config["trunk"] == ("bounded" if name_of_file == "pretrained-bounded" else "objective")
+    assert operator.config["latent_dim"] == 128
 
 
 @pytest.mark.parametrize("name", FAMILY_OF)
@@ -64,11 +65,11 @@ def test_materials_differ(operator):
 
 
 def test_a_fit_starts_from_them(operator, name_of_file):
-    module = PretrainModule(90, init_from=name_of_file)
+    module = PretrainModule(90, operator.trunk, init_from=name_of_file)
     for (name, mine), theirs in zip(module.operator.state_dict().items(), operator.state_dict().values(), strict=True):
         assert torch.equal(mine, theirs), name
     assert torch.equal(module.latents, operator.latents)
-    other = PretrainModule(6, init_from=name_of_file)  # other trajectories: the weights without their latents
+    other = PretrainModule(6, operator.trunk, init_from=name_of_file)  # other trajectories: the weights without their latents
     assert torch.equal(other.operator.elastic_trunk.out.weight, operator.elastic_trunk.out.weight)
     assert other.latents.shape == (6, 128)
 

@@ -125,32 +125,6 @@ def test_fit_writes_the_operator_and_test_scores_it(folder, tmp_path, trunk):
     assert torch.equal(started.latents, model.latents)
 
 
-@pytest.mark.slow
-def test_another_trunk_in_the_latent_space_of_an_operator(folder, tmp_path):
-    """Latents and plastic law stay to the bit; the new stress is learned again."""
-    seed_everything(0)
-    path = str(tmp_path / "old.safetensors")
-    data = TrajectoryDataModule(str(folder), batch_size=120, validation_samples=20, preload=False, num_workers=0)
-    trainer(tmp_path, max_epochs=4).fit(PretrainModule(6, **SMALL, save_to=path, instance_steps=0), data)
-    new = PretrainModule(6, "bounded", **SMALL, latents_from=path, save_to=str(tmp_path / "new.safetensors"), instance_steps=0)
-    before = trainer(tmp_path).validate(new, data, verbose=False)[0]
-    trainer(tmp_path, max_epochs=4, limit_val_batches=0).fit(new, data)
-    after = trainer(tmp_path).validate(new, data, verbose=False)[0]
-    assert after["val/stress_error"] < 0.5 * before["val/stress_error"]
-    assert after["val/between_error"] > 0 and 0.5 < after["val/between_count"] <= 1
-    first, second = (IntrinsicDynamicsOperator.load(tmp_path / f"{name}.safetensors") for name in ("old", "new"))
-    assert second.trunk == "bounded" and torch.equal(first.latents, second.latents) and first.latent_names == second.latent_names
-    F = torch.eye(3) + 0.05 * torch.randn(6, 9, 3, 3)
-    assert torch.equal(first.plastic(first.latents, F), second.plastic(second.latents, F))
-    for other, words in (({"trunk": "raw"}, "no trunk raw"), ({"hidden_dim": 32}, "sizes"), ({"trajectory_count": 5}, "6 latents")):
-        with pytest.raises(UserError, match=words):
-            PretrainModule(**{"trajectory_count": 6, "trunk": "bounded", "latents_from": path, **SMALL, **other})
-    renamed = PretrainModule(6, trunk="bounded", latents_from=path, **SMALL)
-    renamed.teacher.latent_names = ["other"] * 6
-    with pytest.raises(UserError, match="other trajectories"):
-        trainer(tmp_path).validate(renamed, data, verbose=False)
-
-
 def test_errors_name_the_option(folder, tmp_path):
     with pytest.raises(UserError, match=r"model.trajectory_count = 7.*6 trajectories"):
         trainer(tmp_path).fit(PretrainModule(7, **SMALL), TrajectoryDataModule(str(folder)))
