@@ -13,7 +13,8 @@ each principal stress is a positive multiple of its own logarithmic stretch plus
 are compressive where no stretch exceeds one and tensile where none is below, and the work along any line of strain grows without bound.
 An inverted F is pulled together in all directions, most along its shortest, so that it turns back through zero.
 
-The network sees the strain shortened to the norm `RANGE`, that of the training data: beyond, the coefficients do not change any more.
+The network sees the strain shortened to the norm `RANGE`, which few samples of the training exceed; beyond it, the coefficients change
+no more with the size of the strain.
 """
 
 import functools
@@ -34,7 +35,7 @@ SPREAD = 0.95
 """Largest relative distance of a principal modulus from d. Training needs 0.7, of a body crushed to a quarter of its height."""
 
 RANGE = 1.5
-"""Largest norm sqrt(l^2 + q^2) of the strain that the network sees [-]; in the data of Stage I the norm is below 1.7."""
+"""Largest norm sqrt(l^2 + q^2) of the strain that the network sees [-]; the softest cubes of Stage I exceed it at impact."""
 
 VOLUME_FLOOR = 1e-12
 """Lower bound of J in its logarithm [-]."""
