@@ -81,8 +81,13 @@ def _nearest(points: np.ndarray) -> np.ndarray:
 
 
 def _carried(points: np.ndarray, velocity: np.ndarray, x0: np.ndarray) -> np.ndarray:
-    """Interpolate velocities from points to particles: a linear field is carried over exactly."""
+    """Interpolate velocities from points to particles: a linear field is carried over exactly, and what it leaves by near points.
+
+    Near points may lie in one plane, as markers on a face do, and determine no linear field of their own.
+    """
     from scipy.interpolate import RBFInterpolator
 
-    carry = RBFInterpolator(points, velocity, neighbors=min(NEAREST, len(points)), kernel="linear", degree=1)
-    return carry(x0)
+    basis, own = (np.column_stack([np.ones(len(x)), x]) for x in (points, x0))
+    field = np.linalg.lstsq(basis, velocity, rcond=None)[0]
+    carry = RBFInterpolator(points, velocity - basis @ field, neighbors=min(NEAREST, len(points)), kernel="linear", degree=0)
+    return own @ field + carry(x0)

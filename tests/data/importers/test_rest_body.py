@@ -60,3 +60,11 @@ def test_points_in_a_plane():
         rest_body(plane, VELOCITY, None, "a")
     sheet = rest_body(plane, VELOCITY, 1e-4, "a")
     assert not sheet.filled and sheet.volume == 1e-4
+
+
+def test_markers_on_the_faces_of_a_cube_carry_their_velocities_inside():
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 0.1, 8)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    faces = grid[((grid == grid.min()) | (grid == grid.max())).any(axis=1)]
+    body = rest_body(faces, faces @ GRADIENT.T, None, "cube")
+    assert body.filled
+    np.testing.assert_allclose(body.v0, body.x0 @ GRADIENT.T, atol=1e-9)
