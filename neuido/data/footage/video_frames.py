@@ -58,8 +58,6 @@ def read_clip(path: Path, *, frame_rate: float | None = None) -> Clip:
     if len(times) < 3 or size is None:
         raise UserError(f"{path} has {len(times)} frames that can be decoded; at least 3 are needed")
     if frame_rate is not None:
-        if not frame_rate > 0:
-            raise UserError(f"--frame_rate must be positive, got {frame_rate:g}")
         return Clip(path, *size, np.arange(len(times)) / frame_rate)
     t = np.array(times)
     if not np.isfinite(t).all() or (np.diff(t) <= 0).any():

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from neuido.data.footage.contact_sheet import Sheet
 
 KINDS = ("auto", "material", "track", "body", "field")
-WHAT = {"material": "a material test", "track": "a motion", "body": "a motion", "field": "a full field", "film": "a video"}
+WHAT = {"material": "a material test", "track": "a motion", "body": "points on a deforming body", "field": "a full field",
+        "film": "a video", "views": "clips of several cameras (--cameras)"}  # fmt: skip
 """What the data of each kind are called in messages."""
 
 
@@ -79,7 +80,8 @@ def import_file(
         raise UserError(f"--kind {kind} is unknown: choose from {', '.join(KINDS)}")
     if up not in ("y", "z") and not (filming and filming.cameras):
         raise UserError(f"--up {up} must be y or z")
-    for option, value in (("density", density), ("young", young), ("mass", mass), ("diameter", diameter), ("volume", volume)):
+    for option, value in (("density", density), ("young", young), ("mass", mass), ("diameter", diameter), ("volume", volume),
+                          ("scale", scale), ("frame_rate", frame_rate)):  # fmt: skip
         if value is not None:
             number(value, f"--{option}", above=0.0)
     if out is not None and Path(out).expanduser().exists():
@@ -96,13 +98,35 @@ def import_file(
     columns, units = dict(columns or {}), dict(units or {})
     axes = Axes(scale, y_down, up, frame_rate)
     filming, contact = filming or Filming(), None
-    if films := [path for path in paths if is_video(path)]:
+    films = [path for path in paths if is_video(path)]
+    if films and len(films) < len(paths):
+        raise UserError(f"{films[0].name} is a video and {next(p for p in paths if p not in films).name} is not: import them one by one")
+    if films and kind not in ("auto", "track"):
+        raise UserError(f"--kind {kind} is not for videos: leave it out, and give --cameras if the clips are views of one motion")
+    with naming(paths[0]):
+        chosen = "track" if films else _kind(paths[0], columns) if kind == "auto" else kind
+    dimensions = {"section_diameter" if key == "diameter" else key: value for key, value in (specimen or Specimen())._asdict().items()}
+    filmed = {key: None if value == "none" else value for key, value in filming._asdict().items()}
+    several = {key: filmed.pop(key) for key in ("board", "synchronise", "offsets")}
+    _check_options(
+        paths[0].name,
+        "views" if films and filming.cameras is not None else "film" if films else chosen,
+        (("film", "views", "track", "body"), {"scale": scale, "frame_rate": frame_rate}),
+        (("film", "track", "body"), {"y_down": y_down, "point": point, "mass": mass, "diameter": diameter}),
+        (("body",), {"volume": volume}),
+        (("views", "body"), {"floor": floor}),
+        (("material", "field", "body"), {"density": density, "young": young, "poisson": poisson}),
+        (("material",), {"step": step, "sheet": sheet, "compression": compression, "mode": None if mode == "uniaxial" else mode,
+                         **(preparation or Preparation()).changed()}),
+        (("material", "field"), dimensions),
+        (("material", "film", "views", "track", "body"), {"held_out": held_out or None}),
+        (("field",), {"forces": forces, "region": region}),
+        (("film", "views"), filmed),
+        (("views",), several),
+    )  # fmt: skip
+    if films:
         from neuido.data.footage.contact_sheet import Sheet
 
-        if len(films) < len(paths):
-            raise UserError(
-                f"{films[0].name} is a video and {next(p for p in paths if p not in films).name} is not: import them one by one"
-            )
         contact = Sheet()
         if filming.cameras is not None:
             from neuido.data.importers.view_folder import write_view_folder
@@ -111,8 +135,6 @@ def import_file(
                 files_by_name, out, filming, contact, held_out=held_out, scale=scale, up=up, floor=floor, frame_rate=frame_rate
             )
             return summary + _contact_sheet(contact, filming)
-        if kind not in ("auto", "track"):
-            raise UserError(f"--kind {kind} is not for videos: leave it out, and give --cameras if the clips are views of one motion")
 
     def read(path: Path) -> RecordedMotion:
         if contact is None:
@@ -123,20 +145,6 @@ def import_file(
         motion = Motion(found.t, {"object": found.x}, found.unit, False, found.notes, True)
         return in_si(path, motion, units, axes._replace(y_down=False))._replace(scale_error=found.scale_error)
 
-    with naming(paths[0]):
-        chosen = "track" if films else _kind(paths[0], columns) if kind == "auto" else kind
-    dimensions = {"section_diameter" if key == "diameter" else key: value for key, value in (specimen or Specimen())._asdict().items()}
-    _check_options(
-        paths[0].name,
-        "film" if films else chosen,
-        (("film", "track", "body"), {"scale": scale, "y_down": y_down, "frame_rate": frame_rate, "point": point, "mass": mass,
-                                     "diameter": diameter, "volume": volume, "floor": floor}),
-        (("material",), {"step": step, "sheet": sheet, "compression": compression, "mode": None if mode == "uniaxial" else mode,
-                         **(preparation or Preparation()).changed()}),
-        (("material", "field"), dimensions),
-        (("field",), {"forces": forces, "region": region}),
-        (("film",), {key: None if value == "none" else value for key, value in filming._asdict().items()}),
-    )  # fmt: skip
     if chosen == "material":
         summary = write_material_tests(
             files_by_name,
@@ -202,10 +210,11 @@ def _check_options(name: str, chosen: str, *groups: tuple[tuple[str, ...], Mappi
         groups: Kinds of data, and the options that are for these alone.
     """
     for kinds, options in groups:
-        wrong = next((option for option, value in options.items() if value not in (None, False)), None)
+        wrong = next((option for option, value in options.items() if value is not None and value is not False), None)
         if wrong is not None and chosen not in kinds:
             others = " or ".join(dict.fromkeys(WHAT[kind] for kind in kinds))
-            raise UserError(f"--{wrong} is for {others}, and {name} is {WHAT[chosen]}: leave it out, or give --kind")
+            other = "" if chosen in ("film", "views") else ", or give --kind"
+            raise UserError(f"--{wrong} is for {others}, and {name} holds {WHAT[chosen]}: leave it out{other}")
 
 
 def _contact_sheet(contact: "Sheet | None", filming: Filming) -> list[str]:

@@ -53,8 +53,6 @@ def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> R
     t, order = _times(path, motion, units, axes, notes)
     unit = units.get("x", motion.unit)
     if axes.scale is not None:
-        if not np.isfinite(axes.scale) or axes.scale == 0:
-            raise UserError(f"--scale {axes.scale:g} must not be zero: give metres a unit of the positions")
         ratio = axes.scale
     elif unit.lower() in ("px", "pixel", "pixels"):
         raise UserError(f"{path.name} has positions in pixels: give --scale (metres per pixel), and --y_down true if y points down")
@@ -160,8 +158,6 @@ def _times(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes, not
     if motion.frames:
         if axes.frame_rate is None:
             raise UserError(f"{path.name} has frame numbers and no times: give --frame_rate (frames per second)")
-        if not axes.frame_rate > 0:
-            raise UserError(f"--frame_rate {axes.frame_rate:g} must be above 0")
         t = t / axes.frame_rate
     elif "time" in units:
         t = t * conversion_factor(units["time"], "s", "--units.time")
