@@ -60,6 +60,8 @@ def write_views(
     """
     if up not in UP:
         raise UserError(f"--up {up} must be one of {', '.join(UP)}")
+    if frame_rate is not None and filming.synchronise == "audio":
+        raise UserError("--synchronise audio goes by the clock of the files, which --frame_rate replaces: give flash, or --offsets (s)")
     clips = [read_clip(path, frame_rate=frame_rate) for path in paths]
     if len(clips) < 2:
         raise UserError(f"--cameras {filming.cameras} needs the clips of at least two cameras, got {paths[0].name} alone")

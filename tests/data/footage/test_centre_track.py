@@ -87,6 +87,7 @@ def rival(i, image):
         (None, {"scale": PIXEL, "filming": Filming(offsets=[0.1])}, "--offsets is for clips of several cameras .*holds a video"),
         (None, {"mass": 0.057, "filming": Filming(cameras="board")}, "--mass is for .*holds clips of several cameras"),
         (None, {"scale": 0.0, "filming": Filming(cameras="board")}, "--scale must be above 0"),
+        (None, {"frame_rate": 240.0, "filming": Filming(cameras="board", synchronise="audio")}, "--synchronise audio goes by the clock"),
     ],
 )
 def test_what_a_video_cannot_tell(throw, tmp_path, change, options, match):
