@@ -55,11 +55,14 @@ def write_deforming_body(
         if any(x.shape[1] != 3 for x in points.values()):
             raise UserError(f"{name}: a deforming body needs three coordinates: give --columns.x, --columns.y and --columns.z")
         x = np.stack(list(points.values()), 1)
-        x = x[:, np.isfinite(x[0]).all(axis=1)]
+        known = np.isfinite(x[0]).all(axis=1)
+        x = x[:, known]
         if x.shape[1] < 8:
             raise UserError(
                 f"{name}: {x.shape[1]} points are seen in the first frame; at least 8 are needed: cut the recording, or give --kind track"
             )
+        if not known.all():
+            summary.append(f"{name}: {int((~known).sum())} points that are not seen in the first frame are left out")
         x[~np.isfinite(x).all(axis=2)] = np.nan
         velocity, kind = start_velocity(t, x)
         body = rest_body(x[0], velocity, volume, name)
