@@ -1,5 +1,6 @@
 """Reader of a table that pandas wrote to HDF5, as DeepLabCut does; nothing in the file is unpickled or followed out of it."""
 
+import math
 import pickletools
 from pathlib import Path
 from typing import Any
@@ -38,9 +39,8 @@ def read_frame(path: Path) -> tuple[list[tuple[str, ...]], np.ndarray, np.ndarra
             found = group[name]
             if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
                 raise UserError(f"{path}: {name} is no array, or it lies in another file")
-            check_limit(
-                int(np.prod(found.shape)) * max(found.dtype.itemsize // 8, 1), "NEUIDO_MAX_ARRAY_ELEMENTS", f"{path}: {name} is too large"
-            )
+            count = math.prod(found.shape) * max(found.dtype.itemsize // 8, 1)
+            check_limit(count, "NEUIDO_MAX_ARRAY_ELEMENTS", f"{path}: {name} has {count} numbers")
             return found[()]
 
         if "table" in group:

@@ -91,3 +91,12 @@ def test_files_that_lead_elsewhere_are_refused(tmp_path):
     (tmp_path / "d.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + io.BytesIO(b"\0" * 60).getvalue())
     with pytest.raises(UserError, match="not a valid HDF5 file of pandas"):
         read_frame(tmp_path / "d.h5")
+
+
+def test_an_array_that_claims_more_numbers_than_a_word_counts(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        group = file.create_group("df")
+        group.attrs["block0_items_nlevels"] = 0
+        group.create_dataset("block0_values", (2**33, 2**31), "f8", chunks=(1, 8))
+    with pytest.raises(UserError, match=f"block0_values has {2**64} numbers, more than the limit"):
+        read_frame(tmp_path / "a.h5")
