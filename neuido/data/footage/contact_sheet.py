@@ -5,8 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from neuido.data.files.writing import atomic_write
-from neuido.errors import UserError
+from neuido.data.files.writing import write_png
 
 COLUMNS = 6
 """Frames of each video, evenly spread."""
@@ -36,18 +35,10 @@ class Sheet:
         self.rows.setdefault(row, []).append(small)
 
     def write(self, path: Path) -> None:
-        """Write the sheet.
-
-        Raises:
-            UserError: The file cannot be written.
-        """
+        """Write the sheet."""
         height = max(image.shape[0] for row in self.rows.values() for image in row)
         sheet = np.full((height * len(self.rows), WIDTH * COLUMNS, 3), 40, np.uint8)
         for r, row in enumerate(self.rows.values()):
             for c, image in enumerate(row[:COLUMNS]):
                 sheet[r * height : r * height + image.shape[0], c * WIDTH : (c + 1) * WIDTH] = image
-        done, data = cv2.imencode(".png", sheet)
-        if not done:
-            raise UserError(f"--picture {path} cannot be encoded")
-        with atomic_write(path) as hidden:
-            hidden.write_bytes(data.tobytes())
+        write_png(path, sheet)
