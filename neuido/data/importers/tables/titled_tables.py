@@ -233,13 +233,15 @@ def _by_specimen(table: Table, rows: list[list[str]]) -> list[Table]:
     if column is None:
         return [table]
     names = [row[column] if column < len(row) else "" for row in rows[: len(table.data)]]
-    own = [name for name in dict.fromkeys(names) if name]
-    if len(own) < 2 or any(names.count(name) < LEAST_ROWS for name in own):
+    named = [name for name in dict.fromkeys(names) if name]
+    own = [name for name in named if names.count(name) >= LEAST_ROWS]
+    if len(named) < 2 or 2 * sum(map(names.count, own)) < len(names):  # such a column may also count the rows
         return [table]
     out = []
+    short = [f"{table.titles[column]} {name[:40]} has fewer than {LEAST_ROWS} rows and is left out" for name in named if name not in own]
     for name in own:
         chosen = [i for i, other in enumerate(names) if other == name]
-        notes = [*table.notes, f"{table.titles[column]} {name[:40]}"]
+        notes = [*table.notes, f"{table.titles[column]} {name[:40]}", *short]
         out.append(table._replace(data=table.data[chosen], notes=notes, label=name[:40]))
     return out
 

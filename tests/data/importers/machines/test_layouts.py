@@ -78,6 +78,14 @@ def test_several_specimens(tmp_path, make):
     assert (first.role, second.role) == ("fit", "held_out") and any("held out" in line for line in said)
 
 
+def test_a_specimen_of_two_rows_is_left_out(tmp_path):
+    path = column_of_specimens(tmp_path)
+    path.write_text(path.read_text().rstrip() + "\nC,0.0,0.0\nC,0.1,50000.0\n")
+    said = neuido.import_file(path, tmp_path / "out")
+    assert len(neuido.read_material_tests(tmp_path / "out").tests) == 2
+    assert "all files: Specimen C has fewer than 3 rows and is left out" in said
+
+
 def test_one_sheet_by_its_name(tmp_path):
     size = Specimen("50 mm", "10 mm", "2 mm")
     neuido.import_file(sheets(tmp_path), tmp_path / "out", specimen=size, sheet="Specimen 2")
