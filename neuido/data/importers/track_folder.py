@@ -57,7 +57,7 @@ def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> R
     elif unit.lower() in ("px", "pixel", "pixels"):
         raise UserError(f"{path.name} has positions in pixels: give --scale (metres per pixel), and --y_down true if y points down")
     else:
-        ratio = conversion_factor(unit, "m", f"{path.name}, positions") if unit else 1.0
+        ratio = conversion_factor(unit, "m", f"{path.name}, --units.x") if unit else 1.0
         notes.append(f"positions in {unit}" if unit else "positions without a unit, taken as metres (--scale)")
     points, lost = {}, 0
     for name, x in motion.points.items():

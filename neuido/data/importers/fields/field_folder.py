@@ -151,7 +151,7 @@ def _forces(
             own = units.get(quantity) or table.units[found[quantity]]
             if not own and quantity == "force":
                 raise UserError(f"column {table.titles[found[quantity]]!r} has no unit: give --units.force N")
-            values = table.data[:, found[quantity]] * (conversion_factor(own, unit, quantity) if own else 1.0)
+            values = table.data[:, found[quantity]] * (conversion_factor(own, unit, f"--units.{quantity}") if own else 1.0)
             if not np.isfinite(values).all():
                 raise UserError(f"row {int(np.argmax(~np.isfinite(values)))} has no {quantity}: each image needs one")
             notes.append(f"{path.name}: column {table.titles[found[quantity]]!r} -> {quantity}, {own or unit}")

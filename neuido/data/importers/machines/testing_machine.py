@@ -71,7 +71,7 @@ class MachineTable:
             raise UserError(f"{self.name}: column {self.title(quantity)!r} has no unit: give --units.{quantity} {unit or 'percent'}")
         known = own or (f"taken as {unit} (--units.{quantity})" if unit else "a ratio")
         self.summary.append(f"column {index + 1} {self.title(quantity)!r} -> {quantity}, {known}")
-        return self.table.data[:, index] * (conversion_factor(own, unit, f"{self.name}, {quantity}") if own else 1.0)
+        return self.table.data[:, index] * (conversion_factor(own, unit, f"{self.name}, --units.{quantity}") if own else 1.0)
 
     def missing(self, what: str, quantity: str) -> UserError:
         titles = ", ".join(filter(None, self.table.titles))
@@ -194,7 +194,7 @@ def _make_compression(out: dict[str, np.ndarray], given: MachineTable, *, stated
     if stated:
         given.summary.append("a title says compression, so both strain and stress are negative (else --columns names other columns)")
     given.summary.append(
-        "compression: friction at the platens makes a specimen stiffer, and no effect here stands for it; lubricate, or bond"
+        "compression: friction at the platens makes a specimen stiffer, and the library has no effect for it: lubricate the platens"
     )
 
 
