@@ -80,7 +80,7 @@ def stress_along(
 
     Raises:
         UserError: An unknown mode, a path of a wrong shape or with a stretch that is not positive, a rate effect without times, or
-            swelling of an incompressible specimen.
+            swelling of an incompressible specimen or from less than nothing.
     """
     if mode not in MODES:
         raise UserError(f"mode = {mode!r} is not known; one of {', '.join(MODES)}")
@@ -98,6 +98,13 @@ def stress_along(
         raise UserError("swelling changes the volume: leave it out, or declare the specimen as compressible")
     if time is not None:
         specimen.effects.stress_free_size((time[-1:] - time[0]).double().expand(specimen.points), 1)  # refuses one that vanishes
+        before = float(_approach(time))
+        rates = specimen.effects.rows("swelling", specimen.points, time.double())
+        if bool((rates * before >= 1).any()):
+            fast = (
+                f"swelling is {rates.max().item():g} 1/s; {before:g} s before the first row, where the path begins, nothing of the specimen"
+            )
+            raise UserError(f"{fast} would be there: give a smaller rate, or rows that are closer in time")
     if not step > 0:
         raise UserError(f"step = {step} must be positive")
     with torch.no_grad():
@@ -235,8 +242,7 @@ class _Rig:
         start = torch.zeros(1, self.path.shape[1], dtype=torch.float64)
         path = torch.cat([start, self.path])
         if time is not None:
-            first = time[1] - time[0] if n > 1 else torch.ones((), dtype=torch.float64)
-            time = torch.cat([(time[0] - first)[None], time]) - time[0]
+            time = torch.cat([(time[0] - _approach(time))[None], time]) - time[0]
         u = torch.zeros(P, self.free, dtype=torch.float64)
         ratio = torch.zeros(P, self.free, dtype=torch.float64)
         whole = torch.eye(3, dtype=torch.float64).expand(P, 3, 3)  # total F in the axes of the specimen
@@ -287,6 +293,11 @@ class _Rig:
         if self.mode == "equibiaxial":
             return t[..., :2].mean(-1, keepdim=True)
         return t[..., :2] if self.mode == "biaxial" else t[..., :1]
+
+
+def _approach(time: Tensor) -> Tensor:
+    """Return the time in which the undeformed specimen reaches the first row [s]: the first interval, or 1 s for a single row."""
+    return time[1] - time[0] if len(time) > 1 else torch.ones((), dtype=torch.float64)
 
 
 def _log(increment: Tensor, mode: str) -> Tensor:

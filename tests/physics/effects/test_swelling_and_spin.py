@@ -109,6 +109,10 @@ def test_a_body_cannot_shrink_to_nothing():
     t = torch.linspace(0.1, 1.0, 10, dtype=torch.float64)
     with pytest.raises(UserError, match="the body would vanish"):
         stress_along(Specimen(SOFT, None, Effects(swelling=-2.0), 1), "uniaxial", torch.ones(10, 1, dtype=torch.float64), time=t)
+    for rows in (1, 2):  # the path begins 1 s before its first row, where g = 1 - 1.5
+        with pytest.raises(UserError, match=r"swelling is 1\.5 1/s; 1 s before the first row"):
+            path, t = torch.ones(rows, 1, dtype=torch.float64), torch.arange(rows, dtype=torch.float64)
+            stress_along(Specimen(SOFT, None, Effects(swelling=torch.tensor([0.5, 1.5])), 2), "uniaxial", path, time=t)
 
 
 # Spin decay.
