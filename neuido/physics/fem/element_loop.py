@@ -227,7 +227,7 @@ class Loop:
         self._launch(k.move, len(self.x), a.first, a.corner, a.node_scene, a.held, f.mass, f.dt, pull, f.force, self.plane, self.kind,
                      f.friction, self.force, self.x, self.v, self.rest)  # fmt: skip
         gradient = self.trial if self.changes else self.F
-        self._launch(k.kinematics, len(self.F), a.elements, self.x, self.v, self.shape, rates, self.gradients, self.C, gradient, n, 
+        self._launch(k.kinematics, len(self.F), a.elements, self.x, self.v, self.shape, rates, self.gradients, self.C, gradient, n,
                      a.volume, self.lowest, self.since)  # fmt: skip
         if self.swelling is not None:
             self._launch(self.swelling.elastic_part, len(self.F), a.particles.scene, size, gradient)
