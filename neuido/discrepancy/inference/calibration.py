@@ -1,7 +1,7 @@
 """How far the true model was behind the best one in cases whose truth is known: the table that evidences are judged by.
 
 `calibration.csv` has a row for each case that ran through a whole diagnosis, search included: nulls, and experiments with effects of the
-library whose true set was fitted near its optimum. `benchmarks/calibration.py` remakes it. A quantile of n such rows is a conformal one:
+library whose true set was fitted near its optimum. `benchmarks/calibrate.py` remakes it. A quantile of n such rows is a conformal one:
 of the next case, drawn as they were, the true model is at most so far behind with a probability of at least 1 - alpha (Vovk, Gammerman and
 Shafer, Algorithmic Learning in a Random World, 2005), if alpha is 1 / (n + 1) or more; below that the largest value stands for it.
 """

@@ -172,7 +172,7 @@ def first_look(
     until: float = 1.0,
     grows: bool = True,
 ) -> Look:
-    """Screen the candidates, and fit the best; arguments as those of `round`. A base that was looked at last is not looked at again.
+    """Screen the candidates, and fit the best; arguments as those of `find`. A base that was looked at last is not looked at again.
 
     `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
     which there are no others; `until`: share of the search's work past which there are none; `grows`: whether fits grow where these

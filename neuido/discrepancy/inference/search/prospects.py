@@ -38,7 +38,7 @@ def promising(
     most: float = math.inf,
     until: float = 1.0,
 ) -> Promising:
-    """Screen the candidates, and say which are to be fitted and where their fits begin; arguments as those of `look`."""
+    """Screen the candidates, and say which are to be fitted and where their fits begin; arguments as those of `first_look`."""
     lab = search.lab
     ends = led.ends if led is not None else {}
     first = not found and (led is None or led.chosen is not None)
