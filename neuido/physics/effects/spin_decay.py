@@ -33,8 +33,21 @@ class SpinDecay:
     def _launch(self, kernel, dim: int, *arguments) -> None:
         launch(kernel, dim, arguments, self.scene.device)
 
-    def damp(self, loss: Tensor, mass: Tensor, x: Tensor, v: Tensor, C: Tensor | None, v_out: Tensor, C_out: Tensor | None) -> None:
+    def damp(
+        self,
+        loss: Tensor,
+        mass: Tensor,
+        x: Tensor,
+        v: Tensor,
+        C: Tensor | None,
+        v_out: Tensor,
+        C_out: Tensor | None,
+        *,
+        every: bool = False,
+    ) -> None:
         """Write v and C after the torque of a substep.
+
+        Scenes without a loss cost next to nothing: launches that serve every set of effects have many of them.
 
         Args:
             loss: `Effects.spin_loss` [-], (S, 1).
@@ -44,17 +57,18 @@ class SpinDecay:
             C: Affine velocities [1/s], (P, 3, 3), or None for nodes.
             v_out: Velocities after the torque; may be v.
             C_out: Affine velocities after the torque; may be C.
+            every: Find the rotation of scenes without a loss too, as `adjoint` needs it.
         """
         k, rows = self.kernels, self.count * self.lanes
-        self._launch(k.sum_moments, rows, self.first, self.lanes, mass, self.spread, x, v, C, self.partial)
-        self._launch(k.find_spin, self.count, self.lanes, self.spread, self.inside, self.partial, self.state)
+        self._launch(k.sum_moments, rows, self.first, self.lanes, loss, every, mass, self.spread, x, v, C, self.partial)
+        self._launch(k.find_spin, self.count, self.lanes, loss, every, self.spread, self.inside, self.partial, self.state)
         self._launch(k.damp_spin, len(x), self.scene, loss, self.state, x, v, C, v_out, C_out)
 
     def adjoint(
         self, loss: Tensor, mass: Tensor, x: Tensor, v: Tensor, C: Tensor,
         a_loss: Tensor, a_mass: Tensor, a_x: Tensor, a_v: Tensor, a_C: Tensor,
     ) -> None:  # fmt: skip
-        """Compute the adjoint of `damp`, for the same state of which `damp` ran last.
+        """Compute the adjoint of `damp`, for the same state of which `damp` ran last, with `every`.
 
         Adds to a_loss, a_mass and a_x; turns a_v and a_C from the adjoints after the torque into those before it.
         """

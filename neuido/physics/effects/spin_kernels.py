@@ -64,6 +64,8 @@ def build(real: type) -> SimpleNamespace:
     def sum_moments(
         first: wp.array(dtype=wp.int32),
         lanes: int,
+        loss: wp.array2d(dtype=real),
+        every: bool,
         mass: wp.array(dtype=real),
         spread: wp.array(dtype=real),
         x: wp.array(dtype=vec3),
@@ -73,10 +75,13 @@ def build(real: type) -> SimpleNamespace:
     ):
         """Sum `MOMENTS` over every `lanes`-th particle of a scene; a scene's particles are `first[s]` to `first[s + 1]`.
 
-        `spread` is dx^2/4 of each scene [m^2]; without C the particles do not rotate within themselves.
+        `spread` is dx^2/4 of each scene [m^2]; without C the particles do not rotate within themselves. Scenes without a loss are left out
+        unless `every` is set.
         """
         t = wp.tid()
         s = t / lanes
+        if loss[s, 0] == real(0.0) and not every:
+            return
         row = row_of_moments()
         for p in range(first[s] + t % lanes, first[s + 1], lanes):
             m = wp.float64(mass[p])
@@ -98,10 +103,12 @@ def build(real: type) -> SimpleNamespace:
             partial[t, c] = row[c]
 
     @kernel
-    def find_spin(lanes: int, spread: wp.array(dtype=real), inside: bool, partial: wp.array2d(dtype=wp.float64),
-                  state: wp.array2d(dtype=wp.float64)):  # fmt: skip
-        """Write the `STATE` of each scene; `inside`: whether the particles rotate within themselves."""
+    def find_spin(lanes: int, loss: wp.array2d(dtype=real), every: bool, spread: wp.array(dtype=real), inside: bool,
+                  partial: wp.array2d(dtype=wp.float64), state: wp.array2d(dtype=wp.float64)):  # fmt: skip
+        """Write the `STATE` of the scenes of `sum_moments`; `inside`: whether the particles rotate within themselves."""
         s = wp.tid()
+        if loss[s, 0] == real(0.0) and not every:
+            return
         row = row_of_moments()
         for lane in range(lanes):
             for c in range(wp.static(MOMENTS)):
@@ -144,8 +151,12 @@ def build(real: type) -> SimpleNamespace:
         """Write v and C after the torque of a substep; `loss` is f, (S, 1)."""
         p = wp.tid()
         s = scene[p]
-        fw = wp.float64(loss[s, 0]) * vector_at(state, s, 6)
-        v_out[p] = v[p] - narrow(wp.cross(fw, wide(x[p]) - vector_at(state, s, 0)))
+        fw = wp.vec3d()
+        change = wp.vec3d()
+        if loss[s, 0] != real(0.0):  # else there may be no state
+            fw = wp.float64(loss[s, 0]) * vector_at(state, s, 6)
+            change = wp.cross(fw, wide(x[p]) - vector_at(state, s, 0))
+        v_out[p] = v[p] - narrow(change)
         if C:
             C_out[p] = C[p] - wp.skew(narrow(fw))
 

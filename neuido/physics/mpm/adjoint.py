@@ -56,7 +56,7 @@ def run_backward(
             material, a_material = plan.material(inputs, n), plan.material((*inputs[:STATES], *a_fixed), n)
             v_in, C_in = v, C  # what P2G reads
             if spin is not None and damped is not None:
-                spin.damp(inputs[SPIN_LOSS], mass, x, v, C, *damped)
+                spin.damp(inputs[SPIN_LOSS], mass, x, v, C, *damped, every=True)
                 v_in, C_in = damped
             tau, grid, velocity = recompute(plan, inputs, tape, n, state, (v_in, C_in), elastic, material, scratch)
             shrinkage = at_step(inputs[SHRINKAGE], n)
