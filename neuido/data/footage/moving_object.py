@@ -9,7 +9,7 @@ import numpy as np
 
 from neuido.data.files.parsing import read_image
 from neuido.data.footage.video_frames import Clip, images
-from neuido.data.scenes.masks import MIN_DIFFERENCE, mask_on_plain_background
+from neuido.data.scenes.masks import MIN_DIFFERENCE, mask_centre, mask_on_plain_background
 from neuido.errors import UserError
 
 BACKGROUND_FRAMES = 21
@@ -83,8 +83,6 @@ def find_object(image: np.ndarray, background: np.ndarray) -> Sighting:
     # further inside than an outline is blurred, the object is whole whatever its colour
     inside = cv2.erode(filled, np.ones((5, 5), np.uint8))
     mask = np.maximum(inside, near * mask_on_plain_background(colours, background)).astype(np.float32)
-    area = float(mask.sum())
-    centre = tuple(float((mask.sum(axis=axis) * (np.arange(mask.shape[1 - axis]) + 0.5)).sum() / area) for axis in (0, 1))
     cut = left == 0 or top == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]
     rest = np.delete(areas, own - 1)
-    return Sighting(mask, (centre[0], centre[1]), area, cut, float(rest.max() / areas[own - 1]) if len(rest) else 0.0)
+    return Sighting(mask, mask_centre(mask), float(mask.sum()), cut, float(rest.max() / areas[own - 1]) if len(rest) else 0.0)

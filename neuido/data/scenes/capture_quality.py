@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from neuido.data.formats.layout import MultiView
+from neuido.data.scenes.masks import mask_centre
 from neuido.data.scenes.multiview import SceneViews
 from neuido.data.scenes.view_geometry import mean_misfit, triangulate, view_delays
 from neuido.errors import UserError
@@ -144,10 +145,9 @@ def _outline(image: np.ndarray, mask: np.ndarray) -> Outline:
     inside = mask > 0.5
     if not inside.any():
         return Outline((math.nan, math.nan), 0.0, 0.0, False, 0.0)
-    centre = tuple(float((mask.sum(axis=axis) * (np.arange(mask.shape[1 - axis]) + 0.5)).sum() / area) for axis in (0, 1))
     border = bool(inside[0].any() or inside[-1].any() or inside[:, 0].any() or inside[:, -1].any())
     clipped = float((image[inside].min(axis=1) >= CLIPPED / 255).mean())
-    return Outline((centre[0], centre[1]), 2 * math.sqrt(area / math.pi), float(mask.mean()), border, clipped)
+    return Outline(mask_centre(mask), 2 * math.sqrt(area / math.pi), float(mask.mean()), border, clipped)
 
 
 def _framing(row: list[Outline], view: str) -> list[Finding]:

@@ -13,6 +13,12 @@ from neuido.errors import UserError
 MIN_DIFFERENCE = 0.06  # fraction of the colour range; noise and soft shadows change less
 
 
+def mask_centre(mask: np.ndarray) -> tuple[float, float]:
+    """Return the centre [px] of a mask (H, W) that is not empty; x to the right and y down, pixel centres at half-integers."""
+    x, y = (float((mask.sum(axis=axis) * (np.arange(mask.shape[1 - axis]) + 0.5)).sum() / mask.sum()) for axis in (0, 1))
+    return x, y
+
+
 def mask_channel(path: Path) -> np.ndarray:
     """Read a mask file as the object's share of each pixel, (H, W) float32 in [0, 1].
 
