@@ -91,12 +91,14 @@ def loudness(path: Path) -> tuple[np.ndarray, np.ndarray]:
         if not container.streams.audio:
             raise UserError(f"{path} has no sound: give --synchronise flash, or --offsets (s)")
         stream = container.streams.audio[0]
-        parts, start, rate = [], None, int(stream.rate or 0)
+        parts, count, start, rate = [], 0, None, int(stream.rate or 0)
         for frame in container.decode(stream):
             start = frame.time if start is None else start
             samples = np.asarray(frame.to_ndarray(), dtype=np.float64)
             channels = max(frame.layout.nb_channels, 1)
             parts.append(samples.reshape(-1, channels)[:, 0] if samples.shape[0] == 1 else samples[0])
+            count += len(parts[-1])
+            check_limit(count, "NEUIDO_MAX_ARRAY_ELEMENTS", f"{path} has {count} samples of sound")
         if not parts or rate < 1:
             raise UserError(f"{path} has no sound: give --synchronise flash, or --offsets (s)")
     sound = np.concatenate(parts)

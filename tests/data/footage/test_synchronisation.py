@@ -25,7 +25,7 @@ def test_a_flash_that_all_see(tmp_path):
         start_times([clips[0], clip(tmp_path / "c.mp4")], "flash", None)
 
 
-def test_a_clap_that_all_hear(tmp_path):
+def test_a_clap_that_all_hear(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     clips = []
     for name, at in (("a", 0.120), ("b", 0.3437)):
@@ -40,6 +40,9 @@ def test_a_clap_that_all_hear(tmp_path):
     quiet = clip(tmp_path / "d.mp4", sound=0.01 * rng.standard_normal(10240))
     with pytest.raises(UserError, match=r"d.mp4 has no clap"):
         start_times([clips[0], quiet], "audio", None)
+    monkeypatch.setenv("NEUIDO_MAX_ARRAY_ELEMENTS", "5000")
+    with pytest.raises(UserError, match=r"a.mp4 has \d+ samples of sound, more than the limit of 5000"):
+        start_times(clips, "audio", None)
 
 
 def test_given_offsets(tmp_path):
