@@ -23,6 +23,8 @@ MANY_POSES = 5
 """Poses of the board from which on lens distortion and principal point are estimated too."""
 MAX_RESIDUAL = 2.0
 """Root mean square of the distances of seen and projected corners [px] above which a calibration is refused."""
+SURE = 0.02
+"""Relative standard deviation of a focal length above which the summary says how to make it surer."""
 
 
 class Board(NamedTuple):
@@ -153,7 +155,7 @@ def _calibrated(clip: Clip, looks: list[Look], board: Board, drawn: Any, start: 
     spread = float(np.ravel(deviation)[:2].max() / K[0, 0])
     note = (f"{clip.path.name}: board seen in {len(looks)} frames, {len(poses)} pose{'s' * (len(poses) > 1)}; focal length "
             f"{K[0, 0]:.4g} px within {spread:.1%}, corners within {error:.2g} px")  # fmt: skip
-    if spread > 0.02:
+    if spread > SURE:
         note += "; show the board close up and at several slants at the start of the clip to make it surer"
     return View(viewmat, K, tuple(np.ravel(lens)[:5].tolist())), note
 

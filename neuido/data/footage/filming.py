@@ -9,6 +9,9 @@ import numpy as np
 from neuido.data.footage.video_frames import Clip
 from neuido.errors import UserError
 
+SAME_ASPECT = 0.01
+"""Largest relative difference of the aspect ratios of two images of one camera: rounding to whole pixels makes less."""
+
 
 class Filming(NamedTuple):
     """Options of `neuido import` for video files."""

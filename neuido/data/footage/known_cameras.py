@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from neuido.data.files.writing import write_png
-from neuido.data.footage.filming import Filming, View, chosen_frames
+from neuido.data.footage.filming import SAME_ASPECT, Filming, View, chosen_frames
 from neuido.data.footage.video_frames import Clip, images
 from neuido.data.formats import colmap
 from neuido.data.formats.layout import MultiView
@@ -70,7 +70,7 @@ def _of_views(found: MultiView, clips: Sequence[Clip], option: str) -> list[View
             raise UserError(f"{option} has no view {clip.path.stem!r} for {clip.path.name}: it has {', '.join(found.views[:12])}")
         v = stems[clip.path.stem]
         ratio = np.array([clip.width / found.cameras.width, clip.height / found.cameras.height, 1.0])
-        if abs(ratio[0] / ratio[1] - 1) > 0.01:
+        if abs(ratio[0] / ratio[1] - 1) > SAME_ASPECT:
             raise UserError(
                 f"{clip.path} has {clip.width} x {clip.height} px, its camera in {option} {found.cameras.width} x {found.cameras.height}, "
                 "another aspect ratio"

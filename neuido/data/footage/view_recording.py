@@ -10,7 +10,7 @@ import torch
 from neuido.data import cameras as convert
 from neuido.data.footage.board_cameras import board_cameras
 from neuido.data.footage.contact_sheet import Sheet
-from neuido.data.footage.filming import Filming, View, chosen_frames
+from neuido.data.footage.filming import SAME_ASPECT, Filming, View, chosen_frames
 from neuido.data.footage.known_cameras import reconstructed_cameras, recorded_cameras
 from neuido.data.footage.moving_object import background_of, sightings
 from neuido.data.footage.synchronisation import start_times
@@ -26,6 +26,8 @@ VELOCITY_FRAMES = 7
 """Frames from which the initial velocity is estimated, by a parabola."""
 MIDDLE = 0.5
 """Place of the body in x and z of the unit cube [m], the default domain of `neuido reconstruct`."""
+ROOMY = 0.8
+"""Extent of a motion [m] that leaves room for the body in that domain."""
 
 
 def write_views(
@@ -106,7 +108,7 @@ def write_views(
     notes.append(f"centres of the views meet within {misfit:.2g} px (root mean square): it holds errors of cameras, clocks and masks")
     notes.append("velocity at the start {:.3g}, {:.3g}, {:.3g} m/s in motion.yaml".format(*motion.velocity))
     reach = float(np.nanmax(np.ptp(x[np.isfinite(x).all(axis=1)], axis=0)))
-    if reach > 0.8:
+    if reach > ROOMY:
         notes.append(
             f"the body moves over {reach:.2g} m, and the default domain is 1 m wide: give `neuido reconstruct` a larger one (--setting)"
         )
@@ -150,7 +152,7 @@ def _cameras(clips: Sequence[Clip], views: Sequence[View], size: tuple[int, int]
     Ks = []
     for clip, view in zip(clips, views):
         ratio = np.array([size[0] / clip.width, size[1] / clip.height, 1.0])
-        if abs(ratio[0] / ratio[1] - 1) > 0.01:
+        if abs(ratio[0] / ratio[1] - 1) > SAME_ASPECT:
             raise UserError(f"{clip.path} has {clip.width} x {clip.height} px, another aspect ratio than {clips[0].path.name}: crop one")
         Ks.append(view.K * ratio[:, None])
     viewmats = torch.from_numpy(np.stack([view.viewmat for view in views]))
