@@ -17,7 +17,7 @@ from neuido.discrepancy.inference.search.contests import FAR, IN_REACH, MANY, SM
 from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 
-ABOVE = 2.5
+MUCH = 2.5
 """Times the noise of the fitted recordings that the best first fit leaves, from which on fits grow."""
 SIDE_BY_SIDE, ONE_BY_ONE = 8, 4
 """Candidates that grow, where a launch of several points costs as one, one of them of more than `MANY` parameters, and where every point
@@ -74,7 +74,7 @@ def leaves_much(lab: Laboratory, errors: Sequence[np.ndarray]) -> bool:
     if lab.problem.settings == 1 or not lab.problem.declared:
         return False
     noise = score(lab.noise_squares[lab.fitted])
-    return all(score(squares[lab.fitted]) - noise > 2.0 * math.log(ABOVE) for squares in errors)
+    return all(score(squares[lab.fitted]) - noise > 2.0 * math.log(MUCH) for squares in errors)
 
 
 def is_astray(search: Search, base: Fit, floor: Floor) -> bool:
