@@ -172,6 +172,9 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
         raise UserError(
             f"{path.name} has no time or no position: name their columns with --columns.time TITLE --columns.x TITLE (titles: {titles})"
         )
+    if "z" in axes and "y" not in axes:
+        title = table.titles[found["z"]]
+        raise UserError(f"{path.name} has z and no y, which points up: give --columns.y {title!r} if {title!r} is the height")
     units = {table.units[found[axis]] for axis in axes}
     if len(units) > 1:
         raise UserError(f"{path.name}: the axes have different units ({', '.join(sorted(units))}): export them in one unit")
@@ -181,8 +184,8 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
         timed = True
     x = table.data[:, [found[axis] for axis in axes]]
     notes = [*table.notes, *(f"column {found[key] + 1} {table.titles[found[key]]!r} -> {key}" for key in (clock, *axes))]
-    if axes == ["y"]:
-        x = np.stack([np.zeros(len(x)), x[:, 0]], 1)
+    if "x" not in axes:
+        x = np.column_stack([np.zeros(len(x)), x])
     if "id" not in found:
         return Motion(t, {_label(path): x}, units.pop(), clock == "frame", notes, timed)
     ids, times = table.data[:, found["id"]], np.unique(t[np.isfinite(t)])

@@ -180,6 +180,21 @@ def test_pixels_of_deeplabcut(tmp_path):
     assert len(track.t) == 30
 
 
+def test_axes_that_are_absent(tmp_path):
+    across = 0.3 * T
+    plane = write(tmp_path / "plane.csv", ["t (s),y (m),z (m)", *table(T, FLIGHT[:, 1], across)])
+    neuido.import_file(plane, tmp_path / "plane")
+    (track,) = neuido.read_tracks(tmp_path / "plane").recordings
+    assert list(track.axes) == [1, 2]
+    np.testing.assert_allclose(track.x, np.stack([FLIGHT[:, 1], across], 1), atol=1e-9)
+    height = write(tmp_path / "height.csv", ["t (s),x (m),z (m)", *table(T, across, FLIGHT[:, 1])])
+    with pytest.raises(UserError, match=r"has z and no y, which points up: give --columns.y 'z .m.'"):
+        neuido.import_file(height, tmp_path / "height")
+    neuido.import_file(height, tmp_path / "height", columns={"y": "z (m)"})
+    (track,) = neuido.read_tracks(tmp_path / "height").recordings
+    np.testing.assert_allclose(track.x, np.stack([across, FLIGHT[:, 1]], 1), atol=1e-9)
+
+
 def test_particles_of_a_body(tmp_path):
     grid = np.stack(np.meshgrid(*[np.linspace(0.4, 0.6, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
     lines = [f"{t},{i},{x},{y - 4.905 * t * t},{z}" for t in T[:8] for i, (x, y, z) in enumerate(grid)]
