@@ -189,6 +189,10 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
     if "id" not in found:
         return Motion(t, {_label(path): x}, units.pop(), clock == "frame", notes, timed)
     ids, times = table.data[:, found["id"]], np.unique(t[np.isfinite(t)])
+    unnamed = int((~np.isfinite(ids) & np.isfinite(t) & np.isfinite(x).any(axis=1)).sum())
+    if unnamed:
+        title = table.titles[found["id"]]
+        raise UserError(f"{path.name}: {unnamed} rows have a position and no number in column {title!r}: give each point a number")
     points = {}
     for own in np.unique(ids[np.isfinite(ids)]):
         chosen = (ids == own) & np.isfinite(t)

@@ -209,6 +209,8 @@ def test_particles_of_a_body(tmp_path):
     late = write(tmp_path / "late.csv", ["t,id,x,y,z", *lines, f"{T[1]},99,0.5,0.5,0.5"])
     said = neuido.import_file(late, None, density=1000.0, young=5e4)
     assert "late: 1 points that are not seen in the first frame are left out" in said
+    with pytest.raises(UserError, match="1 rows have a position and no number in column 'id'"):
+        neuido.import_file(write(tmp_path / "named.csv", ["t,id,x,y,z", *lines, f"{T[0]},tip,0.5,0.5,0.5"]), None)
 
 
 @settings(max_examples=15, deadline=None)
