@@ -66,7 +66,7 @@ def test_diagnose(crushed, tmp_path):
     options = {
         "effects": ["gravity"],
         "draws": 19,
-        "most": 1,
+        "max_effects": 1,
         "device": "cpu",
         "progress": False,
         "solver": "material_points",
