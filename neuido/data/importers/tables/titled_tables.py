@@ -233,6 +233,8 @@ def _by_specimen(table: Table, rows: list[list[str]]) -> list[Table]:
     if column is None:
         return [table]
     names = [row[column] if column < len(row) else "" for row in rows[: len(table.data)]]
+    for i in range(1, len(names)):
+        names[i] = names[i] or names[i - 1]  # merged cells of a spreadsheet hold their name in the first row
     named = [name for name in dict.fromkeys(names) if name]
     own = [name for name in named if names.count(name) >= LEAST_ROWS]
     if len(named) < 2 or 2 * sum(map(names.count, own)) < len(names):  # such a column may also count the rows

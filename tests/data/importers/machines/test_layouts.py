@@ -26,6 +26,13 @@ def stacked_instron(path):
     return write(path / "bluehill.csv", [line.replace("Compressive ", "") for line in lines])
 
 
+def merged_cells(path):
+    """A name in the first row of each specimen alone, as a spreadsheet exports merged cells."""
+    rows = column_of_specimens(path).read_text().splitlines()
+    kept = [row if i % len(STRETCH) == 0 else row[1:] for i, row in enumerate(rows[1:])]
+    return write(path / "merged.csv", [rows[0], *kept])
+
+
 def beside_zwick(path):
     """Two specimens side by side, with decimal commas."""
     head = ["Probe 1;;Probe 2;", "Dehnung;Standardkraft;Dehnung;Standardkraft", "%;N;%;N"]
@@ -67,7 +74,7 @@ def old_excel(path):
     return path / "zwick.xls"
 
 
-@pytest.mark.parametrize("make", [stacked_instron, beside_zwick, numbered_titles, column_of_specimens, sheets, old_excel])
+@pytest.mark.parametrize("make", [stacked_instron, beside_zwick, numbered_titles, column_of_specimens, merged_cells, sheets, old_excel])
 def test_several_specimens(tmp_path, make):
     specimen = Specimen() if make is stacked_instron else Specimen("50 mm", "10 mm", "2 mm")
     said = neuido.import_file(make(tmp_path), tmp_path / "out", specimen=specimen)
