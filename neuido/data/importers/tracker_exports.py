@@ -193,13 +193,17 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
     if unnamed:
         title = table.titles[found["id"]]
         raise UserError(f"{path.name}: {unnamed} rows have a position and no number in column {title!r}: give each point a number")
-    points = {}
+    points, repeated = {}, 0
     for own in np.unique(ids[np.isfinite(ids)]):
         chosen = (ids == own) & np.isfinite(t)
         values = np.full((len(times), x.shape[1]), np.nan)
         values[np.searchsorted(times, t[chosen])] = x[chosen]
+        repeated += int(chosen.sum()) - len(np.unique(t[chosen]))
         points[f"{own:g}"] = values
-    return Motion(times, points, units.pop(), clock == "frame", [*notes, f"{len(points)} points by id"], timed)
+    notes.append(f"{len(points)} points by id")
+    if repeated:
+        notes.append(f"{repeated} rows repeat the time of a point, of which the last counts")
+    return Motion(times, points, units.pop(), clock == "frame", notes, timed)
 
 
 def _label(path: Path) -> str:

@@ -206,9 +206,10 @@ def test_particles_of_a_body(tmp_path):
     np.testing.assert_allclose(take.body.x, grid, atol=1e-6)
     assert float(take.body.volume.sum()) == pytest.approx(0.008, rel=1e-3) and float(take.body.v.abs().max()) < 1e-5
     assert yaml.safe_load((tmp_path / "out" / "experiment.yaml").read_text())["scene"]["colliders"][0]["point"] == [0.0, 0.0, 0.0]
-    late = write(tmp_path / "late.csv", ["t,id,x,y,z", *lines, f"{T[1]},99,0.5,0.5,0.5"])
+    late = write(tmp_path / "late.csv", ["t,id,x,y,z", *lines, lines[-1], f"{T[1]},99,0.5,0.5,0.5"])
     said = neuido.import_file(late, None, density=1000.0, young=5e4)
     assert "late: 1 points that are not seen in the first frame are left out" in said
+    assert "late.csv: 1 rows repeat the time of a point, of which the last counts" in said
     with pytest.raises(UserError, match="1 rows have a position and no number in column 'id'"):
         neuido.import_file(write(tmp_path / "named.csv", ["t,id,x,y,z", *lines, f"{T[0]},tip,0.5,0.5,0.5"]), None)
 
