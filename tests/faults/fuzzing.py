@@ -91,7 +91,6 @@ def watched(folder: Path) -> Iterator[list[str]]:
     if not getattr(sys, "_neuido_watch", False):
         sys.addaudithook(_watch)  # for good: a hook cannot be removed
         sys._neuido_watch = True  # type: ignore[attr-defined]
-    gc.collect()  # what was left to be collected removes its folders now, not while it is watched
     found: list[str] = []
     before = tempfile.tempdir
     tempfile.tempdir = str(folder)
@@ -222,6 +221,7 @@ def fuzz(reader: Reader, folder: Path, numbers: range, *, stop: float | None = N
     content = {path: (sample / path).read_bytes() for path in files}
     faults, longest, tried = [], 0.0, 0
     shutil.copytree(sample, work)
+    gc.collect()  # what was left to be collected removes its folders now, not while it is watched
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reader.read(work)  # as it is it is taken; what is imported late is imported now
