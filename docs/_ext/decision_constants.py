@@ -106,7 +106,7 @@ def constant_page() -> str:
         "# Constants of the decision",
         "",
         f"What a diagnosis answers, given its fits, depends on **{present} figures that are set by hand**, beside the levels that are",
-        "stated and what follows from these figures. The goal is five. The decision by evidence, which is computed beside it and names",
+        "stated and what follows from these figures. The decision by evidence, which is computed beside it and names",
         f"nothing yet, has **{shadow}**.",
         "How the rules work together is under [how a diagnosis decides](../explanation/diagnosis.md).",
         "",
