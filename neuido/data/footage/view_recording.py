@@ -68,6 +68,8 @@ def write_views(
     if len(clips) < 2:
         raise UserError(f"--cameras {filming.cameras} needs the clips of at least two cameras, got {paths[0].name} alone")
     views, notes = _views(clips, filming)
+    if filming.cameras == "colmap" and scale is None:
+        notes.append("lengths are in COLMAP's own unit, not in metres: give --scale; after a free fall, `neuido check` estimates it")
     late, words = start_times(clips, filming.synchronise, filming.offsets)
     notes.append(words)
     frames, times, gap = _common_frames(clips, late, filming)

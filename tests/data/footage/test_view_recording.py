@@ -8,9 +8,10 @@ import torch
 
 import neuido
 from neuido.data import cameras as convert
+from neuido.data.footage import view_recording
 from neuido.data.footage.board_cameras import parse_board
 from neuido.data.footage.filming import Filming
-from neuido.data.footage.known_cameras import reconstructed_cameras
+from neuido.data.footage.known_cameras import reconstructed_cameras, recorded_cameras
 from neuido.data.footage.video_frames import read_clip
 from neuido.data.scenes.filmed_scene import load_views, read_motion
 from neuido.errors import UserError
@@ -39,7 +40,7 @@ def clips(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_board_on_the_floor_gives_the_cameras(clips, tmp_path):
+def test_a_board_on_the_floor_gives_the_cameras(clips, tmp_path, monkeypatch):
     folder, true, x = clips
     paths = sorted(folder.glob("*.mp4"))
     filming = Filming(start=EMPTY / RATE, cameras="board", board=drawn.BOARD, synchronise="flash")
@@ -76,6 +77,11 @@ def test_a_board_on_the_floor_gives_the_cameras(clips, tmp_path):
     assert torch.allclose(again.Ks, found.cameras.Ks) and torch.allclose(
         again.viewmats[:, :3, :3], found.cameras.viewmats[:, :3, :3], atol=1e-5
     )
+    # cameras without a scale are told of
+    monkeypatch.setattr(view_recording, "reconstructed_cameras", lambda clips, _: recorded_cameras(tmp_path / "named", clips))
+    for scale in (None, 1.0):
+        said = neuido.import_file(paths, None, filming=known._replace(cameras="colmap"), scale=scale)
+        assert any("not in metres: give --scale" in line for line in said) == (scale is None)
 
 
 @pytest.mark.slow
