@@ -1,1 +1,1 @@
-"""From a residual to a name: effects fitted side by side, weighed, and added one by one or in pairs until the answer stands."""
+"""The search for missing effects: fit candidates, compare them, and add effects singly or in pairs until the answer is final."""

@@ -1,4 +1,4 @@
-"""From a residual to a name: grow the model by one effect at a time, drop what became needless, and say how sure the answer is."""
+"""The whole diagnosis: add one effect at a time, drop effects that became needless, and state how sure the answer is."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,13 +25,13 @@ from neuido.discrepancy.store import Budget, Memo, Work
 from neuido.errors import UserError
 
 MOST = 3
-"""Effects that a growth may add."""
+"""Largest number of effects that one diagnosis may add."""
 
 
 def widen(search: Search, r: Round, at: Stand, others: Iterable[Round]) -> None:
-    """Put into the class of a round what another method named that leaves about as much, where that is more than noise.
+    """Add to the class of a round the effects that another method named, where they leave about the same error above noise.
 
-    The methods differ there by as much as the effects do, so that the data tell neither apart.
+    Two methods then differ as much as the effects do, and the data tell neither apart.
     """
     if comparing.is_settled(search.lab, at.errors):
         return
@@ -45,10 +45,13 @@ def widen(search: Search, r: Round, at: Stand, others: Iterable[Round]) -> None:
 
 
 def narrow(search: Search, base: Fit, floor: Floor, found: list[Trial], rounds: list[Round]) -> tuple[Fit, list[Trial]]:
-    """Weigh each class of effects again beside all others that were found: the best one of each stays, with those near it.
+    """Compare the members of each class again beside all other effects that were found, and keep the best ones.
 
-    So are simpler candidates that came close: before the others were found a force of many parameters may have stood for two effects. And
-    where all of them together leave more than noise, the others that came close: a neighbour of the true one may have led alone.
+    Simpler candidates that came close are compared too: before the other effects were found, a force with many parameters may have stood
+    for two effects. Where all effects together leave more than noise, other candidates that came close are compared as well.
+
+    Returns:
+        The fit with the best member of each class, and these members. The rounds are changed in place.
     """
     lab = search.lab
     for r in rounds:
@@ -82,9 +85,9 @@ def narrow(search: Search, base: Fit, floor: Floor, found: list[Trial], rounds: 
 
 
 def drop(search: Search, base: Fit, floor: Floor, found: list[Trial]) -> tuple[Fit, list[Trial]]:
-    """Leave out effects that the others make needless, from where all of them together brought the fit, the most needless one first.
+    """Remove effects that the others make needless, the most needless first, and refit after each removal.
 
-    What is held out says so: what fits the fitted recordings alone as well may foretell nothing.
+    The held-out error decides: an effect may help to fit the fitted recordings and still predict nothing.
     """
     lab = search.lab
     while len(found) > 1:
@@ -105,7 +108,7 @@ def drop(search: Search, base: Fit, floor: Floor, found: list[Trial]) -> tuple[F
 
 @dataclass(eq=False)
 class Diagnosis:
-    """What `diagnose` found; the folder `report` writes it."""
+    """The result of `diagnose`; `neuido.discrepancy.report` writes it."""
 
     problem: Problem
     answer: str
@@ -114,48 +117,48 @@ class Diagnosis:
     after: Point
     parts: list[Part]
     errors: dict[str, dict[str, float]]
-    """`before` and `after`: error of each recording by name, with the differences of the settings that the fitted recordings hold."""
+    """`before` and `after`: error of each recording by name, of one simulation plus `amounts` of the differences between settings."""
     one_setting: dict[str, dict[str, float]]
-    """The same of a simulation under one setting alone."""
+    """`before` and `after`: error of each recording by name, of one simulation alone."""
     amounts: dict[str, np.ndarray]
-    """`before` and `after`: how much of each difference that is."""
+    """`before` and `after`: how much of each difference between settings the fitted recordings show."""
     final: dict[str, Floor]
-    """`before` and `after`: noise and discretisation there."""
+    """`before` and `after`: noise and discretisation at the fitted point."""
     floors: dict[str, float]
     intervals: dict[str, tuple[float, float]]
     declared_intervals: dict[str, tuple[float, float]]
     setting: int
     work: Mapping[str, Work]
-    """What each step ran."""
+    """Work of each step of the search."""
     budget: Budget = field(default_factory=Budget)
-    """What it may take, and what ended it."""
+    """Limits of the search, and what ended it."""
     sealed: list[Part] = field(default_factory=list)
-    """Recordings that took no part in the search: theirs is a test error."""
+    """Recordings that took no part in the search; their error is the test error."""
     leads: list[Trial] = field(default_factory=list)
-    """What leads in a search that was cut off; nothing of it is named."""
+    """Leading effects of a search that was cut off; none of them is named."""
     why: list[str] = field(default_factory=list)
     """Why the recordings say too little, or what is wrong with them."""
     over: dict[str, float] = field(default_factory=dict)
-    """How far what is left after is above the `floor` and above the `noise`: ratios of errors."""
+    """Ratio of the final error to the `floor` and to the `noise`."""
     power: list[Compatible] = field(default_factory=list)
-    """The largest size of each other effect that the data are compatible with."""
+    """Largest size of each other effect with which the data are compatible."""
     unable: Mapping[str, list[str]] = field(default_factory=dict)
-    """The other settings that did not run, by recording."""
+    """Names of the other settings that did not run, by recording."""
     noise_from: dict[str, str] = field(default_factory=dict)
-    """`stated`, `estimated` or `assumed`, by recording."""
+    """Origin of the noise of each recording: `stated`, `estimated` or `assumed`."""
     case: CaseRecord | None = None
-    """What the decision rests on."""
+    """All that the decision rests on."""
     statistics: Mapping[str, np.ndarray] | None = None
-    """Statistics of the best fits, where they were asked for."""
+    """Statistics of the best fits, if they were asked for."""
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """What the search has not done."""
+        """Steps that the search did not do."""
         return tuple(self.budget.left_out)
 
     @property
     def evaluations(self) -> int:
-        """Simulations in all."""
+        """Number of simulations in all."""
         return sum(w.simulations for w in self.work.values())
 
     @property
@@ -175,21 +178,21 @@ def diagnose(
     seconds: float = math.inf,
     statistics: bool = False,
 ) -> Diagnosis:
-    """Fit the declared model, look for effects that it lacks, and say what was found.
+    """Fit the declared model, search for effects that it lacks, and return what was found.
 
     Args:
         problem: Model and data.
-        keep: Candidates that get a full fit in each round, at the least.
-        draws: Of the parametric bootstrap of the largest gain.
-        seed: Of the draws.
-        most: Effects that may be added.
-        tell: Called with a line of progress.
+        keep: Least number of candidates that get a full fit in each round.
+        draws: Number of draws of the parametric bootstrap of the largest gain.
+        seed: Seed of the draws.
+        most: Largest number of effects that may be added.
+        tell: Function that is called with each line of progress.
         passes: Work of the search, in runs of the declared model through all recordings under the suggested setting.
-        seconds: After which it is stopped; see `Budget`.
+        seconds: Time [s] after which the search is stopped; see `Budget`.
         statistics: Keep what a likelihood needs of the best fits, which takes further simulations.
 
     Raises:
-        UserError: No method can predict the declared model; the line of its simulator.
+        UserError: No method can predict the declared model; the message is that of its simulator.
     """
     memo, journal = Memo(problem), Journal()
     budget = budget_of(problem, memo, passes, seconds)
@@ -208,7 +211,7 @@ def diagnose(
             continue
         if len(starts) == 1 and told_exactly(tried[0], starts[0]):
             break
-        # the problem's own parameters are about the other method
+        # extra parameters of the problem belong to the other method: only the declared ones are passed on
         near = {name: starts[0].fit.point[name] for name in search.lab.as_declared} if starts else None
         try:
             start = base_fits.base_fit(search, near)
@@ -230,12 +233,12 @@ def diagnose(
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
         found.append(step)
-        # near the noise too: what leaves that alone in one simulation is told by it, however little it gains
+        # an effect near the noise counts too: it is named if one simulation with it leaves only noise, however small its gain
         settled = len(found) == most or comparing.is_noise(search.lab, step.errors)
         hurried = budget.over
         if hurried and not settled:
             budget.skips("a further effect")
-        if hurried:  # nothing but the last fit follows
+        if hurried:  # only the last fit follows
             budget.conclude()
         at = base_fits.finished(search.lab, step.stand)
         if settled or hurried or comparing.is_noise(search.lab, at.errors):
@@ -245,7 +248,7 @@ def diagnose(
         if problem.settings > 1 and not comparing.is_settled(search.lab, at.errors) and next_effect.over_floor(search.lab, at) < CLEAR:
             break
         rounds.append(next_effect.find(search, at.fit, at.floor, found))
-    # where every point costs pairs grow after what takes less, and where nothing was named last of all
+    # where simulations run one by one, growing pairs come after the cheaper steps; where nothing was named, they come last
     if not hurried and (not found or (len(found) == 1 and not problem.together)):
         grown = by_growing(search, rounds[0], at, others)
     if hurried and 0 < len(found) < MOST and not comparing.is_settled(search.lab, at.errors):
@@ -273,13 +276,16 @@ def diagnose(
 
 
 def budget_of(problem: Problem, memo: Memo, passes: float, seconds: float) -> Budget:
-    """Return the budget of a search in the unit of the problem's effort: of a body particle-substeps, so that it goes with its size."""
+    """Return the budget of a search, in the unit of `Problem.effort` (particle-substeps for a body).
+
+    The budget therefore grows with the size of the body.
+    """
     one = sum(problem.effort(n, problem.solvers[0]) for n in range(len(problem.recordings)))
     return Budget(passes * one, spent=lambda: memo.effort, seconds=seconds, pace=lambda: memo.pace)
 
 
 def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], rounds: list[Round]) -> Diagnosis:
-    """The answer and its figures, each stand with the floor that its effects were weighed with."""
+    """Return the diagnosis: the answer and its figures, before and after with the floor that each was measured with."""
     lab = search.lab
     first, problem = rounds[0], lab.problem
     cut = lab.budget.cut and (bool(found) or not comparing.is_noise(lab, before.errors))
@@ -290,11 +296,11 @@ def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], ro
     wrong = [] if cut else findings(lab, after)
     missing = bool(found) or first.unsure or next_effect.is_unexplained(lab, first)
     if missing and not cut and not wrong:
-        discretisation.floor_at(lab, after.fit.point, like=after.floor)  # which settings run there
+        discretisation.floor_at(lab, after.fit.point, like=after.floor)  # records which settings run there
     facts = {"cut": cut, "wrong": wrong, "blind": missing and blind_to_settings(lab), "found": [t.candidate.key for t in found]}
     answer, why = decided(lab, before.errors, found, steps, cut=cut, wrong=wrong, blind=facts["blind"])
     case = case_of(lab, before, after, rounds, answer, why, facts)
-    if found and answer not in ("effect", "class"):  # nothing is named, and nothing added
+    if found and answer not in ("effect", "class"):  # no effect is named, so none is added
         after, found, over = before, [], first.over
         steps = [replace(first, chosen=None, members=[])]
     stands = {"before": before, "after": after}
@@ -340,7 +346,7 @@ def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], ro
 
 
 def leading(rounds: Sequence[Round]) -> list[Trial]:
-    """What leads in a search that was cut off: the effects that would be named, and else the best fit."""
+    """Return the leading effects of a search that was cut off: those that would be named, else the best fit if it gains anything."""
     chosen = [r.chosen for r in rounds if r.chosen is not None]
     return chosen or [t for r in rounds[:1] for t in r.trials[:1] if t.gain > 0]
 
@@ -348,7 +354,10 @@ def leading(rounds: Sequence[Round]) -> list[Trial]:
 def tested(
     search: Search, stands: Mapping[str, Stand], amounts: Mapping[str, np.ndarray], alone: Mapping[str, np.ndarray]
 ) -> tuple[dict[str, Floor], dict[str, dict[str, float]], dict[str, dict[str, float]]]:
-    """The floors, errors and errors under one setting, `before` and `after`, with those of the recordings that were sealed until now."""
+    """Return floors, errors and errors under one setting, `before` and `after`, of all recordings.
+
+    The sealed recordings, which took no part in the search, are simulated here for the first time.
+    """
     lab = search.lab
     floors, errors, single = {}, {}, {}
     for when, stand in stands.items():

@@ -1,4 +1,4 @@
-"""The declared model fitted, and from there the directions of every candidate in the data."""
+"""The base fit: the declared model fitted before any effect is added, and the helpers that grow a fit over time."""
 
 import math
 from collections.abc import Sequence
@@ -13,23 +13,29 @@ from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.problem import Parameter, Point
 
 FOLLOWED = 1.5
-"""What the errors of the declared model must fall by for a parameter of the problem's own to leave its place."""
+"""Factor by which the error of the declared model must fall before an extra parameter of the problem (such as the height of the
+colliders) may leave its first value."""
 AGAIN, MOST_AGAIN = 2, 4
-"""Fits of the declared model with the differences of the settings, each with those of where the last one ended: the least, and the most
-while a parameter of the problem's own follows the amounts."""
+"""Least and largest number of fits of the declared model, each with the differences of the settings at the end of the fit before. More
+than the least are made only while an extra parameter of the problem still changes."""
 HORIZONS = (0.25, 0.4, 0.6, 0.8)
-"""Shares of the time of the fitted recordings that a growing fit reads, one after the other, before all of it."""
+"""Shares of the time of the fitted recordings that a growing fit reads one after the other, before it reads all of it."""
 STEPWISE, STEPWISE_ONE_BY_ONE = 6, 16
-"""Iterations at each of these, at the most; the second where every point costs, and an iteration is one point or two: of twelve pairs of
-effects that turn a phase six of them find four there, sixteen ten for a fifth more points."""
+"""Largest number of iterations at each horizon. The second is used where simulations run one by one and an iteration takes only one or
+two of them: of twelve pairs of effects that change the phase of a motion, six iterations find four and sixteen find ten, with a fifth
+more simulations."""
 ELSEWHERE = 1.0
-"""Coordinates that the base fit stands apart from where the declared model fits the first horizon, to be taken for led astray."""
+"""Distance in fit coordinates between the base fit and the fit to the first horizon, above which the base fit is taken to be in a wrong
+local minimum."""
 ASTRAY = 1.05
-"""Times the error of the fitted parts from which on the end of a fit is not taken for a better one."""
+"""Ratio of the errors of the fitted parts above which the end of a further fit is rejected."""
 
 
 def fit_declared(lab: Laboratory, starts: Sequence[Point], floor: Floor, **options: Any) -> Fit:
-    """The declared parameters fitted from several starts; the best one after a few iterations goes on, with options of the fit."""
+    """Fit the declared parameters from the best of several starts.
+
+    Each start gets a few iterations, and the one of least cost goes on. `options` are those of `Laboratory.request`.
+    """
     free = lab.problem.declared
     if len(starts) > 1:
         short = lab.fits([lab.request(free, s, iterations=3) for s in starts], floor)
@@ -38,17 +44,17 @@ def fit_declared(lab: Laboratory, starts: Sequence[Point], floor: Floor, **optio
 
 
 def stepwise(lab: Laboratory) -> int:
-    """Iterations at a horizon, at the most."""
+    """Return the largest number of iterations at one horizon."""
     return STEPWISE if lab.problem.together else STEPWISE_ONE_BY_ONE
 
 
 def early(lab: Laboratory, floor: Floor, share: float) -> Floor:
-    """`Floor.early` of this problem."""
+    """Return a floor that gives no weight to data after this share of the fitted time; see `Floor.early`."""
     return floor.early(lab.problem, lab.parts, share)
 
 
 def first_part(lab: Laboratory, free: Sequence[Parameter], point: Point, floor: Floor) -> Point:
-    """Where a fit of parameters from a point to the first horizon ends."""
+    """Return the point at which a fit of the parameters to the first horizon ends."""
     (fit,) = lab.fits([lab.request(free, point, iterations=stepwise(lab))], early(lab, floor, HORIZONS[0]))
     return fit.point
 
@@ -63,12 +69,22 @@ def grown(
     most: int | None = None,
     sizes: Sequence[Sequence[str]] = (),
 ) -> list[tuple[int, Fit]]:
-    """Fits of parameters from points of the first horizon, side by side, to more of the recordings and at last to all of them.
+    """Fit parameters to a growing share of the recordings, several fits side by side.
 
-    What a body does after it has bounced has many valleys, and what it does before has few: each horizon begins where the one before
-    it ended, near enough for the next bounce. What costs more than `reach` times the least at a horizon is given up, and all but the
-    `most` that cost least; past the share `until` of the work they are where they are. Each with its place among the entries, the least
-    cost first. `sizes`: of each entry, what begins smaller where its point does not run.
+    The motion after a bounce gives the cost many local minima, the motion before it few. Therefore each horizon begins at the end of the
+    one before, which is near enough to pass the next bounce.
+
+    Args:
+        lab: The method that predicts.
+        entries: Parameters and the point, already fitted to the first horizon, of each fit.
+        floor: Weights of the residuals.
+        until: Share of the search's work after which the fits stop at the horizon that they have reached.
+        reach: Ratio to the least cost above which a fit is given up at a horizon.
+        most: Number of fits that go on past each horizon; all where absent.
+        sizes: Names of the parameters of each entry that are made smaller where its point does not run.
+
+    Returns:
+        The index of the entry and the fit, the least cost first.
     """
     ended: list[tuple[int, Fit]] = []
     live = [(i, point) for i, (_, point) in enumerate(entries)]
@@ -85,7 +101,7 @@ def grown(
 
 
 def scattered(lab: Laboratory, point: Point) -> list[Point]:
-    """A point, and half and twice each parameter whose logarithm is fitted."""
+    """Return the point, and copies of it with each log-scaled declared parameter halved and doubled."""
     out: list[Point] = [dict(point)]
     for p in lab.problem.declared:
         if p.log:
@@ -95,12 +111,18 @@ def scattered(lab: Laboratory, point: Point) -> list[Point]:
 
 
 def base_fit(search: Search, near: Point | None = None) -> Stand | None:
-    """The base fit, with what noise and discretisation do to it; from about the declared values, or from them and from `near`.
+    """Fit the declared model, and measure what noise and discretisation add at its end.
 
-    None: given `near`, the fit ends where not every recording can be predicted.
+    The fit begins at several points about the declared values, or at the declared values and at `near`.
+
+    Returns:
+        The fitted model, or None if `near` is given and some recording cannot be predicted at the end of the fit.
+
+    Raises:
+        NotFinite: Without `near`, some recording cannot be predicted at the end of the fit.
     """
     lab = search.lab
-    # the first fit only says where the floor is to be found
+    # the first fit only finds the point at which to measure the floor
     begins = [{}, near] if near else scattered(lab, {})
     with discretisation.quickly(lab):
         fit = fit_declared(lab, begins, lab.noise(), iterations=6, tolerance=ROUGH)
@@ -123,7 +145,7 @@ def base_fit(search: Search, near: Point | None = None) -> Stand | None:
         if turn and lab.budget.skips("the declared model again"):
             break
         begins = [begin]
-        if begin != fit.point and not asked:  # a modulus may have made up for where the floor is
+        if begin != fit.point and not asked:  # a modulus may have compensated for a wrong height of the floor
             begins.append({**begin, **lab.as_declared})
             asked = True
         fit = fit_declared(lab, begins, floor)
@@ -137,9 +159,10 @@ def base_fit(search: Search, near: Point | None = None) -> Stand | None:
 
 
 def begun_anew(search: Search, made: Sequence[Stand]) -> list[Stand]:
-    """The base fit by growing horizons from the declared values, where others leave more than noise: they may be in a side valley.
+    """Fit the declared model again by growing horizons, in case the fits so far ended in a wrong local minimum.
 
-    It is weighed by the floor where the first horizon ends, for what the settings differ by elsewhere may have led the others.
+    This is done only where more than noise is left. The new fits use the floor at the end of the first horizon, because the differences of
+    the settings elsewhere may have misled the other fits. The list is empty where no new fit was made.
     """
     lab = search.lab
     best = min(made, key=lambda stand: comparing.fitted_score(lab, stand.errors))
@@ -166,14 +189,15 @@ def begun_anew(search: Search, made: Sequence[Stand]) -> list[Stand]:
 
 
 def apart(lab: Laboratory, point: Point, other: Point) -> float:
-    """The largest difference of two points in a coordinate of a declared parameter."""
+    """Return the largest distance between two points in the fit coordinate of a declared parameter."""
     return max(abs(p.coordinate(point[p.name]) - p.coordinate(other[p.name])) for p in lab.problem.declared)
 
 
 def plainest(search: Search, made: Sequence[Stand]) -> Stand:
-    """The stand that leaves least of the fitted parts: one whose point follows the amounts must leave clearly less than the others.
+    """Return the fitted model with the least error, preferring those whose extra parameters kept their first values.
 
-    A parameter of the problem's own that makes up for an effect in part stands in the way of all that begins there.
+    An extra parameter of the problem, such as the height of the colliders, may compensate for part of an effect and so hide it. It must
+    therefore lower the error of the fitted parts by the factor `FOLLOWED`.
     """
     lab = search.lab
 
@@ -190,10 +214,10 @@ def plainest(search: Search, made: Sequence[Stand]) -> Stand:
 
 
 def finished(lab: Laboratory, named: Stand) -> Stand:
-    """A fit once more from its end, with the floor there, until a standard deviation of the noise would show.
+    """Continue the fit of a fitted model with the floor at its end, until a change of one standard deviation of the noise would show.
 
-    Unless that leaves more of the fitted parts than `named` does, with the floor where it stands or the one that it was named with:
-    weights are about what another grid does, and a step along that can go further from the data.
+    Return the continued fit, unless it leaves more of the fitted parts than `named` does. That can happen because the weights come from the
+    differences between grids, and a step in their direction can move away from the data.
     """
 
     def left(stand: Stand) -> float:
