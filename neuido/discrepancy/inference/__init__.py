@@ -1,1 +1,1 @@
-"""What inference stands on: fits and their floors, what noise and chance do, the records kept of them, and their evidence."""
+"""Fits of a model to recordings, their error floors, tests against chance, the stored records of them, and their model evidence."""

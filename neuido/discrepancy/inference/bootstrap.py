@@ -1,8 +1,9 @@
-"""How far chance, the nuisances and the discretisation alone would go: a linear model of the fits and its parametric bootstrap.
+"""Parametric bootstrap of the null hypothesis: how much could a candidate lower the error if no effect were missing?
 
-All directions (declared parameters, nuisances, discretisation, candidates) are brought to one orthonormal basis, so that a draw
-costs a few small products. Fits hold the differences of the settings beside the parameters, with a prior, and the nuisances are taken
-out of every recording, as in the errors of a diagnosis. Reference: Westfall and Young, Resampling-Based Multiple Testing, 1993 (the
+Noise, nuisances and discretisation error are drawn at random. Each draw is fitted by a linear model, with and without each candidate.
+All directions (declared parameters, nuisances, discretisation, candidates) are expressed in one orthonormal basis, so that a draw costs
+a few small matrix products. As in the errors of a diagnosis, a fit also finds the amounts of the differences between settings, with a
+prior, and the nuisances are projected out of every recording. Source: Westfall and Young, Resampling-Based Multiple Testing, 1993 (the
 maximum over candidates).
 """
 
@@ -11,36 +12,39 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neuido.discrepancy.inference.floors import past_nuisances, score
+from neuido.discrepancy.inference.floors import project_out_nuisances, score
 
 NOISE_ALONE = 1.8
-"""Mean squares up to so many times that of the noise are noise."""
+"""Errors count as noise while their mean square is at most this many times that of the noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Directions in the data of one recording, each (n, k)."""
+    """Directions in the data of one recording: each is an array (n, k) of k columns for n data, in the unit of the data."""
 
     weight: np.ndarray
-    """Of each datum in the fit, one over its standard deviation, (n,)."""
+    """Weight of each datum in the fit, one over its standard deviation, (n,)."""
     noise: float
+    """Standard deviation of the noise."""
     declared: np.ndarray
+    """Slopes of the declared parameters."""
     nuisances: np.ndarray
-    """Times their prior standard deviations."""
+    """Effect of one prior standard deviation of each nuisance."""
     discretisation: np.ndarray
-    """Differences of the settings at the base."""
+    """Differences between the other settings and the one in use, where the base fit ended."""
     smooth: np.ndarray
-    """Patterns of an unknown part of it, times its size."""
+    """Smooth patterns of the discretisation error that no setting shows, of its expected size."""
     candidates: Mapping[str, np.ndarray]
+    """Directions of each candidate effect, by its key."""
 
 
 class LinearModel:
-    """Fits of the base and of each candidate to draws from the null hypothesis.
+    """Linear fits of the base model, with and without each candidate, to draws from the null hypothesis.
 
     Args:
         fit: Columns of the recordings that are fitted.
-        held_out: Of those that are only scored.
-        seed: Of the draws.
+        held_out: Columns of the recordings that are only scored.
+        seed: Seed of the random draws.
     """
 
     def __init__(self, fit: Sequence[Columns], held_out: Sequence[Columns], *, seed: int = 0) -> None:
@@ -51,11 +55,14 @@ class LinearModel:
         self.solvers = {name: _solver([p for p in self.parts if p.fitted], keys) for name, keys in names}
 
     def draw(self, *, exact: bool = False) -> list[np.ndarray]:
-        """One residual of each part under the null, in its basis; `exact`: of noise and nuisances alone."""
+        """Draw one residual of each part under the null hypothesis, in the basis of the part.
+
+        With `exact`, only noise and nuisances are drawn, and no discretisation error.
+        """
         return [p.draw(self.rng, exact) for p in self.parts]
 
     def errors(self, draw: Sequence[np.ndarray]) -> dict[str | None, np.ndarray]:
-        """Mean squares of each part after the fit of the base (None) and of each candidate, (parts,)."""
+        """Fit a draw, and return the mean squares (parts,) that the base (key None) and each candidate leave."""
         out = {}
         fitted = np.concatenate([p.weighted(r) for p, r in zip(self.parts, draw, strict=True) if p.fitted])
         for name, solve in self.solvers.items():
@@ -65,7 +72,13 @@ class LinearModel:
         return out
 
     def null(self, data: np.ndarray, count: int = 199, *, exact: bool = False) -> np.ndarray:
-        """The largest gain over the candidates in each of `count` draws, weighed as that of the data is; `data` as for `gain`."""
+        """Return the largest `gain` over all candidates in each of `count` draws, (count,).
+
+        Args:
+            data: Mean squares of the parts that the base leaves of the measured data, as in `gain`.
+            count: Number of draws.
+            exact: Whether to draw noise and nuisances alone.
+        """
         return np.array([self._largest(self.errors(self.draw(exact=exact)), data) for _ in range(count)])
 
     def _largest(self, errors: Mapping[str | None, np.ndarray], data: np.ndarray) -> float:
@@ -73,7 +86,10 @@ class LinearModel:
         return max((gain(errors[None], errors[key], fitted, noise, data=data) for key in self.keys), default=0.0)
 
     def cosine(self, a: str, b: str) -> float:
-        """Cosine of two candidates in the fit's metric, the declared parameters projected out (largest over their planes)."""
+        """Return the cosine between two candidates, after the directions of the base fit are projected out.
+
+        Data are weighted as in the fit. A candidate of several parameters spans a plane; the largest cosine of two planes counts.
+        """
         parts = [p for p in self.parts if p.fitted]
         base = np.concatenate([p.design(()) * p.scale[:, None] for p in parts])
         A, B = (np.concatenate([p.candidates[k] * p.scale[:, None] for p in parts]) for k in (a, b))
@@ -83,18 +99,19 @@ class LinearModel:
 
 
 def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: np.ndarray, *, data: np.ndarray | None = None) -> float:
-    """Logarithm of the ratio of errors, before over after: the smaller of those of the fitted and of the held-out recordings.
+    """Return the logarithm of the error before over the error after: the smaller one of fitted and held-out recordings.
 
-    Each is the geometric mean over its recordings, as in the score: where one is far off whatever the effect, the others still count. Of
-    the held-out ones alone where the fitted ones are at the noise before and after: the declared parameters have taken the effect in
-    there, and what they predict of the others says so. All arguments but `fitted` are mean squares of the parts.
+    Each of the two is a geometric mean over recordings, as in `score`, so that one recording that no effect explains does not hide the
+    others. If the fitted recordings are at the noise before and after, only the held-out ones count: the declared parameters then stand
+    in for the effect where they were fitted, and only other recordings show it. All arguments except `fitted` are mean squares of the
+    parts, (parts,).
 
     Args:
-        before: Of the base.
-        after: With an effect.
+        before: What the base leaves.
+        after: What the fit with an effect leaves.
         fitted: Which parts are fitted.
-        noise: Of the noise.
-        data: Of the base with the data themselves, where `before` is of a draw, which is at the noise whatever the data are.
+        noise: The noise.
+        data: What the base leaves of the measured data, if `before` belongs to a draw. A draw is always near the noise, the data may not.
     """
     own = np.array(fitted)
     if own.all():
@@ -106,12 +123,12 @@ def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: n
 
 
 def ratio(before: np.ndarray, after: np.ndarray, group: np.ndarray) -> float:
-    """Logarithm of the ratio of errors, before over after, of a group of the parts; of their mean squares."""
+    """Return the logarithm of the error before over the error after, for a group of parts given by a mask; arguments are mean squares."""
     return 0.5 * (score(np.minimum(before[group], 1e300)) - score(np.minimum(after[group], 1e300)))
 
 
 class _Part:
-    """Columns of one recording in an orthonormal basis of their span; what is outside is noise alone."""
+    """Columns of one recording in an orthonormal basis of their span. Outside of this span the data hold only noise."""
 
     def __init__(self, columns: Columns, fitted: bool) -> None:
         self.fitted = fitted
@@ -124,35 +141,38 @@ class _Part:
         self.count, self.noise = len(everything), columns.noise
         self.outside = max(self.count - basis.shape[1], 0)
         self.nuisances, self.smooth = basis.T @ columns.nuisances, basis.T @ columns.smooth
-        self.past = past = past_nuisances(self.nuisances, self.noise)
+        self.project = project = project_out_nuisances(self.nuisances, self.noise)
         self.discretisation = basis.T @ columns.discretisation
-        self.declared = past(basis.T @ columns.declared)
-        self.settings = past(self.discretisation)
-        self.candidates = {key: past(basis.T @ value) for key, value in columns.candidates.items()}
-        # the weights vary slowly over the data: in the basis each direction gets its own mean weight
+        self.declared = project(basis.T @ columns.declared)
+        self.settings = project(self.discretisation)
+        self.candidates = {key: project(basis.T @ value) for key, value in columns.candidates.items()}
+        # weights vary slowly over the data, so a mean weight for each direction of the basis is enough
         self.scale = np.sqrt(np.maximum((basis**2).T @ columns.weight**2, 1e-300))
 
     def design(self, keys: Sequence[str]) -> np.ndarray:
-        """What a fit moves, the amounts of the settings' differences last."""
+        """Return the columns of the linear fit (k, q): declared parameters, candidates, differences between settings (in this order)."""
         return np.concatenate([self.declared, *(self.candidates[key] for key in keys), self.settings], axis=1)
 
     def weighted(self, r: np.ndarray) -> np.ndarray:
+        """Return a residual (k,) times the weight of each direction."""
         return r[: len(self.scale)] * self.scale
 
     def draw(self, rng: np.random.Generator, exact: bool = False) -> np.ndarray:
+        """Draw a residual (k,) under the null hypothesis, with the nuisances projected out; `exact`: without discretisation error."""
         k = len(self.scale)
         r = self.noise * rng.standard_normal(k)
         for columns in (self.nuisances,) if exact else (self.nuisances, self.discretisation, self.smooth):
             r = r + columns @ rng.standard_normal(columns.shape[1])
         self.rest = self.noise**2 * (rng.chisquare(self.outside) if self.outside else 0.0)
-        return self.past(r)
+        return self.project(r)
 
     def square(self, r: np.ndarray) -> float:
-        """Mean square over all data of the recording."""
+        """Return the mean square over all data of the recording, given a residual (k,) in the basis."""
         return (float(r @ r) + self.rest) / self.count
 
 
 def _solver(parts: Sequence[_Part], keys: Sequence[str]) -> np.ndarray:
+    """Return the matrix that maps the weighted residuals of the fitted parts to the fitted amounts; those of settings have a prior."""
     A = np.concatenate([p.design(keys) * p.scale[:, None] for p in parts])
     amounts = parts[0].settings.shape[1]
     prior = np.eye(A.shape[1])[A.shape[1] - amounts :]

@@ -1,9 +1,10 @@
-"""How far the true model was behind the best one in cases whose truth is known: the table that evidences are judged by.
+"""Thresholds for the model evidence, calibrated on blind cases whose true effects are known.
 
-`calibration.csv` has a row for each case that ran through a whole diagnosis, search included: nulls, and experiments with effects of the
-library whose true set was fitted near its optimum. `benchmarks/calibrate.py` remakes it. A quantile of n such rows is a conformal one:
-of the next case, drawn as they were, the true model is at most so far behind with a probability of at least 1 - alpha (Vovk, Gammerman and
-Shafer, Algorithmic Learning in a Random World, 2005), if alpha is 1 / (n + 1) or more; below that the largest value stands for it.
+Each row of `calibration.csv` is one case that went through a whole diagnosis, search included. It holds how far the evidence of the true
+model was behind that of the best one. The cases are nulls, and experiments with effects of the library whose true set was fitted near
+its optimum. `benchmarks/calibrate.py` writes the table. Thresholds are conformal quantiles of its n rows: in a further case, drawn like
+these, the true model is no further behind with a probability of at least 1 - alpha, if alpha >= 1 / (n + 1). For a smaller alpha the
+largest value is used. Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005.
 """
 
 import csv
@@ -16,56 +17,56 @@ from typing import Any
 
 TABLE = Path(__file__).with_name("calibration.csv")
 ALPHA = 0.05
-"""Probability of naming anything where nothing is missing, and of a class that lacks the true set."""
+"""Accepted probability of a false alarm (an effect is named, but none is missing), and of a class without the true set of effects."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How far true models were behind, differences of evidence."""
+    """Differences of log-evidence between the best and the true model, in cases whose truth is known."""
 
     nulls: tuple[float, ...]
-    """The declared model, where nothing is missing: what the best other one leads by."""
+    """Lead of the best model over the declared one in each null."""
     effects: tuple[float, ...]
-    """The true set of effects."""
+    """Lead of the best model over the true set of effects in each case with effects."""
     beyond: tuple[float, ...] = ()
-    """Of all these true models, what a free scale of the patterns adds to the log-density: `evidence.Evidence.beyond`."""
+    """`evidence.Evidence.beyond` of the true model in each case."""
 
     def least_lead(self, alpha: float = ALPHA) -> float:
-        """Return what a model must lead the declared one by to be named."""
+        """Return the lead over the declared model, as a difference of log-evidence, above which a model is named."""
         return quantile(self.nulls, alpha)
 
     def apart(self, alpha: float = ALPHA) -> float:
-        """Return how far behind the best set one is told from it."""
+        """Return the difference of log-evidence above which the data distinguish a set of effects from the best one."""
         return quantile(self.effects, alpha)
 
     def foreign(self, alpha: float = ALPHA) -> float:
-        """Return what a free scale must add for something unknown to be there.
+        """Return the value of `evidence.Evidence.beyond` above which an unknown effect is missing.
 
-        Where the scale is what the settings leave, the mean of the ratio of densities is one, and one of 1 / alpha is as rare as alpha
-        (Markov's inequality).
+        It is never below log(1 / alpha). If nothing is missing, the ratio of densities with a free and with the least scale has mean one,
+        so that it exceeds 1 / alpha with a probability of at most alpha (Markov's inequality).
         """
         return max(quantile(self.beyond, alpha) if self.beyond else 0.0, -math.log(alpha))
 
     def p_value(self, lead: float) -> float:
-        """Return the share of nulls with such a lead or a larger one, the present case counted among them."""
+        """Return the share of nulls whose lead is at least this large; the present case counts as one of them."""
         return (1 + sum(own >= lead for own in self.nulls)) / (1 + len(self.nulls))
 
 
 def quantile(values: Sequence[float], alpha: float) -> float:
-    """Return the conformal quantile of values: infinite without any, the largest where they are too few for the level."""
+    """Return the conformal quantile of values at level 1 - alpha: infinite without values, the largest of them if they are too few."""
     if not values:
         return math.inf
     return sorted(values)[min(math.ceil((len(values) + 1) * (1.0 - alpha)), len(values)) - 1]
 
 
 def calibration_of(rows: Sequence[Mapping[str, Any]]) -> Calibration:
-    """Return the calibration of rows of the table."""
+    """Return the calibration from rows of the table, as dictionaries by column."""
     behind = {missing: tuple(float(r["behind"]) for r in rows if (r["kind"] != "none") == missing) for missing in (False, True)}
     return Calibration(behind[False], behind[True], tuple(float(r["beyond"]) for r in rows))
 
 
 @cache
 def calibration(table: Path = TABLE) -> Calibration:
-    """Return the calibration that a table holds."""
+    """Read the calibration from a CSV file; the result is cached."""
     with table.open(newline="") as stream:
         return calibration_of(list(csv.DictReader(stream)))

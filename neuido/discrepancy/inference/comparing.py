@@ -1,4 +1,4 @@
-"""What the errors of fits say beside each other and beside the noise."""
+"""Comparison of the errors of fits with each other and with the noise."""
 
 import math
 
@@ -11,56 +11,56 @@ from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.problems.problem import Point
 
 LEAST_GAIN = math.log(1.7)
-"""Smaller gains are no reason to name anything: other solvers differ by as much in ways that no setting of one solver shows."""
+"""Least gain with which an effect is named: other solvers differ by as much in ways that no setting of one solver shows."""
 NEARLY = 2.5
-"""Times the noise up to which what first fits leave is refined before another method is asked: it may be noise then."""
+"""If a first fit leaves at most this many times the noise, it is refined before another method is tried: it may reach the noise."""
 
 
 def moved(lab: Laboratory, point: Point) -> float:
-    """The largest ratio of a declared parameter to the value that the model states, or of this to that."""
+    """Return the largest factor by which a fit raised or lowered a declared parameter that is fitted as a logarithm; 1 without any."""
     ratios = [point[p.name] / p.value for p in lab.problem.declared if p.log]
     return max((max(r, 1.0 / r) for r in ratios), default=1.0)
 
 
 def tell_lead(lab: Laboratory, key: str, squares: np.ndarray, before: np.ndarray) -> None:
-    """Tell which candidate leads and what it leaves, where progress shows that."""
+    """Report the leading candidate and the errors with and without it to the progress display, if that shows them."""
     lead = getattr(lab.tell, "lead", None)
     if lead is not None:
         lead(key, typical(lab, squares), typical(lab, before), lab.problem.unit)
 
 
 def typical(lab: Laboratory, squares: np.ndarray) -> float:
-    """The geometric mean over the parts of root mean squares, in the unit of the data."""
+    """Return the geometric mean over the parts of their root mean squares, in the unit of the problem."""
     return lab.scale * math.exp(0.5 * score(squares))
 
 
 def is_noise(lab: Laboratory, errors: np.ndarray, *, fitted: bool = False) -> bool:
-    """Whether nothing but noise is left in any part, or in those of the fitted ones that are given."""
+    """Return whether the errors of all parts are at the noise; with `fitted`, `errors` holds the fitted parts alone."""
     return bool(np.all(errors < NOISE_ALONE * (lab.noise_squares[lab.fitted] if fitted else lab.noise_squares)))
 
 
 def may_be_noise(lab: Laboratory, errors: np.ndarray) -> bool:
-    """Whether what a fit leaves in any part is so near the noise that it may be that once it is refined."""
+    """Return whether the errors of all parts are so close to the noise that a refined fit may reach it."""
     return is_noise(lab, errors / NEARLY**2)
 
 
 def is_settled(lab: Laboratory, errors: np.ndarray) -> bool:
-    """Whether no effect could be named any more: nothing is left but noise, or too little above it for any gain to be enough."""
+    """Return whether no further effect can be named: only noise is left, or no gain down to the noise would be enough."""
     hopeless = lab.problem.settings > 1 and gain(lab, errors, lab.noise_squares) < LEAST_GAIN
     return hopeless or is_noise(lab, errors)
 
 
 def gain(lab: Laboratory, before: np.ndarray, after: np.ndarray) -> float:
-    """`bootstrap.gain` of mean squares of the parts."""
+    """Return `bootstrap.gain` between mean squares of the parts."""
     return bootstrap.gain(before, after, lab.fitted, lab.noise_squares)
 
 
 def foretold(lab: Laboratory, before: np.ndarray, after: np.ndarray) -> float:
-    """Logarithm of the ratio of errors of what is held out, or of all parts where nothing is; of mean squares of the parts."""
+    """Return the logarithm of the error before over the error after of the held-out parts, or of all parts if none is held out."""
     fitted = np.array(lab.fitted)
     return bootstrap.ratio(before, after, fitted if fitted.all() else ~fitted)
 
 
 def fitted_score(lab: Laboratory, errors: np.ndarray) -> float:
-    """Score of what is left of the fitted parts, of mean squares of all."""
+    """Return the score of the fitted parts, given the mean squares of all parts."""
     return score(errors[lab.fitted])

@@ -1,4 +1,4 @@
-"""The linear picture about a point: the slopes of its parameters, the direction of every candidate, and what each promises."""
+"""Linear approximation around a point: slopes of parameters, directions of candidates, and the screening of candidates by them."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -10,57 +10,71 @@ from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 from neuido.errors import UserError
 
 LEAST_STEP = 1e-3
-"""Of a slope, in typical steps of a parameter: below it no smaller one is tried."""
+"""Smallest difference step of a slope, in typical steps of a parameter."""
 
 
 def candidate_columns(
     lab: Laboratory, point: Point, candidates: Sequence[Candidate], recordings: Sequence[int]
 ) -> dict[tuple[str, int], dict[int, np.ndarray]]:
-    """Directions of each candidate and start in the data of recordings: (key, start) -> {recording: (n, sizes)}."""
-    asked, places = [], []
+    """Return how the prediction changes by each start of each candidate.
+
+    Returns:
+        (key of the candidate, number of its start) -> {recording: (n, sizes)}, with a column for each size parameter.
+    """
+    points, places = [], []
     for c in candidates:
         for i, start in enumerate(c.starts):
             sizes = [p.name for p in c.size_parameters]
             shape = {k: v for k, v in start.items() if k not in sizes}
             for name in sizes:
-                asked.append(dict(point) | shape | {name: start[name]})
+                points.append(dict(point) | shape | {name: start[name]})
                 places.append((c.key, i))
     out: dict[tuple[str, int], dict[int, np.ndarray]] = {place: {} for place in places}
     with lab.memo.during("screening"):
-        predicted = lab.memo.predict_several([([point, *asked], n, lab.setting) for n in recordings])
+        predicted = lab.memo.predict_several([([point, *points], n, lab.setting) for n in recordings])
     for n, (here, *rows) in zip(recordings, predicted, strict=True):
-        lab.tell(f"directions of {len(asked)} effects in {lab.problem.recordings[n].name}")
+        lab.tell(f"directions of {len(points)} effects in {lab.problem.recordings[n].name}")
         for place in out:
             out[place][n] = np.stack([row - here for row, p in zip(rows, places, strict=True) if p == place], axis=1)
     return out
 
 
-def around(lab: Laboratory, parameters: Sequence[Parameter], point: Point, step: float) -> tuple[list[Point], list[list[float]]]:
-    """The points on both sides of one, a step in each coordinate, and how far they are from it, within the ranges."""
-    asked: list[Point] = []
+def step_points(parameters: Sequence[Parameter], point: Point, step: float) -> tuple[list[Point], list[list[float]]]:
+    """Return the points one step up and one step down in each coordinate, clipped to the ranges of the parameters.
+
+    Args:
+        parameters: Parameters to step along.
+        point: Where to start.
+        step: In typical steps of a parameter.
+
+    Returns:
+        Points (up and down of the first parameter, up and down of the second, ...), and the two distances of each parameter.
+    """
+    points: list[Point] = []
     spans = []
     for p in parameters:
         q = p.coordinate(point.get(p.name, p.value))
         ends = [p.physical(q + step), p.physical(q - step)]
-        asked += [dict(point) | {p.name: end} for end in ends]
+        points += [dict(point) | {p.name: end} for end in ends]
         spans.append([p.coordinate(ends[0]) - q, q - p.coordinate(ends[1])])
-    return asked, spans
+    return points, spans
 
 
 def slopes(
     lab: Laboratory, parameters: Sequence[Parameter], point: Point, recordings: Sequence[int], step: float = 0.3
 ) -> dict[int, np.ndarray]:
-    """Derivatives of the data by coordinates of parameters, one typical step each; central where the range allows.
+    """Return the derivatives (n, p) of each recording by the parameters, per typical step of each.
 
-    One-sided where the model runs on one side alone; where it runs on neither, by smaller steps.
+    Differences are central if the range allows it, and one-sided if the model runs on one side alone. If it runs on neither side, smaller
+    steps are tried, down to `LEAST_STEP`.
 
     Raises:
         UserError: The model runs at the point, but not even a small step away from it on either side.
     """
     out = {}
-    asked, spans = around(lab, parameters, point, step)
+    points, spans = step_points(parameters, point, step)
     with lab.memo.during("slopes"):
-        predicted = lab.memo.predict_several([([point, *asked], n, lab.setting) for n in recordings])
+        predicted = lab.memo.predict_several([([point, *points], n, lab.setting) for n in recordings])
     for n, (here, *rows) in zip(recordings, predicted, strict=True):
         columns = [np.empty((len(here), 0))]
         for i, (up, down) in enumerate(spans):
@@ -79,15 +93,22 @@ def slopes(
 
 
 def screen(lab: Laboratory, point: Point, candidates: Sequence[Candidate], floor: Floor, slopes: Mapping[int, np.ndarray]):
-    """Starts of full fits, best first: (predicted share of the misfit that stays, candidate, start, point), and the directions."""
+    """Rank the starts of all candidates by how much of the misfit they remove in the linear approximation.
+
+    The declared parameters of `slopes` adjust along with each candidate.
+
+    Returns:
+        Starts of full fits, the best first, as (predicted share of the squared misfit that is left, candidate, number of the start,
+        point), and the directions of `candidate_columns`.
+    """
     fits = [p for p in lab.parts if p.fitted]
     columns = candidate_columns(lab, point, candidates, [p.recording for p in fits])
-    past = past_slopes(lab, slopes, floor)
-    left = past({p.recording: lab.residual(point, p.recording) for p in fits})
+    project = project_out_slopes(lab, slopes, floor)
+    left = project({p.recording: lab.residual(point, p.recording) for p in fits})
     ranked = []
     for c in candidates:
         for i, start in enumerate(c.starts):
-            B = past(columns[c.key, i])
+            B = project(columns[c.key, i])
             if not np.isfinite(B).all():
                 continue
             amount = -np.linalg.lstsq(B, left, rcond=1e-6)[0]
@@ -95,24 +116,27 @@ def screen(lab: Laboratory, point: Point, candidates: Sequence[Candidate], floor
             if not c.linear:
                 amount = np.clip(amount, 0.0, 1.5)
             for k, p in enumerate(sizes):
-                if start[p.name] == 0:  # its direction is nothing
+                if start[p.name] == 0:  # this size does nothing, so its column is zero
                     amount[k] = 0.0
                     continue
                 low, high = (p.lower / start[p.name], p.upper / start[p.name])
                 amount[k] = np.clip(amount[k], min(low, high), max(low, high))
-            stays = float(np.sum((left + B @ amount) ** 2) / max(np.sum(left**2), 1e-300))
+            share_left = float(np.sum((left + B @ amount) ** 2) / max(np.sum(left**2), 1e-300))
             if c.linear:
                 factor = np.clip(amount, -4.0, 4.0)
                 factor = np.where(np.abs(factor) < 0.2, np.where(factor < 0, -0.2, 0.2), factor)
             else:
                 factor = np.ones(len(sizes))
-            ranked.append((stays, c, i, dict(point) | c.times(start, factor)))
+            ranked.append((share_left, c, i, dict(point) | c.times(start, factor)))
     ranked.sort(key=lambda entry: entry[0])
     return ranked, columns
 
 
-def past_slopes(lab: Laboratory, slopes: Mapping[int, np.ndarray], floor: Floor) -> Callable[[Mapping[int, np.ndarray]], np.ndarray]:
-    """What columns of the fitted recordings, {recording: (n,) or (n, k)}, do past the parameters of the slopes, whitened."""
+def project_out_slopes(lab: Laboratory, slopes: Mapping[int, np.ndarray], floor: Floor) -> Callable[[Mapping[int, np.ndarray]], np.ndarray]:
+    """Return a function that whitens columns of the fitted recordings and removes what the slopes can explain.
+
+    The function takes {recording: (n,) or (n, k)} and returns the rows of all fitted recordings together, (rows,) or (rows, k).
+    """
     whiten = floor.whitener(lab.parts)
 
     def rows(of: Mapping[int, np.ndarray]) -> np.ndarray:
@@ -120,8 +144,8 @@ def past_slopes(lab: Laboratory, slopes: Mapping[int, np.ndarray], floor: Floor)
 
     q, _ = np.linalg.qr(rows(slopes))
 
-    def past(columns: Mapping[int, np.ndarray]) -> np.ndarray:
+    def project(columns: Mapping[int, np.ndarray]) -> np.ndarray:
         A = rows(columns)
         return A - q @ (q.T @ A)
 
-    return past
+    return project

@@ -96,7 +96,7 @@ class Floor:
             if part.fitted and part.recording in self.differences:
                 n, w = part.recording, self.noise[part.recording]
                 N = self.nuisances.get(n, np.empty((len(part.rows), 0)))
-                past = past_nuisances(N[part.rows], w)
+                past = project_out_nuisances(N[part.rows], w)
                 A.append(past(self.differences[n][part.rows]) / w)
                 b.append(past(residuals[n][part.rows]) / w)
         if not A or not A[0].shape[1]:
@@ -123,7 +123,7 @@ def patterns(problem: Problem, floor: Floor, part: Part, square: float) -> np.nd
     return scale[:, None] * problem.directions(part.recording)[part.rows]
 
 
-def past_nuisances(N: np.ndarray, noise: float) -> Callable[[np.ndarray], np.ndarray]:
+def project_out_nuisances(N: np.ndarray, noise: float) -> Callable[[np.ndarray], np.ndarray]:
     """What nuisances N (n, k), columns of one prior standard deviation each, leave of columns of data of that noise."""
     back = np.linalg.solve(N.T @ N / noise**2 + np.eye(N.shape[1]), N.T / noise**2)
     return lambda A: A - N @ (back @ A)

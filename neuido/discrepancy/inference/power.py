@@ -54,7 +54,9 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
         slopes = directions.slopes(lab, free, r.base, recordings)
         columns = directions.candidate_columns(lab, r.base, candidates, recordings)
     beside = [columns[t.candidate.key, 0] for t in found if (t.candidate.key, 0) in columns and t.candidate.name not in own]
-    past = directions.past_slopes(lab, {n: np.concatenate([slopes[n], *(c[n] for c in beside)], axis=1) for n in recordings}, at.floor)
+    past = directions.project_out_slopes(
+        lab, {n: np.concatenate([slopes[n], *(c[n] for c in beside)], axis=1) for n in recordings}, at.floor
+    )
     left = past({n: lab.residual(at.fit.point, n) for n in recordings})
     unseen = {}
     for part, square in zip(lab.parts, r.floors - lab.noise_squares, strict=True):

@@ -190,6 +190,6 @@ def _foresee_slopes(lab: Laboratory, fits: Sequence[FitRecord]) -> None:
     """Run what the slopes of all fits will ask for, side by side."""
     points = []
     for fit in fits:
-        points += directions.around(lab, [lab.problem.parameter(name) for name in fit.names], fit.point, STEP)[0]
+        points += directions.step_points([lab.problem.parameter(name) for name in fit.names], fit.point, STEP)[0]
     with lab.memo.during("slopes"):
         lab.predicted(points, lab.scored_recordings)

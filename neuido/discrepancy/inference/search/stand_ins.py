@@ -93,7 +93,7 @@ def alike(
     if not lead.linear or lead.size_parameters != lead.parameters:
         return {}
     at = chosen.get(lead.key, 0)  # what is a limit of another one may lead without a place in the screening
-    past, start = directions.past_slopes(lab, slopes, floor), lead.starts[at]
+    past, start = directions.project_out_slopes(lab, slopes, floor), lead.starts[at]
     does = past(columns[lead.key, at]) @ np.array([fit.point[p.name] / start[p.name] for p in lead.parameters])
     if not np.isfinite(does).all():
         return {}
