@@ -1,1 +1,1 @@
-"""What inference may ask of measured data and a model: parameters, recordings, candidates, predictions."""
+"""Problems: measured data with a declared model, as the search for missing effects sees them (parameters, recordings, predictions)."""

@@ -1,7 +1,7 @@
-"""The effects that a moving body may lack, with ranges and starting points in the body's own scales.
+"""The effects that a moving body may lack, with ranges and starts of the fits in proportion to the body.
 
-`physics.effects` holds the equations; here is how large each effect may be on a given body (stress by its modulus, times by its
-waves and by the recording, accelerations by gravity), where a fit of it starts, and how its parameters enter a rollout.
+The equations are in `physics.effects`. Here stresses are scaled by the modulus of the body, times by its waves and by the recording,
+and accelerations by gravity.
 """
 
 import math
@@ -18,30 +18,30 @@ from neuido.physics.effects.library import KNOTS
 from neuido.physics.effects.parameters import Effects
 
 REST = {"maxwell.time": 1.0, "stiffness_gradient.radius": 1e-6, "time_force.frequency": 0.0}
-"""What parameters of shape take in a launch beside points that lack the effect."""
+"""Values of shape parameters in parameter sets without the effect, when others of the same launch have it."""
 
 
 class Scales(NamedTuple):
     """Typical sizes of an experiment."""
 
     young: float
-    """Declared modulus [Pa]."""
+    """Declared Young's modulus [Pa]."""
     wave: float
-    """Time of a shear wave through the body [s]."""
+    """Travel time of a shear wave through the body [s]."""
     duration: float
-    """Length of a recording [s]."""
+    """Length of the longest fitted recording [s]."""
     speed: float
     """Typical speed [m/s]."""
     length: float
     """Size of the body [m]."""
     gravity: float
-    """[m/s^2]"""
+    """Acceleration of gravity [m/s^2]."""
     step: float
     """Substep [s]."""
 
 
 def scales(experiment: Experiment) -> Scales:
-    """Those of an experiment, from its model and its recordings to fit."""
+    """Estimate the typical sizes of an experiment from its declared model and its fitted recordings."""
     model = experiment.model
     young, rho = float(model["elasticity"]["young"]), float(model["density"])
     fits = [r for r in experiment.recordings if r.role == "fit"]
@@ -53,7 +53,7 @@ def scales(experiment: Experiment) -> Scales:
 
 
 def _speed(x: np.ndarray, t: np.ndarray) -> float:
-    """Root mean square speed of the points over the fastest frame [m/s]."""
+    """Return the root mean square speed of the points between the two frames where it is largest [m/s]."""
     v = np.diff(x, axis=0) / np.diff(t)[:, None, None]
     seen = np.isfinite(v).all(axis=(1, 2)) if not np.isfinite(v).all() else np.ones(len(v), bool)
     square = np.nanmean((v[seen] if seen.any() else v) ** 2, axis=1).sum(axis=-1)
@@ -61,7 +61,7 @@ def _speed(x: np.ndarray, t: np.ndarray) -> float:
 
 
 def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
-    """Every effect that makes sense for the declared model of an experiment."""
+    """Return the candidates for an experiment: the effects that its declared model allows, with ranges and starts."""
     s = scales(experiment)
     plastic = experiment.model["plasticity"]["law"]
     planes = [p for r in experiment.recordings for p in r.scene.colliders]
@@ -107,7 +107,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     k = 1.0 / s.duration**2
     centre = np.nanmean(experiment.recordings[0].x.numpy(), axis=(0, 1))
     places = dict(zip("xyz", map(float, centre), strict=True))
-    # a pull to a far centre is a uniform force first of all, and from a centre in the body a fit ends there
+    # a pull to a far centre is almost a uniform force, so that a fit from a centre in the body ends there; hence the starts outside
     centres = [places, *(places | {a: c + far * s.length} for a, c in places.items() for far in (2, -2))]
     add("position_force", "flight", [{"k": k, **c} for c in centres], ("k", "1/s^2", k, -40 * k, 40 * k, False),
         *[(a, "m", s.length, c - 20 * s.length, c + 20 * s.length, False) for a, c in places.items()], sizes="k", apart="k")  # fmt: skip
@@ -120,7 +120,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     add("added_mass", "flight", [{"c": 0.1}], ("c", "1", 0.1, -0.5, 3.0, False))
     k = 0.3 / s.duration
     add("spin_decay", "rotation", [{"k": k}], ("k", "1/s", k, 0.0, 30 * k, False))
-    rate = 0.05 / s.duration  # below -1 over the duration nothing of the body would be left
+    rate = 0.05 / s.duration  # at a total of -1 nothing of the body would be left
     add("swelling", "rest", [{"rate": rate}], ("rate", "1/s", rate, -0.8 / s.duration, 2.0 / s.duration, False))
     eta = 0.05 * s.young * s.wave
     add("viscosity_shear", "internal modes", [{"eta": 0.1 * eta}, {"eta": eta}], ("eta", "Pa s", eta, 0.0, 20 * eta, False))
@@ -128,7 +128,7 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     add("maxwell", "internal modes", [{"ratio": 0.5, "time": s.wave * f} for f in (0.3, 1.5, 6.0)],
         ("ratio", "1", 0.3, 0.0, 20.0, False), ("time", "s", 0.5, s.step, 20 * s.duration, True),
         sizes="ratio", takes=("young",))  # fmt: skip
-    # its branches stiffen the body by about twice the loss factor
+    # its Maxwell branches stiffen the body, relative to its modulus, by about twice the loss factor
     add("hysteresis", "internal modes", [{"eta": 0.1}], ("eta", "1", 0.1, 0.0, 1.5, False), beside={"young": -2.0})
     add(
         "stiffness_change",
@@ -153,13 +153,13 @@ def body_candidates(experiment: Experiment) -> tuple[Candidate, ...]:
     if planes:
         least = min(p.friction for p in planes)
         add("friction", "contact", [{"mu": 0.15}, {"mu": 0.5}], ("mu", "1", 0.1, -least, 3.0, False), linear=False)
-        # per substep of a node in contact: one that takes half of the speed in one is large, above 10 nothing is left and no fit goes on
+        # rate times substep: half of the speed lost in one substep is much, and above 10 no speed is left and the slope is zero
         rates = [0.02 / s.step, 0.2 / s.step]
         rate = ("rate", "1/s", 1.0, 1e-4 / s.step, 200 / s.step, True)
         for name in ("stick", "restitution"):
             add(name, "contact", [{"rate": r} for r in rates], rate, sizes="rate", linear=False, saturates=True)
     if plastic == "identity":
-        # at large yield stresses nothing flows and the slope is zero: the fit starts where something does
+        # at large yield stresses nothing yields and the slope is zero, so that fits start at yield stresses that are reached
         starts = [{"inverse": 1.0 / (f * s.young)} for f in (0.2, 0.08, 0.03, 0.012)]
         add("yield", "rest", starts, ("inverse", "1/Pa", 0.3, 1e-9 / s.young, 1.0 / (0.001 * s.young), True), sizes="inverse", linear=False)
     if plastic == "von_mises":
@@ -179,11 +179,11 @@ _UP = math.atan(math.sqrt(0.5))
 DIRECTIONS = ((0.0, 0.0), (0.0, math.pi / 2), (math.pi / 2, 0.0), (0.0, math.pi / 4), (0.0, -math.pi / 4), (math.pi / 2, math.pi / 4),
               (math.pi / 2, -math.pi / 4), (math.pi / 4, 0.0), (-math.pi / 4, 0.0), (math.pi / 4, _UP), (math.pi / 4, -_UP),
               (-math.pi / 4, _UP), (-math.pi / 4, -_UP))  # fmt: skip
-"""Azimuth and elevation of the fibre directions that are probed: axes, and diagonals of the faces and of the body."""
+"""Azimuth and elevation [rad] of the fibre directions where fits start: axes, diagonals of the faces, diagonals of the cube."""
 
 
 def _places(experiment: Experiment, length: float) -> list[dict[str, float]]:
-    """Balls in the body: the points of a 3 x 3 x 3 lattice over it that lie inside, as starts of an inclusion."""
+    """Return starts of an inclusion: balls around those points of a 3 x 3 x 3 lattice that lie inside the body of size `length` [m]."""
     x = next(r for r in experiment.recordings if r.role == "fit").body.x.double().numpy()
     mean, half = x.mean(axis=0), 0.5 * np.ptp(x, axis=0)
     middle = 0.5 * (x.min(axis=0) + x.max(axis=0))
@@ -193,7 +193,7 @@ def _places(experiment: Experiment, length: float) -> list[dict[str, float]]:
         place = middle + 0.55 * half * (np.array(i) - 1)
         if np.linalg.norm(x - place, axis=1).min() < 1.5 * spacing:
             c = place - mean
-            # a border of one spacing: a sharp one moves particles in and out one by one, and has no slope
+            # the border is one particle spacing wide: at a sharp one, particles would switch one by one and the slope would be zero
             out.append(
                 {"log_ratio": 1.0, "cx": float(c[0]), "cy": float(c[1]), "cz": float(c[2]), "radius": 0.3 * length, "width": float(spacing)}
             )
@@ -201,7 +201,7 @@ def _places(experiment: Experiment, length: float) -> list[dict[str, float]]:
 
 
 def present(candidates: Sequence[Candidate], effects: Mapping[str, float]) -> tuple[Candidate, ...]:
-    """The candidates with the values that a model declares already as those of their absence."""
+    """Return the candidates with effects that the model declares already: a declared value is the one that counts as absent."""
 
     def own(p: Parameter) -> Parameter:
         value = effects.get(p.name, p.value)
@@ -213,14 +213,14 @@ def present(candidates: Sequence[Candidate], effects: Mapping[str, float]) -> tu
 def effects_of(
     points: Sequence[Mapping[str, float]], x: torch.Tensor, scene: torch.Tensor, duration: float, *, always: Sequence[str] = ()
 ) -> Effects:
-    """The effects of several points, a row each.
+    """Build the effects of a rollout from several parameter sets, one scene each.
 
     Args:
-        points: Full points; names with a dot are those of effects.
-        x: Particles at the start [m], (P, 3), for fields over the body.
-        scene: Which point each particle belongs to, (P,).
-        duration: Over which the knots of a time force spread [s].
-        always: Names that take part even where all points lack them: a captured launch then serves every set of effects.
+        points: Complete parameter sets. Names with a dot belong to effects.
+        x: Particles at the start [m], (P, 3), for effects that depend on the place in the body.
+        scene: Parameter set that each particle belongs to, (P,).
+        duration: Time over which the knots of a time-dependent force are spread [s].
+        always: Names that are included even if absent in all sets, so that one captured launch serves every set of effects.
     """
     names = sorted({name for point in points for name in point if "." in name}.union(always))
     rows = {name: [point.get(name, REST.get(name, 0.0)) for point in points] for name in names}
@@ -228,7 +228,7 @@ def effects_of(
     values: dict[str, torch.Tensor] = {
         name: torch.tensor(row, dtype=torch.float64) for name, row in rows.items() if name.split(".")[0] in active
     }
-    interval = max(values.pop("time_force.interval", torch.zeros(1)).tolist())  # of a declared force; all points have it
+    interval = max(values.pop("time_force.interval", torch.zeros(1)).tolist())  # of a declared force, the same in all sets
     waves = {name: values.pop(name) for name in [n for n in values if n.startswith("time_force.") and not n[-1].isdigit()]}
     made = Effects.of(values, x=x, scene=scene)
     if made.time_force is not None and made.time_force_interval is None:
@@ -239,7 +239,7 @@ def effects_of(
 
 
 def _with_waves(made: Effects, waves: Mapping[str, torch.Tensor], duration: float) -> Effects:
-    """Harmonic accelerations s sin(2 pi f t) + c cos(2 pi f t), at knots that are close enough for the highest frequency."""
+    """Add harmonic accelerations s sin(2 pi f t) + c cos(2 pi f t), sampled at knots that resolve the highest frequency."""
     zero = torch.zeros_like(next(iter(waves.values())))
     frequency = waves.get("time_force.frequency", zero)
     count = int(min(max(16 * float(frequency.max()) * duration, 32), 512)) + 1
@@ -250,7 +250,7 @@ def _with_waves(made: Effects, waves: Mapping[str, torch.Tensor], duration: floa
         for a in "xyz"
     ]
     knots = torch.stack(parts, -1)
-    if made.time_force is not None and made.time_force_interval is not None:  # in one launch with points that have knots of their own
+    if made.time_force is not None and made.time_force_interval is not None:  # other parameter sets of the launch have a force at knots
         own = torch.as_tensor(made.time_force).double().expand(len(zero), -1, 3)
         at = (t / float(made.time_force_interval)).clamp(max=own.shape[1] - 1)
         left = at.floor().long().clamp(max=own.shape[1] - 2)

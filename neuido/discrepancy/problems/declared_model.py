@@ -1,6 +1,6 @@
-"""The declared model of an experiment: the figures that a fit may move, and the laws and effects that a rollout takes.
+"""The declared model of an experiment: its fitted values, and the laws and effects of a rollout.
 
-The laws are classical ones, or a neural one that was read from video.
+The laws are classical, or a neural law that `neuido predict` has written.
 """
 
 import shutil
@@ -30,14 +30,15 @@ from neuido.physics.runtime.once import cached
 
 
 class Figure(NamedTuple):
-    """How a fit moves a declared figure."""
+    """Unit, typical step and range of a declared value in a fit."""
 
     unit: str
     step: float
-    """A typical step: relative where `log`, else in the unit."""
+    """Typical step, relative if `log`, else in `unit`."""
     lower: float
     upper: float
     log: bool
+    """Whether the logarithm is fitted."""
 
 
 FIGURES = {
@@ -51,7 +52,10 @@ FIGURES = {
 
 
 def declared(name: str, value: float, *, within: tuple[float, float] | None = None) -> Parameter:
-    """The parameter of a figure at its declared value; `within`: a narrower range, where a simulator needs one."""
+    """Return the parameter of a declared value (a key of `FIGURES`).
+
+    `within` is a narrower range for simulators that need one.
+    """
     figure = FIGURES[name]
     lower, upper = within or (figure.lower, figure.upper)
     return Parameter(name, figure.unit, float(value), figure.step, lower, upper, log=figure.log)
@@ -61,11 +65,11 @@ CLASSICAL = {
     name: "the law is a neural one, whose flow has no such parameter"
     for name in ("yield", "hardening", "softening", "kinematic_hardening", "rate_yield", "cohesion")
 }
-"""Effects that act on a classical plastic law alone, and what is said of them."""
+"""Effects that need a classical plastic law, with the reason that the report gives beside a neural law."""
 
 
 class Ready(NamedTuple):
-    """What a rollout takes."""
+    """Laws and effects in the form that a rollout takes."""
 
     elasticity: ElasticLaw
     plasticity: PlasticLaw
@@ -73,7 +77,7 @@ class Ready(NamedTuple):
 
 
 def read_model_file(path: str) -> dict[str, Any]:
-    """The model of a file: a `model_after.yaml`, or a file with the key `model`.
+    """Read a model from a `model_after.yaml`, or from a file with the key `model`.
 
     Raises:
         UserError: No such file, or no YAML mapping.
@@ -87,16 +91,16 @@ def read_model_file(path: str) -> dict[str, Any]:
         raise UserError(f"model = {path} is not valid YAML: {error}") from error
     model = content["model"] if set(content) == {"model"} and isinstance(content["model"], dict) else content
     law = model.get("law")
-    if isinstance(law, dict) and isinstance(law.get("file"), str):  # a law beside the file
+    if isinstance(law, dict) and isinstance(law.get("file"), str):  # the path of the law is relative to the file
         model = model | {"law": law | {"file": str(file.resolve().parent / law["file"])}}
     return model
 
 
 def with_law(experiment: Experiment, path: str) -> Experiment:
-    """The experiment with a neural law in place of its elasticity and plasticity; a factor on its stress is free.
+    """Return the experiment with a neural law in place of elasticity and plasticity; a factor on its stress is fitted.
 
     Raises:
-        UserError: No such file, or no law.
+        UserError: No such file, or no law in it.
     """
     _load(path)
     model = experiment.model | {"law": {"file": str(Path(path).expanduser().resolve()), "stiffness": 1.0}}
@@ -105,7 +109,9 @@ def with_law(experiment: Experiment, path: str) -> Experiment:
 
 
 def laws_of(model: Mapping[str, Any], points: Sequence[Mapping[str, float]]) -> tuple[ElasticLaw, PlasticLaw]:
-    """The laws of several points, a row each: what a point names takes the place of the model's figure.
+    """Build the laws of a model for several parameter sets, one scene each.
+
+    A value in a parameter set replaces that of the model.
 
     Raises:
         UserError: An impossible material, or no law in the file that the model names.
@@ -124,14 +130,18 @@ def laws_of(model: Mapping[str, Any], points: Sequence[Mapping[str, float]]) -> 
 
 
 def scaled(law: Any, factor: Tensor) -> Any:
-    """A neural elastic law with factors on its stress, one for each scene (S,): exact, since its last layer is linear."""
+    """Return a neural elastic law with its stress times a factor per scene (S,); exact, because its last layer is linear."""
     W1, b1, W2, b2, W3, b3 = law.tensors()
     factor = factor.to(W3)
     return type(law)(W1, b1, W2, b2, factor[:, None, None] * W3, factor[:, None] * b3, scale=law.scale)
 
 
 def classical(experiment: Experiment) -> Experiment:
-    """The experiment with the small-strain moduli of its neural law in the model's elasticity, for typical sizes alone."""
+    """Return the experiment with Young's modulus of its neural law at rest in the elasticity, for estimates of typical sizes.
+
+    Raises:
+        UserError: The modulus is not positive.
+    """
     if "law" not in experiment.model:
         return experiment
     elastic, _ = laws_of(experiment.model, [{}])
@@ -144,15 +154,15 @@ def classical(experiment: Experiment) -> Experiment:
 
 
 def ready(model: str | Path | Mapping[str, Any], simulator: Simulator | FiniteElements, *, duration: float | None = None) -> Ready:
-    """The laws and effects of a model, ready for a rollout of `simulator`.
+    """Build the laws and effects of a model for a rollout of `simulator`.
 
     Args:
-        model: A model_after.yaml, or the content of one.
-        simulator: Of one body or several alike; gradients and fibres lie in its bodies as they are at t = 0.
-        duration: Length of the recording over which a force in time was fitted, s, where the model does not say.
+        model: A model_after.yaml, or its content.
+        simulator: Simulator of one body, or of several with the same model. Gradients and fibres refer to the bodies at t = 0.
+        duration: Length [s] of the recording to which a time-dependent force was fitted, where the model does not contain it.
 
     Raises:
-        UserError: A file that is no model, an impossible material, an unknown effect.
+        UserError: The file is no model, the material is impossible, or an effect is unknown.
     """
     content = read_model_file(str(model)) if isinstance(model, str | Path) else dict(model)
     checked, _ = read_declared_model(content)
@@ -170,7 +180,7 @@ def ready(model: str | Path | Mapping[str, Any], simulator: Simulator | FiniteEl
 
 
 def beside(folder: Path, model: Mapping[str, Any]) -> dict[str, Any]:
-    """The model for a file in `folder`, with its neural law, where it has one, copied there."""
+    """Copy the neural law of a model to `folder`, and return the model with the name of the copy; other models stay as they are."""
     if "law" not in model:
         return dict(model)
     source, target = Path(model["law"]["file"]), folder / "law.safetensors"

@@ -1,4 +1,4 @@
-"""A material test as a `Problem`: the declared law along measured paths of the deformation gradient, and the effects it may lack."""
+"""Material tests as a `Problem`: the declared law along the measured stretch or shear, and the effects that it may lack."""
 
 import math
 import os
@@ -33,15 +33,16 @@ STAGES = {
     "viscosity_bulk": "rate of the volume",
     "stiffness_change": "time",
 }
+"""Stage in which each effect shows."""
 MOST_POINTS = 256
-"""Parameter sets in one batch."""
+"""Largest number of parameter sets per batch."""
 
 
 class MaterialProblem(Problem):
-    """A folder of the format `neuido-material-test/1`.
+    """Tests of one material, from a folder of the format `neuido-material-test/1` or read already.
 
-    Nothing is discretised: the steps of a path with a history are exact for proportional loading and subdivided otherwise. A held-out
-    test that continues a specimen (`MaterialTests.histories`) is predicted with the history of the tests before it.
+    There is one setting, because nothing is discretised: steps of a path with a history are exact for proportional loading and subdivided
+    otherwise. A held-out test that continues with the same specimen is predicted with the history of the tests before it.
     """
 
     def __init__(self, folder: str | os.PathLike | MaterialTests) -> None:
@@ -78,14 +79,14 @@ class MaterialProblem(Problem):
         time = None if last.time is None else torch.from_numpy(np.concatenate([test.time for test in specimen]))
         try:
             out = stress_along(self._specimen(points), last.mode, path, direction=last.direction, time=time, true_stress=last.true_stress)
-        except UserError:  # one point outside what the law admits fails the batch
+        except UserError:  # one parameter set that the law refuses fails the whole batch
             if len(points) == 1:
                 return np.full((1, n), np.nan)
             return np.concatenate([self.predict([point], recording) for point in points])
         return out[:, -len(last.path) :].reshape(len(points), -1).numpy()
 
     def _specimen(self, points: Sequence[Point]) -> Specimen:
-        """The laws and effects of several points, a row each."""
+        """Build a specimen with the laws and effects of several parameter sets."""
 
         def rows(name: str, absent: float) -> torch.Tensor:
             return torch.tensor([float(point.get(name, absent)) for point in points], dtype=torch.float64)
@@ -102,7 +103,7 @@ class MaterialProblem(Problem):
         values = {}
         for effect in dict.fromkeys(name.partition(".")[0] for name in effects):
             if not bool(rows(amounts[effect], self._partners.get(amounts[effect], 0.0)).any()):
-                continue  # absent in every point
+                continue  # absent in every parameter set
             own = [p.name for entry in LIBRARY if entry.name == effect for p in entry.parameters]
             for name in (f"{effect}.{part}" for part in own):
                 if name in effects or name in self._partners:
@@ -127,10 +128,11 @@ class MaterialProblem(Problem):
 
 
 def material_candidates(tests: MaterialTests) -> tuple[Candidate, ...]:
-    """The effects that a law may lack in these tests, in the scales of its modulus and of what was done to it.
+    """Return the effects that these tests could show, with ranges and starts scaled by the modulus and the applied strain.
 
-    Only those that the tests can show: effects of the rate need times; hardening a declared yield stress, its kinematic kind and damage a
-    path that turns back; an asymmetry stresses of both signs; a fibre loads along two axes; a yield stress a body declared elastic.
+    Effects of the rate need times, and hardening needs a declared yield stress. Kinematic hardening and softening need a path that
+    turns back, an asymmetry needs stresses of both signs, and a fibre needs loads along two axes. Yield is a candidate only where the
+    declared law is elastic.
     """
     fits = [test for test in tests.tests if test.role == "fit"]
     young, poisson = (float(tests.model["elasticity"][key]) for key in ("young", "poisson"))
@@ -143,7 +145,7 @@ def material_candidates(tests: MaterialTests) -> tuple[Candidate, ...]:
     out: list[Candidate] = []
 
     def add(name: str, starts: Sequence[dict[str, float]], *parameters: tuple, sizes: str = "", linear: bool = True, log: str = "") -> None:
-        """Parameters as (name, typical step, lower, upper); `sizes` are those that vanish with the effect, all where empty."""
+        """Add a candidate with parameters (name, typical step, lower, upper); `sizes` are zero when it is absent (all where empty)."""
         units = {p.name: p.unit for entry in LIBRARY if entry.name == name for p in entry.parameters}
         made = []
         for key, scale, lower, upper in parameters:
@@ -153,7 +155,7 @@ def material_candidates(tests: MaterialTests) -> tuple[Candidate, ...]:
         out.append(Candidate(name, tuple(made), points, STAGES[name], sizes=tuple(f"{name}.{key}" for key in sizes.split()), linear=linear))
 
     k = 0.3 / reach
-    if reach > 0.1:  # in smaller strains both are the shear modulus again
+    if reach > 0.1:  # at smaller strains both act like a change of the shear modulus
         add("strain_stiffening", [{"k": k}, {"k": k / 10}], ("k", k, -10 * k, 10 * k), linear=False)
         add("second_invariant", [{"c": 0.2}], ("c", 0.2, -0.5, 5.0))
     ends = [end for test in tests.tests for end in (float(test.stress.min()), float(test.stress.max()))]
@@ -196,13 +198,13 @@ def material_candidates(tests: MaterialTests) -> tuple[Candidate, ...]:
 
 
 def _unloads(test: MaterialTest) -> bool:
-    """Whether a path turns back on itself by more than a tenth of its length."""
+    """Return whether more than a fifth of the length of a path runs back over what was passed before, in every column."""
     e = test.path if test.mode == "simple_shear" else np.log(test.path)
     return len(e) > 2 and bool((np.ptp(e, axis=0) < 0.8 * np.abs(np.diff(e, axis=0)).sum(axis=0)).all())
 
 
 def _reach(test: MaterialTest) -> float:
-    """The largest I1 - 3 of a test at constant volume."""
+    """Return the largest I1 - 3 of a test at constant volume, with I1 the first invariant of the Cauchy-Green tensor."""
     if test.mode == "simple_shear":
         return max(float((test.path**2).max()), 1e-6)
     first = test.path[:, 0]
@@ -211,9 +213,9 @@ def _reach(test: MaterialTest) -> float:
 
 
 def _angles(tests: MaterialTests) -> list[str]:
-    """The angles of a fibre that these tests can see: those of the plane of their loading axes.
+    """Return the angles of a fibre that these tests can determine, in the plane of their loading axes.
 
-    None where all load the material along one axis: a fibre then shows as a stiffening like any other.
+    The list is empty where all tests load along one axis: a fibre then looks like any other stiffening.
     """
     frames = [(test, turn(torch.tensor(test.direction, dtype=torch.float64)).numpy()) for test in tests.tests]
     d = np.array([R[:, 0] for _, R in frames] + [R[:, 1] for test, R in frames if test.mode in ("biaxial", "pure_shear")])
@@ -232,7 +234,7 @@ def _recording(test: MaterialTest, noise: float | None) -> Recording:
 
 
 def _noise_in(tests: MaterialTests, chain: Sequence[int], i: int) -> float | None:
-    """The noise of test i: of a held-out one that continues a specimen that of the part that is fitted, for it is the same machine."""
+    """Return the noise of test i [Pa]; for a held-out test that continues a specimen, that of its fitted part on the same machine."""
     if tests.tests[i].role == "held_out":
         found = [noise_of(tests.tests[j]) for j in chain if tests.tests[j].role == "fit"]
         if found and found[0] is not None:
@@ -241,11 +243,11 @@ def _noise_in(tests: MaterialTests, chain: Sequence[int], i: int) -> float | Non
 
 
 def noise_of(test: MaterialTest) -> float | None:
-    """Standard deviation of a test's independent noise [Pa]: what local cubics along its path leave (`noise.high_pass`), over its channels.
+    """Estimate the standard deviation of the independent noise of a test [Pa], by local cubics along its path (`noise.high_pass`).
 
-    Rows without any run that is long enough, such as a grid of biaxial states or a curve in disorder, are taken by their place instead: a
-    curve in the order of its strain, states by the smooth surface through them. Not below 1e-4 of the largest stress, which is what three
-    or four digits in a file are worth; none where the rows are too few.
+    Where no monotone part of the path is long enough, as in a grid of biaxial states or a curve in disorder, a curve is sorted by strain
+    and states are fitted with a smooth surface. The estimate is at least 1e-4 of the largest stress, the rounding of three or four digits
+    in a file. None where there are too few rows.
     """
     e = test.path if test.mode == "simple_shear" else np.log(test.path)
     pieces = []

@@ -1,4 +1,4 @@
-"""How noisy a series is, from itself: what a local cubic leaves over."""
+"""Estimates of measurement noise from the data alone, by the residual of local polynomials."""
 
 import itertools
 import math
@@ -7,22 +7,23 @@ from typing import NamedTuple
 import numpy as np
 
 LEAST_ROWS = 8
-"""Rows that a surface is fitted to, at the least."""
+"""Least number of rows for the fit of a surface."""
 WINDOW = 6
-"""Samples in a window; a cubic leaves two degrees of freedom."""
+"""Samples per window. A cubic leaves two degrees of freedom."""
 
 
 def high_pass(pieces: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
-    """Standard deviation of the independent noise of a series that is smooth in pieces.
+    """Estimate the standard deviation of the independent noise of a piecewise smooth series.
 
-    A cubic is fitted to every run of six neighbouring samples; the median of the squared residuals, over the median of the same for
-    unit noise (that of chi^2 with two degrees of freedom, 2 ln 2), is the variance. Corners and outliers are few and hardly move it.
+    A cubic is fitted to every window of six neighbouring samples. The variance of the noise is the median over the windows of the sum of
+    squared residuals, divided by its median for noise of variance one: 2 ln 2, that of chi^2 with two degrees of freedom. Because it is a
+    median, a few corners and outliers hardly change it.
 
     Args:
-        pieces: Abscissae and values of each smooth piece, (n,) each, in order.
+        pieces: Abscissae (n,) and values (n,) of each smooth piece, in the order of the abscissae.
 
     Returns:
-        In the unit of the values; none where no piece has six samples.
+        The standard deviation in the unit of the values. None where no piece has six samples.
     """
     squares = []
     for at, values in pieces:
@@ -38,17 +39,17 @@ def high_pass(pieces: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
 
 
 def surface(at: np.ndarray, values: np.ndarray) -> float | None:
-    """Standard deviation of the independent noise of rows in any order, from what a polynomial of their place leaves.
+    """Estimate the standard deviation of the independent noise of values at scattered places, by a smooth surface through them.
 
-    Polynomials of total degree up to four with at most half as many terms as there are rows; the one that counts foretells best the rows
-    that it was fitted without.
+    The surface is a polynomial of total degree one to four with at most half as many terms as there are values. Its degree is the one with
+    the least leave-one-out error.
 
     Args:
         at: Places, (n, d).
-        values: (n,).
+        values: Values at the places, (n,).
 
     Returns:
-        In the unit of the values; none for fewer than eight rows.
+        The standard deviation in the unit of the values. None for fewer than eight values.
     """
     n, d = at.shape
     if n < LEAST_ROWS:
@@ -71,22 +72,25 @@ def surface(at: np.ndarray, values: np.ndarray) -> float | None:
 
 
 MOST_SERIES = 300
-"""Series of a recording that its noise is read from, at the most."""
+"""Largest number of series of a recording from which its noise is estimated."""
 ASSUMED = 1e-3
-"""Noise where nothing says what it is, as a share of how far the data move."""
+"""Assumed noise where it can be neither read nor estimated, as a share of the variation of the data (`moved`)."""
 UNSURE = 9.0
-"""Relative standard deviation of a noise that is assumed: it may be ten times as large."""
+"""Relative standard deviation of an assumed noise: it may be ten times as large."""
 OVERLAP = 1.5
-"""Over the number of data: the square of the relative deviation of `high_pass`, whose windows overlap and which is a median."""
+"""Relative variance of the estimate of `high_pass`, times the number of data: large, for it is a median of overlapping windows."""
 
 
 def of_series(values: np.ndarray, groups: np.ndarray, times: np.ndarray) -> float | None:
-    """Noise of a recording from its own series: the median over the groups of what `high_pass` finds; none where all are too short.
+    """Estimate the noise of a recording: the median over its series of the estimates of `high_pass`.
 
     Args:
-        values: All data, (n,).
-        groups: Which series each belongs to, (n,).
-        times: (n,).
+        values: Data, (n,).
+        groups: Series that each value belongs to, (n,).
+        times: Time of each value, (n,).
+
+    Returns:
+        The standard deviation in the unit of the values. None where all series are too short.
     """
     names = np.unique(groups)
     found = []
@@ -99,14 +103,17 @@ def of_series(values: np.ndarray, groups: np.ndarray, times: np.ndarray) -> floa
 
 
 def moved(values: np.ndarray, groups: np.ndarray) -> float:
-    """Root mean square of how far the data of each series lie from its mean: independent of the origin and of the order of rows."""
+    """Return the root mean square deviation of values (n,) from the mean of their series.
+
+    `groups` (n,) names the series of each value. The result does not depend on the origin or on the order of the values.
+    """
     _, index = np.unique(groups, return_inverse=True)
     means = np.bincount(index, values) / np.bincount(index)
     return float(np.sqrt(np.mean((values - means[index]) ** 2)))
 
 
 def monotone_pieces(path: np.ndarray) -> list[slice]:
-    """The longest runs of rows along which no column of a path (n, k) turns round."""
+    """Divide a path (n, k) into the longest runs of rows in which every column is monotone."""
     out, start, sign = [], 0, np.zeros(path.shape[1])
     for i in range(1, len(path)):
         step = np.sign(path[i] - path[i - 1])
@@ -119,40 +126,44 @@ def monotone_pieces(path: np.ndarray) -> list[slice]:
 
 
 class SeriesError(NamedTuple):
-    """Error of a series: independent noise and a slow part, covariance sigma^2 delta + amplitude^2 exp(-|dt| / time)."""
+    """Model of a measurement error with the covariance sigma^2 delta + amplitude^2 exp(-|dt| / time)."""
 
     sigma: float
+    """Standard deviation of the independent noise."""
     amplitude: float
+    """Standard deviation of the slow error."""
     time: float
-    """[s]"""
+    """Correlation time of the slow error [s]."""
 
     def covariance(self, t: np.ndarray) -> np.ndarray:
-        """Of samples at times t (n,), (n, n)."""
+        """Return the covariance matrix (n, n) of samples at times t (n,) [s]."""
         slow = self.amplitude**2 * np.exp(-np.abs(t[:, None] - t[None]) / self.time)
         return slow + self.sigma**2 * np.eye(len(t))
 
 
 DEGREE = 5
-"""Of the local polynomials that the slow part is read from."""
+"""Degree of the local polynomials by which the slow error is estimated."""
 WIDER = 4 / 3
-"""Ratio of the lengths of successive windows that are tried for it."""
+"""Ratio of the lengths of successive windows for the slow error."""
 AT_ONCE = 1.6
-"""Largest growth of the variance from one window to the next that is an error's. What a smooth motion leaves of a polynomial of degree five
-grows by (4/3)^12 = 32, that of an error by the share of its slow part at the most."""
+"""Largest growth of the residual variance from one window length to the next that is attributed to a slow error.
+
+The residual variance of a smooth motion grows by (4/3)^12 = 32 with polynomials of degree five; that of a slow error grows far less.
+"""
 
 
 def correlation(series: list[tuple[np.ndarray, np.ndarray]]) -> SeriesError:
-    """The error of series whose true course is smooth, from what local polynomials leave; no model of the motion enters.
+    """Estimate the measurement error of series whose true course is smooth, without a model of the motion.
 
-    The independent part is that of `high_pass`, the median over the series. The slow part is read from quintics in ever longer windows, up
-    to the whole series, for as long as what they leave grows slowly: a motion that turns round leaves suddenly more, and that is no error.
-    Its time comes from the covariance of neighbouring samples in the longest of these windows.
+    The independent noise is the median over the series of the estimates of `high_pass`. The slow error is the residual of polynomials of
+    degree five in windows that grow up to the whole series. They grow only while the residual variance does so slowly (`AT_ONCE`): a
+    sudden growth comes from the motion. The correlation time follows from the covariance of neighbouring residuals in the longest window.
 
     Args:
-        series: Times [s] and values of each, (n,).
+        series: Times [s] and values of each series, (n,) each.
 
     Returns:
-        Sigma and amplitude in the unit of the values. Series too short for either count as exact to 1e-9 of their extent.
+        The error, with sigma and amplitude in the unit of the values. For series that are too short, sigma is 1e-9 of their range.
     """
     extent = max(float(np.ptp(y)) for _, y in series)
     sigmas = [s for s in (high_pass([piece]) for piece in series) if s is not None]
@@ -174,7 +185,10 @@ def correlation(series: list[tuple[np.ndarray, np.ndarray]]) -> SeriesError:
 
 
 def _left_by_windows(series: list[tuple[np.ndarray, np.ndarray]], width: int) -> tuple[float, float] | None:
-    """Variance, and covariance of neighbours, of what quintics in windows of so many samples leave: medians of windows, means of series."""
+    """Return the variance of the residuals of quintics in windows of `width` samples, and the covariance of neighbouring residuals.
+
+    Both are medians over the windows of a series, averaged over the series. None where all series are too short.
+    """
     found = []
     for t, y in series:
         n = min(width, len(t))

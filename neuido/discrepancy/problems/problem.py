@@ -1,7 +1,6 @@
-"""What the closed loop asks of a forward model: its parameters, the effects it may lack, its recordings, and a prediction.
+"""The interface between a diagnosis and a forward model: parameters, candidate effects, recordings and predictions.
 
-The bodies of the material point method, the material point and the point mass all answer to `Problem`; the inference
-(`inference`) and the report know nothing else of them.
+Deforming bodies, material tests and tracks are subclasses of `Problem`. The inference and the report use nothing but this interface.
 """
 
 import math
@@ -12,52 +11,54 @@ from typing import Any
 import numpy as np
 
 Point = Mapping[str, float]
-"""Physical values of parameters by name; those that are absent take their `Parameter.value`."""
+"""A parameter set: physical values by name. A parameter without an entry has its `Parameter.value`."""
 Ask = tuple[Sequence[Point], int, int]
-"""Points, the number of a recording, and a setting: the arguments of `Problem.predict`."""
+"""A request for predictions, the arguments of `Problem.predict`: parameter sets, number of the recording, number of the setting."""
 Rows = Generator[np.ndarray, None, None]
-"""What each of several asks is answered, (len(points), n), as it comes."""
+"""Predictions (len(points), n) of each request, in turn."""
 SURE = 1.3
-"""Times a setting's step that must be stable for it to stand in for another one: a beam of a Poisson ratio of 0.494 failed at 1.15 in three
-recordings of five, and moved by itself in the others."""
+"""Factor by which the time step of a setting must stay below the stability limit before it may replace another setting.
+
+At a factor of 1.15, a beam with a Poisson's ratio of 0.494 diverged in three recordings of five and moved by itself in the others.
+"""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A figure that a fit may move."""
+    """A quantity that a fit may change."""
 
     name: str
-    """Such as `young`, `release_time:drop`; that of an effect is `<effect>.<parameter>`, as `viscosity_shear.eta`."""
+    """For example `young` or `release_time:drop`. A parameter of an effect is `<effect>.<parameter>`, as `viscosity_shear.eta`."""
     unit: str
     value: float
-    """Where the fit starts; for an effect what it takes where the effect is absent."""
+    """Start of the fit. For an effect: the value at which the effect is absent."""
     scale: float
-    """A typical step: relative where `log`, else in the unit."""
+    """Typical step, relative if `log`, else in `unit`."""
     lower: float
     upper: float
-    """Physical range, inclusive; a fit that ends at a bound of an effect counts as unphysical, unless it `saturates`."""
+    """Physical range, inclusive. A fit of an effect that ends at a bound counts as unphysical, unless `saturates`."""
     log: bool = False
-    """The fit moves the logarithm."""
+    """Whether the logarithm is fitted."""
     prior: float | None = None
-    """Standard deviation of a Gaussian prior about `value`, in the coordinate of the fit; none: flat."""
+    """Standard deviation of a Gaussian prior about `value`, in the coordinate of the fit. None: a flat prior."""
     saturates: bool = False
-    """At its upper bound an effect does all that it can: a fit that ends there is physical."""
+    """Whether the effect is complete at its upper bound, so that a fit that ends there is physical."""
 
     def coordinate(self, value: float) -> float:
-        """The coordinate of the fit, of order one for a typical change."""
+        """Return the dimensionless coordinate that is fitted for a physical value; a typical change is of order one."""
         return float(np.log(value) if self.log else value) / self.scale
 
     def physical(self, coordinate: float) -> float:
-        """The inverse of `coordinate`, clipped to the range."""
+        """Return the physical value for a coordinate of the fit, clipped to the range."""
         return self.within(float(np.exp(coordinate * self.scale) if self.log else coordinate * self.scale))
 
     def within(self, value: float) -> float:
-        """The value, clipped to the range."""
+        """Return a physical value, clipped to the range."""
         return min(max(value, self.lower), self.upper)
 
     @property
     def signs(self) -> tuple[float, ...]:
-        """Those that its range has."""
+        """Signs that values in the range can have."""
         return (1.0, -1.0) if self.lower < 0 else (1.0,)
 
 
@@ -66,77 +67,77 @@ class Candidate:
     """An effect that the model may lack."""
 
     name: str
-    """Of the vocabulary of `neuido-diagnosis/2`."""
+    """Name in the file format `neuido-diagnosis/2`."""
     parameters: tuple[Parameter, ...]
     starts: tuple[Mapping[str, float], ...]
-    """Values of its parameters that the screening probes and that full fits start from."""
+    """Parameter values that the screening tries and that full fits start from."""
     where: str
-    """The stage of the motion that gives it away."""
+    """Stage of the motion in which the effect shows, such as `flight` or `contact`."""
     form: str = ""
-    """Where an effect has several forms (a gradient, an inclusion), which one this is."""
+    """Form of an effect that has several, such as `gradient` or `inclusion` for the stiffness."""
     sizes: tuple[str, ...] = ()
-    """Names of the parameters whose zero is the effect's absence; the others give its shape. Empty: all are."""
+    """Names of the parameters that are zero when the effect is absent. The others describe its shape. Empty: all parameters are sizes."""
     linear: bool = True
-    """Whether small sizes act in proportion; a yield stress does not."""
+    """Whether a small effect is proportional to its size (a yield stress is not)."""
     apart: str = ""
-    """A size whose sign no fit changes, for at zero the effect's shape has no meaning: fits begin on either side."""
+    """Size whose sign a fit cannot change, because at zero the shape has no meaning. Fits start on both sides of zero. Empty: none."""
     far: float = 0.0
-    """What `apart` is, up and down, where every start is tried once at full strength; zero: nowhere."""
+    """Value of `apart`, with both signs, at which every start is also tried at full strength. Zero: not tried."""
     beside: Mapping[str, float] = field(default_factory=dict)
-    """By how much of a size the logarithm of a declared parameter goes with it: a stiff part in a soft rest, as stiff together."""
+    """Change of the logarithm of a declared parameter per unit of the size, which keeps the whole body about as stiff as before."""
     takes: tuple[str, ...] = ()
-    """Declared parameters that a fit without the effect makes too large for the lack of it: a modulus, of what stiffens."""
+    """Declared parameters that a fit overestimates while the effect is missing, such as the modulus of a body that stiffens."""
 
     @property
     def key(self) -> str:
-        """Name and form."""
+        """Name, with the form after a colon where there is one."""
         return f"{self.name}:{self.form}" if self.form else self.name
 
     @property
     def size_parameters(self) -> tuple[Parameter, ...]:
-        """The parameters that vanish with the effect."""
+        """Parameters that are zero when the effect is absent."""
         return tuple(p for p in self.parameters if not self.sizes or p.name in self.sizes)
 
     def shape(self, point: Point) -> tuple[float, ...]:
-        """What a point has of the other parameters."""
+        """Return the values of the parameters of shape (those that are not sizes) in a parameter set."""
         return tuple(point.get(p.name, p.value) for p in self.parameters if p not in self.size_parameters)
 
     def times(self, start: Mapping[str, float], factors: Sequence[float]) -> dict[str, float]:
-        """A start with its sizes times factors, clipped to their ranges."""
+        """Return a start with each size multiplied by its factor and clipped to its range."""
         sizes = {p.name: p.within(start[p.name] * f) for p, f in zip(self.size_parameters, factors, strict=True)}
         return dict(start) | sizes
 
     def own(self, point: Point) -> dict[str, float]:
-        """What a point has of this effect."""
+        """Return the entries of a parameter set that belong to this effect."""
         return {name: value for name, value in point.items() if name.startswith(f"{self.name}.")}
 
     def without(self, point: Point) -> dict[str, float]:
-        """What a point has beside this effect."""
+        """Return a parameter set without the entries of this effect."""
         return {name: value for name, value in point.items() if not name.startswith(f"{self.name}.")}
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Measured data of one recording as one vector."""
+    """Measured data of one recording as a vector."""
 
     name: str
     role: str
-    """`fit`, or `held_out`: only ever scored."""
+    """`fit`, or `held_out` (scored, never fitted)."""
     y: np.ndarray
-    """(n,) float64 without NaN."""
+    """Data, (n,) float64 without NaN."""
     noise: float | None
-    """Standard deviation of its independent part; none: not known."""
+    """Standard deviation of the independent noise, in the unit of the data. None: not known."""
     groups: np.ndarray
-    """(n,) whole numbers; rows of one group are samples of one quantity in the order of time."""
+    """Series that each value belongs to, (n,) integers. A series holds samples of one quantity in the order of time."""
     times: np.ndarray
-    """(n,) time [s] of each row, or its order where there is no time."""
+    """Time of each value [s], (n,); its place in the file where no time was measured."""
     noise_from: str = "stated"
-    """Where the noise comes from: it is `stated`, or `estimated` from the data."""
+    """Origin of `noise`: `stated` in the folder, or `estimated` from the data."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A model with its data. Subclasses implement `predict` and `model_after`."""
+    """Measured data with a declared model; subclasses implement `predict` and `model_after`."""
 
     name: str
     measure: str
@@ -146,24 +147,27 @@ class Problem:
     candidates: tuple[Candidate, ...]
     recordings: tuple[Recording, ...]
     settings: int = 1
-    """Settings of the discretisation; 0 is the suggested one, and 1 of them means that nothing is discretised."""
+    """Number of settings (grid, time step, mesh, method). Setting 0 is the suggested one. 1: the model is not discretised."""
     solvers: tuple[int, ...] = (0,)
-    """The settings that are methods of their own: the data choose among them."""
+    """Settings that stand for a simulation method each. The data choose among them."""
     labels: dict[str, Any] = field(default_factory=dict)
-    """What the report says beside the figures."""
+    """Facts for the report: `kind` of the data, `body`, and effects that are `excluded`, with the reason."""
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
-        """The data that each point predicts, (len(points), n); a row of NaN where the model cannot run there."""
+        """Predict the data of a recording for each parameter set, (len(points), n); a row is NaN where the simulation fails."""
         raise NotImplementedError
 
     def predict_several(self, asks: Sequence[Ask]) -> Rows:
-        """What `predict` says to each of several asks, in their order: run side by side where one after the other leaves cores idle."""
+        """Yield the result of `predict` for each request, in their order.
+
+        Subclasses run the requests in parallel where that uses more cores.
+        """
         return (self.predict(*ask) for ask in asks)
 
     def margin(self, point: Point, setting: int = 0) -> float:
-        """How far a point lies from where the model cannot run any more, as the logarithm of a ratio; below zero it does not run.
+        """Return the logarithm of the stability limit over the time step for a parameter set; a negative margin cannot be simulated.
 
-        Computed without a run; infinite where nothing is known.
+        The margin is computed without a simulation. It is infinite where no limit is known.
         """
         return math.inf
 
@@ -172,53 +176,66 @@ class Problem:
         return f"the declared model has no finite prediction ({self.setting_name(setting)}): check its values and units"
 
     def bears(self, point: Point, setting: int) -> bool:
-        """Whether a point is `SURE` to run under a setting that is to stand in for another one."""
+        """Return whether a parameter set stays stable, by the factor `SURE`, under a setting that is to replace another one."""
         return self.margin(point, setting) >= math.log(SURE)
 
     def effort(self, recording: int, setting: int = 0) -> float:
-        """What one prediction costs, in a unit of the model's own (particle-substeps of a body); data where that says enough."""
+        """Return the cost of one prediction: particle-substeps of a simulated body, else the number of data."""
         return float(len(self.recordings[recording].y))
 
     @property
     def together(self) -> bool:
-        """Whether several points cost about as much as one, so that a fit asks for all that it may want at once."""
+        """Whether predictions of several parameter sets cost about as much as one, so that a fit may request them all at once."""
         return True
 
     def directions(self, recording: int) -> np.ndarray:
-        """Smooth patterns in which an unknown part of the discretisation error may lie, (n, k), of mean square one together."""
+        """Return smooth patterns (n, k) that describe a discretisation error of unknown shape.
+
+        The squares of the k patterns add up to one, in the mean over the n values.
+        """
         return np.empty((len(self.recordings[recording].y), 0))
 
     def error(self, residual: np.ndarray, recording: int) -> float:
-        """A residual (n,) as one figure in `unit`."""
+        """Return the root mean square of a residual (n,), in `unit`."""
         return float(np.sqrt(np.mean(residual**2)))
 
     def others(self, setting: int) -> list[int]:
-        """The other settings whose differences to one are directions that the data may lie in, whatever the law."""
+        """Return the settings whose differences from a setting estimate its discretisation error."""
         return [s for s in range(self.settings) if s != setting]
 
     def quick(self, setting: int) -> int:
-        """A setting that moves about as one does for less, which stands in for it while a search has far to go; itself if there is none."""
+        """Return a cheaper setting with about the same motion for the early search, or the setting itself if there is none."""
         return setting
 
     def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
-        """The point moved to where amounts of the differences to `others` lead, as far as a parameter of the problem's own can go there."""
+        """Return a parameter set in which a parameter of the problem takes over differences between settings, where one can.
+
+        Args:
+            point: The parameter set.
+            setting: The setting that predicts.
+            amounts: Amount of the difference of each of the settings `others(setting)` in the prediction.
+        """
         return point
 
     def setting_name(self, setting: int) -> str:
-        """What a setting is, for the report."""
+        """Return the name of a setting for the report."""
         return "suggested" if setting == 0 else f"setting {setting}"
 
     def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
-        """The content of `model_after.yaml`: the folder's model with these values and effects."""
+        """Return the content of `model_after.yaml`: the declared model with fitted values and added effects."""
         raise NotImplementedError
 
     @property
     def roles(self) -> dict[str, list[int]]:
-        """Numbers of the recordings by role."""
+        """Numbers of the recordings of each role, `fit` and `held_out`."""
         return {role: [i for i, r in enumerate(self.recordings) if r.role == role] for role in ("fit", "held_out")}
 
     def parameter(self, name: str) -> Parameter:
-        """The parameter of a name."""
+        """Return the parameter with a name.
+
+        Raises:
+            KeyError: No such parameter.
+        """
         for p in (*self.declared, *self.nuisances, *(p for c in self.candidates for p in c.parameters)):
             if p.name == name:
                 return p

@@ -1,4 +1,4 @@
-"""The start of a recorded flight and what the instruments may have off: the nuisances of a track, and their estimate from early frames."""
+"""The nuisances of a track (start of the flight, clock, length scale), and their estimate from its first frames."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,24 +10,32 @@ from neuido.discrepancy.problems.problem import Parameter
 from neuido.physics.points.point_mass import Forces, fly
 
 RANGE = 2.0
-"""How far a nuisance of the folder may be off, in its standard deviations."""
+"""Largest error of a clock or length scale, in standard deviations of its prior."""
 FIRST = 4
-"""Frames that the first guess of the velocity is taken from."""
+"""Number of frames for the first estimate of the velocity."""
 ITERATIONS = 25
+"""Largest number of steps of the least-squares fit."""
 PROBE = 1e-3
-"""Difference step, in typical steps of a nuisance."""
+"""Step of the finite differences, in units of `Parameter.scale`."""
 STILL = 1e-5
-"""A move of fewer typical steps ends the search."""
+"""Step at which the fit has converged, in units of `Parameter.scale`."""
 LONGEST, LEAST_STEPS = 0.05, 60
-"""Step of the integration: at most this long [s], and at least this many in a recording."""
+"""Largest time step of the integration [s], and least number of steps per recording."""
 
 
 class Released:
-    """A body that is held until its release and then flies, as the instruments of one recording see it.
+    """One recording of a body that is held until its release and then flies, with the errors of its instruments.
 
-    Parameters: position and velocity along each measured axis, then release_time [s], length_scale and time_base [-] where the folder
-    allows them a standard deviation; each with the name of the recording behind a colon. A time t of the file is (1 + time_base) t; a
-    displacement from the place of release is seen (1 + length_scale) times as large.
+    Its parameters are position [m] and velocity [m/s] along each measured axis, then `release_time` [s], `length_scale` [-] and
+    `time_base` [-] where the folder gives them a standard deviation. Each name is followed by a colon and the name of the recording.
+    A time t in the file is the true time (1 + time_base) t. A displacement from the place of release is measured (1 + length_scale)
+    times too large.
+
+    Args:
+        track: The recording.
+        nuisances: Prior standard deviation of `release_time` [s], `length_scale` [-] and `time_base` [-]; 0: without error.
+        gravity: Acceleration of gravity [m/s^2], (3,).
+        error: Error of the tracked positions [m].
     """
 
     def __init__(self, track: Track, nuisances: Mapping[str, float], gravity: Sequence[float], error: SeriesError) -> None:
@@ -38,7 +46,7 @@ class Released:
         slope = np.polyfit(track.t[:n], track.x[:n], 1)[0]
         extent = max(float(np.ptp(track.x)), 10 * sigma)
         size = max(float(np.linalg.norm(gravity)), 1e-3)
-        # in the first frames noise and gravity alone make this much of the slope
+        # noise and gravity alone change the slope of the first frames by this much
         spread = float(np.hypot(2 * sigma / span, size * span))
         out = []
         for a, at in zip(track.axes, np.median(track.x[:3], axis=0), strict=True):
@@ -54,7 +62,7 @@ class Released:
         self.parameters: tuple[Parameter, ...] = tuple(out)
 
     def seen(self, values: np.ndarray, forces: Forces, t: np.ndarray) -> np.ndarray:
-        """The measured coordinates at times t (n,) for parameters (P, k), (P, n, A) [m]."""
+        """Predict the measured coordinates [m], (P, n, A) for A axes, at times t (n,) [s] for P rows of parameters (P, k)."""
         axes, count = list(self.track.axes), len(values)
         x, v = np.zeros((count, 3)), np.zeros((count, 3))
         x[:, axes], v[:, axes] = values[:, : len(axes)], values[:, len(axes) : 2 * len(axes)]
@@ -66,33 +74,36 @@ class Released:
         return (x[:, None] + (1 + off["length_scale"])[:, None, None] * (moved - x[:, None]))[..., axes]
 
     def off_prior(self, values: np.ndarray) -> np.ndarray:
-        """How far parameters (P, k) are from where their priors have them, in standard deviations, one column for each that has one."""
+        """Return the deviation of parameters (P, k) from their priors in standard deviations, a column per parameter with a prior."""
         owned = [(i, p, p.prior) for i, p in enumerate(self.parameters) if p.prior is not None]
         return np.stack([(values[:, i] - p.value) / (p.scale * prior) for i, p, prior in owned], axis=1)
 
     @property
     def variance(self) -> float:
-        """Of the tracking error of one coordinate [m^2]: a noise that is stated, or the estimate with its slow part."""
+        """Variance of the tracking error of a coordinate [m^2]: of the stated noise, or of the estimated error with its slow part."""
         return self.error.sigma**2 + self.error.amplitude**2 if self.track.noise is None else self.track.noise**2
 
     def whitener(self, t: np.ndarray) -> np.ndarray:
-        """The matrix (n, n) that brings the tracking error at times t (n,) to unit variance."""
+        """Return the matrix (n, n) [1/m] that turns tracking errors at times t (n,) into independent ones of variance one."""
         if self.track.noise is not None:
             return np.eye(len(t)) / self.track.noise
         return np.linalg.inv(np.linalg.cholesky(self.error.covariance(t)))
 
 
 def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarray:
-    """The nuisances of a recording (P, k) that its first frames call for, for P models at once.
+    """Fit the nuisances of a recording to its first frames, for P models at once.
 
-    Least squares in the metric of the tracking error, with the priors, by Levenberg and Marquardt's method; from the prior's centre,
-    and from a release one standard deviation later.
+    The fit is least squares with the priors, weighted by the tracking error (Levenberg-Marquardt). It starts from the centre of the
+    priors and from a release one standard deviation later, and the better result counts.
 
     Args:
         start: The recording.
-        forces: What acts, a row for each model or one for all.
-        count: Models P.
-        frames: How many frames count.
+        forces: Forces on the body, a row per model or one for all.
+        count: Number of models P.
+        frames: Number of frames that are fitted.
+
+    Returns:
+        Nuisances (P, k) in the order of `start.parameters`.
     """
     parameters, track = start.parameters, start.track
     t, y = track.t[:frames], track.x[:frames]
@@ -106,7 +117,7 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
     forces = _repeated(forces, count, len(begun) * (k + 1))
 
     def evaluate(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (rows, m) and their slopes (rows, m, k) by coordinates in units of `scale`."""
+        """Return residuals (rows, m) and their derivatives (rows, m, k) by the parameters in units of `scale`."""
         step = np.where(v + PROBE * scale > high, -PROBE, PROBE)
         probes = np.concatenate([v[None], v[None] + np.eye(k)[:, None] * (step * scale)[None]]).reshape(-1, k)
         seen = start.seen(probes, forces, t) - y
@@ -124,7 +135,7 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
         usable = np.asarray(np.isfinite(J).all((1, 2)) & np.isfinite(r).all(1))
         Jc, rc = np.where(usable[:, None, None], J, 0.0), np.where(usable[:, None], r, 0.0)
         A, g = np.einsum("pmi,pmj->pij", Jc, Jc), np.einsum("pmi,pm->pi", Jc, rc)
-        # a parameter at its bound that wants to go on is held there
+        # a parameter at its bound that would move out of the range stays there
         held = ((values <= low) & (g > 0)) | ((values >= high) & (g < 0))
         free = ~held
         A = A * free[:, :, None] * free[:, None, :]
@@ -145,9 +156,10 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
 
 
 def settled_error(start: Released, forces: Forces, frames: int) -> float:
-    """Root mean square error [m] of the later frames that the tracking error causes where one model is right.
+    """Return the root mean square error [m] of the later frames that the tracking error alone causes in the right model.
 
-    The tracking error itself, and that of the nuisances, which `settle` takes from the first frames: it grows with time.
+    It is the tracking error of these frames together with the error of the nuisances, which `settle` fits to the first `frames` frames
+    and which grows with time.
     """
     parameters, t = start.parameters, start.track.t
     scale = np.array([p.scale for p in parameters])
@@ -162,7 +174,7 @@ def settled_error(start: Released, forces: Forces, frames: int) -> float:
 
 
 def _repeated(forces: Forces, count: int, times: int) -> Forces:
-    """The forces of P models, over and over."""
+    """Repeat the rows of P = `count` models `times` times."""
     fields = {}
     for name, value in forces._asdict().items():
         if value is not None and name != "time_force_interval":

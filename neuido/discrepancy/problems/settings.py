@@ -1,28 +1,28 @@
-"""The settings of the discretisation: those whose differences are measured, and those of a search."""
+"""The settings of a simulation (method, grid, step, mesh) that a diagnosis compares, and the cheaper ones that its search uses."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One discretisation."""
+    """One choice of method, grid, step and mesh."""
 
     cells: float
-    """Factor of the suggested number of cells."""
+    """Factor on the suggested number of cells."""
     dt: float
-    """Factor of the suggested step."""
+    """Factor on the suggested time step."""
     solver: str = "material_points"
     """`material_points` or `finite_elements`."""
     elements: float = 1.0
-    """Finite elements a particle."""
+    """Number of finite elements per particle."""
     tetrahedra: int = 5
-    """Finite elements that a cell of the mesh's lattice is cut into."""
+    """Number of tetrahedra that each cell of the mesh's lattice is divided into."""
     lift: float = 0.0
-    """Suggested cells by which the colliders and the grid are higher; see `CONTACT_HEIGHT`."""
+    """Height by which colliders and grid are raised [suggested cells]; see `CONTACT_HEIGHT`."""
 
     @property
     def name(self) -> str:
-        """For the report."""
+        """Name in the report."""
         parts = ["finite elements"] * (self.solver == "finite_elements") + [f"{self.elements:g} a particle"] * (self.elements != 1.0)
         parts += [f"{self.tetrahedra} a cell"] * (self.tetrahedra != 5)
         parts += [f"{self.cells:g} times the cells"] * (self.cells != 1.0) + [f"{self.dt:g} of the step"] * (self.dt != 1.0)
@@ -41,22 +41,24 @@ SETTINGS = (
     Setting(1.0, 1.0, "finite_elements", tetrahedra=6),
 )
 LONGER = (4.0, 2.0)
-"""Times the suggested step that a search moves material points with: the longest that leaves a margin."""
+"""Factors on the suggested time step of material points that a search tries, longest first."""
 STEADY = 1.8
-"""Margin that a longer step leaves where the model is declared, at the least, as a ratio: a step takes a wave through half a cell then."""
+"""Least ratio of the stability limit to a longer time step, at the declared values. A wave then crosses half a cell in a step."""
 QUICK = tuple(Setting(cells, dt, lift=lift) for dt in LONGER for cells, lift in ((1.0, 0.0), (0.85, 0.0), (1.2, 0.0), (1.0, 0.5)))
 EVERY = SETTINGS + QUICK
-"""The settings by their numbers: those whose differences are measured, and those of a search."""
+"""All settings; the number of a setting is its place here. First those that are compared, then those of the search."""
 SOLVERS = tuple(next(i for i, s in enumerate(SETTINGS) if s.solver == name) for name in ("material_points", "finite_elements"))
-"""The settings that are methods of their own."""
+"""Number of the setting that stands for each simulation method."""
 AFFORDED = 16
-"""Times the inner steps of the declared model that finite elements may take: viscosities at the edge of their range ask for 70 to 360, and
-of fits on a GPU, which share their launches, all wait for the slowest one."""
-COARSE = SETTINGS.index(Setting(1.0, 1.0, "finite_elements", elements=0.6))
-"""What finite elements are searched with."""
-CONTACT_HEIGHT = "contact_height"
-"""Name in a point: how much higher [m] than they are declared the colliders are, with the grid.
+"""Largest factor on the inner steps that finite elements need for the declared model.
 
-A body meets a plane of a grid at a layer of nodes, up to a cell from where the plane is declared, and two grids differ by that whatever
-their cells; a real floor is where it was measured to be, more or less. A prediction moves the body instead, and what is seen of it back.
+Viscosities at the edge of their range would need a factor of 70 to 360, and fits that share a launch on a GPU all wait for the slowest.
+"""
+COARSE = SETTINGS.index(Setting(1.0, 1.0, "finite_elements", elements=0.6))
+"""Setting with which finite elements are searched: a coarser mesh."""
+CONTACT_HEIGHT = "contact_height"
+"""Name of a parameter: height of the colliders and the grid above their declared place [m].
+
+On a grid, a body meets a plane at a layer of nodes, up to one cell from the declared plane, and grids differ by that. The place of a real
+floor is known only to a measurement error. A simulation lowers the body instead, and raises the predicted positions again.
 """
