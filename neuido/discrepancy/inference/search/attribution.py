@@ -13,7 +13,7 @@ from neuido.discrepancy.inference.laboratory import Tell
 from neuido.discrepancy.inference.least_squares import Fit, NotFinite
 from neuido.discrepancy.inference.power import Compatible, compatible
 from neuido.discrepancy.inference.search import base_fits, judging, next_effect
-from neuido.discrepancy.inference.search.choosing import first_rounds, told_exactly
+from neuido.discrepancy.inference.search.choosing import first_rounds, is_explained_exactly
 from neuido.discrepancy.inference.search.decision import case_of, decided
 from neuido.discrepancy.inference.search.intervals import blind_to_settings, findings, intervals, unable
 from neuido.discrepancy.inference.search.judging import CLASS_RATIO, CLEAR, FORETELLS
@@ -209,7 +209,7 @@ def diagnose(
         search = next_effect.new_search(problem, setting=n, keep=keep, draws=draws, seed=seed, **shared)
         if starts and (comparing.is_settled(tried[-1].lab, starts[-1].errors) or budget.skips(problem.setting_name(n))):
             continue
-        if len(starts) == 1 and told_exactly(tried[0], starts[0]):
+        if len(starts) == 1 and is_explained_exactly(tried[0], starts[0]):
             break
         # extra parameters of the problem belong to the other method: only the declared ones are passed on
         near = {name: starts[0].fit.point[name] for name in search.lab.as_declared} if starts else None

@@ -1,4 +1,4 @@
-"""Full fits of candidates side by side: where they begin, who is fitted, and who is given up."""
+"""Full fits of candidates side by side: their starts, their order, and when a fit is given up."""
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -13,27 +13,31 @@ from neuido.discrepancy.inference.search.search_state import Contest, PutOff, St
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 
 SMALL = 2
-"""Parameters up to which a candidate gets a fit in the first round whatever its place in the screening: a direction says little of what a
-yield stress or a lossy floor does once it acts."""
+"""Number of parameters up to which a candidate is fitted in the first round whatever its rank in the screening. The screening's
+direction says little of what a yield stress or a lossy floor does once it acts."""
 SIZED = 3
-"""Parameters up to which a candidate of one size is tried at several sizes before it is fitted."""
+"""Number of parameters up to which a candidate with one size is tried at several sizes before it is fitted."""
 TRIED_AT_ONCE = 48
-"""Starts, at the least, that are tried in one go where points run together: between two goes the budget is looked at."""
+"""Least number of starts in one batch where many simulations run in one launch. The budget is checked between batches."""
 SHAPES = 4
-"""Shapes of a candidate of more than `SMALL` parameters that are fitted: from 17 degrees beside a fibre a fit comes to it, from 47 not."""
+"""Number of shapes of a candidate with more than `SMALL` parameters that are fitted. A fit finds a fibre from 17 degrees away, but not
+from 47."""
 FAR = 6.0
-"""Times the size that a candidate is screened at, for a fit from elsewhere."""
+"""Factor from the size at which a candidate is screened to the larger size from which further fits begin."""
 BESIDE = 2.0
-"""Times the cost of a candidate's best start up to which one with the other declared values is kept beside it. By as much one as declared
-is taken to leave less, where the base fit made up for the effect: what does as well as that with the stated modulus does better between."""
+"""Ratio of costs up to which a start with other declared values is kept beside a candidate's best start. Where the base fit may have
+compensated for the effect, the cost of a start at the declared values is divided by it too: with values in between, such a start does
+better."""
 TAKEN = (0.75, 0.55)
-"""Times a declared parameter that a candidate takes from (`Candidate.takes`), at which larger sizes of it are tried too."""
+"""Factors on a declared parameter that the fit without the effect makes too large (`Candidate.takes`); larger sizes are tried with them
+too."""
 LED_FAR = 1.6
-"""Times a declared value, or part of it, at which the base fit stands for an effect itself, and says little of where fits are to begin."""
+"""Ratio of a fitted to a declared value, or the reverse, above which the base fit may have compensated for an effect, so that fits also
+begin elsewhere."""
 
 
-def _in_goes(places: Sequence[tuple[list[Start], list[Start]]], count: int) -> Iterator[list[tuple[list[Start], list[Start]]]]:
-    """Candidates with their starts, so many starts together at the least."""
+def _batches(places: Sequence[tuple[list[Start], list[Start]]], count: int) -> Iterator[list[tuple[list[Start], list[Start]]]]:
+    """Yield batches of candidates, each with at least `count` starts but the last."""
     chunk: list[tuple[list[Start], list[Start]]] = []
     for place in places:
         chunk.append(place)
@@ -45,15 +49,15 @@ def _in_goes(places: Sequence[tuple[list[Start], list[Start]]], count: int) -> I
 
 
 MANY = 5
-"""Parameters above which a candidate is fitted after the others, and not at all where one of those leaves noise alone."""
+"""Number of parameters above which a candidate is fitted after the others, and not at all where one of those leaves only noise."""
 LEADERS = 4
-"""Candidates that are fitted before the others."""
+"""Number of candidates that are fitted before the others."""
 IN_REACH = 4.0
-"""Times the lowest cost up to which that of a fit is worth refining: twice its error."""
+"""Ratio to the least cost up to which a fit is worth refining; it means twice the error."""
 CLOSELY = 8
-"""Quick fits, at the most, that are made once more under the own setting."""
+"""Largest number of quick fits that are repeated under the method's own setting."""
 AT_MOST = 6
-"""Iterations of these."""
+"""Largest number of iterations of such a repeated fit."""
 
 NO_TIME = "the search ended before its fit"
 FAR_BEHIND = "by the method that fits best it was not fitted, by the other one the first few fits leave far more"
@@ -62,7 +66,7 @@ OTHERS_DO = "another effect leaves nothing but noise, and its direction in the d
 
 
 def better(fits: Iterable[tuple[Candidate, Fit]], than: Mapping[str, tuple[Candidate, Fit]]) -> dict[str, tuple[Candidate, Fit]]:
-    """The fit of least cost of each candidate, by its key, where it beats the one there is."""
+    """Return the fit of least cost of each candidate, by key, where it costs less than the one in `than`."""
     out: dict[str, tuple[Candidate, Fit]] = {}
     for c, fit in fits:
         rival = out.get(c.key) or than.get(c.key)
@@ -80,7 +84,10 @@ def first_slopes(
     columns: Mapping[tuple[str, int], Mapping[int, np.ndarray]],
     floor: Floor,
 ) -> np.ndarray | None:
-    """What the screening says of the slopes of a candidate's fit; none where it probed only sizes, or they do not act in proportion."""
+    """Return the slopes of a candidate's fit as the screening knows them, whitened.
+
+    Return None if they are unknown or small sizes of the effect do not act in proportion.
+    """
     if not c.linear or c.size_parameters != c.parameters or any(p.log for p in c.parameters):
         return None
     coordinates = [p.coordinate(c.starts[start][p.name]) for p in c.parameters]
@@ -88,17 +95,20 @@ def first_slopes(
 
 
 def whitened(lab: Laboratory, slopes: Mapping[int, np.ndarray], own: Mapping[int, np.ndarray], floor: Floor) -> np.ndarray | None:
-    """Slopes of the declared and of a candidate's parameters, {recording: (n, k)}, as fits take them; none where not all are finite."""
+    """Return whitened slopes of the declared and a candidate's parameters, or None if some are not finite.
+
+    `slopes` and `own` map a recording to an array (n, k). The result has the fitted rows of all recordings.
+    """
     whiten = floor.whitener(lab.parts)
     J = np.concatenate([whiten(np.concatenate([slopes[n], own[n]], axis=1), n) for n in lab.fitted_recordings])
     return J if np.isfinite(J).all() else None
 
 
 def strong(lab: Laboratory, c: Candidate, places: Sequence[Point], point: Point, floor: Floor) -> list[Point]:
-    """The best of some starts at full strength, of either sign, by what they leave as they are.
+    """Return the best start of each sign at full strength, by the cost of one simulation each.
 
-    A part that is many times as stiff as the rest moves the body in another way than the direction of a little stiffness says, and a
-    fit that begins at a little comes down into the nearest valley.
+    A part that is many times as stiff as the rest moves the body differently than a slightly stiffer part does. A fit from a small size
+    would end in the nearest local minimum.
     """
     begins = [{**point, **start, **along(lab, c, point, {c.apart: size})} for size in (c.far, -c.far) for start in places]
     if not begins:
@@ -110,7 +120,7 @@ def strong(lab: Laboratory, c: Candidate, places: Sequence[Point], point: Point,
 
 
 def along(lab: Laboratory, c: Candidate, point: Point, size: Mapping[str, float]) -> dict[str, float]:
-    """A size of a candidate, with the declared parameters that go with it (`Candidate.beside`) from what they are at a point."""
+    """Return a size of a candidate, and the declared parameters that change with it (`Candidate.beside`) from their values at a point."""
     (value,) = size.values()
     beside = [p for p in lab.problem.declared if p.log and p.name in c.beside]
     moved = {p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + c.beside[p.name] * value / p.scale) for p in beside}
@@ -118,9 +128,9 @@ def along(lab: Laboratory, c: Candidate, point: Point, size: Mapping[str, float]
 
 
 def secant(lab: Laboratory, c: Candidate, point: Point, base: Point, slopes: Mapping[int, np.ndarray], floor: Floor) -> np.ndarray | None:
-    """About the slopes of a fit of a candidate of one size: those of the declared values at the base, and the secant from there.
+    """Return approximate slopes for the fit of a candidate with one size: those of the base, and a secant for the size.
 
-    None where the point has other declared values than the base, or shapes that are fitted too.
+    Return None where the declared values of the point differ from the base, or shapes are fitted too.
     """
     (p,) = c.size_parameters
     same = all(point.get(name) == value for name, value in base.items())
@@ -135,11 +145,12 @@ def secant(lab: Laboratory, c: Candidate, point: Point, base: Point, slopes: Map
 def sized(
     lab: Laboratory, starts: Sequence[Start], base: Fit, slopes: Mapping[int, np.ndarray], floor: Floor, *, until: float = 1.0
 ) -> tuple[list[Start], dict[str, float]]:
-    """The best starts of each candidate, and the least share of the base fit's misfit that one leaves as it is, by key.
+    """Return the best starts of each candidate, and the least share of the base fit's misfit that one start leaves, by key.
 
-    Candidates of few parameters and one size are tried at the sizes and in the shapes of `tried`, one simulation each. The best one is
-    kept, and of the others the best one with the base fit's, or with the declared, values. A direction has several valleys: of such
-    candidates the best start of each of some shapes is kept. Past the share `until` of the work the rest keep their starts.
+    Candidates with one size and few parameters are tried at the sizes and shapes of `tried`, one simulation each. The best start is kept,
+    and beside it the best one that has the other declared values (fitted or declared). A direction has several local minima, so for
+    candidates with more than `SMALL` parameters the best start of each of several shapes is kept. After the share `until` of the search's
+    work, the remaining candidates keep their starts.
     """
     led_far = comparing.moved(lab, base.point) > LED_FAR
     places: list[tuple[list[Start], list[Start]]] = []
@@ -151,7 +162,7 @@ def sized(
     out = [start for start in starts if all(start[0] is not own[0][0] for own, _ in places)]
     least: dict[str, float] = {}
     lab.tell(f"{sum(len(made) for _, made in places)} starts of {len(places)} effects")
-    for chunk in _in_goes(places, TRIED_AT_ONCE if lab.problem.together else 1):
+    for chunk in _batches(places, TRIED_AT_ONCE if lab.problem.together else 1):
         if lab.budget.ends(until):
             out += [start for own, _ in chunk for start in own]
             continue
@@ -172,11 +183,11 @@ def sized(
 
 
 def tried(lab: Laboratory, start: Start, base: Fit, *, led_far: bool) -> list[Start]:
-    """Further starts of a candidate of one size: at larger sizes, and in the other shapes that it is screened in.
+    """Return further starts of a candidate with one size: larger sizes, and the other shapes in which it is screened.
 
-    How a large effect acts is not what the slope at none says, and one that has shapes may be very large. Where the base fit has gone
-    far from the declared values (`led_far`) from these too and from between, for it may have made up for the effect; what stiffens a
-    body is tried with less of a modulus too, and what goes with a declared value along a valley (`Candidate.beside`) with that.
+    The slope at zero does not tell how a large effect acts, and an effect that has shapes may be very large. If `led_far`, the base fit may
+    have compensated for the effect, so sizes are also tried at the declared values and half way to them. An effect that stiffens a body is
+    tried with a smaller modulus too, and one that changes together with a declared value (`Candidate.beside`) along that line.
     """
     c, begun, _ = start
     (p,) = c.size_parameters
@@ -200,17 +211,20 @@ def tried(lab: Laboratory, start: Start, base: Fit, *, led_far: bool) -> list[St
 
 
 def each_as_declared(lab: Laboratory, c: Candidate, point: Point) -> list[Start]:
-    """Every start of a candidate with the declared values: where one that does not act in proportion begins to act goes with these."""
+    """Return every start of a candidate at the declared values.
+
+    They matter for an effect that does not act in proportion: the size at which it begins to act depends on the declared values.
+    """
     return [(c, {**at_declared(lab, point), **start}, None) for start in c.starts]
 
 
 def at_declared(lab: Laboratory, point: Point) -> Point:
-    """The point with the declared parameters, and the problem's own, as the model states them; the effects as they are."""
+    """Return the point with the declared parameters as stated and without extra parameters of the problem; effects keep their values."""
     return {k: v for k, v in point.items() if "." in k} | lab.as_declared
 
 
 def between(lab: Laboratory, point: Point) -> Point:
-    """The point with the declared parameters half way from there to what the model states, in the coordinates that are fitted."""
+    """Return the point with the declared parameters half way to their stated values, in fit coordinates."""
     half = {p.name: p.physical(0.5 * (p.coordinate(point.get(p.name, p.value)) + p.coordinate(p.value))) for p in lab.problem.declared}
     return {**point, **half}
 
@@ -228,23 +242,24 @@ def contest(
     puts_off: bool = False,
     before: Sequence[tuple[Candidate, Fit]] = (),
 ) -> Contest:
-    """Fit the candidates side by side; fits that cannot catch up with the best one stop.
+    """Fit the candidates side by side, and stop fits that cannot catch up with the best one.
 
-    Where every point costs, the first of the screening set the pace, and candidates of many parameters come last, if at all. Where the
-    first ones leave noise alone, those of the others that are not `hopeful` get no fit, and the rest one each.
-
-    All of it quickly; what came close goes on under the own setting.
+    Where simulations run one by one, the leading candidates of the screening are fitted first, so that others can be given up early, and
+    candidates with many parameters come last, if at all. Where the first fits leave only noise, later candidates that are not `hopeful` get
+    no fit, and the others one each. All fits use the setting in use, which may be a quick one; those that come close are repeated under the
+    method's own setting.
 
     Args:
-        free: What is fitted beside a candidate's parameters.
-        starts: Of the fits.
-        floor: What weighs the residuals.
-        hopeful: Keys of candidates that could take something off by the screening; all where absent.
-        then: Further starts, given the best fit of each candidate in the order of their costs.
-        beyond: Score of the leading one after the first ones beyond which there are no others: another method does far better.
-        until: Share of the search's work at which fits end where they are and no others begin: the rest is for other steps.
-        between: Further fits after the first ones, given what the leading one of these leaves, where there are others to come.
-        puts_off: Whether the others wait where the first ones leave more than may be noise: it may be the wrong method.
+        lab: The method that predicts.
+        free: Parameters that are fitted beside those of a candidate.
+        starts: Starts of the fits.
+        floor: Weights of the residuals.
+        hopeful: Keys of candidates that could lower the misfit according to the screening; all where absent.
+        then: Returns further starts, given the best fit of each candidate in order of cost.
+        beyond: Score of the best first fit above which no others are made, because another method does far better.
+        until: Share of the search's work at which fits stop and no others begin.
+        between: Returns further fits after the first ones, given the least errors that these leave, where other fits are to come.
+        puts_off: Whether the other fits wait where the first ones leave more than what may be noise: the method may be the wrong one.
         before: Fits that were made before `starts` were put off (`PutOff.ended`).
     """
     ended = list(before)
@@ -262,7 +277,7 @@ def contest(
         best.update(better(fits, best))
 
     def left() -> tuple[tuple[Candidate, Fit], np.ndarray]:
-        (leading,) = wholly(lab, free, [min(best.values(), key=lambda entry: entry[1].cost)], floor, until)
+        (leading,) = refit_under_own_setting(lab, free, [min(best.values(), key=lambda entry: entry[1].cost)], floor, until)
         with lab.under(lab.own):
             return leading, lab.mean_squares([leading[1].point], floor)[0]
 
@@ -283,7 +298,7 @@ def contest(
             leading, remains = left()
         if remains is not None and score(remains) > beyond:
             unfitted = {c.key: FAR_BEHIND for wave in waves[i:] for c, *_ in wave}
-            return Contest(*closely(lab, free, best, None, floor, until), unfitted)
+            return Contest(*refit_nearest(lab, free, best, None, floor, until), unfitted)
         if puts_off and leading is not None and remains is not None and not comparing.may_be_noise(lab, remains):
             waiting = tuple(start for wave in waves[i:] for start in wave)
             unfitted = {c.key: NO_TIME for c, *_ in waiting}
@@ -302,10 +317,10 @@ def contest(
     other = other_sign(lab, free, best, ended, floor)
     if other is not None and other[1].cost < best[other[0].key][1].cost:
         best[other[0].key], other = other, best[other[0].key]
-    return Contest(*closely(lab, free, best, other, floor, until), unfitted)
+    return Contest(*refit_nearest(lab, free, best, other, floor, until), unfitted)
 
 
-def closely(
+def refit_nearest(
     lab: Laboratory,
     free: Sequence[Parameter],
     best: Mapping[str, tuple[Candidate, Fit]],
@@ -313,20 +328,20 @@ def closely(
     floor: Floor,
     until: float,
 ) -> tuple[dict[str, tuple[Candidate, Fit]], tuple[Candidate, Fit] | None]:
-    """Quick fits that came close once more under the own setting, from where they ended; the best first, and not all of many."""
+    """Repeat the quick fits of least cost under the method's own setting, from their ends; at most `CLOSELY` of them."""
     fits = sorted(best.values(), key=lambda entry: entry[1].cost)
     near = [entry for entry in fits if entry[1].cost < IN_REACH * fits[0][1].cost][:CLOSELY]
-    ended = wholly(lab, free, near if other is None else [*near, other], floor, until)
+    ended = refit_under_own_setting(lab, free, near if other is None else [*near, other], floor, until)
     again = None if other is None else ended.pop()
     return {**best, **{c.key: (c, fit) for c, fit in ended}}, again
 
 
-def wholly(
+def refit_under_own_setting(
     lab: Laboratory, free: Sequence[Parameter], fits: Sequence[tuple[Candidate, Fit]], floor: Floor, until: float
 ) -> list[tuple[Candidate, Fit]]:
-    """Quick fits once more under the own setting, from where they ended; as they are where nothing runs there.
+    """Repeat quick fits under the method's own setting, from their ends, and keep a quick fit where that does not run.
 
-    Without a race: who is in a class is said by where they end.
+    No fit is given up early, because the class of an effect depends on where all of them end.
     """
     if lab.setting == lab.own:
         return list(fits)
@@ -344,9 +359,10 @@ def other_sign(
     ended: Sequence[tuple[Candidate, Fit]],
     floor: Floor,
 ) -> tuple[Candidate, Fit] | None:
-    """The leading candidate's best fit of the other sign, where its signs are apart.
+    """Return the leading candidate's best fit with the opposite sign, if its sign cannot change during a fit (`Candidate.apart`).
 
-    A stiff end of a body is much like a soft rest of it, and the one that comes down faster has the other given up: it goes on alone.
+    A stiff end of a body resembles a soft rest of it, and the sign that descends faster makes the other be given up. That fit is continued
+    here alone.
     """
     if not best:
         return None

@@ -1,4 +1,4 @@
-"""The answer of a diagnosis from its judged rounds, live or from what a journal stored of them, without a simulation."""
+"""The answer of a diagnosis from its judged rounds, without further simulation; the rounds may be live or stored in a journal."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -16,7 +16,7 @@ from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 
 ENOUGH = 3, 10
-"""Data that each part needs for each figure of the declared model, and beside them, to say that nothing is missing."""
+"""Data that each part needs to answer `none`: this many for each parameter of the declared model, and this many more."""
 
 
 def decided(
@@ -32,8 +32,8 @@ def decided(
     """Return the answer, and why the recordings say too little or what is wrong with them.
 
     Args:
-        lab: The method that the answer goes by.
-        before: Mean squares of what the declared model leaves of each part.
+        lab: The method on which the answer rests.
+        before: Mean squares of the residual of the declared model, of each part.
         found: The effects that were named.
         steps: The rounds of the answer.
         cut: Whether the search ended early.
@@ -62,7 +62,7 @@ def decided(
 
 
 def enough(lab: Laboratory) -> bool:
-    """Whether there are many more data than parameters in every part."""
+    """Return whether every part has many more data than the declared model has parameters; see `ENOUGH`."""
     each, beside = ENOUGH
     return all(int(p.rows.sum()) > each * len(lab.problem.declared) + beside for p in lab.parts)
 
@@ -96,34 +96,34 @@ def case_of(
 
 @dataclass(frozen=True)
 class Decision:
-    """What stored fits say."""
+    """The answer that follows from stored fits."""
 
     answer: str
     why: tuple[str, ...]
     effects: tuple[str, ...]
     """Keys of the named effects."""
     classes: tuple[tuple[str, ...], ...]
-    """Names of the effects that each is not told from, itself among them."""
+    """Names of the effects in the class of each named effect, itself among them."""
     differs: tuple[int, ...]
-    """Numbers of the judged rounds in which another effect, or another class, is named than when they were made."""
+    """Numbers of the judged rounds that now name another effect, or another class, than when they were made."""
 
 
 class StoredEnds:
-    """`search_state.Ends` as a journal stored them for one judged round.
+    """Fit results (`search_state.Ends`) of one judged round, read from a journal.
 
     Args:
-        lab: The method whose round it is.
-        candidates: All of the case, by key.
-        record: What was stored.
+        lab: The method of the round.
+        candidates: All candidates of the case, by key.
+        record: The stored round.
     """
 
     def __init__(self, lab: Laboratory, candidates: Mapping[str, Candidate], record: RoundRecord) -> None:
         self.best: dict[str, tuple[Candidate, Fit]] = {}
         self.stands: list[Stand] = []
         self.ends: list[tuple[Stand, Stand]] = []
-        """Fits that went on to their ends, and these."""
+        """Pairs of a fitted model and its continuation to the end of the fit."""
         self.left: dict[tuple, np.ndarray] = {}
-        """What one simulation leaves, by `journal.place`."""
+        """Errors of one simulation alone, mean squares of the parts, by `journal.place`."""
         self.lab = lab
         for fit in record.fits:
             c, stand = candidates[fit.effects[-1]], self._stand(fit)
@@ -133,7 +133,7 @@ class StoredEnds:
                 self.ends.append((stand, self._stand(fit.finished)))
 
     def _stand(self, record: FitRecord) -> Stand:
-        """Return the stand of a record, and note what one simulation leaves there."""
+        """Return the fitted model of a record, and keep the errors of one simulation alone if they are stored."""
         stand = stand_of(self.lab, record)
         if record.alone is not None:
             self.left[place(self.lab.own, stand)] = np.array(record.alone)
@@ -150,7 +150,7 @@ class StoredEnds:
 
 
 def stored_problem(case: CaseRecord) -> Problem:
-    """Return a problem of which only what was stored is known; it predicts nothing."""
+    """Return a problem with the stored facts only; it cannot predict."""
     declared = tuple(Parameter(**p) for p in case.declared)
     recordings = tuple(
         Recording(name, role, np.zeros(count), noise, np.zeros(count, int), np.linspace(0.0, 1.0, count), origin)
@@ -161,13 +161,13 @@ def stored_problem(case: CaseRecord) -> Problem:
 
 
 def stand_of(lab: Laboratory, record: FitRecord) -> Stand:
-    """Return the stand of a record, without its arrays."""
+    """Return the fitted model of a record, without its arrays."""
     fit = Fit(record.point, record.names, record.cost, np.empty(0), record.evaluations, record.converged, setting=record.setting)
     return Stand(fit, floor_of(lab, np.array(record.spread)), np.array(record.errors))
 
 
 def floor_of(lab: Laboratory, spread: np.ndarray) -> Floor:
-    """Return a floor of which the mean squares that the settings differ by are known."""
+    """Return a floor of which only the mean squares of the differences between settings are known."""
     by_row = {n: np.zeros(len(lab.problem.recordings[n].y)) for n in lab.scored_recordings}
     for part, square in zip(lab.parts, spread, strict=True):
         by_row[part.recording][part.rows] = np.sqrt(square)
@@ -175,7 +175,7 @@ def floor_of(lab: Laboratory, spread: np.ndarray) -> Floor:
 
 
 class _Drawn:
-    """The null hypothesis as it was drawn."""
+    """The stored draws of the null hypothesis, in the place of a `bootstrap.LinearModel`."""
 
     keys: tuple[str, ...] = ()
 
@@ -187,7 +187,7 @@ class _Drawn:
 
 
 def stored_parts(case: CaseRecord) -> list[Part]:
-    """Return the parts of a case; the rows of several parts of one recording are disjoint."""
+    """Return the parts of a case; parts of the same recording get disjoint rows."""
     parts, begun = [], dict.fromkeys((n for n, *_ in case.parts), 0)
     for n, fitted, count, name in case.parts:
         rows = np.zeros(case.recordings[n][2], bool)
@@ -198,7 +198,7 @@ def stored_parts(case: CaseRecord) -> list[Part]:
 
 
 def judged_again(lab: Laboratory, candidates: Mapping[str, Candidate], r: RoundRecord) -> Round:
-    """Return a stored round as the rules judge it now."""
+    """Return a stored round as the present rules judge it."""
     ends = StoredEnds(lab, candidates, r)
     floor = floor_of(lab, np.zeros(len(lab.parts)))
     empty = Round(
@@ -208,10 +208,10 @@ def judged_again(lab: Laboratory, candidates: Mapping[str, Candidate], r: RoundR
 
 
 def decide(case: CaseRecord) -> Decision:
-    """Return what the rules say of stored fits, without a simulation.
+    """Return the answer that the present rules give to stored fits, without a simulation.
 
-    Every judged round is judged again. Where one comes out as it did, the steps of the answer are what the search made of it; where it does
-    not, the step is the round as it comes out now, and no further step follows from it.
+    Every stored round is judged again. A round with the same outcome keeps its step of the answer. A round with another outcome becomes a
+    step as it is judged now, and no step follows it.
     """
     problem, parts = stored_problem(case), stored_parts(case)
     candidates = {c.key: c for c in problem.candidates}

@@ -1,4 +1,4 @@
-"""How sure the fitted parameters are, and what forbids an answer."""
+"""Confidence intervals of fitted parameters, and findings that forbid an answer."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,22 +15,31 @@ from neuido.discrepancy.inference.search.judging import IMPLAUSIBLE
 from neuido.discrepancy.problems.problem import Parameter
 
 QUANTILE = 0.95
-"""Of each end of a 90 % interval."""
+"""Probability below the upper end of a 90 % interval."""
 NORMAL = float(norm.ppf(QUANTILE))
 ROOM = 4.0
-"""Times the mean square that a refit leaves of the discretisation error up to which a residual above the noise widens an interval."""
+"""Largest factor by which a residual above the noise may scale the estimated discretisation error of an interval, a ratio of mean
+squares."""
 NEARBY = 0.02
-"""Sum of squares of the amounts of the other settings up to which the data lie on the setting in use."""
+"""Sum of squares of the amounts of the other settings up to which the data are taken to lie on the setting in use."""
 
 
 def intervals(lab: Laboratory, fit: Fit, floor: Floor, errors: np.ndarray) -> dict[str, tuple[float, float]]:
-    """90 % intervals of the parameters of a fit that leaves `errors`, mean squares of the parts.
+    """Return 90 % intervals of the fitted parameters, in their physical units.
 
-    Noise, nuisances and the differences of the settings count to first order, as the fit has them. What no difference shows is estimated
-    by fits to the motions under other settings, each without its own difference: how far the parameters go, with Student's quantile since
-    such fits are few, and scaled by what the residuals leave for it, or by how far the data lie from the setting in use where that is more.
-    The residual is of the part where it is largest beside it: where a fit has taken the error of the solver into its parameters, only what
-    was held out shows it. A parameter that does nothing may have any value.
+    Noise, nuisances and the differences between settings count to first order, as in the fit. Solver errors that no difference shows are
+    estimated by refits: the motion under each other setting is fitted without its own difference, and the shifts of the parameters are
+    measured. The shifts count with Student's quantile, because there are few refits. They are scaled by the part with the largest residual
+    relative to what the refits leave, or by the distance of the data from the setting in use where that is more. Held-out parts count here,
+    because a fit may hide the error of the solver in its parameters.
+
+    A parameter without influence on the data gets its whole range.
+
+    Args:
+        lab: The method that predicts.
+        fit: The fit.
+        floor: Noise and discretisation at its end.
+        errors: Mean squares of its residual, of each part.
     """
     parameters = [lab.problem.parameter(name) for name in fit.names]
     above = np.maximum(errors - lab.noise_squares, 0.0)
@@ -51,27 +60,27 @@ def intervals(lab: Laboratory, fit: Fit, floor: Floor, errors: np.ndarray) -> di
 
 
 def _room(above: np.ndarray, error: np.ndarray) -> float:
-    """How many times an error, at most `ROOM`, what is left above the noise has room for; both mean squares of the parts."""
+    """Return by what factor, at most `ROOM`, a solver's error fits into what is left above the noise; mean squares of the parts."""
     shares = above / np.maximum(error, 1e-300)
     return min(float(np.max(shares[np.isfinite(shares)], initial=0.0)), ROOM)
 
 
 def _widened(count: int) -> float:
-    """Student's quantile over the normal one, for a deviation about a known mean of so many values."""
+    """Return the ratio of Student's to the normal quantile, for a deviation from `count` values with a known mean."""
     return float(student.ppf(QUANTILE, count)) / NORMAL
 
 
 def _first_order(lab: Laboratory, parameters: Sequence[Parameter], fit: Fit, floor: Floor) -> np.ndarray:
-    """Variances of the coordinates through the slopes, the nuisances and the amounts of the settings' differences marginalised.
+    """Return variances of the fit coordinates to first order, with nuisances and amounts of the settings' differences marginalised.
 
-    The size of the errors is that of the residual: the weights go by what the settings differ by, which the fit may have taken out.
+    The size of the errors is that of the residual, because the weights rest on differences between settings that the fit may have removed.
     """
     if not parameters:
         return np.empty(0)
     whiten, recordings = floor.whitener(lab.parts), lab.fitted_recordings
     slopes = directions.slopes(lab, parameters, fit.point, recordings, step=0.1)
     J = np.concatenate([whiten(slopes[n], n) for n in recordings])
-    known = np.isfinite(J).all(axis=0)  # beside a point where the model just runs it may not: then nothing is known of the parameter
+    known = np.isfinite(J).all(axis=0)  # the model may fail just beside the point; then nothing is known of the parameter
     gain = np.linalg.pinv(np.where(known, J, 0.0))
     gain[~(known & J.any(axis=0))] = np.inf
     left = np.concatenate([whiten(lab.residual(fit.point, n), n) for n in recordings])
@@ -79,17 +88,18 @@ def _first_order(lab: Laboratory, parameters: Sequence[Parameter], fit: Fit, flo
 
 
 TOLD = 3.84
-"""The 95 % quantile of chi squared with one degree of freedom: a figure whose change costs less is not told by the data."""
+"""The 95 % quantile of chi squared with one degree of freedom. The data do not determine a figure whose change costs less."""
 AT_BOUND = 1e-6
-"""Relative distance from a bound at which a figure stands on it."""
+"""Relative distance from a bound within which a figure stands at it."""
 FREE_AT = {"poisson": "upper"}
-"""Bounds that are no sign of a fault: an incompressible body is one."""
+"""Bounds at which a figure may stand without a fault: an incompressible body has the largest Poisson's ratio."""
 
 
 def findings(lab: Laboratory, at: Stand) -> list[str]:
-    """Return what is wrong with fitted figures of the declared model, in words: those at a bound, and those far from what was declared.
+    """Return sentences on fitted figures of the declared model that stand at a bound or far from their declared values.
 
-    A figure counts where the data tell it: put back to what is plausible, the others as they are, the fit is worse by more than chance.
+    A figure counts only if the data determine it: moved back to a plausible value, with the others unchanged, it must make the fit worse by
+    more than chance.
     """
     point, out = at.fit.point, []
     for p in lab.problem.declared:
@@ -112,13 +122,13 @@ def findings(lab: Laboratory, at: Stand) -> list[str]:
 
 
 def _is_at(p: Parameter, value: float, side: str) -> bool:
-    """Whether a value stands at the `lower` or the `upper` bound of a parameter."""
+    """Return whether a value stands at the `lower` or the `upper` bound of a parameter."""
     bound = getattr(p, side)
     return abs(value - bound) <= AT_BOUND * max(abs(bound), 0.0 if p.log else p.scale)
 
 
 def would_help(kind: str, *, discretised: bool) -> list[str]:
-    """What would let a further diagnosis say more, in words."""
+    """Return suggestions for measurements or settings that would let a further diagnosis say more."""
     out = ["a longer or faster recording of the same body", "a recording of another launch, fitted beside these"]
     if kind == "material test":
         out = ["tests to larger strain, in another mode, or at another rate", "a repeated test, which gives the scatter of the specimens"]
@@ -128,12 +138,12 @@ def would_help(kind: str, *, discretised: bool) -> list[str]:
 
 
 def unable(lab: Laboratory) -> Mapping[str, list[str]]:
-    """The names of the other settings that do not run where the model stands, by recording."""
+    """Return the names of the other settings that do not run at the model's final point, by recording."""
     problem = lab.problem
     return {problem.recordings[n].name: [problem.setting_name(s) for s in own] for n, own in lab.unable.items() if own}
 
 
 def blind_to_settings(lab: Laboratory) -> bool:
-    """Whether no other setting runs in some recording, so that its discretisation error is not known."""
+    """Return whether no other setting runs for some recording, so that its discretisation error is unknown."""
     others = lab.problem.others(lab.setting)
     return bool(others) and any(len(own) == len(others) for own in lab.unable.values())

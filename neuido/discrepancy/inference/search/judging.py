@@ -1,4 +1,4 @@
-"""What a step says of its fits: what is named, and why the others are rejected."""
+"""The judgement of one round of fits: which effect is named, and why the others are rejected."""
 
 import math
 from collections.abc import Mapping
@@ -19,80 +19,83 @@ from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.problem import Candidate
 
 LED_AWAY = 2.5
-"""Ratio of a declared parameter to what the model states at which a base fit is led away by what it lacks."""
+"""Ratio of a fitted to a declared value, or the reverse, above which the base fit is taken to compensate for a missing effect."""
 
 
 ALPHA = 0.05
-"""Family-wise level of a named effect."""
+"""Family-wise significance level of a named effect."""
 CLASS_RATIO, CLASS_RATIO_EXACT = 1.4, 1.15
-"""Candidates whose errors are within this factor of the best one's are not told from it; the smaller one where the discretisation has no
-part in them (`EXACT`)."""
+"""Ratio to the error of the best candidate up to which another one belongs to its class. The smaller one holds where one simulation
+leaves only noise (`EXACT`), so that discretisation plays no part."""
 CLASS_RATIO_ABOVE = 1.8
-"""The same where the best one leaves more than noise, for then the errors are those of the discretisation. With 1.7 one of 30 blind cases
-loses a member of its class, with 1.96 another one gets a wrong leader."""
+"""The same where the best candidate leaves more than noise, because the errors are then those of discretisation. With 1.7 one of 30
+blind cases loses a member of its class, with 1.96 another one gets a wrong leader."""
 RIVAL = 0.4
-"""Share of the best gain that a member of a class needs, so that what gains next to nothing is none. With 0.5 one of 30 blind cases loses a
-member."""
+"""Share of the best gain that a member of a class needs, so that an effect that hardly helps is none. With 0.5 one of 30 blind cases
+loses a member."""
 LEAST_GAIN_EXACT = math.log(CLASS_RATIO_EXACT)
-"""`LEAST_GAIN` where nothing is discretised: what two effects are told apart by."""
+"""`LEAST_GAIN` where nothing is discretised: the ratio at which two effects can be told apart."""
 WITHIN = 0.5
-"""Share of the floor within which a residual that no effect explains is no reason to look further; as far above it is `ABOVE`."""
+"""Ratio to its floor up to which a residual that no effect explains is no reason to search further; its reciprocal is `ABOVE`."""
 ABOVE = 1.0 / WITHIN
-"""Times its floor from which a residual that no effect explains is unknown."""
+"""Ratio to its floor above which a residual that no effect explains is called unknown."""
 CLEAR = 1.5
-"""Times its floor from which a residual is clearly above it: the least gain is enough, and what an effect leaves is searched for another
-one; eight searches below it found none. Above it what the suggested method leaves is searched before another one is asked."""
+"""Ratio to its floor from which a residual is clearly above it. Then the least gain is enough to name an effect, a further effect is
+searched for, and the suggested method's effects are searched before another method is asked. Eight searches for a further effect below
+it found none."""
 GAIN_IN_FLOOR = math.log(4.0)
-"""What it takes well within the floor, where the best candidates of blind nulls gained up to 3.3 times: only an effect that the data show
-far below it."""
+"""Least gain where the residual is well within the floor, where the best candidates of blind nulls gained up to 3.3-fold. Only an effect
+that the data show far below the floor passes."""
 GAIN_AT_FLOOR = math.log(2.5)
-"""What it takes where the residual is as large as the floor; those of 55 blind nulls gained up to 1.9 times there."""
+"""Least gain where the residual is as large as the floor, where the best candidates of 55 blind nulls gained up to 1.9-fold."""
 GAIN_TO_NOISE = 0.5 * GAIN_IN_FLOOR
-"""What it takes where noise alone is left, for a candidate can take the place of what the grid does; of one that `stands_alone`; and above
-the floor where the base fit is led away, as none of 40 nulls' was. Twofold."""
+"""Least gain (twofold) of an effect that leaves only noise, because a candidate may fit what the grid does; of an effect that
+`stands_alone`; and, above the floor, where the base fit compensates for something (`LED_AWAY`), as none of 40 nulls' base fits did."""
 EXACT = 1.05
-"""Mean squares up to so many times those of the noise, and three deviations of their own, that one simulation alone leaves where no other
-grid has a part in the data."""
+"""Ratio of mean squares to those of the noise up to which one simulation alone leaves only noise, beside three standard deviations of
+the estimate. No other grid then plays a part in the data."""
 BROUGHT_BACK = 1.5
-"""Ratio of a declared parameter to what the model states up to which it is as stated: what brings a base fit back there that is led away
-(`LED_AWAY`) need gain no more than `LEAST_GAIN`, and `BACK_GAIN` above the floor. Of 344 blind cases, 119 nulls among them, the first
-changed one answer, to a right one. Well within the floor it needs what all need there: grids led one null's base fit 36-fold away."""
+"""Ratio of a fitted to a declared value, or the reverse, up to which the value counts as declared. An effect that brings a base fit
+beyond `LED_AWAY` back to it needs a gain of only `LEAST_GAIN`, or `BACK_GAIN` above the floor. Of 344 blind cases, 119 nulls among them,
+the first changed one answer, to a right one. Well within the floor the usual gain is required: there grids led one null's base fit
+36-fold away."""
 BACK_GAIN = math.log(CLASS_RATIO)
-"""What such an effect must gain above the floor: what effects are told apart by."""
+"""Least gain of such an effect above the floor: the ratio at which effects can be told apart."""
 FEW = 3
-"""Parameters up to which an effect is told by the fitted recordings, where it leaves noise alone there, gains `GAIN_IN_FLOOR` and leads
-every other by `GAIN_TO_NOISE`. In a blind seed ten of eleven like that were named, all rightly, and none came up on its twenty nulls. With
-as many parameters more than the best one a rival must be better."""
+"""Number of parameters up to which an effect may be named by the fitted recordings: where it leaves only noise there, gains
+`GAIN_IN_FLOOR` and leads every other effect by `GAIN_TO_NOISE`. In a blind seed ten of eleven such effects were named, all rightly, and
+none occurred on its twenty nulls. A rival with as many parameters more than the best effect must have the smaller error."""
 FORETELLS = 0.5 * LEAST_GAIN
-"""What such a one must gain in what is held out, and what each of several must add to the others there: half of what one alone must."""
+"""Least gain in the held-out data of an effect that the fitted recordings name, and of each of several effects beside the others: half
+of what a single effect needs."""
 SEEN = 0.1
-"""Share of the noise, mean squares, that counts as above it where less is left."""
+"""Share of the mean square of the noise that counts as the residual above the noise where less is left."""
 IMPLAUSIBLE = 30.0
-"""Ratio of a fitted figure to the declared one from which the data are not those of the declared units or material."""
+"""Ratio of a fitted figure to the declared one from which the data do not have the declared units or material."""
 STANDS_OUT = 5.0
-"""Times the noise above which a residual within its floor is no reason to say that nothing is missing: too much could hide there."""
+"""Ratio to the noise above which a residual within its floor does not allow the answer `none`: too large an effect could hide there."""
 LIKE_A_GRID = WITHIN, math.exp(GAIN_AT_FLOOR)
-"""Times what another grid does, without a refit, in the held-out recordings: an effect that leaves more than the first where less than the
-second was to be explained is not named. Of 223 named in eight blind seeds one was like that, a wrong one."""
+"""Ratios of held-out errors to the difference that another grid makes without a refit. An effect is not named if it leaves more than the
+first where less than the second was to be explained. Of 223 effects named in eight blind seeds one was like that, a wrong one."""
 
 
 def stands_alone(r: Round, t: Trial) -> bool:
-    """Whether no other effect comes within `LEAST_GAIN` of what one of few parameters gains.
+    """Return whether an effect of few parameters gains more than every other effect by at least `LEAST_GAIN`.
 
-    What a grid does several make up for in part, about as well: in no step of 187 blind nulls did the best of them lead the next by so much
-    with more than half of the error taken away.
+    Several effects compensate about equally well for a grid: in no step of 187 blind nulls did the best lead the next by so much with more
+    than half of the error removed.
     """
     others = [o.gain for o in r.trials if o.candidate.name != t.candidate.name]
     return bool(others) and len(t.candidate.size_parameters) <= SMALL and t.gain - max(others) > LEAST_GAIN
 
 
 def gain_over_floor(over: float) -> float:
-    """Return the gain that an effect must bring by how far the residual is above its floor, a ratio of errors."""
+    """Return the gain that an effect needs, given the ratio of the residual to its floor."""
     return float(np.interp(math.log(over), [math.log(WITHIN), 0.0, math.log(CLEAR)], [GAIN_IN_FLOOR, GAIN_AT_FLOOR, LEAST_GAIN]))
 
 
 class SimulatedEnds:
-    """`search_state.Ends` by simulations of a laboratory."""
+    """Fit results (`search_state.Ends`) by simulations."""
 
     def __init__(self, lab: Laboratory) -> None:
         self.lab = lab
@@ -110,7 +113,15 @@ class SimulatedEnds:
 def judge(
     search: Search, empty: Round, best: Mapping[str, tuple[Candidate, Fit]], model: bootstrap.LinearModel, *, every: bool = False
 ) -> Round:
-    """A round with the trials that fits make, and what is chosen of them; `every` as for `measured`."""
+    """Return a round with the trials of all fits and the effect that is named, if any.
+
+    Args:
+        search: The search by one method.
+        empty: The round without trials: its base, floors and null hypothesis.
+        best: The best fit of each candidate, by key.
+        model: The linear model of the fits, for the null hypothesis and the cosines between effects.
+        every: Whether all fits are measured with the floor at their ends, not the leading ones alone.
+    """
     lab = search.lab
     errors = empty.errors
     trials = []
@@ -136,10 +147,10 @@ def judge(
             result.cosines[t.candidate.key] = model.cosine(t.candidate.key, top.candidate.key)
     named = p <= ALPHA and above_noise(lab, errors, top) > least_gain(lab, result, top)
     near = not named and top.gain > LEAST_GAIN_EXACT and comparing.is_noise(lab, top.errors)
-    if near and not is_exact(search, top):  # fits end where a step gains little, which may be short of the noise
+    if near and not is_exact(search, top):  # a fit ends where a step gains little, which may be before it reaches the noise
         top.stand = finished[top.candidate.key] = search.ends.finished(top.stand)
         top.gain = comparing.gain(lab, errors, top.errors)
-    if near and is_exact(search, top):  # only chance is to be beaten
+    if near and is_exact(search, top):  # the effect must only beat chance
         exact_null = model.null(errors, search.draws, exact=True)
         result.p_value = float((1 + np.sum(exact_null >= top.gain)) / (1 + len(exact_null)))
         named = result.p_value <= ALPHA
@@ -156,7 +167,7 @@ def judge(
 
 
 def is_exact(search: Search, t: Trial) -> bool:
-    """Whether one simulation of a fit, without the differences of the settings, leaves nothing but a noise that is stated."""
+    """Return whether one simulation of a fit, without differences between settings, leaves only noise that is stated in the folder."""
     lab = search.lab
     stated = all(lab.problem.recordings[p.recording].noise for p in lab.parts)
     if lab.problem.settings == 1 or not stated or not comparing.is_noise(lab, t.errors):
@@ -167,16 +178,17 @@ def is_exact(search: Search, t: Trial) -> bool:
 
 
 def left_alone(lab: Laboratory, stand: Stand) -> np.ndarray:
-    """What one simulation leaves where a fit ended, mean squares of the parts."""
+    """Return the mean squares of the parts that one simulation leaves at the end of a fit, and record them in the journal."""
     squares = lab.mean_squares([stand.fit.point], stand.floor, plain=True)[0]
     lab.journal.alone[place(lab.own, stand)] = tuple(squares.tolist())
     return squares
 
 
 def is_like_a_grid(lab: Laboratory, t: Trial, before: np.ndarray) -> bool:
-    """Whether what is held out was off by about as much as grids differ by, `LIKE_A_GRID`, and still is with the effect.
+    """Return whether the held-out error is about as large as differences between grids, both before and with the effect.
 
-    Not where the effect brings what is fitted to the noise, or gains what one within the floor needs: there it does what no grid does.
+    The limits are `LIKE_A_GRID`. An effect that brings the fitted recordings down to noise, or gains `GAIN_IN_FLOOR`, does what no grid
+    does and is exempt.
     """
     if t.gain > GAIN_IN_FLOOR or comparing.is_noise(lab, t.errors[lab.fitted], fitted=True):
         return False
@@ -185,7 +197,10 @@ def is_like_a_grid(lab: Laboratory, t: Trial, before: np.ndarray) -> bool:
 
 
 def over_grids(lab: Laboratory, errors: np.ndarray, at: Trial) -> float:
-    """Errors of what is held out over what grids differ by where a trial stands; NaN where nothing is held out, or there is no grid."""
+    """Return the ratio of the held-out errors to the differences between grids where a trial stands.
+
+    Return NaN where nothing is held out or nothing is discretised. `errors` are mean squares of the parts.
+    """
     out = ~np.array(lab.fitted)
     if lab.problem.settings == 1 or not out.any():
         return math.nan
@@ -193,7 +208,7 @@ def over_grids(lab: Laboratory, errors: np.ndarray, at: Trial) -> float:
 
 
 def verdict(lab: Laboratory, r: Round) -> str:
-    """A line about what a round found."""
+    """Return one line about the outcome of a round."""
     before = f"{comparing.typical(lab, r.errors):.3g} {lab.problem.unit}"
     if not r.trials:
         return f"{before} left, no candidate runs"
@@ -203,10 +218,13 @@ def verdict(lab: Laboratory, r: Round) -> str:
 
 
 def least_gain(lab: Laboratory, r: Round, t: Trial) -> float:
-    """The gain that an effect must bring, by the residual over the floor, what it and others leave, and where declared values go."""
-    if lab.problem.settings == 1:  # nothing is discretised: only chance is to be beaten
+    """Return the gain that an effect needs to be named.
+
+    It depends on the ratio of the residual to its floor, on what this and other effects leave, and on how far the declared values move.
+    """
+    if lab.problem.settings == 1:  # nothing is discretised: the effect must only beat chance
         return LEAST_GAIN_EXACT
-    if comparing.is_noise(lab, t.errors):  # whatever the floor, no error of the discretisation is in there
+    if comparing.is_noise(lab, t.errors):  # whatever the floor is, no discretisation error is left
         return GAIN_TO_NOISE
     if is_told_by_fit(lab, r, t):
         return FORETELLS
@@ -218,9 +236,9 @@ def least_gain(lab: Laboratory, r: Round, t: Trial) -> float:
 
 
 def is_told_by_fit(lab: Laboratory, r: Round, t: Trial) -> bool:
-    """Whether an effect of few parameters, and no other one by far, brings the fitted recordings from far above the noise down to it.
+    """Return whether an effect of few parameters alone brings the fitted recordings from far above the noise down to it.
 
-    What is held out may lie within what grids differ by all the same, for there their amounts are those of the fitted ones.
+    The held-out error may still lie within differences between grids, because it uses the amounts of the fitted recordings.
     """
     if all(lab.fitted) or not comparing.is_noise(lab, t.errors[lab.fitted], fitted=True) or len(t.candidate.parameters) > FEW:
         return False
@@ -230,9 +248,11 @@ def is_told_by_fit(lab: Laboratory, r: Round, t: Trial) -> bool:
 
 
 def above_noise(lab: Laboratory, before: np.ndarray, t: Trial) -> float:
-    """The gain, that of the fitted recordings by what is above the noise: near it nothing lowers the whole of an error by much.
+    """Return the gain of an effect, by the error above the noise where that is larger.
 
-    Of 531 steps of nine blind seeds this names one effect that was not named before, a right one.
+    Near the noise nothing lowers the whole error by much. So the gain of the fitted recordings is taken from their error above the noise,
+    and counts up to the gain of the held-out ones. Of 531 steps of nine blind seeds this names one effect that was not named before, a
+    right one.
     """
     if lab.problem.settings == 1:
         return t.gain
@@ -242,12 +262,15 @@ def above_noise(lab: Laboratory, before: np.ndarray, t: Trial) -> float:
 
 
 def by_chance(lab: Laboratory, r: Round) -> float:
-    """Gain up to which an effect is not worth another look, be it alone or with a second one."""
+    """Return the gain up to which an effect is not worth another look, alone or with a second one."""
     return max(r.by_chance(ALPHA), SOME_GAIN)
 
 
 def as_good(search: Search, t: Trial, top: Trial) -> bool:
-    """Whether a fit comes near the errors of the best one; with `FEW` parameters more it must be better, by `PARSIMONY` for each."""
+    """Return whether a fit has about the error of the best one.
+
+    With `FEW` or more parameters more than the best one, it must have a smaller error, by `PARSIMONY` for each.
+    """
     lab = search.lab
     more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
     ratio = CLASS_RATIO if lab.problem.settings == 1 or comparing.is_noise(lab, top.errors) else CLASS_RATIO_ABOVE
@@ -257,15 +280,16 @@ def as_good(search: Search, t: Trial, top: Trial) -> bool:
 
 
 def is_rival(search: Search, t: Trial, top: Trial) -> bool:
-    """Whether the data cannot tell `t` from the best one: about its errors, a gain of its own, and not by many more parameters."""
+    """Return whether the data cannot tell a trial from the best one, so that it belongs to its class."""
     return t is top or (as_good(search, t, top) and t.gain > RIVAL * top.gain) or is_behind_by_a_grid(search.lab, t, top)
 
 
 def is_behind_by_a_grid(lab: Laboratory, t: Trial, top: Trial) -> bool:
-    """Whether `t` is behind in what is held out alone, where it leaves less than grids differ by: another grid may foretell it.
+    """Return whether a trial is behind the best one only in the held-out data, and there within differences between grids.
 
-    With no more parameters it leaves no more of what is fitted, and the best one leaves more than noise there. Of 304 named steps of
-    ten blind seeds that puts a further effect into two classes, in one of them the true one.
+    Another grid might then predict the held-out data as well. The trial must have no more parameters and leave no more of the fitted
+    recordings than the best one, and the best one must leave more than noise there. Of 304 named steps of ten blind seeds this adds an
+    effect to two classes, to one of them the true one.
     """
     if comparing.is_noise(lab, top.errors[lab.fitted], fitted=True):
         return False

@@ -1,8 +1,8 @@
-"""One step of a diagnosis: screen every candidate, fit the best, and test the best one's gain against chance and floors.
+"""One round of a diagnosis: screen every candidate, fit the best, and test the best one's gain against chance and floors.
 
-The order is that of protocols for model discrepancy: the base fit with its nuisances; the discretisation error from several settings;
-every candidate's direction in the data and its gain once the declared parameters are refitted; full fits of the best; the gain on
-recordings that were held out against a parametric bootstrap of the largest gain.
+The order is that of protocols for model discrepancy: the base fit with its nuisances; the discretisation error from several settings; the
+direction of every candidate in the data, and its gain after a refit of the declared parameters; full fits of the best candidates; the gain
+on held-out recordings against a parametric bootstrap of the largest gain.
 """
 
 import math
@@ -26,40 +26,41 @@ from neuido.discrepancy.inference.search.search_state import Look, Search
 from neuido.discrepancy.problems.problem import Candidate, Problem
 
 CONFIRMED = 0.8
-"""Share of the search's work at which the first fits of a method end that is asked after another one named an effect: what is left is
-for a second one."""
+"""Share of the search's work at which first fits end, for a method that is asked after another one named an effect. The rest is for a
+second effect."""
 PLAIN, AS_WELL = 2, 1.2
-"""Places where fits with an effect ended at which the model is weighed without it, and times the error of the base fit in the fitted
-recordings up to which it stands there instead."""
+"""Number of fitted effects from whose ends the model without them is evaluated, and the ratio to the base fit's error in the fitted
+recordings up to which such a point replaces the base."""
 MEMBERS = 3
-"""Members of a class where whose fits ended the model is weighed without them."""
+"""Number of members of a class from whose ends the model without them is evaluated."""
 UNEXPLAINED_EXACT = 3.0
-"""`ABOVE` where nothing is discretised: the noise that a folder states is an estimate."""
+"""`ABOVE` where nothing is discretised: larger, because the noise that a folder states is an estimate."""
 UNSURE = float(norm.ppf(1.0 - 0.5 * ALPHA))
-"""Deviations of an estimated noise that widen the limit of what is unknown."""
+"""Standard deviations of an estimated noise that widen the limit of the answer `unknown`."""
 
 
 def new_search(problem: Problem, *, keep: int = 7, draws: int = 199, seed: int = 0, **options: Any) -> Search:
-    """Return a search that has looked at nothing yet; options of `Laboratory`, and `keep`, `draws` and `seed` of `Search`."""
+    """Return a search that has not begun; `options` are those of `Laboratory`."""
     lab = Laboratory(problem, **options)
     return Search(lab, judging.SimulatedEnds(lab), keep, draws, seed)
 
 
 def unexplained(lab: Laboratory) -> float:
-    """Times its floor above which a residual that no effect explains is called unknown."""
-    unsure = max(lab.noise_uncertainty(n) for n in lab.scored_recordings)  # a residual of a noise that is not known may be noise
+    """Return the ratio to its floor above which a residual that no effect explains is called unknown."""
+    unsure = max(lab.noise_uncertainty(n) for n in lab.scored_recordings)  # where the noise is uncertain, the residual may be noise
     return (ABOVE if lab.problem.settings > 1 else UNEXPLAINED_EXACT) * (1.0 + UNSURE * unsure)
 
 
 def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival: Round | None = None, *, most: float = math.inf) -> Round:
-    """Look for one more effect beside those that were found.
+    """Search for one more effect beside those that were found.
 
     Args:
-        base: Where the model stands.
-        floor: Noise and discretisation there, as `stand` gives them.
+        search: The search by one method.
+        base: The fit to which an effect is to be added.
+        floor: Noise and discretisation there, as `discretisation.stand` gives them.
         found: The effects so far.
-        rival: That of another solver which named an effect: what led there and the first of the screening get a fit.
-        most: Parameters that a candidate may have.
+        rival: Round of another method that named an effect. Its leading candidates and the first of the screening get a fit.
+        most: Largest number of parameters of a candidate.
     """
     lab = search.lab
     first = rival is None and not found
@@ -114,12 +115,15 @@ def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival:
 
 
 def without_effect(lab: Laboratory, result: Round, base: Fit, floor: Floor) -> Stand | None:
-    """The model without the effect of a round, where fits with one ended, if it does better there than where it was fitted.
+    """Return the model without the round's effect at the point where a fit with an effect ended, if it is better there than the base.
 
-    Where the settings' differences can do much, the fitted recordings say little of a modulus, and each fit with an effect ends at
-    another one: what that alone does to the held-out recordings is no effect's. It must fit the fitted ones about as well. Where no
-    effect explains what is left, it is fitted from there: the base may stand in a side valley. Where those that are named ended it is
-    weighed with the floor there: the differences of the settings at the base may have led the base fit, and hide what is better.
+    Where differences between settings are large, the fitted recordings hardly determine a modulus, and each fit with an effect ends at
+    another one. What the modulus alone does to the held-out recordings must not count as an effect. The point must fit the fitted
+    recordings about as well as the base.
+
+    Where no effect explains the residual, the declared model is fitted again from these points, because the base may be a wrong local
+    minimum. Where effects were named, the floor at their ends is used, because differences between settings at the base may have misled the
+    base fit. Return None if no point is better.
     """
     if lab.problem.settings == 1 or not result.trials:
         return None
@@ -131,7 +135,7 @@ def without_effect(lab: Laboratory, result: Round, base: Fit, floor: Floor) -> S
     left = [score(squares) for squares in lab.mean_squares(places, floor)]
     here, as_well = score(result.errors), comparing.fitted_score(lab, result.errors) + 2.0 * math.log(AS_WELL)
     wanted = [places[i] for i in sorted(range(len(places)), key=lambda i: left[i])[:PLAIN] if left[i] < (math.inf if lost else here)]
-    if result.chosen is not None:  # by the floor of the base alone it may look worse there than it is
+    if result.chosen is not None:  # measured with the floor of the base, the model may seem worse there than it is
         own = [t.candidate.without(t.fit.point) for t in result.members[:MEMBERS]]
         wanted = own + [place for place in wanted if place not in own][: max(PLAIN - len(own), 0)]
     if not wanted:
@@ -149,13 +153,13 @@ def without_effect(lab: Laboratory, result: Round, base: Fit, floor: Floor) -> S
 
 
 def is_led_away(lab: Laboratory, base: Fit, r: Round) -> bool:
-    """Whether the base fit of a motion leaves more than noise of what is fitted, at declared values far from those stated."""
+    """Return whether the base fit of a motion leaves more than noise in the fitted data, at values far from the declared ones."""
     far = lab.problem.settings > 1 and comparing.moved(lab, base.point) > LED_AWAY
     return far and not comparing.is_noise(lab, r.errors[lab.fitted], fitted=True)
 
 
 def is_unexplained(lab: Laboratory, r: Round) -> bool:
-    """Whether the residual of a round's base is above what noise and discretisation would leave, by so much that it is not none."""
+    """Return whether the residual of a round's base is so far above its floor that the answer cannot be `none`."""
     held_out = r.held_out_over(lab.fitted) if lab.problem.settings > 1 else 0.0
     return r.over > unexplained(lab) or held_out > ABOVE
 
@@ -172,16 +176,23 @@ def first_look(
     until: float = 1.0,
     grows: bool = True,
 ) -> Look:
-    """Screen the candidates, and fit the best; arguments as those of `find`. A base that was looked at last is not looked at again.
+    """Screen the candidates and fit the best ones, or return the last look if it had the same base.
 
-    `led`: what led by another method, and little else gets a fit, from where that ended too; `beyond`: score of the first fits beyond
-    which there are no others; `until`: share of the search's work past which there are none; `grows`: whether fits grow where these
-    leave much, in a base that was looked at without as well.
+    Args:
+        search: The search by one method.
+        base: The fit to which an effect is to be added.
+        floor: Noise and discretisation there.
+        found: The effects so far.
+        led: Leading candidates of another method; only these, also from the ends of their fits there, and a few others get a fit.
+        most: Largest number of parameters of a candidate.
+        beyond: Score of the first fits above which no others are made.
+        until: Share of the search's work after which no fit begins.
+        grows: Whether growing fits are made where the first fits leave much, also for a look that was made without them.
     """
     lab = search.lab
     if not found and search.seen is not None and search.seen.base is base:
         if grows:
-            search.seen = grown_on(search, whole(search, search.seen, floor, until), floor, found, until)
+            search.seen = with_growing_fits(search, with_postponed_fits(search, search.seen, floor, until), floor, found, until)
         return search.seen
     with discretisation.quickly(lab, base.point, floor):
         asked = prospects.promising(search, base, floor, found, led, most=most, until=until)
@@ -201,14 +212,14 @@ def first_look(
         left = left_by(lab, contest.best, floor)
     look = Look(base, asked, contest, left[:1], bool(grown))
     if grows and len(found) < 2:
-        look = grown_on(search, look, floor, found, until)
+        look = with_growing_fits(search, look, floor, found, until)
     if not found:
         search.seen = look
     return look
 
 
-def whole(search: Search, look: Look, floor: Floor, until: float) -> Look:
-    """A look for a first effect with the fits that were put off."""
+def with_postponed_fits(search: Search, look: Look, floor: Floor, until: float) -> Look:
+    """Complete a look for a first effect with the fits that were put off."""
     lab = search.lab
     begun = look.contest.put_off
     if begun is None or lab.budget.skips(f"fits of {', '.join(begun.keys)}", until):
@@ -221,42 +232,43 @@ def whole(search: Search, look: Look, floor: Floor, until: float) -> Look:
     return look._replace(contest=contest, least=left[:1])
 
 
-def grown_on(search: Search, look: Look, floor: Floor, found: Sequence[Trial], until: float) -> Look:
-    """A look with fits that grow, once more under the own setting, where none did and its own leave much."""
+def with_growing_fits(search: Search, look: Look, floor: Floor, found: Sequence[Trial], until: float) -> Look:
+    """Add growing fits, repeated under the method's own setting, to a look that has none and leaves much."""
     lab = search.lab
     if look.grown or not refining.leaves_much(lab, look.least) or lab.budget.skips("growing fits", until):
         return look
     with discretisation.quickly(lab, look.base.point, floor):
         further = list(refining.growing(search, look.base, floor, look.asked.candidates, found, until=until).values())
-        whole = contests.wholly(lab, look.asked.free, further, floor, until)
-        best = {**look.contest.best, **better(whole, look.contest.best)}
+        refitted = contests.refit_under_own_setting(lab, look.asked.free, further, floor, until)
+        best = {**look.contest.best, **better(refitted, look.contest.best)}
         left = left_by(lab, best, floor)
     return look._replace(contest=look.contest._replace(best=best), least=left[:1], grown=True)
 
 
 def left_by(lab: Laboratory, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor) -> list[np.ndarray]:
-    """What the fits under the own setting leave, mean squares of the parts, the least first."""
+    """Return the errors that fits under the method's own setting leave, mean squares of the parts, the least first."""
     ends = [fit.point for _, fit in best.values() if fit.setting == lab.own]
     with lab.under(lab.own):
         return sorted(lab.mean_squares(ends, floor), key=score)
 
 
 def over_floor(lab: Laboratory, at: Stand) -> float:
-    """How far the residual there is above what noise and discretisation would leave after a refit: a ratio of errors."""
+    """Return the ratio of the residual to what noise and discretisation would leave after a refit."""
     free = [lab.problem.parameter(name) for name in at.fit.names]
     return times_over(at.errors, discretisation.floors(lab, at.fit.point, free, at.floor))
 
 
 def promised(search: Search, at: Stand, beside: Trial) -> float:
-    """The least share of the misfit there that an effect of few parameters would leave, predicted or by one simulation."""
+    """Return the least share of the misfit that a second effect of few parameters would leave, predicted or by one simulation."""
     with discretisation.quickly(search.lab, at.fit.point, at.floor):
         return min(prospects.promising(search, at.fit, at.floor, [beside], most=MANY).promise.values(), default=1.0)
 
 
 def linear_model(search: Search, point, floor, left, slopes, columns, chosen, candidates) -> bootstrap.LinearModel:
-    """The linear model of the fits; `left` is what the discretisation leaves after a refit, mean squares of the parts.
+    """Return the linear model of the fits, for the null hypothesis.
 
-    Of all candidates, or once the search is over of those that got a fit.
+    It has all candidates, or those with a fit once the search is over. `left` is what discretisation leaves after a refit, mean squares of
+    the parts.
     """
     lab = search.lab
     held = [p.recording for p in lab.parts if not p.fitted]

@@ -1,4 +1,4 @@
-"""Two effects at once: what is tried with a second one where none is enough alone, and where one leaves more than noise."""
+"""Two effects at once: the search where no single effect is enough, or where one effect leaves more than noise."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,31 +17,34 @@ from neuido.discrepancy.problems.problem import Candidate, Point
 from neuido.physics.effects.library import LIMITS
 
 WORSE = 3.0
-"""Times the error of the better method at which the other one is not asked any more: where that found nothing, and for two effects."""
+"""Ratio of the errors of two methods above which the worse one is not asked any more, for a first effect or for two."""
 LOOKED_AHEAD = 2
-"""Effects that are tried with a second one, where none gains enough alone, or in the place of one with more parameters."""
+"""Number of effects that are tried with a second one where none gains enough alone, or in the place of one with more parameters."""
 FAR_ABOVE = 4.0
-"""Times its floor above which the best few effects are tried with a second one, however little each gains alone."""
+"""Ratio of the residual to its floor from which the best few effects are tried with a second one, however small their gains."""
 BLIND_GAIN = 2.0 * LEAST_GAIN
-"""What an effect must gain in the fitted recordings to be tried with a second one although it foretells nothing of those held out."""
+"""Least gain in the fitted recordings of an effect that is tried with a second one although it does not improve the held-out data."""
 PROMISED = 0.9
-"""Share of the misfit that a second effect may leave beside a first one, predicted or by one simulation, to be fitted there."""
+"""Largest share of the misfit that a second effect may leave beside a first one, predicted or by one simulation, to be fitted there."""
 BESIDE = 3
-"""Members of a class beside which a second effect is looked for."""
+"""Number of members of a class beside which a second effect is searched for."""
 GROWN = 3
-"""Pairs that grew together whose ends are weighed."""
+"""Number of pairs from growing fits that are fitted further."""
 IN_TIME = 0.6
-"""Share of the search's work past which no pairs grow where every point costs: what is left is for what takes less."""
+"""Share of the search's work after which no pairs grow where simulations run one by one; the rest is for cheaper steps."""
 IN_PLACE = 5
-"""Effects that are fitted in the place of a first one beside the best that was tried beside it."""
+"""Number of other first effects that are fitted beside the best second one."""
 CLOSE = 2.5
-"""Times the error of a chosen effect up to which one with fewer parameters is weighed again once others were found."""
+"""Ratio to the error of a chosen effect up to which one with fewer parameters is compared again once others were found."""
 
 
 def look_ahead(search: Search, first: Round) -> list[Round]:
-    """Where no single effect gains enough: the one of the best few beside which another does, and the round that found that one.
+    """Try the best few effects with a second one where no single effect gains enough.
 
-    Two effects may each be worth little without the other: a body that slides and dissipates is as badly fitted by friction alone.
+    Two effects may each be worth little alone: friction alone hardly improves the fit of a body that slides and also dissipates.
+
+    Returns:
+        The round of the first effect and that of the second, or `first` alone where no two effects gain enough.
     """
     lab = search.lab
     if first.chosen is not None or not first.trials:
@@ -49,10 +52,10 @@ def look_ahead(search: Search, first: Round) -> list[Round]:
     by_chance = judging.by_chance(lab, first)
     at_least = by_chance if first.over < FAR_ABOVE else 0.0
     good = [t for t in first.trials if t.gain > at_least and not unphysical(t.candidate, t.fit.point)]
-    if first.over < next_effect.unexplained(lab):  # it may all be the discretisation
+    if first.over < next_effect.unexplained(lab):  # all of the residual may be discretisation
         good = [t for t in good if t.gain > LEAST_GAIN]
     bases = sorted(good, key=lambda t: t.penalised)[:LOOKED_AHEAD]
-    blind = fits_alone(lab, first, bases)
+    blind = best_on_fitted(lab, first, bases)
     for t in (*bases, *blind):
         if lab.budget.skips(f"a second effect beside {t.candidate.key}"):
             break
@@ -60,7 +63,7 @@ def look_ahead(search: Search, first: Round) -> list[Round]:
         second = next_effect.find(search, here.fit, here.floor, [t], most=MANY)
         if second.chosen is None or comparing.gain(lab, first.errors, second.chosen.errors) < 2.0 * LEAST_GAIN:
             continue
-        little = t in blind or t.gain <= by_chance  # what the two leave must be near the floor then
+        little = t in blind or t.gain <= by_chance  # then the two effects must leave little more than the floor
         if little and times_over(second.chosen.errors, first.floors) > next_effect.unexplained(lab):
             continue
         t.reason = ""
@@ -71,10 +74,11 @@ def look_ahead(search: Search, first: Round) -> list[Round]:
     return [first]
 
 
-def fits_alone(lab: Laboratory, first: Round, others: Sequence[Trial]) -> list[Trial]:
-    """The effect that fits the fitted recordings best, where it does so by far, is none of the others, and foretells nothing.
+def best_on_fitted(lab: Laboratory, first: Round, others: Sequence[Trial]) -> list[Trial]:
+    """Return the effect that fits the fitted recordings best, as a list of one, to be tried with a second effect.
 
-    What fits in the place of two effects is off wherever these come in another proportion.
+    The list is empty where its gain there is at most `BLIND_GAIN`, or it is among `others`. An effect that stands for two may fit well and
+    still fail on held-out recordings, where the two occur in another proportion.
     """
     if first.over < next_effect.unexplained(lab) or all(lab.fitted):
         return []
@@ -90,18 +94,21 @@ def fits_alone(lab: Laboratory, first: Round, others: Sequence[Trial]) -> list[T
 def two_effects(
     search: Search, rounds: Sequence[Round], found: Sequence[Trial], at: Stand, others: Mapping[Search, Round]
 ) -> tuple[Search, list[Round]]:
-    """Where more than noise is left: two effects, if any, as their rounds, and the method that they are found by.
+    """Search for two effects where the named one leaves more than noise.
 
-    The other method comes before what else its own has, for it need not be the right one: of nine pairs that five blind seeds missed, seven
-    were looked for by the wrong one. What it finds is taken where that leaves nothing but noise, or clearly less than its own. Where two
-    were found already it alone is asked.
+    The other methods are asked before the chosen one tries again, because the choice may be wrong: of nine pairs that five blind seeds
+    missed, seven were searched for by the wrong method. The result of another method is taken where it leaves only noise, or clearly less
+    than that of the chosen one. Where two effects were found already, only the other methods are asked.
 
     Args:
-        search: The one that named an effect.
-        rounds: Its rounds: the first, and one beside that effect where one was made.
+        search: The search that named an effect.
+        rounds: Its rounds: the first, and one beside that effect if it was made.
         found: The effects that they named.
-        at: Where these stand.
-        others: The other methods, with their first rounds.
+        at: The model fitted with these effects.
+        others: The searches by other methods, with their first rounds.
+
+    Returns:
+        The search of the method that found two effects, and their rounds; no rounds where there are none.
     """
     elsewhere = by_another_method(others, search, at, found, within=len(rounds) == 1)
     if elsewhere is not None and comparing.is_noise(elsewhere[0].lab, elsewhere[1][-1].chosen.errors):
@@ -117,12 +124,15 @@ def two_effects(
 
 
 def by_growing(search: Search, first: Round, at: Stand, others: Mapping[Search, Round]) -> tuple[Search, list[Round]] | None:
-    """Where much is left: two effects that grew together, and the method that they are found by.
+    """Search for two effects with growing fits where much is left.
 
-    The round of the second one begins where both ended, and says whether it is one. All methods are asked until two leave noise alone, the
-    suggested one first, whichever goes on: one effect chose it, and of three pairs of a blind seed for which it chose finite elements all
-    were the suggested one's. Where nothing was named they are looked for if what is left is more than the discretisation, and must come
-    down to that.
+    All methods are asked, the suggested one first, until two effects leave only noise. The choice of a method rests on one effect and may
+    be wrong: for three pairs of a blind seed finite elements were chosen, and the suggested method was right each time. The round of the
+    second effect begins at the end of the joint fit and decides whether it is one. Where nothing was named, pairs are searched for only if
+    the residual is more than discretisation, and they must bring it down to that.
+
+    Returns:
+        The search of the method that found the pair and its rounds, or None.
     """
     lab = search.lab
     named = first.chosen is not None
@@ -154,9 +164,9 @@ def by_growing(search: Search, first: Round, at: Stand, others: Mapping[Search, 
 def as_rounds(
     search: Search, first: Round, both: tuple[Candidate, Candidate], there: Stand, errors: np.ndarray, least: float
 ) -> list[Round]:
-    """Two effects that were fitted together as a first round and one beside it; nothing where these gain less than `least`.
+    """Return the rounds of two effects that were fitted together, or an empty list where they gain less than `least`.
 
-    The one that does better alone is the first.
+    The effect that does better alone is the first.
     """
     lab = search.lab
     alone = {c.key: next((t for t in few(first.trials) if t.candidate.key == c.key and np.isfinite(t.score)), None) for c in both}
@@ -175,9 +185,9 @@ def as_rounds(
 def fitted_with(
     search: Search, first: Round, t: Trial, alone: Stand, second: Trial, errors: np.ndarray, least: float = LEAST_GAIN
 ) -> list[Round]:
-    """A first effect, and the round beside it that begins where it was fitted with a second one.
+    """Return the rounds of a first effect and of a second one that was fitted together with it.
 
-    Nothing where none is named, or the two gain less than `least` beside `errors`.
+    The list is empty where the second round names no effect, or the two gain less than `least` compared with `errors`.
     """
     led = replace(first, chosen=None, members=[], trials=[second])
     again = next_effect.find(search, alone.fit, alone.floor, [t], led, most=MANY)
@@ -188,11 +198,15 @@ def fitted_with(
 
 
 def beside_members(search: Search, rounds: Sequence[Round], at: Stand) -> list[Round]:
-    """Where one effect was found and leaves more than noise: a member of its class beside which a second one is named, and that round.
+    """Search for a second effect beside the members of a class, where one effect was found and leaves more than noise.
 
-    Two effects at once leave a class of effects each of which is partly right, and the best of them need be neither of the two. Nor was a
-    second one looked for beside what lies within its floor. One of many parameters may stand for both: what is simpler is tried instead,
-    and it itself last, for what is simpler may leave too much alone to say what is beside it; `narrow` then takes it for what it is.
+    Two effects together give a class of effects that are each partly right, and its best member need be neither of the two. No second
+    effect was searched for where the residual lay within its floor. An effect of many parameters may stand for both: simpler effects are
+    tried in its place. It is tried itself last, because a simpler one may leave too much to show the other effect; `narrow` then replaces
+    it.
+
+    Returns:
+        The round of the member and that of the second effect, or an empty list.
     """
     if comparing.is_settled(search.lab, at.errors):
         return []
@@ -214,20 +228,22 @@ def beside_members(search: Search, rounds: Sequence[Round], at: Stand) -> list[R
 def by_another_method(
     others: Mapping[Search, Round], search: Search, at: Stand, found: Sequence[Trial], *, within: bool = False
 ) -> tuple[Search, list[Round]] | None:
-    """Where more than noise is left: another method by which two effects leave less than that, and the two rounds.
+    """Search for two effects by the other methods, where more than noise is left.
 
-    The method goes by what one effect leaves. Where there are two, that is no measure: by the wrong method one effect may stand for both
-    and for what the method gets wrong, and beside it there is no other. The first one of the other method gets what that of the chosen
-    method had: a search beside it, whatever the screening promises. Where that named none, and what is left is above its floor, so does
-    the first one that the chosen method named.
+    The method is chosen by what one effect leaves. With two effects that is misleading: by the wrong method one effect may compensate both
+    for the other and for errors of the method. So the first effect of each other method gets a search beside it, whatever the screening
+    promises. Where a method named none, and the residual is above its floor, the first effect of the chosen method is used.
 
     Args:
-        others: The other methods, with their first rounds.
-        search: The one that named an effect.
-        at: Where what it named stands.
+        others: The searches by other methods, with their first rounds.
+        search: The search that named an effect.
+        at: The model fitted with what it named.
         found: The effects that it named.
-        within: It lies within its floor, where no second one was looked for: two effects must show a promise, and leave what may be noise
-            once they are refined.
+        within: Whether the residual lies within its floor, where no second effect was searched for. Two effects must then be promised by
+            the screening, and leave what may be noise once it is refined.
+
+    Returns:
+        The search that found the two effects with the least error and their rounds, or None.
     """
     if comparing.is_settled(search.lab, at.errors):
         return None
@@ -251,10 +267,7 @@ def by_another_method(
 
 
 def from_there(lab: Laboratory, t: Trial, point: Point) -> Stand:
-    """An effect's fit, or the one from the declared values of a point, where another method has come further: what leaves less.
-
-    And from the sizes that the effect has there, if it has any.
-    """
+    """Return the fit of an effect, or a new one from the values of `point` (declared ones and the effect's) if that leaves less."""
     free = (*lab.problem.declared, *t.candidate.parameters)
     here, begin = (
         Stand(t.fit, *discretisation.stand(lab, t.fit.point)),
@@ -269,7 +282,10 @@ def from_there(lab: Laboratory, t: Trial, point: Point) -> Stand:
 
 
 def at_its_end(lab: Laboratory, t: Trial) -> Stand:
-    """Where an effect's fit comes to by itself: one that was given up in a race stands where nothing beside it looks like the truth."""
+    """Return the fitted model of a trial, continued to the end of its fit.
+
+    A fit that was given up early stands at a point beside which no second effect looks right.
+    """
     here = Stand(t.fit, *discretisation.stand(lab, t.fit.point))
     return here if t.fit.converged else base_fits.finished(lab, here)
 
@@ -277,10 +293,17 @@ def at_its_end(lab: Laboratory, t: Trial) -> Stand:
 def second_beside(
     search: Search, first: Round, members: Sequence[Trial], errors: np.ndarray, *, at: Stand | None = None, sure: Trial | None = None
 ) -> list[Round]:
-    """The member beside which a second effect leaves least, and the round of that one.
+    """Return the round of the member beside which a second effect leaves least, and the round of that effect.
 
-    Nothing is returned where none leaves clearly less than `errors`, or nothing but noise in one simulation. A member is asked where the
-    screening beside it promises much, or it is `sure`. `at` is where the chosen one stands, if its fit was finished.
+    The list is empty where none leaves clearly less than `errors`, or only noise in one simulation.
+
+    Args:
+        search: The search by one method.
+        first: The first round.
+        members: Effects beside which a second one is searched for, if the screening there promises much.
+        errors: Errors to improve on, mean squares of the parts.
+        at: The model with the chosen effect, if its fit was continued to the end.
+        sure: A member that is tried whatever the screening promises.
     """
     lab = search.lab
     pairs: list[list[Round]] = []
@@ -302,11 +325,14 @@ def second_beside(
 
 
 def in_its_place(search: Search, first: Round, second: Round, errors: np.ndarray) -> list[Round]:
-    """Where nothing was named beside an effect, though one takes most off the fitted recordings: that one beside another first effect.
+    """Try other first effects beside a second one that improves the fitted recordings most, where no second one was named.
 
-    What leads alone, where there are two, need be neither of them, nor be in a class with one: a quadratic drag of a body that yields is a
-    linear one. The best of the others are fitted with the second one from where that ended, and beside what leaves least so one is looked
-    for as beside any. Nothing is returned where it is not named, or the two leave no less than `errors`.
+    Where there are two effects, the leading single one need be neither of them, nor share a class with one: a quadratic drag of a body that
+    yields may appear as a linear one. The best other effects are fitted together with the second one. Beside the one that leaves least, a
+    second effect is then searched for as usual.
+
+    Returns:
+        The two rounds, or an empty list where no second effect is named or the two leave no less than `errors`.
     """
     lab = search.lab
     here = comparing.fitted_score(lab, second.errors)
@@ -336,9 +362,9 @@ def in_its_place(search: Search, first: Round, second: Round, errors: np.ndarray
 
 
 def simpler(r: Round, chosen: Trial) -> list[Trial]:
-    """What may take the chosen one's place: the best trials with fewer parameters that came close to it, and what it is in a limit.
+    """Return trials that may replace the chosen one: its limiting cases, and the best close ones with fewer parameters.
 
-    A limit need not come close: what the force of many parameters gained beyond it may be the other effect's.
+    A limiting case need not come close: what a force of many parameters gains beyond it may be due to the other effect.
     """
     sizes = len(chosen.candidate.size_parameters)
     narrower = [t for t in others(r) if t.candidate.name in LIMITS.get(chosen.candidate.name, ())]
@@ -347,22 +373,22 @@ def simpler(r: Round, chosen: Trial) -> list[Trial]:
 
 
 def neighbours(r: Round, chosen: Trial) -> list[Trial]:
-    """The best trials of no more parameters than the chosen one that came close to it."""
+    """Return the best trials that came close to the chosen one with no more parameters."""
     most = len(chosen.candidate.parameters)
     return [t for t in close_to(r, chosen) if len(t.candidate.parameters) <= most][:LOOKED_AHEAD]
 
 
 def few(trials: Iterable[Trial]) -> list[Trial]:
-    """Those whose candidates have few parameters."""
+    """Return the trials whose candidates have few parameters."""
     return [t for t in trials if len(t.candidate.parameters) <= MANY]
 
 
 def others(r: Round) -> list[Trial]:
-    """The trials of a round that can be, but for those of the class that was named."""
+    """Return the physically possible trials of a round outside the named class."""
     return [t for t in r.trials if t not in r.members and not unphysical(t.candidate, t.fit.point)]
 
 
 def close_to(r: Round, chosen: Trial) -> list[Trial]:
-    """Those of `others` that came close to the chosen one, best first."""
+    """Return those of `others` that came close to the chosen one, the best first."""
     limit = chosen.score + 2.0 * math.log(CLOSE)
     return sorted((t for t in others(r) if t.score < limit), key=lambda t: t.penalised)
