@@ -1,4 +1,4 @@
-"""What noise, nuisances and discretisation do where a model stands: the differences of the settings, before and after a refit."""
+"""Error floor of a model at one point: noise, nuisances, and differences between settings before and after a refit."""
 
 import math
 from collections.abc import Sequence
@@ -13,43 +13,51 @@ from neuido.discrepancy.inference.least_squares import Fit
 from neuido.discrepancy.problems.problem import Parameter, Point
 
 ROUGH = 0.02
-"""Relative gain that ends a fit which only says where floors are to be found, or what they are."""
+"""Relative gain that ends a fit which serves only to compute a floor."""
 UNSEEN = 0.1
-"""Largest share of the differences of the settings that lies outside their directions: what a fit weighs the data by, beside the noise."""
+"""Largest share of the discretisation error outside the directions of the differences: data are weighted by noise and this share."""
 ALIKE = 0.3
-"""Share of what is left that a quick setting may differ by, so that a search there is for what is left."""
+"""Largest difference between a quick setting and the suggested one, as a share of the residual, with which a search uses it."""
 
 
 def quickly(lab: Laboratory, at: Point | None = None, floor: Floor | None = None) -> AbstractContextManager[None]:
-    """While it is open, what moves about as the own setting does, for less, predicts in its place (`Problem.quick`).
+    """Predict by a quicker setting (`Problem.quick`) while the context is open.
 
-    At a point that is given, unless that differs there by as much as is to be explained.
+    Given a point and its floor, the quick setting is used only if its motion there is close enough to that of the suggested setting.
     """
     quick = lab.problem.quick(lab.own)
-    return lab.under(quick if at is None or floor is None or about_alike(lab, at, floor, quick) else lab.own)
+    return lab.under(quick if at is None or floor is None or is_close(lab, at, floor, quick) else lab.own)
 
 
-def about_alike(lab: Laboratory, point: Point, floor: Floor, setting: int) -> bool:
-    """Whether a setting differs from the own one by a small part of what is left, past what the differences of the settings take up."""
+def is_close(lab: Laboratory, point: Point, floor: Floor, setting: int) -> bool:
+    """Return whether a setting differs little from the suggested one, compared with the residual.
+
+    The part of the difference along the differences between settings is subtracted first.
+    """
     if not lab.bears(point, setting):
         return False
     with lab.memo.during("discretisation"):
         rows = lab.predicted([point], lab.fitted_recordings, (lab.own, setting))
-    off = {n: rows[n, setting][0] - rows[n, lab.own][0] for n in lab.fitted_recordings}
-    if not all(np.isfinite(row).all() for row in off.values()):
+    difference = {n: rows[n, setting][0] - rows[n, lab.own][0] for n in lab.fitted_recordings}
+    if not all(np.isfinite(row).all() for row in difference.values()):
         return False
-    squares = lab.left(off, floor, floor.amounts(off, lab.parts))[lab.fitted]
+    squares = lab.left(difference, floor, floor.amounts(difference, lab.parts))[lab.fitted]
     with lab.under(lab.own):
         (here,) = lab.mean_squares([point], floor, fitted=True)
     return score(squares) < score(here) + 2.0 * math.log(ALIKE)
 
 
 def floor_at(lab: Laboratory, point: Point, *, like: Floor | None = None, fitted: bool = False, of: Sequence[int] | None = None) -> Floor:
-    """Noise and discretisation at a point: differences of the settings, and how large they are in the course of time.
+    """Return the floor at a point, by a simulation under each setting.
 
-    `like`: a floor whose nuisances serve here too. `fitted`: the differences of the fitted recordings alone, which is what fits read.
-    `of`: the recordings, where these are not all that are scored. A setting that does not run there has a column of zeros, and is noted
-    in `unable`.
+    A setting that does not run there gets a column of zeros, and is added to `lab.unable`.
+
+    Args:
+        lab: Runs the simulations.
+        point: Where to compute the floor.
+        like: A floor whose nuisances are used here too, to save simulations.
+        fitted: Whether to compute differences of the fitted recordings alone, which is enough for a fit.
+        of: Numbers of the recordings; all scored ones by default.
     """
     plain = lab.noise(of)
     others = lab.problem.others(lab.setting)
@@ -73,7 +81,13 @@ def floor_at(lab: Laboratory, point: Point, *, like: Floor | None = None, fitted
 
 
 def sharpened(lab: Laboratory, floor: Floor, errors: np.ndarray) -> Floor:
-    """The floor for fits about where `errors`, mean squares of all parts, are left: no more than that is unseen."""
+    """Return the floor with a smaller share of discretisation error outside the differences, if the fit leaves less than that.
+
+    Args:
+        lab: Gives the parts and their noise.
+        floor: The floor.
+        errors: Mean square that a fit leaves of each part, (parts,).
+    """
     if lab.problem.settings == 1 or not np.isfinite(errors[lab.fitted]).all():
         return floor
     spread = np.mean(floor.spread_squares([p for p in lab.parts if p.fitted]))
@@ -82,16 +96,16 @@ def sharpened(lab: Laboratory, floor: Floor, errors: np.ndarray) -> Floor:
 
 
 def foresee(lab: Laboratory, points: Sequence[Point], *, fitted: bool = False) -> None:
-    """Run what `floor` and `stand` of several points will ask for, in one launch; the memo keeps it."""
+    """Run the simulations that `floor_at` and `stand` of several points need, in one launch, and keep them in the memo."""
     with lab.memo.during("discretisation"):
         wanted = lab.fitted_recordings if fitted else lab.scored_recordings
         lab.predicted(points, wanted, [lab.setting, *lab.problem.others(lab.setting)])
 
 
 def stand(lab: Laboratory, point: Point, *, like: Floor | None = None, fitted: bool = False) -> tuple[Floor, np.ndarray]:
-    """The floor at a point, sharpened by what is left there, and what that is, mean squares of the parts.
+    """Return the floor at a point, sharpened by the errors there, and these errors as mean squares of the parts, (parts,).
 
-    `like` and `fitted` as for `floor`; infinite for parts that were not asked for.
+    `like` and `fitted` are those of `floor_at`. With `fitted`, the errors of the other parts are infinite.
     """
     floor = floor_at(lab, point, like=like, fitted=fitted)
     errors = np.full(len(lab.parts), np.inf)
@@ -100,12 +114,21 @@ def stand(lab: Laboratory, point: Point, *, like: Floor | None = None, fitted: b
 
 
 def refits(lab: Laboratory, point: Point, free: Sequence[Parameter], floor: Floor) -> list[tuple[Fit, np.ndarray]]:
-    """The motions under the other settings fitted as if they had been measured: the fits, and what they leave.
+    """Fit the motion under each other setting as if it had been measured; settings that do not run are left out.
 
-    Each without its own difference. Most of what a grid or a step does a stiffness, or the difference of another grid, can do as well:
-    how far a fit goes from `point` is the discretisation error of the parameters, and what it leaves, mean squares of the parts, the
-    one that an effect could be mistaken for. The clock ends none of them: one that stops at once leaves the whole difference
-    of the settings, and any residual lies within that.
+    A different grid or step moves the body much as a different stiffness does. The distance of a fit from `point` is therefore the
+    discretisation error of the parameters, and what the fit leaves is the discretisation error that an effect could be mistaken for.
+    Each fit may use the differences of all settings but its own. No time limit ends these fits: a fit that stopped at once would leave
+    the whole difference, and any residual would seem to lie within the floor.
+
+    Args:
+        lab: Runs the fits.
+        point: Where the fits start.
+        free: Parameters to fit.
+        floor: The floor at the point.
+
+    Returns:
+        Each fit, and the mean square that it leaves of each part, (parts,).
     """
     others = lab.problem.others(lab.setting)
     with lab.memo.during("discretisation"):
@@ -125,22 +148,25 @@ def refits(lab: Laboratory, point: Point, free: Sequence[Parameter], floor: Floo
 
 
 def floors(lab: Laboratory, point: Point, free: Sequence[Parameter], floor: Floor) -> np.ndarray:
-    """Noise, and what a refit leaves of the discretisation error, together as mean squares of the parts."""
+    """Return the mean square of noise and of the discretisation error after a refit, together, for each part, (parts,)."""
     left = [squares for _, squares in refits(lab, point, free, floor)]
     return lab.noise_squares + np.nanmean(left, axis=0) if left else lab.noise_squares
 
 
 def nuisance_directions(lab: Laboratory, point: Point, recordings: Sequence[int]) -> dict[int, np.ndarray]:
-    """Directions of the nuisances of each recording, of one prior standard deviation, as a quick motion has them where it runs."""
-    asks = {}
+    """Return the change (n, k) of each recording by one prior standard deviation of each of its nuisances.
+
+    They are computed under the quick setting, and under the suggested one for recordings where the quick one does not run.
+    """
+    points = {}
     for n in recordings:
         own = [(p, p.prior) for p in lab.problem.nuisances if p.prior is not None and p.name.endswith(f":{lab.problem.recordings[n].name}")]
-        asks[n] = [point, *({**point, p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + prior)} for p, prior in own)]
+        points[n] = [point, *({**point, p.name: p.physical(p.coordinate(point.get(p.name, p.value)) + prior)} for p, prior in own)]
     quick, predicted = lab.problem.quick(lab.own), {}
     for setting in dict.fromkeys((quick, lab.own) if lab.bears(point, quick) else (lab.own,)):
         wanted = [n for n in recordings if n not in predicted or not np.isfinite(predicted[n][0]).all()]
         with lab.memo.during("nuisances"):
-            predicted |= dict(zip(wanted, lab.memo.predict_several([(asks[n], n, setting) for n in wanted]), strict=True))
+            predicted |= dict(zip(wanted, lab.memo.predict_several([(points[n], n, setting) for n in wanted]), strict=True))
     out = {}
     for n, (here, *rows) in predicted.items():
         columns = [np.where(np.isfinite(row - here).all(), row - here, 0.0) for row in rows]

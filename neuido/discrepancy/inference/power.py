@@ -1,4 +1,4 @@
-"""What the data do not exclude: for each effect the largest size that is still compatible with them."""
+"""Upper limits on the sizes of effects that were not found: how large could each effect be without being detected?"""
 
 import math
 from collections.abc import Sequence
@@ -13,35 +13,41 @@ from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.problems.problem import Parameter
 
 COMPATIBLE = 0.9
-"""Probability that the size of an effect is smaller than the largest compatible one."""
+"""Probability that the size of an effect is below its upper limit."""
 NOTHING = 1e-10
-"""Share of what one size does that it must do by itself beside the other sizes of its effect for these data to limit it."""
+"""Least share of the influence of a size that the other sizes of its effect cannot imitate; below it the data give no limit."""
 
 
 class Compatible(NamedTuple):
-    """The largest compatible size of an effect."""
+    """The upper limit on one parameter of an effect."""
 
     name: str
+    """Name of the effect."""
     parameter: str
+    """Name of the parameter, without that of the effect."""
     unit: str
+    """Unit of the limit."""
     up_to: float | None
-    """None: any size within the effect's range."""
+    """The limit; none: the data do not exclude any size within the range of the effect."""
 
 
 def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()) -> list[Compatible]:
-    """Return the size that each effect is smaller than with a probability of 90 %, beside the model where it stands.
+    """Return the size that each effect does not exceed with a probability of 90 %.
 
-    To first order, and of the fitted recordings: the size is what the residual holds of the motion that the effect makes, past what the
-    fitted figures, the nuisances and the other settings make up for. How far it may be off is told by the noise and by the patterns of what
-    another solver does, of the size that the settings leave of one another after a refit; where more is left than both, by that (Birge's
-    ratio). Its prior is flat, over one sign where the effect has but one. Of several shapes of an effect the one counts that could be
-    largest. Directions are those of the screening, so that next to nothing is simulated anew where effects were looked for.
+    The estimate is linear, from the fitted recordings. The size of an effect is fitted to the residual after the fitted parameters, the
+    nuisances and the differences between settings are projected out. Its uncertainty comes from the noise and from smooth patterns of the
+    size of the discretisation error after a refit. If the residual is larger than both, the uncertainty grows with it (Birge's ratio). The
+    prior is flat, over one sign if the effect has only one. Of several shapes of an effect, the largest limit counts. The directions are
+    those of the screening, so that hardly anything is simulated anew after a search.
 
     Args:
-        lab: The method that the answer goes by.
-        at: Where the model stands.
-        r: The round that looked last.
-        found: The effects that the model has.
+        lab: The method that gives the answer.
+        at: The final model.
+        r: The last round.
+        found: The effects of the final model.
+
+    Returns:
+        A limit for each parameter of each other effect; none if there are no candidates or the final model does not run.
     """
     problem, recordings = lab.problem, lab.fitted_recordings
     taken = {t.candidate.name for t in found}
@@ -54,17 +60,17 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
         slopes = directions.slopes(lab, free, r.base, recordings)
         columns = directions.candidate_columns(lab, r.base, candidates, recordings)
     beside = [columns[t.candidate.key, 0] for t in found if (t.candidate.key, 0) in columns and t.candidate.name not in own]
-    past = directions.project_out_slopes(
+    project = directions.project_out_slopes(
         lab, {n: np.concatenate([slopes[n], *(c[n] for c in beside)], axis=1) for n in recordings}, at.floor
     )
-    left = past({n: lab.residual(at.fit.point, n) for n in recordings})
+    left = project({n: lab.residual(at.fit.point, n) for n in recordings})
     unseen = {}
     for part, square in zip(lab.parts, r.floors - lab.noise_squares, strict=True):
         if part.fitted:
             own_rows = patterns(problem, r.floor, part, square)
             unseen[part.recording] = np.zeros((len(part.rows), own_rows.shape[1]))
             unseen[part.recording][part.rows] = own_rows
-    S = past(unseen)
+    S = project(unseen)
     expected = 1.0 + float(np.sum(S**2)) / max(len(left), 1)
     birge = max(float(np.mean(left**2)) / expected, 1.0)
     largest: dict[tuple[str, str], Compatible] = {}
@@ -72,7 +78,7 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
         if c.name in taken:
             continue
         for i, start in enumerate(c.starts):
-            means, deviations = amounts(past(columns[c.key, i]), left, S)
+            means, deviations = amounts(project(columns[c.key, i]), left, S)
             for p, mean, deviation in zip(c.size_parameters, means, deviations * math.sqrt(birge), strict=True):
                 size = bound(p, start[p.name] * mean, abs(start[p.name]) * deviation)
                 one = Compatible(c.name, p.name.partition(".")[2], p.unit, size if size < max(abs(p.lower), abs(p.upper)) else None)
@@ -83,25 +89,28 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
 
 
 def amounts(B: np.ndarray, left: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the amounts of directions that the measured data hold, and the standard deviation of each.
+    """Return the amount of each direction that explains the residual best, (k,), and its standard deviation, (k,).
 
     Args:
-        B: What the prediction gains by an amount of one of each, (n, k), whitened.
+        B: Change of the prediction by an amount of one of each direction, (n, k), whitened.
         left: Predicted minus measured, (n,), whitened.
-        S: Further patterns in `left` beside white noise, of amounts of variance one, (n, s).
+        S: Patterns that `left` may hold beside white noise, (n, s), with amounts of variance one.
     """
     if not (np.isfinite(B).all() and np.isfinite(left).all()):
         return np.zeros(B.shape[1]), np.full(B.shape[1], math.inf)
     G = B.T @ B
-    does = np.diag(G)
-    inverse = np.linalg.inv(G + np.diag(np.where(does > 0.0, NOTHING * does, 1.0)))
-    away = inverse @ (B.T @ S)
-    variances = np.diag(inverse) + np.sum(away**2, axis=1)
-    return -inverse @ (B.T @ left), np.where(does > 0.0, np.sqrt(variances), math.inf)
+    squares = np.diag(G)
+    inverse = np.linalg.inv(G + np.diag(np.where(squares > 0.0, NOTHING * squares, 1.0)))
+    bias = inverse @ (B.T @ S)
+    variances = np.diag(inverse) + np.sum(bias**2, axis=1)
+    return -inverse @ (B.T @ left), np.where(squares > 0.0, np.sqrt(variances), math.inf)
 
 
 def bound(p: Parameter, mean: float, deviation: float) -> float:
-    """Return the size that a Gaussian amount is smaller than with a probability of 90 %, within the signs that a parameter has."""
+    """Return the size that a Gaussian amount does not exceed with a probability of 90 %, if the range of `p` limits its sign.
+
+    The size is infinite if the deviation is zero or not finite.
+    """
     if not math.isfinite(deviation) or deviation <= 0.0:
         return math.inf
     if p.lower < 0.0 < p.upper:
