@@ -1,4 +1,4 @@
-"""Which candidates get a full fit, and where their fits begin: what the screening and single simulations promise."""
+"""The choice of candidates for full fits, and of the starts of these fits, from the screening and single simulations."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,16 +16,17 @@ from neuido.discrepancy.inference.search.search_state import HOPELESS, Promising
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 
 VAIN = 0.98
-"""Share of the misfit that even such a candidate may leave, as the screening predicts it, if small sizes of it act in proportion."""
+"""Predicted share of the misfit from which a candidate of at most `SMALL` parameters gets no fit in the first round, if small sizes of
+it act in proportion."""
 FAINT = 0.9
-"""Share of the misfit that a candidate of one size leaves at the least, predicted or by one simulation, from which on it gets no first fit
-where every point costs."""
+"""Least share of the misfit, predicted or by one simulation, above which a candidate of one size gets no first fit where simulations run
+one by one."""
 PLACES = 9
-"""Starts of a candidate that are tried at full strength, the first of the screening."""
+"""Number of a candidate's starts, the first of the screening, that are tried at full strength."""
 ALSO_WITHOUT = 6
-"""Candidates of the least costs that are fitted without the problem's own parameters too."""
+"""Number of candidates of least cost that are also fitted without the extra parameters of the problem."""
 OWN = 3
-"""Candidates that the screening of a second solver may add to those that led with the first one."""
+"""Number of candidates that the screening by a further method may add to those that led by the first one."""
 
 
 def promising(
@@ -38,7 +39,7 @@ def promising(
     most: float = math.inf,
     until: float = 1.0,
 ) -> Promising:
-    """Screen the candidates, and say which are to be fitted and where their fits begin; arguments as those of `first_look`."""
+    """Screen the candidates, and return those to be fitted with the starts of their fits; the arguments are those of `first_look`."""
     lab = search.lab
     ends = led.ends if led is not None else {}
     first = not found and (led is None or led.chosen is not None)
@@ -69,9 +70,10 @@ def promising(
 
 
 def tries_all(lab: Laboratory, led: Led | None) -> bool:
-    """Whether the first look by another method tries every small candidate at several sizes, before it keeps a few: in one launch.
+    """Return whether the first look by another method tries every small candidate at several sizes before it keeps a few.
 
-    A viscosity of volume promised nothing by its direction where the declared model was fitted, and left noise alone at a larger size.
+    It does so where all of them run in one launch. A volume viscosity seemed to do nothing by its direction at the base fit, and left only
+    noise at a larger size.
     """
     return led is not None and led.chosen is not None and lab.problem.together
 
@@ -90,18 +92,32 @@ def first_starts(
     *,
     hurried: bool = False,
 ) -> tuple[dict[str, int], list[Start]]:
-    """Which candidates get a fit by the screening, with the start of each that it put first, and where their fits could begin.
+    """Return the candidates that get a fit by the screening, and the starts of these fits.
 
-    `hurried`: without trying any place at full strength.
+    Args:
+        search: The search by one method.
+        base: The fit to which an effect is to be added.
+        floor: Noise and discretisation there.
+        found: The effects so far.
+        led: Leading candidates of another method.
+        candidates: All candidates.
+        free: Parameters that are fitted beside those of a candidate.
+        slopes: Slopes of the prediction along these, by recording.
+        ranked: Result of the screening, the best first.
+        columns: Directions of the candidates in the data.
+        hurried: Whether to skip the starts at full strength.
+
+    Returns:
+        The best start of each chosen candidate, by key, and all starts.
     """
     lab = search.lab
     chosen: dict[str, int] = {}
     starts: list[Start] = []
-    # what many parameters could fit says little of how near the others are
+    # a candidate of many parameters promises much anyway: only those of few set the limit
     near = _near(stays for stays, c, *_ in ranked if len(c.parameters) <= MANY)
     keep, leaders = (search.keep, ()) if led is None else (min(search.keep, OWN), led.keys)
     first = led is None and not found
-    # beside an effect they are tried at larger sizes before any is chosen, and by another method where that costs one launch
+    # beside a found effect, small candidates are first tried at larger sizes; by another method only where that is one launch
     every = bool(found or tries_all(lab, led)) and not hurried
     for stays, c, i, begin in ranked:
         leads = c.key in leaders
@@ -118,7 +134,7 @@ def first_starts(
             starts.append((c, begin, None))
     finite = {c.key for _, c, *_ in ranked}
     for c in candidates:
-        # what cannot run where the base fit went, or does nothing there, may do so where the model was declared
+        # a candidate that fails or does nothing at the base fit may run and act at the declared values
         small = len(c.parameters) <= MANY if c.key not in finite else c.linear and len(c.parameters) <= SMALL
         if c.key not in chosen and ((first and small) or c.key in leaders):
             chosen[c.key] = 0
@@ -130,7 +146,7 @@ def first_starts(
 
 
 def with_effect(lab: Laboratory, point: Point, c: Candidate, end: Point, found: Sequence[Trial] = ()) -> Point:
-    """A point with a candidate's parameters, the declared ones and those of what was found, of the end of another fit of it."""
+    """Return the point with the values of the candidate, the declared model and the found effects from the end of another fit."""
     names = {*lab.as_declared, *(p.name for t in found for p in t.candidate.parameters)}
     return {**point, **{name: value for name, value in end.items() if name in names}, **c.own(end)}
 
@@ -138,9 +154,10 @@ def with_effect(lab: Laboratory, point: Point, c: Candidate, end: Point, found: 
 def without_own(
     search: Search, point: Point, starts: Sequence[Start], found: Sequence[Trial], ended: Sequence[tuple[Candidate, Fit]]
 ) -> list[Start]:
-    """The starts once more without the problem's own parameters, where the base has some: what it needs them for may be an effect.
+    """Return the starts once more without the extra parameters of the problem, or an empty list if the base has none.
 
-    Of the candidates that the screening or the fits with them (`ended`, best first) put among the first; and where these fits ended.
+    An extra parameter, such as the height of the colliders, may compensate for an effect. The list has the leading candidates of the
+    screening and of the fits in `ended` (the best first), from their starts and from the ends of these fits.
     """
     lab = search.lab
     plain = {k: v for k, v in point.items() if "." in k or k in lab.as_declared}
@@ -154,9 +171,12 @@ def without_own(
 
 
 def screened(lab: Laboratory, point: Point, floor: Floor, found: Sequence[Trial], most: float, led: Led | None = None):
-    """The candidates beside effects that were found, the free parameters and their slopes, and what `screen` says.
+    """Screen the candidates beside the effects that were found.
 
-    What did not lead among another method's first fits has the one start here that it was given there.
+    A candidate that did not lead among another method's first fits has only the start that it was given there.
+
+    Returns:
+        The candidates, the free parameters, their slopes, and the two results of `directions.screen`.
     """
     taken = {t.candidate.name for t in found}
     candidates = [c for c in lab.problem.candidates if c.name not in taken and len(c.parameters) <= most]
@@ -169,5 +189,5 @@ def screened(lab: Laboratory, point: Point, floor: Floor, found: Sequence[Trial]
 
 
 def _near(promises: Iterable[float]) -> float:
-    """Share of the misfit below which a candidate beyond the first few may promise as much as they do."""
+    """Return the share of the misfit below which a candidate beyond the first few is fitted too: twice the least, at most `HOPELESS`."""
     return min(2.0 * min(promises, default=0.0), HOPELESS)

@@ -1,4 +1,4 @@
-"""First fits that read more and more of the recordings, and the best fits once more from where they and others stand."""
+"""Growing fits, which read more and more of the recordings, and further fits of the best candidates from other starts."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,27 +18,27 @@ from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 
 MUCH = 2.5
-"""Times the noise of the fitted recordings that the best first fit leaves, from which on fits grow."""
+"""Ratio of the best first fit's error in the fitted recordings to the noise, above which growing fits are made."""
 SIDE_BY_SIDE, ONE_BY_ONE = 8, 4
-"""Candidates that grow, where a launch of several points costs as one, one of them of more than `MANY` parameters, and where every point
-costs, none of those."""
+"""Number of candidates with growing fits. The first is for many simulations in one launch, and includes one candidate of more than
+`MANY` parameters; the second is for simulations one by one, and includes none."""
 
 
 class Breadth(NamedTuple):
-    """How many pairs of effects grow."""
+    """Limits on the number of pairs of effects with growing fits."""
 
     firsts: int
-    """Candidates beside which a second one grows."""
+    """Number of first effects."""
     seconds: int
-    """Beside each of these."""
+    """Number of second effects beside each first one."""
     pairs: int
-    """That go on past the second horizon."""
+    """Number of pairs that go on past each horizon."""
     parameters: int
-    """Of a candidate, at the most."""
+    """Largest number of parameters of a candidate."""
 
 
 PAIRS, PAIRS_ONE_BY_ONE = Breadth(10, 4, 12, MANY), Breadth(5, 3, 4, 4)
-"""Where a launch of several points costs as one, and where every point costs."""
+"""Limits where many simulations run in one launch, and where they run one by one."""
 
 
 class Pair(NamedTuple):
@@ -49,28 +49,31 @@ class Pair(NamedTuple):
 
 
 POLISHED = 4
-"""Candidates whose fits are refined from further starts."""
+"""Number of candidates whose fits are refined from further starts."""
 NEARBY = 2.5
-"""Times the least error, that of what is held out too, up to which a fit is worth refining."""
+"""Ratio to the least error, held-out data included, up to which a fit is worth refining."""
 BEYOND = 8.0
-"""Times the error of what another solver named beyond which fits are not refined: that has gained up to 7-fold."""
+"""Ratio to the error of another method's named effect above which no fit is refined: refining has gained up to 7-fold."""
 MEASURED, NEAR = 6, 4.0
-"""Fits whose errors are measured with the differences of the settings where they end: so many of the best, or all, within this factor of
-their errors."""
+"""Fits that are measured with the floor at their ends: this many of the best, with errors up to this factor above the least. Without the
+first limit, all within this factor are measured."""
 BY_FAR = 0.5
-"""Share of the least cost of a candidate of few parameters below which one of many is refined."""
+"""Share of the least cost of candidates of few parameters below which a fit of many parameters is refined."""
 ONWARD = 3
-"""Further fits of a candidate, each with the differences of the settings where the last one ended: while each gains `SOME_GAIN` or has
-not come to its end."""
+"""Number of further fits of a candidate, each with the floor at the end of the one before. They go on while each gains `SOME_GAIN` or
+has not converged."""
 SOME_GAIN = math.log(1.2)
-"""Smaller gains are no reason to look further."""
+"""Least gain that is a reason to search further."""
 
 Onset = tuple[Sequence[Parameter], Fit, Sequence[Point]]
-"""What is fitted, a fit of it, and where further ones begin."""
+"""The parameters, a fit of them, and the starts of further fits."""
 
 
 def leaves_much(lab: Laboratory, errors: Sequence[np.ndarray]) -> bool:
-    """Whether the least of what fits leave of all parts, mean squares, is far above noise: they may have missed a valley."""
+    """Return whether all fits leave far more than noise, so that they may have missed a minimum.
+
+    `errors` are the mean squares of all parts, of each fit.
+    """
     if lab.problem.settings == 1 or not lab.problem.declared:
         return False
     noise = score(lab.noise_squares[lab.fitted])
@@ -78,7 +81,7 @@ def leaves_much(lab: Laboratory, errors: Sequence[np.ndarray]) -> bool:
 
 
 def is_astray(search: Search, base: Fit, floor: Floor) -> bool:
-    """Whether the base fit leaves much and stands elsewhere than the declared model fits the first part of the recordings."""
+    """Return whether the base fit leaves much, and is far from the fit of the declared model to the first horizon."""
     lab = search.lab
     if search.begun is None or not leaves_much(lab, lab.mean_squares([base.point], floor)):
         return False
@@ -88,32 +91,37 @@ def is_astray(search: Search, base: Fit, floor: Floor) -> bool:
 def growing(
     search: Search, base: Fit, floor: Floor, candidates: Sequence[Candidate], found: Sequence[Trial] = (), *, until: float = 1.0
 ) -> dict[str, tuple[Candidate, Fit]]:
-    """Fits of the candidates that promise most in the first part of the fitted recordings, by growing horizons, by their keys.
+    """Fit the candidates that promise most in the first part of the recordings by growing horizons.
 
-    They are screened where the declared model, with the effects that were found, fits the first part of the recordings, by what they
-    would take off a little more of it, and the start of each that does best is the one that grows. What falls behind at a horizon is
-    given up. One of many parameters grows where a launch of several points costs as one.
+    They are screened at the fit of the declared model, with the found effects, to the first horizon, by how much they would improve the fit
+    to the second one. Each grows from its best start, and those that fall behind at a horizon are given up. A candidate of many parameters
+    is included only where many simulations run in one launch.
+
+    Returns:
+        The candidate and its fit, by key, with the cost over the whole recordings.
     """
     lab = search.lab
     free = (*lab.problem.declared, *(p for t in found for p in t.candidate.parameters))
     at = at_first(search, free, contests.at_declared(lab, base.point), floor, found)
     starts = leading(lab, at, candidates, base_fits.early(lab, floor, HORIZONS[1]), free)
-    # where every point costs one of many parameters takes five times as long as the others together
+    # one by one, the simulations for a candidate of many parameters take five times as long as for all others together
     large = [entry for entry in starts if len(entry[0].parameters) > MANY][: 1 if lab.problem.together else 0]
     live = [entry for entry in starts if entry in large or len(entry[0].parameters) <= MANY]
     live = live[: SIDE_BY_SIDE if lab.problem.together else ONE_BY_ONE]
     lab.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
     entries = [((*free, *c.parameters), point) for c, point in live]
     ended = [(live[i][0], fit) for i, fit in base_fits.grown(lab, entries, floor, until=until, reach=IN_REACH)]
-    costs = lab.costs([fit.point for _, fit in ended], floor) if ended else []  # they may have ended at an earlier horizon
+    costs = (
+        lab.costs([fit.point for _, fit in ended], floor) if ended else []
+    )  # the fits may have ended at an earlier horizon, so their costs are taken anew
     return {c.key: (c, replace(fit, cost=cost)) for (c, fit), cost in zip(ended, costs, strict=True) if np.isfinite(cost)}
 
 
 def growing_pairs(search: Search, base: Point, floor: Floor) -> list[Pair]:
-    """Fits of two effects at once by growing horizons, the least cost first.
+    """Fit pairs of effects by growing horizons, and return them with the least cost first.
 
-    In the first part of the recordings many a single effect does about as well as the right ones, whichever they are; a little later
-    the second one shows beside it. What one effect alone leaves of the whole says little of that.
+    In the first part of the recordings many single effects fit about as well as the right ones; a little later the second effect shows
+    beside a right one. The error of a single effect over the whole recordings says little about that.
     """
     lab = search.lab
     free, breadth = lab.problem.declared, PAIRS if lab.problem.together else PAIRS_ONE_BY_ONE
@@ -137,7 +145,7 @@ def growing_pairs(search: Search, base: Point, floor: Floor) -> list[Pair]:
 
 
 def at_first(search: Search, free: Sequence[Parameter], point: Point, floor: Floor, found: Sequence[Trial] = ()) -> Point:
-    """`first_part`, which is kept where no effect was found yet."""
+    """Return the result of `first_part`, stored for reuse while no effect was found."""
     lab = search.lab
     if found:
         return base_fits.first_part(lab, free, point, floor)
@@ -149,7 +157,7 @@ def at_first(search: Search, free: Sequence[Parameter], point: Point, floor: Flo
 def leading(
     lab: Laboratory, at: Point, candidates: Sequence[Candidate], floor: Floor, free: Sequence[Parameter]
 ) -> list[tuple[Candidate, Point]]:
-    """Candidates, those first that would take most off there past the free parameters, each with the start that does best."""
+    """Return the candidates with their best starts, those first that would improve the fit at a point most beside the free parameters."""
     ranked, _ = directions.screen(lab, at, candidates, floor, directions.slopes(lab, free, at, lab.fitted_recordings))
     starts: dict[str, tuple[Candidate, Point]] = {}
     for _, c, _, begin in ranked:
@@ -166,12 +174,22 @@ def polish(
     rival: Round | None = None,
     other: tuple[Candidate, Fit] | None = None,
 ) -> dict[str, tuple[Candidate, Fit]]:
-    """The best fits once more, from where they ended, from the declared values, and from those of the very best one.
+    """Repeat the best fits from their ends, from the declared values, and from the declared parameters of the very best fit.
 
-    The base fit may have led all of them astray, and its weights too, for the settings differ most where the model is wrong: each is
-    weighed by the floor where it stands. Which end is the best one is said by the errors, for weights differ. Where `rival`, the round
-    of another solver, named an effect that leaves far less than any of them, none is refined. `other`, the leading candidate's fit of
-    the other sign, is refined beside it.
+    The base fit may have misled all of them, and so may its floor, because settings differ most where the model is wrong. So each fit is
+    weighted by the floor at its own end, and the best end is chosen by errors, which do not depend on the weights.
+
+    Args:
+        lab: The method that predicts.
+        free: Parameters that are fitted beside those of a candidate.
+        best: The best fit of each candidate, by key.
+        base: The base fit.
+        floor: Noise and discretisation at the base.
+        rival: Round of another method. If it named an effect that leaves far less than any of these fits, none is refined.
+        other: The leading candidate's fit with the opposite sign, which is refined too.
+
+    Returns:
+        The refined fits, by key.
     """
     ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
     within = [entry for entry in ranked if entry[1].cost < IN_REACH * ranked[0][1].cost]
@@ -195,7 +213,7 @@ def polish(
     least: dict[str, float] = {}
     if other is not None and other[1].cost < IN_REACH * ranked[0][1].cost:
         top = (*top, other)
-    able = runnable(lab, top)  # elsewhere there is no floor
+    able = runnable(lab, top)  # where a recording does not run there is no floor
     entries = []
     for c, fit in able:
         starts = [fit.point, contests.at_declared(lab, fit.point)]
@@ -213,10 +231,10 @@ def polish(
 def widened(
     lab: Laboratory, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
 ) -> dict[str, tuple[Candidate, Fit]]:
-    """The fit of many parameters that leads all of few by far, once more with the floor where it stands, as `polish` does for those.
+    """Repeat a leading fit of many parameters with the floor at its end, if it is far ahead of all fits of few parameters.
 
-    What another grid does where the model is wrong is then in its many parameters: a force in time came to the noise by the weights of
-    the base, 53 mm off, and left more than a uniform one of what was held out.
+    Its many parameters may fit what another grid does where the model is wrong: with the floor of the base, a time-dependent force came
+    down to the noise 53 mm away, and left more of the held-out data than a uniform force. Return the fit by key if it is better.
     """
     ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
     few = min((fit.cost for c, fit in ranked if len(c.parameters) <= MANY), default=math.inf)
@@ -232,12 +250,12 @@ def widened(
 
 
 def runnable(lab: Laboratory, fits: Sequence[tuple[Candidate, Fit]]) -> list[tuple[Candidate, Fit]]:
-    """Those that end where every recording runs."""
+    """Return the fits at whose ends every recording can be predicted."""
     return [entry for entry, ok in zip(fits, lab.which_run([fit.point for _, fit in fits]), strict=True) if ok]
 
 
 def onward(lab: Laboratory, entries: Sequence[Onset], floor: Floor) -> list[tuple[Fit, Floor]]:
-    """What `from_here` makes of each entry, and further from where that ends, up to `ONWARD` times."""
+    """Refit each entry as `from_here` does, then repeat this from its end up to `ONWARD` times."""
     ends = from_here(lab, entries, floor)
     going = list(range(len(ends)))
     for _ in range(ONWARD):
@@ -260,7 +278,7 @@ def onward(lab: Laboratory, entries: Sequence[Onset], floor: Floor) -> list[tupl
 
 
 def from_here(lab: Laboratory, entries: Sequence[Onset], like: Floor) -> list[tuple[Fit, Floor]]:
-    """Of each entry the best of its fit and of those from its starts, and the floor of all of them: that where the fit stands.
+    """Fit each entry from its starts, and return its best fit with the floor at the end of the given fit.
 
     The fits of all entries run side by side.
     """
@@ -284,14 +302,16 @@ def from_here(lab: Laboratory, entries: Sequence[Onset], like: Floor) -> list[tu
 
 
 def measured(lab: Laboratory, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor, *, every: bool = False) -> list[Stand]:
-    """Each fit, in their order, with what it leaves by `floor`, or for the leading ones by that where they end, if it leaves less.
+    """Return each fit, in the given order, with the errors that it leaves.
 
-    What another grid does moves with the law: the differences at the base say little of it where a fit has gone far. By these the
-    truth of a blind case, a yield stress that grows with the rate, was behind twenty others. `every`: not the leading ones alone.
+    The errors are measured with `floor`, and for the leading fits also with the floor at their ends, if that leaves less. The differences
+    between settings change with the law, so those at the base say little of a fit that ended far away: by these, the true effect of a blind
+    case, a yield stress that grows with the rate, ranked behind twenty others. With `every`, all fits count as leading, up to the factor
+    `NEAR`.
     """
     fits, points = [fit for _, fit in best.values()], [fit.point for _, fit in best.values()]
     squares: dict[int, np.ndarray] = {}
-    for setting in {fit.setting for fit in fits}:  # those that came close have the own one
+    for setting in {fit.setting for fit in fits}:  # fits that came close ended under the method's own setting
         own = [i for i, fit in enumerate(fits) if fit.setting == setting]
         with lab.under(setting):
             squares |= zip(own, lab.mean_squares([points[i] for i in own], floor), strict=True)
@@ -313,7 +333,10 @@ def measured(lab: Laboratory, best: Mapping[str, tuple[Candidate, Fit]], floor: 
 def elsewhere(
     lab: Laboratory, base: Fit, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
 ) -> dict[str, tuple[Candidate, Fit]]:
-    """Fits of one size once more, from the declared values and a larger size: the slope at zero may have led into a side valley."""
+    """Repeat the fits of candidates with one size from the declared values and a larger size.
+
+    The slope at size zero may have led the earlier fits into a wrong local minimum.
+    """
     begins: list[tuple[Candidate, Point]] = []
     for key, (c, fit) in best.items():
         if not c.linear or len(c.size_parameters) != 1 or len(c.parameters) > SMALL:
@@ -327,17 +350,19 @@ def elsewhere(
         race = Race(min((fit.cost for _, fit in best.values() if fit.setting == lab.setting), default=np.inf))
         requests = [lab.request((*lab.problem.declared, *c.parameters), begin, race=race) for c, begin in begins]
         ended = list(zip((c for c, _ in begins), lab.fits(requests, floor), strict=True))
-    found = better((entry for entry in ended if entry[1].setting == lab.own), best)  # the costs of quick ones are of another motion
+    found = better(
+        (entry for entry in ended if entry[1].setting == lab.own), best
+    )  # costs of quick fits belong to another motion and cannot be compared
     return found | ahead(lab, ended, {**best, **found}, floor)
 
 
 def ahead(
     lab: Laboratory, ended: Sequence[tuple[Candidate, Fit]], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
 ) -> dict[str, tuple[Candidate, Fit]]:
-    """Ends of fits once more with the floor where they stand, those that leave least: candidates that then leave less than their best.
+    """Repeat the fits that leave least with the floor at their ends, and return those that then beat the candidate's best fit.
 
-    Any will do for one that has none. What another grid does there may be another thing than at the base, and by the weights of that
-    the truth stays behind.
+    A candidate without a fit takes any. The differences between grids may be others there than at the base, and with the floor of the base
+    the true effect may stay behind.
     """
     ended = [entry for entry in ended if np.isfinite(entry[1].cost)]
     if lab.problem.settings == 1 or not ended or lab.budget.ends():

@@ -1,4 +1,4 @@
-"""What a search by one method of prediction knows: where it stands, what it looked at last, and how it measures where fits end."""
+"""The state of a search by one method of prediction: its base, its last results, and the interface to the ends of fits."""
 
 import math
 from collections.abc import Mapping
@@ -13,72 +13,72 @@ from neuido.discrepancy.inference.least_squares import Fit
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 
 HOPELESS = 0.75
-"""Share of the misfit that a candidate beyond the first few may leave, as the screening predicts it, and still get a fit."""
+"""Predicted share of the misfit from which a candidate beyond the first few gets no fit."""
 LED_BY = 8
-"""First fits by one method that lead when another one is asked."""
+"""Number of first fits by one method that lead the fits when another method is asked."""
 
 Start = tuple[Candidate, Point, np.ndarray | None]
-"""A candidate, where a fit of it begins, and about the slopes there, if they are known."""
+"""A candidate, the start of a fit of it, and approximate slopes there if they are known."""
 
 
 class PutOff(NamedTuple):
-    """Candidates whose fits wait until another method was asked, and the fits that were made before them."""
+    """Starts of fits that wait until another method was asked, and the fits that were made before."""
 
     ended: tuple[tuple[Candidate, Fit], ...]
     starts: tuple[Start, ...]
 
     @property
     def keys(self) -> list[str]:
-        """Of the candidates that wait."""
+        """Keys of the candidates that wait."""
         return list(dict.fromkeys(c.key for c, *_ in self.starts))
 
 
 class Contest(NamedTuple):
-    """What fits of candidates came to; those that came close ended under the own setting, others may be quick ones (`Fit.setting`)."""
+    """The fits of candidates. Those that came close ended under the method's own setting, others may be quick ones (`Fit.setting`)."""
 
     best: dict[str, tuple[Candidate, Fit]]
-    """Of each candidate, by its key."""
+    """The best fit of each candidate, by its key."""
     other: tuple[Candidate, Fit] | None
-    """The leading candidate's of the other sign."""
+    """The leading candidate's fit with the opposite sign."""
     unfitted: dict[str, str]
     """Why a candidate got no fit, by its key."""
     put_off: PutOff | None = None
-    """What goes on later."""
+    """Fits that are made later."""
 
 
 class Promising(NamedTuple):
-    """Which candidates are to be fitted, and where their fits begin."""
+    """Candidates that are to be fitted, and the starts of these fits."""
 
     candidates: list[Candidate]
     free: tuple[Parameter, ...]
     slopes: dict[int, np.ndarray]
     columns: dict[tuple[str, int], dict[int, np.ndarray]]
     chosen: dict[str, int]
-    """The start of each candidate that gets a fit which the screening put first."""
+    """Number of the start that the screening ranks first, of each candidate that gets a fit, by key."""
     starts: list[Start]
     promise: dict[str, float]
-    """The least share of the misfit that a candidate leaves, predicted by the screening or by one simulation."""
+    """Least share of the misfit that a candidate leaves, predicted by the screening or by one simulation, by key."""
 
     @property
     def hopeful(self) -> set[str]:
-        """Keys of the candidates that could take something off."""
+        """Keys of the candidates that could lower the misfit notably."""
         return {c.key for c in self.candidates if self.promise.get(c.key, math.inf) < HOPELESS or not c.linear}
 
 
 class Look(NamedTuple):
-    """The first fits of a step."""
+    """The screening and first fits of one round."""
 
     base: Fit
     asked: Promising
     contest: Contest
     least: list[np.ndarray]
-    """What the best of them leaves, mean squares of the parts; empty where nothing runs."""
+    """The least errors of the fits, mean squares of the parts; empty where no fit runs."""
     grown: bool = False
-    """Whether some grew with the recordings."""
+    """Whether growing fits were made."""
 
     @property
     def led(self) -> Led:
-        """The candidates of the least costs, and after them what was put off."""
+        """The candidates of least cost, and after them those whose fits were put off."""
         fits = sorted(self.contest.best.values(), key=lambda entry: entry[1].cost)
         begun = self.contest.put_off
         waiting = begun.keys if begun else []
@@ -86,18 +86,18 @@ class Look(NamedTuple):
 
 
 class Ends(Protocol):
-    """Where fits end and what they leave there: simulated, or as a journal stored it."""
+    """Where fits end and what they leave there, by simulation or from a journal."""
 
     def measured(self, best: Mapping[str, tuple[Candidate, Fit]], floor: Floor, *, every: bool = False) -> list[Stand]:
-        """Return each fit with what it leaves, as `refining.measured` does."""
+        """Return each fit with the errors that it leaves, as `refining.measured` does."""
         ...
 
     def finished(self, named: Stand) -> Stand:
-        """Return a fit at its end, as `base_fits.finished` does."""
+        """Return a fit continued to its end, as `base_fits.finished` does."""
         ...
 
     def alone(self, stand: Stand) -> np.ndarray:
-        """Return what one simulation leaves, as `judging.left_alone` does."""
+        """Return the errors that one simulation leaves, as `judging.left_alone` does."""
         ...
 
 
@@ -106,18 +106,18 @@ class Search:
     """The search for effects by one method of prediction."""
 
     lab: Laboratory
-    """What it measures with."""
+    """The method: simulations, fits and errors."""
     ends: Ends
     keep: int = 7
-    """Candidates that get a full fit by their place in the screening, at the least; in the first round all small ones do beside."""
+    """Least number of candidates that get a full fit by their rank in the screening. In the first round all small ones get one too."""
     draws: int = 199
-    """Of the bootstrap."""
+    """Number of draws of the bootstrap."""
     seed: int = 0
-    """Of the draws."""
+    """Seed of the draws."""
     begun: Point | None = None
-    """Where the declared model fits the first part of the fitted recordings, if that was asked for."""
+    """Point at which a fit of the declared model to the first horizon ends, once it was made."""
     still: Point | None = None
-    """Where the declared model fits best without a parameter of the problem's own, if it was given one."""
+    """Point at which the declared model fits best with the extra parameters at their first values, if the base moved them."""
     seen: Look | None = None
     """The last look for a first effect."""
     asked: Round | None = None

@@ -1,4 +1,4 @@
-"""Other candidates in the place of the leading effect, fitted from where that one ended."""
+"""Other candidates in the place of the leading effect, fitted from the point where its fit ended."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,42 +17,46 @@ from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 from neuido.physics.effects.library import LIMITS
 
 NEAR_IT = 1.5
-"""Times the cost of the leading fit from which on a candidate is behind it."""
+"""Ratio to the cost of the leading fit from which a candidate counts as behind it."""
 ALIKE = 0.3
-"""Share of what the leading effect does to the data, past the declared parameters, that a candidate may leave to be fitted from there."""
+"""Largest share of the leading effect's action on the data, beyond the declared parameters, that a candidate may fail to reproduce if it
+is fitted from there."""
 HALF = 0.5
-"""Share of the base fit's cost below which the leading effect says where the declared values are."""
+"""Share of the base fit's cost below which the fit with the leading effect is trusted for the declared values."""
 PROMISING = 0.75
-"""Share of the misfit that a candidate may leave there, as its directions say, to be tried in its place where every point costs: another
-stiffness in compression left more than 0.82 by them, and was the true effect."""
+"""Predicted share of the misfit below which a candidate is tried in the place of the leading one where simulations run one by one. The
+limit can miss an effect: a true one, another stiffness in compression, left more than 0.82 by this measure."""
 INSTEAD, INSTEAD_ONE_BY_ONE = 8, 2
-"""Candidates that are fitted there, and the same where every point costs."""
+"""Number of candidates that are fitted there; the second where simulations run one by one."""
 SCANNED = 8
-"""Candidates whose sizes are tried there where every point costs; otherwise all."""
+"""Number of candidates whose sizes are scanned there where simulations run one by one; otherwise all are."""
 FROM_THERE = 20.0
-"""Times the cost of the leading fit up to which one of these sizes is fitted: three that this has found began at 0.4, 6 and 15 times."""
+"""Ratio to the cost of the leading fit up to which a scanned size is fitted. Three effects that were found so began at ratios of 0.4, 6
+and 15."""
 NO_MORE = 1.1
-"""Mean squares up to so many times those of the noise that are no reason to look further where a base fit is led away."""
+"""Ratio of mean squares to those of the noise up to which there is no reason to search further although the base fit is far from the
+declared values."""
 STEP, STEPS = 1.5, 9
-"""Ratio of these sizes, and how many: up to 26 times the one that the candidate is screened at."""
+"""Ratio between neighbouring scanned sizes, and their number: up to 26 times the size at which the candidate is screened."""
 
 
 def leader(best: Mapping[str, tuple[Candidate, Fit]]) -> tuple[Candidate, Fit] | None:
-    """The candidate of few parameters with the fit of least cost, if there is one."""
+    """Return the candidate of few parameters with the fit of least cost, or None."""
     return min((entry for entry in best.values() if len(entry[0].parameters) <= MANY), key=lambda entry: entry[1].cost, default=None)
 
 
 def is_behind(c: Candidate, best: Mapping[str, tuple[Candidate, Fit]], fit: Fit) -> bool:
-    """Whether a candidate has no fit that comes near a leading one."""
+    """Return whether a candidate has no fit with about the cost of a leading one."""
     return c.key not in best or best[c.key][1].cost >= NEAR_IT * fit.cost
 
 
 def limits(
     lab: Laboratory, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], candidates: Sequence[Candidate], floor: Floor
 ) -> dict[str, tuple[Candidate, Fit]]:
-    """Fits of what the leading candidate is in a limit, from its declared values and with sizes that do about as much.
+    """Fit limiting cases of the leading candidate from its declared values, with sizes that act about as strongly.
 
-    The base fit may have led theirs astray.
+    Their earlier fits may have ended elsewhere because the base fit was far off. Only fits better than those in `best` are returned, by
+    key.
     """
     if not best:
         return {}
@@ -81,10 +85,11 @@ def alike(
     slopes: Mapping[int, np.ndarray],
     floor: Floor,
 ) -> dict[str, tuple[Candidate, Fit]]:
-    """Fits of the candidates that act on the data as the leading one does, from its fit, with the sizes that do as much.
+    """Fit candidates that act on the data as the leading one does, from its fit, with sizes that act as strongly.
 
-    A fit that started far from there may have been given up, and a class would lack one of its members. One of many parameters is
-    among them if the leading one is a limit of it and leaves more than noise.
+    An earlier fit of such a candidate may have begun far away and been given up, and the class would lack a member. A candidate of many
+    parameters is included if the leading one is a limiting case of it and leaves more than noise. Only fits better than those in `best` are
+    returned, by key.
     """
     top = leader(best)
     if top is None:
@@ -92,7 +97,7 @@ def alike(
     lead, fit = top
     if not lead.linear or lead.size_parameters != lead.parameters:
         return {}
-    at = chosen.get(lead.key, 0)  # what is a limit of another one may lead without a place in the screening
+    at = chosen.get(lead.key, 0)  # a limiting case may lead without a rank in the screening
     past, start = directions.project_out_slopes(lab, slopes, floor), lead.starts[at]
     does = past(columns[lead.key, at]) @ np.array([fit.point[p.name] / start[p.name] for p in lead.parameters])
     if not np.isfinite(does).all():
@@ -124,12 +129,12 @@ def instead(
     base: Fit,
     floor: Floor,
 ) -> dict[str, tuple[Candidate, Fit]]:
-    """Fits of other candidates from where the leading one ended, without it.
+    """Fit other candidates from the end of the leading fit, without the leading effect.
 
-    The base fit makes up for what it lacks by a modulus far from the true one, and the fits that begin there may all miss their valleys
-    but for one effect that stands in for the true one: with it the declared values come near theirs. They are held while sizes of what
-    promises something there, or of all where that is one launch, are tried and fitted: the valleys of a size and a modulus together are
-    narrow.
+    The base fit may compensate for a missing effect by a wrong modulus. Fits that begin there may then all end in wrong local minima, but
+    for one effect that resembles the true one and brings the declared values near their true values. These values are held while sizes of
+    promising candidates are tried and fitted, because the minimum in size and modulus together is narrow; then all are fitted. All
+    candidates are tried where that takes one launch. Only fits better than those in `best` are returned, by key.
     """
     top = leader(best)
     if top is None or lab.problem.settings == 1:
@@ -175,14 +180,18 @@ def instead(
 
 
 def leaves_no_more(lab: Laboratory, base: Fit, squares: np.ndarray) -> bool:
-    """Whether noise alone is left; a little more than that may be what a stand-in leaves, where the base fit is led away."""
+    """Return whether only noise is left, so that no other effect is to be tried.
+
+    Where the base fit is far from the declared values (`LED_AWAY`), the limit is stricter: a little more than noise may come from an effect
+    that only resembles the true one.
+    """
     return comparing.is_noise(lab, squares) and (
         comparing.moved(lab, base.point) < LED_AWAY or bool(np.all(squares < NO_MORE * lab.noise_squares))
     )
 
 
 def scanned(lab: Laboratory, c: Candidate, start: Point) -> list[Point]:
-    """A start of a candidate of one size with sizes of either sign from the one that it is screened at up."""
+    """Return copies of a candidate's start with increasing sizes of either sign; none unless it has one size and acts in proportion."""
     if len(c.size_parameters) != 1 or not c.linear:
         return []
     p = c.size_parameters[0]
