@@ -1,11 +1,12 @@
-"""The evidence of each model: how well what was held out is foretold from what was fitted, less the price of the search.
+"""Model evidence of each set of effects: how well it predicts the held-out data from the fitted ones, less a penalty for the search.
 
     E(M) = log p(y_validation | y_fitted, M) - log(k C(K, m))
 
 for a set of m of K effects, with k kinds of model (`KINDS`). The exponential of E is a prior weight times a predictive density, and the
-weights of all models sum to one. How far the best model must lead, and when two are told apart, is measured: `calibration`.
+prior weights of all models sum to one. Thresholds (how far the best model must lead, and when two models are distinguished) are
+calibrated on blind cases: `calibration`.
 
-This is computed beside the present decision, from stored fits, and decides nothing yet.
+The evidence is computed from stored fits and reported beside the answer of the rules. It decides nothing yet.
 """
 
 import math
@@ -24,53 +25,61 @@ from neuido.discrepancy.problems.problem import Parameter
 KINDS = 4
 """Kinds of model, of equal prior weight: none, one, two or three effects."""
 WIDE = 10.0
-"""Prior standard deviation of a parameter without a finite range, in its typical steps."""
+"""Largest prior standard deviation of a parameter without a prior of its own, in its typical steps."""
 LEAST = 0.1
-"""Share of the noise that the patterns' scale is at the least: finer settings than those that were tried differ by something too."""
+"""Least scale of the smooth patterns, as a share of the noise: settings finer than those that were tried differ a little too."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """A model with its evidence."""
+    """A fitted model and its evidence."""
 
     record: FitRecord
+    """The fit."""
     value: float
+    """Log-evidence E, natural logarithm."""
     beyond: float = 0.0
-    """Log-density of all recordings with any scale of the patterns, over that with the one that the settings leave of one another. Where
-    it is large, something is missing that the model has not."""
+    """Log-density of all recordings averaged over the scales of the patterns, minus that at the least scale. A large value means that
+    the model lacks an effect that is not among the candidates."""
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Keys of its effects, in alphabetical order."""
+        """Return the keys of the effects of the model, in alphabetical order."""
         return tuple(sorted(self.record.effects))
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the evidences of a case say."""
+    """The answer for a case by model evidence."""
 
     answer: str
     """`effect`, `class`, `unknown` or `none`."""
     sets: tuple[tuple[str, ...], ...]
-    """The sets of effects that the data do not tell apart, the best first; of those that hold another one only that."""
+    """Sets of effects that the data cannot tell apart, the best first; sets that contain another one of them are left out."""
     lead: float
-    """Of the best model over the declared one."""
+    """Log-evidence of the best model minus that of the declared one."""
     p_value: float
-    """Share of nulls on which something led by as much, this case counted among them."""
+    """Share of nulls with at least this lead; the case itself counts as one of them."""
 
 
 def price(effects: int, candidates: int) -> float:
-    """Return the logarithm of one over the prior weight of a set of effects."""
+    """Return minus the logarithm of the prior weight of a set of effects.
+
+    Args:
+        effects: Number of effects in the set.
+        candidates: Number of candidate effects.
+    """
     return math.log(KINDS * math.comb(candidates, effects))
 
 
-def prior_of(case: CaseRecord, fit: FitRecord) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far a fit ended from the prior mean of each free parameter, and the prior variances, in the coordinates of fits.
+def prior_offsets(case: CaseRecord, fit: FitRecord) -> tuple[np.ndarray, np.ndarray]:
+    """Return the offset of each fitted parameter from its prior mean, (p,), and its prior variance, (p,), in the coordinates of fits.
 
-    The mean is what is declared, the absence of an effect for its size, and the middle of the range for a logarithm without such a value.
+    The prior mean is the declared value of a parameter, and for an effect the value at which it is absent. A parameter that is fitted as
+    a logarithm and has no such value takes the middle of its range.
     """
     known = {p["name"]: Parameter(**p) for p in (*case.declared, *(p for c in case.candidates for p in c["parameters"]))}
-    away, variances = [], []
+    offsets, variances = [], []
     for name in fit.names:
         p = known[name]
         span = p.coordinate(p.upper) - p.coordinate(p.lower) if not (p.log and p.lower <= 0) else math.inf
@@ -78,82 +87,89 @@ def prior_of(case: CaseRecord, fit: FitRecord) -> tuple[np.ndarray, np.ndarray]:
             mean = p.coordinate(p.value)
         else:
             mean = p.coordinate(p.lower) + 0.5 * span if math.isfinite(span) else p.coordinate(fit.point[name])
-        away.append(p.coordinate(fit.point[name]) - mean)
+        offsets.append(p.coordinate(fit.point[name]) - mean)
         variances.append((p.prior if p.prior is not None else min(span / math.sqrt(12.0), WIDE)) ** 2)
-    return np.array(away), np.array(variances)
+    return np.array(offsets), np.array(variances)
 
 
 def unseen(parts: Sequence[PartStatistics], declared: Sequence[bool] | None = None) -> float:
-    """Return what the settings leave of one another, root mean square: each fitted by the slopes and by the other differences.
+    """Return the least scale of the smooth patterns: an estimate of the simulation error that no setting shows, in the unit of the data.
 
-    That is the scale of what another solver does that none of the settings shows, where the fit ended.
+    The difference of each setting is fitted by the slopes and by the differences of the other settings. The scale is the root mean square
+    of what these fits leave, and at least `LEAST` times the noise.
 
     Args:
-        parts: Of the fitted recordings.
-        declared: Which slopes are by parameters of the declared model; all by default. Those of effects take no part: the more a set
-            has, the smaller its scale would be, and it would lead by that alone.
+        parts: The fitted parts.
+        declared: Mask of the slopes by declared parameters, (p,); all by default. Slopes of effects are left out, as a set with many
+            effects would get a smaller scale and lead for that reason alone.
     """
     slopes, settings = (np.concatenate([getattr(p, name) for p in parts]) for name in ("slopes", "settings"))
     if declared is not None:
         slopes = slopes[:, np.array(declared, bool)]
     rows, noise = sum(p.rows for p in parts), min(p.noise for p in parts)
-    able = [j for j in range(settings.shape[1]) if settings[:, j].any()]
+    runnable = [j for j in range(settings.shape[1]) if settings[:, j].any()]
     left = []
-    for j in able:
-        others = np.concatenate([slopes, settings[:, [i for i in able if i != j]]], axis=1)
+    for j in runnable:
+        others = np.concatenate([slopes, settings[:, [i for i in runnable if i != j]]], axis=1)
         fit = others @ np.linalg.lstsq(others, settings[:, j], rcond=1e-8)[0] if others.shape[1] else 0.0
         left.append(float(np.sum((settings[:, j] - fit) ** 2)) / rows)
     return max(math.sqrt(float(np.mean(left))) if left else 0.0, LEAST * noise)
 
 
-def at_the_prior_mean(parts: Sequence[PartStatistics], away: np.ndarray) -> list[PartStatistics]:
-    """Return the parts with the residuals that the slopes promise at the prior mean of the parameters.
+def shift_to_prior_mean(parts: Sequence[PartStatistics], offsets: np.ndarray) -> list[PartStatistics]:
+    """Return the parts with their residuals moved from the end of the fit to the prior mean of the parameters, by the slopes.
 
-    So the density is that of the model with its prior, however far the fit went: a set that fits whatever it meets pays for it.
+    The density then is that of the model with its prior, wherever the fit ended, so that a very flexible set of effects pays for it.
+
+    Args:
+        parts: Parts of the data.
+        offsets: Offset of each fitted parameter from its prior mean, (p,).
     """
-    return [replace(p, residual=p.residual - p.slopes @ away) for p in parts]
+    return [replace(p, residual=p.residual - p.slopes @ offsets) for p in parts]
 
 
 def densities(
     parts: Sequence[PartStatistics], recordings: Sequence[int], fitted: Sequence[bool], variances: np.ndarray, scale: float
 ) -> tuple[float, float]:
-    """Return the log-density of the validation parts given the fitted ones, and how much a free scale adds to that of all parts.
-
-    Where nothing is held out the first is that of the fitted parts themselves.
+    """Compute the predictive density of the validation parts, averaged over the scales of the patterns.
 
     Args:
-        parts: Of all recordings, their residuals at the prior mean.
-        recordings: The recording of each part.
+        parts: All parts, with residuals at the prior mean.
+        recordings: Number of the recording of each part.
         fitted: Which parts were fitted.
-        variances: Prior variances of the coordinates of the free parameters.
-        scale: Below which the patterns' scale is not.
+        variances: Prior variance of each fitted parameter, (p,), in the coordinates of fits.
+        scale: Least scale of the patterns, in the unit of the data.
+
+    Returns:
+        The log-density of the validation parts given the fitted ones (of the fitted ones themselves if nothing is held out), and the
+        log-density of all parts minus that at the least scale.
     """
     shared = [np.concatenate([p.settings, p.slopes], axis=1) for p in parts]
     prior = np.concatenate([np.ones(parts[0].settings.shape[1]), variances])
-    counted = {n: share([p for p, own in zip(parts, recordings, strict=True) if own == n]) for n in recordings}
+    counted_share = {n: share([p for p, own in zip(parts, recordings, strict=True) if own == n]) for n in recordings}
 
-    @cache  # a recording that is fitted as a whole is asked for twice
-    def turned(own: tuple[int, ...]) -> Rotated:
-        return rotated([parts[i] for i in own], [shared[i] for i in own], counted[recordings[own[0]]])
+    @cache  # a recording that is fitted as a whole is needed twice
+    def rotated_recording(own: tuple[int, ...]) -> Rotated:
+        return rotated([parts[i] for i in own], [shared[i] for i in own], counted_share[recordings[own[0]]])
 
     def by_scale(chosen: Sequence[int]) -> np.ndarray:
         by_recording: dict[int, list[int]] = {}
         for i in chosen:
             by_recording.setdefault(recordings[i], []).append(i)
-        return log_densities([turned(tuple(own)) for own in by_recording.values()], prior, SCALES * scale)
+        return log_densities([rotated_recording(tuple(own)) for own in by_recording.values()], prior, SCALES * scale)
 
     early = [i for i, f in enumerate(fitted) if f]
     everything = by_scale(range(len(parts)))
     whole = log_mean(everything)
-    foretold = whole - log_mean(by_scale(early)) if len(early) < len(parts) else whole
-    return foretold, whole - float(everything[0])
+    predictive = whole - log_mean(by_scale(early)) if len(early) < len(parts) else whole
+    return predictive, whole - float(everything[0])
 
 
 def evidences(case: CaseRecord, fits: Sequence[FitStatistics]) -> list[Evidence]:
     """Return the evidence of every stored fit, the best first.
 
-    The least scale of the patterns is that of the declared model by the same method, whatever a set adds: how far simulations of the body
-    differ does not depend on what is asked about it, and no set leads by ending where they happen to differ less.
+    The least scale of the patterns is computed for the declared model of each method, and used for all sets of effects. The error of the
+    simulation does not depend on the effects that are tried, so no set may lead because settings happen to differ less where its fit ended.
 
     Raises:
         ValueError: The declared model is not among the fits of a method.
@@ -169,19 +185,19 @@ def evidences(case: CaseRecord, fits: Sequence[FitStatistics]) -> list[Evidence]
     for fit in fits:
         if fit.record.method not in scales:
             raise ValueError("the declared model has no statistics")
-        away, variances = prior_of(case, fit.record)
-        foretold, beyond = densities(at_the_prior_mean(fit.parts, away), recordings, fitted, variances, scales[fit.record.method])
-        out.append(Evidence(fit.record, foretold - price(len(fit.record.effects), len(case.candidates)), beyond))
+        offsets, variances = prior_offsets(case, fit.record)
+        predictive, beyond = densities(shift_to_prior_mean(fit.parts, offsets), recordings, fitted, variances, scales[fit.record.method])
+        out.append(Evidence(fit.record, predictive - price(len(fit.record.effects), len(case.candidates)), beyond))
     return sorted(out, key=lambda e: -e.value)
 
 
 def judged(found: Sequence[Evidence], calibration: Calibration, alpha: float = ALPHA) -> Verdict:
-    """Return what evidences say: each set counts by its best fit, of whatever method.
+    """Return the answer by model evidence. Each set of effects counts by its best fit of any method.
 
     Args:
-        found: With the declared model among them.
-        calibration: What leads nulls had, and how far true effects were behind.
-        alpha: Probability of naming anything where nothing is missing.
+        found: Evidence of each fit, the declared model included.
+        calibration: Thresholds.
+        alpha: Accepted probability of a false alarm.
 
     Raises:
         ValueError: The declared model is not among them.

@@ -1,19 +1,21 @@
-"""The likelihood of recordings under a fitted model: noise, nuisances, other settings, and what no setting shows.
+"""Likelihood of recordings under a fitted model with noise, nuisances, and errors of the simulation.
 
-For the residual r of a recording where a fit ended,
+The residual r of a recording where a fit ended is Gaussian:
 
     r ~ N(0, sigma^2 I + N N^T + s^2 S S^T + D D^T + J P J^T),
 
-with N one prior standard deviation of each nuisance, S smooth patterns of one mean square together, D the differences of the other
-settings, and J the slopes by the free parameters, of prior variances P. The amounts of N and S are a recording's own, those of D and J are
-shared by all recordings. The scale s of the patterns is common and unknown: densities are computed for many scales at once, and averaged.
-It is never below what the settings leave of one another after a refit: that is what simulations differ by, whatever the effects, and none
-leads by promising less.
+* sigma: standard deviation of the noise.
+* N: change of the data by one prior standard deviation of each nuisance; the amounts differ between recordings.
+* S: smooth patterns of mean square one, for errors of the simulation that no setting shows; the amounts differ between recordings.
+* s: scale of S. It is unknown, and the same for all recordings. Densities are averaged over many scales (`SCALES`), the least of which is
+  what the settings differ by after a refit of the declared model (`evidence.unseen`).
+* D: differences between the other settings and the one in use; the amounts are the same for all recordings.
+* J: slopes by the free parameters, with prior variances P; the amounts are the same for all recordings.
 
-A recording is rotated once into the principal patterns left by noise and nuisances; a density at any scale then costs a few products of
-small matrices (Woodbury's identity, and the determinant lemma beside it).
+A recording is rotated once into its principal patterns. A density at any scale then costs a few products of small matrices (Woodbury's
+identity and the matrix determinant lemma).
 
-What lies outside the patterns and the nuisances is counted as few data, not row by row: see `share`.
+Rows outside the patterns and nuisances do not count one by one, but as few data: see `share`.
 """
 
 import math
@@ -27,41 +29,44 @@ from scipy.special import logsumexp
 from neuido.discrepancy.inference.statistics import PartStatistics
 
 SCALES = np.geomspace(1.0, 1000.0, 61)
-"""Scales of the patterns that densities are averaged over, in units of what the settings leave of one another: how much more another
-solver may differ by is unknown by orders of magnitude, so each counts alike."""
+"""Scales of the smooth patterns that densities are averaged over, in units of the least scale. The error of the simulation is unknown by
+orders of magnitude, so each of them counts alike."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rotated:
-    """A recording in its principal patterns, whitened by noise and nuisances."""
+    """A recording in its principal patterns, whitened by noise and nuisances; q is the number of directions shared by all recordings."""
 
     constant: float
-    """Counted rows times log(2 pi), and the log-determinant of noise and nuisances."""
+    """Counted rows times log(2 pi), plus the log-determinant of the covariance of noise and nuisances."""
     strength: np.ndarray
-    """(k,) variances of the principal patterns at scale one, over noise and nuisances."""
+    """(k,), variances of the principal patterns at scale one, relative to noise and nuisances."""
     along: np.ndarray
-    """(k, q + 1) the shared directions and the residual along them."""
+    """(k, q + 1), shared directions and residual (last column), projected on the principal patterns."""
     gram: np.ndarray
-    """(q + 1, q + 1) their inner products."""
+    """(q + 1, q + 1), inner products of shared directions and residual."""
 
 
 def share(parts: Sequence[PartStatistics]) -> float:
-    """Return the share of its rows that a recording counts outside its smooth patterns: as many data as there are patterns.
+    """Return the weight of the rows of a recording outside its smooth patterns; together they count as many data as there are patterns.
 
-    Solvers differ by finer structures than the patterns have. Were each of 60,000 rows a datum of its own there, an effect that happens to
-    take a hundredth of such a structure would lead by hundreds.
+    Solvers also differ by structures finer than the patterns. If each of some 60,000 rows counted as an independent datum, an effect that
+    happens to explain one per cent of such a structure would lead by hundreds.
+
+    Args:
+        parts: All parts of one recording.
     """
     patterns, rows = parts[0].smooth.shape[1], sum(p.rows for p in parts)
     return 1.0 if not patterns else min(patterns / max(rows - patterns, 1), 1.0)
 
 
 def rotated(parts: Sequence[PartStatistics], shared: Sequence[np.ndarray], outside: float = 1.0) -> Rotated:
-    """Return parts of one recording as one.
+    """Join parts of one recording, and rotate them into their principal patterns.
 
     Args:
-        parts: Of one recording, with one noise.
-        shared: Of each part the directions whose amounts all recordings share, (k, q).
-        outside: Share of the rows that are counted of what lies outside the patterns and the nuisances.
+        parts: Parts of one recording, with the same noise.
+        shared: Directions of each part whose amounts are the same for all recordings, (k, q).
+        outside: Weight of the rows outside the patterns and nuisances: `share`.
     """
     noise, rows = parts[0].noise, sum(p.rows for p in parts)
     smooth, nuisances, residual = (np.concatenate([getattr(p, name) for p in parts]) for name in ("smooth", "nuisances", "residual"))
@@ -87,9 +92,9 @@ def log_densities(recordings: Sequence[Rotated], variances: np.ndarray, scales: 
     """Return the log-density of the residuals of several recordings at each scale of the patterns, (len(scales),).
 
     Args:
-        recordings: With the same shared directions.
-        variances: Prior variances of the shared amounts, (q,).
-        scales: Of the patterns, in the unit of the data.
+        recordings: Recordings with the same q shared directions.
+        variances: Prior variances of the amounts of the shared directions, (q,).
+        scales: Scales of the patterns, in the unit of the data.
     """
     q = len(variances)
     gram = np.zeros((len(scales), q + 1, q + 1))
@@ -107,6 +112,6 @@ def log_densities(recordings: Sequence[Rotated], variances: np.ndarray, scales: 
 
 
 def log_mean(densities: np.ndarray) -> float:
-    """Return the logarithm of the mean density over scales, of log-densities."""
-    total: Any = logsumexp(densities)  # a pair only where signs are asked for
+    """Return the logarithm of the mean of densities, given their logarithms (one for each scale)."""
+    total: Any = logsumexp(densities)  # typed as a pair, which it is only with return_sign
     return float(total) - math.log(len(densities))

@@ -1,8 +1,8 @@
-"""Statistics of fits that a likelihood needs, small enough to keep: the data enter through their projections on a few directions.
+"""Sufficient statistics of fits for the likelihood, small enough to store with each diagnosis.
 
-For a part with residual r, and directions S (smooth patterns), N (nuisances), D (the other settings' differences) and J (slopes), a
-Gaussian density of r whose covariance is made of these directions depends on the triangular factor of [S N D J r] alone. It is kept in
-single precision, the part of S and N once for all fits of a method.
+Take a part of the data with residual r and directions S (smooth patterns), N (nuisances), D (differences between settings) and J (slopes).
+A Gaussian density of r with a covariance of noise and these directions depends only on the triangular QR factor of [S N D J r]. This
+factor is stored in single precision. Its columns of S and N are stored once for all fits of a method.
 """
 
 import json
@@ -21,25 +21,27 @@ from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.errors import UserError
 
 MOST = 24
-"""Fits that statistics are kept of: the declared model by each method, and the best of each set of effects by each method."""
+"""Most fits whose statistics are kept: the declared model by each method, and the best fits of sets of effects by each method."""
 STEP = 0.1
 """Difference step of the slopes, in typical steps of a parameter."""
 
 
 @dataclass(frozen=True, eq=False)
 class PartStatistics:
-    """A part of the data in an orthonormal basis of the directions and the residual; what is outside holds no residual."""
+    """A part of the data in an orthonormal basis (of size k) of the directions and the residual, which holds all of the residual."""
 
     rows: int
+    """Number of data."""
     noise: float
+    """Standard deviation of the noise."""
     smooth: np.ndarray
-    """(k, s); the mean square over all rows of their sum is one."""
+    """(k, s), smooth patterns; their sum has a mean square of one over all rows."""
     nuisances: np.ndarray
-    """(k, n), of one prior standard deviation each."""
+    """(k, n), change by one prior standard deviation of each nuisance."""
     settings: np.ndarray
-    """(k, d), differences of the other settings."""
+    """(k, d), differences between the other settings and the one in use."""
     slopes: np.ndarray
-    """(k, p) by the coordinates of the free parameters."""
+    """(k, p), derivatives by the coordinates of the free parameters."""
     residual: np.ndarray
     """(k,), predicted minus measured."""
 
@@ -49,24 +51,26 @@ class FitStatistics:
     """A fit with the statistics of all parts."""
 
     record: FitRecord
+    """The fit."""
     parts: tuple[PartStatistics, ...]
+    """Statistics of each part, in the order of the parts of the case."""
 
 
 def best_fits(journal: Journal, ends: Sequence[FitRecord] = (), most: int = MOST) -> list[FitRecord]:
-    """Return the declared model's fits, and the best fit of each set of effects by each method, at most so many.
+    """Choose the fits to keep: the fits of the declared model, and the best fit of each set of effects by each method.
 
     Args:
-        journal: What was judged.
-        ends: Fits of the answer, which go on from judged ones and are kept first.
-        most: Fits in all.
+        journal: Records of the diagnosis.
+        ends: Final fits of the answer; their sets of effects are kept first.
+        most: Largest number of fits.
     """
     best: dict[tuple, FitRecord] = {}
     judged = [fit.finished or fit for r in journal.rounds for fit in r.fits]
-    for last in (*ends, *judged):
-        if last.effects and np.isfinite(last.errors).all():
-            key = last.method, tuple(sorted(last.effects))
-            if key not in best or score(np.array(last.errors)) < score(np.array(best[key].errors)):
-                best[key] = last
+    for fit in (*ends, *judged):
+        if fit.effects and np.isfinite(fit.errors).all():
+            key = fit.method, tuple(sorted(fit.effects))
+            if key not in best or score(np.array(fit.errors)) < score(np.array(best[key].errors)):
+                best[key] = fit
     declared = {fit.digest: fit for fit in (*journal.bases, *(fit for fit in ends if not fit.effects))}
     first = {end.method: tuple(sorted(end.effects)) for end in ends}
     ranked = sorted(best.items(), key=lambda item: (first.get(item[0][0]) != item[0][1], score(np.array(item[1].errors))))
@@ -76,13 +80,13 @@ def best_fits(journal: Journal, ends: Sequence[FitRecord] = (), most: int = MOST
 def statistics_of(
     laboratories: Sequence[Laboratory], floors: Sequence[Floor], journal: Journal, ends: Sequence[FitRecord] = ()
 ) -> dict[str, np.ndarray]:
-    """Return the arrays to keep.
+    """Compute the statistics of the best fits, as named arrays for `write_fits`.
 
     Args:
         laboratories: The methods.
-        floors: The floor of each where its declared model ended: its nuisances serve for all fits.
-        journal: What was fitted.
-        ends: Fits of the answer.
+        floors: Floor of each method where the fit of the declared model ended; its nuisances are used for all fits.
+        journal: Records of the diagnosis.
+        ends: Final fits of the answer.
     """
     arrays: dict[str, np.ndarray] = {}
     listed, chosen = [], best_fits(journal, ends)
@@ -111,7 +115,7 @@ def statistics_of(
 
 
 def read(arrays: Mapping[str, np.ndarray]) -> list[FitStatistics]:
-    """Return the fits of kept arrays."""
+    """Return the fits from the arrays of `statistics_of`."""
     out = []
     for k, text in enumerate(arrays["fits"]):
         record = fit_of(json.loads(str(text)))
@@ -140,16 +144,16 @@ def read(arrays: Mapping[str, np.ndarray]) -> list[FitStatistics]:
 
 
 def write_fits(path: Path, case: CaseRecord, arrays: Mapping[str, np.ndarray] | None) -> None:
-    """Write a case, and the statistics of its fits where there are some, as one compressed file."""
+    """Write a case, and the statistics of its fits if given, to one compressed NumPy file (.npz)."""
     text = np.frombuffer(to_json(case).encode(), np.uint8)
     write_arrays(path, {"case": text, **(arrays or {})})
 
 
 def read_fits(path: Path) -> tuple[CaseRecord, list[FitStatistics]]:
-    """Return the case and the statistics of a file of `write_fits`.
+    """Read the case and the statistics of its fits from a file of `write_fits`; there may be no statistics.
 
     Raises:
-        UserError: The file is none.
+        UserError: The file cannot be read, or was not written by `write_fits`.
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
@@ -160,7 +164,11 @@ def read_fits(path: Path) -> tuple[CaseRecord, list[FitStatistics]]:
 
 
 def _common(lab: Laboratory, floor: Floor) -> list[tuple[np.ndarray, np.ndarray, tuple[int, int]]]:
-    """Return basis, factor and numbers of the smooth patterns and nuisances of each part."""
+    """Factorise the smooth patterns and nuisances of each part.
+
+    Returns:
+        For each part the orthonormal basis (rows, k), the triangular factor (k, s + n), and the numbers s of patterns and n of nuisances.
+    """
     out = []
     for part in lab.parts:
         smooth = lab.problem.directions(part.recording)[part.rows]
@@ -171,7 +179,7 @@ def _common(lab: Laboratory, floor: Floor) -> list[tuple[np.ndarray, np.ndarray,
 
 
 def _columns(lab: Laboratory, fit: FitRecord, floor: Floor) -> dict[int, np.ndarray] | None:
-    """Return [D J r] of each recording where a fit ended; none where it or a slope does not run."""
+    """Return the columns [D J r] of each recording at the end of a fit; None if the model or a slope does not run there."""
     parameters = [lab.problem.parameter(name) for name in fit.names]
     recordings = lab.scored_recordings
     there = discretisation.floor_at(lab, fit.point, like=floor)
@@ -187,7 +195,7 @@ def _columns(lab: Laboratory, fit: FitRecord, floor: Floor) -> dict[int, np.ndar
 
 
 def _foresee_slopes(lab: Laboratory, fits: Sequence[FitRecord]) -> None:
-    """Run what the slopes of all fits will ask for, side by side."""
+    """Run the simulations for the slopes of all fits in one launch, and keep them in the memo."""
     points = []
     for fit in fits:
         points += directions.step_points([lab.problem.parameter(name) for name in fit.names], fit.point, STEP)[0]

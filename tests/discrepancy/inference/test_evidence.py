@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from neuido.discrepancy.inference.calibration import Calibration, calibration, quantile
-from neuido.discrepancy.inference.evidence import KINDS, LEAST, Evidence, at_the_prior_mean, densities, evidences, judged, price, unseen
+from neuido.discrepancy.inference.evidence import KINDS, LEAST, Evidence, densities, evidences, judged, price, shift_to_prior_mean, unseen
 from neuido.discrepancy.inference.journal import FitRecord
 from neuido.discrepancy.inference.likelihood import SCALES, log_densities, log_mean, rotated, share
 from neuido.discrepancy.inference.search.attribution import diagnose
@@ -130,7 +130,7 @@ def weighed(residuals, slopes, smooth, *, refit=True):
         own = [r - j @ q for r, j in zip(residuals, J, strict=True)]
         nothing = np.zeros((ROWS, 0))
         parts = [PartStatistics(ROWS, NOISE, smooth, nothing, nothing, j, r) for j, r in zip(J, own, strict=True)]
-        foretold, beyond = densities(at_the_prior_mean(parts, -q), [0, 1], [True, False], np.full(len(q), 9.0), PHI)
+        foretold, beyond = densities(shift_to_prior_mean(parts, -q), [0, 1], [True, False], np.full(len(q), 9.0), PHI)
         out.append(of(foretold - price(len(effects), len(slopes) - 1), *effects, beyond=beyond))
     return out
 
