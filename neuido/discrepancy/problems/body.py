@@ -1,7 +1,7 @@
-"""The MPM body as a `Problem`: tracked points of a deforming body, its declared law, and the effects that it may lack.
+"""A deforming body with tracked points as a `Problem`.
 
-Points that follow a particle are compared with that particle; points with an anchor move with the material around it, by a
-moving least-squares map of the nearest particles that reproduces every affine motion exactly.
+A tracked point that names a particle is compared with that particle. A point with an anchor moves with the material around the anchor: it
+is a weighted mean of the nearest particles (moving least squares, exact for affine motions).
 """
 
 from collections import Counter
@@ -31,9 +31,9 @@ from neuido.physics.runtime.once import cached
 from neuido.physics.runtime.threads import one_thread_each, scene_pool
 
 POISSON = 0.0, 0.495
-"""What the simulators take: waves grow without bound towards 0.5."""
+"""Range of Poisson's ratio in simulations. The speed of pressure waves grows without bound towards 0.5."""
 
-NUISANCES = (  # name, unit, prior standard deviation; of the frame interval, of one, of the speed
+NUISANCES = (  # name, unit, prior standard deviation: in frame intervals for the release, in typical speeds and spins for the launch
     ("release_time", "s", 0.1),
     ("time_base", "1", 0.003),
     ("length_scale", "1", 0.003),
@@ -46,39 +46,40 @@ NUISANCES = (  # name, unit, prior standard deviation; of the frame interval, of
 )
 INSTRUMENTS = ("release_time", "time_base", "length_scale")
 NEIGHBOURS = 12
+"""Number of particles that determine the place of a tracked point with an anchor."""
 TOGETHER = 192
-"""Motions in a launch on a GPU."""
+"""Number of motions that one launch on a GPU computes."""
 WINDOWS = 6
-"""In time, of the patterns of an unknown discretisation error."""
+"""Number of time windows of the patterns of an unknown discretisation error (`directions`)."""
 
 
 class Run(NamedTuple):
-    """Motions of one recording that are asked for."""
+    """A request for predictions of one recording, and their place in memory."""
 
     points: Sequence[Point]
     groups: list[list[int]]
-    """Which points move alike."""
+    """Parameter sets with the same motion, by their numbers in `points`."""
     recording: int
     setting: int
     out: np.ndarray
-    """A row a point, to be filled."""
+    """Predictions, a row per parameter set, filled later."""
 
     @property
     def firsts(self) -> list[Point]:
-        """One point of each group."""
+        """First parameter set of each group."""
         return [self.points[group[0]] for group in self.groups]
 
 
 @dataclass(frozen=True, eq=False)
 class BodyProblem(BodyRollouts):
-    """An experiment folder with tracked points."""
+    """An experiment with tracked points."""
 
     batch: int = 0
-    """Motions in a launch on a GPU; 0: `TOGETHER`. On the CPU each runs alone, as many at a time as there are cores."""
+    """Number of motions per launch on a GPU; 0: `TOGETHER`. On the CPU each motion is simulated alone, as many at a time as cores."""
     instruments: tuple[str, ...] = INSTRUMENTS
-    """Nuisances that change what is seen of a motion, and not the motion."""
+    """Nuisances of the measurement, which do not change the motion."""
     tracked: bool = True
-    """Whether the data are positions of points."""
+    """Whether the data are positions of tracked points."""
     _maps: dict[int, Any] = field(default_factory=dict, init=False, repr=False)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
@@ -86,14 +87,14 @@ class BodyProblem(BodyRollouts):
         return rows
 
     def predict_several(self, asks: Sequence[Ask]) -> Rows:
-        with one_thread_each():  # what the host prepares for a launch is small too
+        with one_thread_each():  # on a GPU too: the preparation on the host is too small for several threads
             yield from (self._side_by_side if self.device == "cpu" else self._in_one_launch)(self._runs(asks))
 
     def _runs(self, asks: Sequence[Ask]) -> list[Run]:
         return [Run(points, self._alike(points, n), n, s, np.empty((len(points), len(self.recordings[n].y)))) for points, n, s in asks]
 
     def _side_by_side(self, runs: Sequence[Run]) -> Iterator[np.ndarray]:
-        """Every motion by itself, as many at a time as there are cores."""
+        """Simulate each motion alone on the CPU, as many at a time as there are cores, and yield the predictions of each run."""
         waiting: list[list[Future]] = []
         try:
             for run in runs:
@@ -108,7 +109,10 @@ class BodyProblem(BodyRollouts):
                     one.cancel()
 
     def _in_one_launch(self, runs: Sequence[Run]) -> Iterator[np.ndarray]:
-        """The recordings of a setting in launches that they share, where their frames are the same substeps."""
+        """Simulate on a GPU, and yield the predictions of each run.
+
+        Recordings with the same setting share launches if their frames fall on the same substeps.
+        """
         shared: dict[tuple, list[Run]] = {}
         keys, times = [], Counter()
         for run in runs:
@@ -117,7 +121,7 @@ class BodyProblem(BodyRollouts):
             times[of] += 1
             shared.setdefault(keys[-1], []).append(run)
         for key, run in zip(keys, runs, strict=True):
-            together = shared.pop(key, [])  # those that were asked for with an earlier one are there
+            together = shared.pop(key, [])  # empty where an earlier run of the same launch has filled it
             size = max((self.batch or TOGETHER) // max(len(together), 1), 1)
             for at in range(0, max((len(one.groups) for one in together), default=0), size):
                 parts = [one._replace(groups=one.groups[at : at + size]) for one in together]
@@ -125,7 +129,7 @@ class BodyProblem(BodyRollouts):
             yield run.out
 
     def _alike(self, points: Sequence[Point], recording: int) -> list[list[int]]:
-        """Which points move alike: instruments alone need no further run."""
+        """Group parameter sets with the same motion, those that differ only in `instruments` or in nuisances of other recordings."""
         name = self.measured[recording].name
         instruments = tuple(f"{kind}:{name}" for kind in self.instruments)
         unique: dict[tuple, list[int]] = {}
@@ -142,7 +146,7 @@ class BodyProblem(BodyRollouts):
         return float(np.sqrt(3.0 * np.mean(residual**2)))
 
     def directions(self, recording: int) -> np.ndarray:
-        """Affine motions of the body in windows of time: where the part of the discretisation error may lie that no setting shows."""
+        """Return affine motions of the body in windows of time, (n, k): patterns of a discretisation error that no setting shows."""
         r = self.measured[recording]
         seen = r.seen.numpy()[1:]
         place = r.x.double().numpy()[0]
@@ -156,12 +160,12 @@ class BodyProblem(BodyRollouts):
         return columns / np.sqrt(np.mean(np.sum(columns**2, axis=1)))
 
     def motion(self, point: Point, recording: int, setting: int = 0) -> np.ndarray:
-        """Predicted tracked points [m], (T, N, 3)."""
+        """Predict the tracked points [m], (T, N, 3), without errors of the instruments."""
         ((x, _),) = self._roll([([point], recording)], setting)
         return x[0]
 
     def simulated(self, recording: int) -> Measured:
-        """The recording as the declared model has it, with its effects and without noise."""
+        """Return the recording with the points that the declared model predicts, without noise."""
         r = self.measured[recording]
         x = torch.from_numpy(self.motion({}, recording)).float()
         return replace(r, x=x, noise=None, video=None, gaussians=None)
@@ -181,9 +185,10 @@ class BodyProblem(BodyRollouts):
     # Forward runs.
 
     def _predict(self, runs: Sequence[Run], *, freed: bool = False) -> None:
-        """Fill the rows of groups of points that move alike, all of one setting and in one launch; NaN where a simulation is impossible.
+        """Simulate runs of one setting in one launch and fill in their predictions; NaN where a simulation is impossible.
 
-        A launch for which a GPU has no memory is divided, once what is kept for others is given up (`freed`).
+        If the launch fails, its halves are tried. If a GPU lacks memory, the simulators that are kept are given up first (`freed`: this
+        has happened).
 
         Raises:
             UserError: There is no memory for a single motion.
@@ -213,18 +218,18 @@ class BodyProblem(BodyRollouts):
             runs[0].out[runs[0].groups[0]] = np.nan
 
     def _simulate(self, runs: Sequence[Motions], setting: int) -> Sequence[Any]:
-        """The motions of each recording, as `_fill` takes them."""
+        """Simulate each recording, and return its motions in the form that `_fill` takes."""
         return self._roll(runs, setting)
 
     def _fill(self, run: Run, moved: Any) -> None:
-        """The rows of each group, from its motion."""
+        """Fill in the predictions of a run from its motions."""
         seen = self.measured[run.recording].seen.numpy()
         for group, xs, vs in zip(run.groups, *moved, strict=True):
             for i in group:
                 run.out[i] = self._as_seen(run.points[i], run.recording, xs, vs)[1:][seen[1:]].reshape(-1)
 
     def _as_seen(self, point: Point, recording: int, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Positions as the instruments see them: clock and ruler may be off."""
+        """Return positions (T, N, 3) [m] as measured with the errors of clock and length scale, to first order in the velocity `v`."""
         r = self.measured[recording]
         value = {name: point.get(f"{name}:{r.name}", 0.0) for name in ("release_time", "time_base", "length_scale")}
         if not any(value.values()):
@@ -234,7 +239,7 @@ class BodyProblem(BodyRollouts):
         return centre + (1.0 + value["length_scale"]) * (x + (value["release_time"] + value["time_base"] * t) * v - centre)
 
     def _roll(self, runs: Sequence[Motions], setting: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Positions and velocities of the tracked points of each recording, (S, T, N, 3) each."""
+        """Simulate, and return positions [m] and velocities [m/s] of the tracked points of each recording, (S, T, N, 3) each."""
         out = []
         for (_, recording), frames in zip(runs, self._move(runs, setting), strict=True):
             index, weight = self._map(recording)
@@ -243,7 +248,7 @@ class BodyProblem(BodyRollouts):
         return out
 
     def _map(self, recording: int) -> tuple[Tensor, Tensor | None]:
-        """Particles (N, k) and weights (N, k) of each tracked point; particles (N,) alone where each point is one."""
+        """Return particles (N, k) and weights (N, k) of the tracked points; particles (N,) and None if each point is a particle."""
         if recording not in self._maps:
             r = self.measured[recording]
             x = r.body.x.double()
@@ -263,10 +268,15 @@ class BodyProblem(BodyRollouts):
 
 
 def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0) -> BodyProblem:
-    """The problem of an experiment whose recordings have tracked points.
+    """Build the problem of an experiment with tracked points.
+
+    Args:
+        experiment: The experiment.
+        device: `cpu` or a CUDA device.
+        batch: Number of motions per launch on a GPU; 0: `TOGETHER`.
 
     Raises:
-        UserError: A recording without particles, or no recording to fit.
+        UserError: A recording has no tracked points or fewer than four frames, or none is to be fitted.
     """
     measured = experiment.recordings
     for r in measured:
@@ -311,14 +321,17 @@ def body_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0)
 
 @cached
 def _workers() -> ThreadPoolExecutor:
-    """Threads for single scenes; what they launch is built before, for two threads must not build the same kernels."""
+    """Return threads for single scenes; the kernels are compiled first, because two threads must not compile the same ones."""
     for build in (stress_kernels.build, classical_kernels.kernels):
         build(real_of(torch.float32))
     return scene_pool()
 
 
 def _halves(runs: Sequence[Run]) -> list[list[Run]]:
-    """Runs in two parts, by their groups where one has several: a point that is impossible is so in every recording, mostly."""
+    """Divide runs into two parts, by parameter sets where there are several: an impossible one mostly fails in every recording.
+
+    The list is empty where there is one motion alone.
+    """
     most = max(len(run.groups) for run in runs)
     if most == 1:
         return [list(runs[: len(runs) // 2]), list(runs[len(runs) // 2 :])] if len(runs) > 1 else []
@@ -336,7 +349,7 @@ def _recording(r: Measured) -> Recording:
 
 
 def _typical(r: Measured) -> tuple[float, float]:
-    """A speed [m/s] and a spin [rad/s] of the recording: of its motion over its length, at the least."""
+    """Return a typical speed [m/s] and spin [rad/s] of a recording: its fastest mean motion, and that over the size of the body."""
     x = r.x.double().numpy()
     step = np.linalg.norm(np.diff(np.nanmean(x, axis=1), axis=0), axis=1) / np.diff(r.t.numpy())
     speed = float(np.nanmax(step))
@@ -345,12 +358,12 @@ def _typical(r: Measured) -> tuple[float, float]:
 
 
 def _gather(x: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
-    """Weighted sums over particles, (K, S, P, 3) -> (K, S, N, 3); no weights: the particles themselves."""
+    """Return weighted sums over particles, (K, S, P, 3) -> (K, S, N, 3); without weights the particles themselves."""
     return x[:, :, index] if weight is None else torch.einsum("nk,tsnkc->tsnc", weight.to(x), x[:, :, index])
 
 
 def _first_seen(r: Measured) -> Tensor:
-    """Where each point is in the body at t = 0: its first frame, by the mean motion where that is a later one."""
+    """Return the place of each point at t = 0, (N, 3) [m]; of a point seen later, its first place less the mean motion until then."""
     x = r.x.double()
     seen = r.seen
     first = seen.int().argmax(dim=0)
@@ -364,7 +377,7 @@ def _first_seen(r: Measured) -> Tensor:
 
 
 def _parts(model: Mapping[str, Any]) -> list[Any]:
-    """The parts of a model that hold figures."""
+    """Return the mappings of a model that contain values: elasticity, plasticity, neural law, and the model itself."""
     return [model["elasticity"], model["plasticity"], model.get("law", {}), model]
 
 

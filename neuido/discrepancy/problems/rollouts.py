@@ -1,6 +1,6 @@
-"""How the bodies of an experiment move under points of parameters: simulators, and launches.
+"""Simulation of the bodies of an experiment for sets of parameters.
 
-A launch moves one or several recordings under one or several points each. What is seen of the motions is `body`'s.
+One launch simulates one or several recordings with one or several parameter sets each. `body` and `video` compare the motions with data.
 """
 
 import functools
@@ -31,46 +31,52 @@ from neuido.physics.runtime.frames import Frames
 from neuido.types import ParticleState
 
 SEGMENT = 200
-"""Substeps of the piece that a GPU captures; a rollout replays it. A longer one takes longer to capture than to run."""
+"""Number of substeps that a GPU captures as one piece, which a rollout replays. A longer piece takes longer to capture than to run."""
 KEPT = {"cpu": 24, "cuda": 96}
-"""Simulators that are kept: of each recording, setting, and number of parameter sets or thread. On a GPU they hold captured launches."""
+"""Largest number of simulators in memory. On a GPU each holds captured launches."""
 SIZES = (1, 4, 12, 32, 96)
-"""Parameter sets of a recording in a launch, filled up: each number of them has buffers and captured launches of its own."""
+"""Numbers of parameter sets per recording in a launch. Others are filled up, since each number needs own buffers and captured launches."""
 
 STIFFENING = ("strain_stiffening.k", "second_invariant.c", "tension_compression.r")
-"""Effects that stiffen a body as it is strained, past what the inner steps of the finite elements are for."""
+"""Parameters of effects that stiffen a strained body, so that the usual inner steps of finite elements may be too long."""
 FINER = (1, 2, 6)
-"""Times the inner steps that are tried, one after the other until the motion stays finite; the last only for what stiffens."""
+"""Factors on the number of inner steps of finite elements, tried in turn until the motion stays finite; the last only with `STIFFENING`."""
 
 LEAST_LIFT, MOST_LIFT, GAP = 0.05, 0.8, 1.0
-"""Suggested cells: what the contact height moves by, at the least; how far from where it is declared it may be; and how far from the
-colliders a body begins that may be lifted against them."""
+"""Limits of the contact height, in suggested cells.
+
+They are its least change, its largest distance from the declared height, and the least distance at the start between the colliders and a
+body for which it may change.
+"""
 
 Motions = tuple[Sequence[Point], int]
-"""Points, and the number of the recording that moves under each of them."""
+"""Parameter sets, and the number of the recording that is simulated with each of them."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyRollouts(Problem):
-    """A problem whose data are seen of moving bodies."""
+    """A problem with simulated bodies; subclasses compare their motions with the data."""
 
     experiment: Experiment = None  # type: ignore[assignment]
     measured: tuple[Measured, ...] = ()
     device: str = "cpu"
-    # of these recordings: a copy with others (`replace`) starts with none
+    # these depend on the recordings: a copy with other recordings (`replace`) starts without them
     _simulators: dict[Any, Simulator | FiniteElements] = field(default_factory=dict, init=False, repr=False)
     _still: dict[int, Simulator | FiniteElements] = field(default_factory=dict, init=False, repr=False)
-    """By setting, one scene a recording, on the CPU: what is asked for its step alone."""
+    """Simulators on the CPU by setting, with a scene per recording; they only compute stability limits."""
     _meshes: dict[tuple[int, float, int], Mesh] = field(default_factory=dict, init=False, repr=False)
     _lock: Any = field(default_factory=threading.RLock, init=False, repr=False)
 
     def effort(self, recording: int, setting: int = 0) -> float:
-        """Particle-substeps; inner steps of the finite elements count as one."""
+        """Return the cost of a prediction in particle-substeps; the inner steps of finite elements are not counted."""
         r = self.measured[recording]
         return float(len(r.body.x) * substeps(r, r.scene.dt * EVERY[setting].dt)[1])
 
     def margin(self, point: Point, setting: int = 0) -> float:
-        """Of the explicit step, in the recording that bears least, or of the inner steps that finite elements may take (`AFFORDED`)."""
+        """Return the logarithm of the stability limit over the step, the least of all recordings; see `Problem.margin`.
+
+        For finite elements, the limit is that of the inner steps that they may take (`AFFORDED`).
+        """
         recordings = range(len(self.measured))
         full = [self._full(point)] * len(recordings)
         try:
@@ -94,7 +100,7 @@ class BodyRollouts(Problem):
         return f"the declared model cannot run: {line}"
 
     def _strict(self, setting: int) -> str:
-        """Why the declared model's motion is not finite, in the words of its simulator."""
+        """Simulate the declared model, and return the simulator's message why the motion is not finite."""
         for n in range(len(self.measured)):
             simulator = self._made([n], setting, 1, "cpu")
             every, steps, _ = substeps(self.measured[n], simulator.scenes[0].dt)
@@ -110,25 +116,34 @@ class BodyRollouts(Problem):
 
     @property
     def duration(self) -> float:
-        """Over which the knots of a force in time spread, in every recording [s]: the longest one that is fitted."""
+        """Time [s] over which the knots of a time-dependent force are spread: that of the longest fitted recording."""
         return max(float(r.t[-1]) for r in self.measured if r.role == "fit" and r.t is not None)
 
     def _moved(self, point: Point, recording: int, setting: int = 0) -> ParticleState:
-        """The frames of one motion, (T, 1, P, ...)."""
+        """Simulate one recording with one parameter set, and return its frames, (T, 1, P, ...)."""
         (frames,) = self._move([([point], recording)], setting)
         return frames
 
     def doubts(self, point: Point, recording: int, setting: int = 0) -> list[Event]:
-        """What makes one motion doubtful: matter that turned inside out or collapsed, strains beyond what a law has learned."""
+        """Return the events that make a motion doubtful: matter turned inside out or collapsed, strains beyond the training of a law."""
         noted: list[Event] = []
         self._move([([point], recording)], setting, noted=noted)
         return noted
 
     def _move(self, runs: Sequence[Motions], setting: int, finer: int = 0, noted: list[Event] | None = None) -> list[ParticleState]:
-        """The frames of each recording under each of its points, (T, S, P, ...); of several motions those that fail are NaN.
+        """Simulate recordings with several parameter sets each in one launch.
 
-        All move in the same launches: their frames are the same substeps (`substeps`). `finer`: which of `FINER`. `noted`: takes the
-        events of the first motion.
+        Args:
+            runs: Parameter sets and recording of each run. All recordings have their frames at the same substeps (`substeps`).
+            setting: Number of the setting.
+            finer: Place in `FINER` of the factor on the inner steps.
+            noted: List to which the events of the first motion are added.
+
+        Returns:
+            Frames of each run, (T, S, P, ...) for S parameter sets. A motion that fails is NaN.
+
+        Raises:
+            UserError: There is one motion alone, and it fails.
         """
         size = most = max(len(points) for points, _ in runs)
         if self.device != "cpu":
@@ -164,7 +179,7 @@ class BodyRollouts(Problem):
         return moved
 
     def _refine(self, runs: Sequence[Motions], moved: Sequence[ParticleState], setting: int, finer: int) -> None:
-        """Move what failed again with finer inner steps, in place; what fails with the finest that it gets stays NaN."""
+        """Simulate failed motions again with more inner steps, and replace them in `moved`; those that fail again stay NaN."""
         failed = []
         for (points, _), frames in zip(runs, moved, strict=True):
             broken = (~torch.isfinite(frames.x[-1]).flatten(1).all(dim=1)).tolist()
@@ -184,19 +199,20 @@ class BodyRollouts(Problem):
 
     @functools.cached_property
     def _room(self) -> float:
-        """How far the bodies that may be lifted against their colliders begin from them [m]."""
+        """Least distance at the start between colliders and body, of the recordings whose contact height may change [m]."""
         return min((_gap(r) for r, up in zip(self.measured, self._ups, strict=True) if up.any()), default=0.0)
 
     @property
     def lifts(self) -> bool:
-        """Whether colliders may be higher than they are declared in some recording."""
+        """Whether the contact height may change in some recording."""
         return any(up.any() for up in self._ups)
 
     def others(self, setting: int) -> list[int]:
-        """Of material points a finer step and grid and, where the body meets something, a lift of that, else a coarser grid.
+        """Return the settings whose differences from a setting estimate its discretisation error.
 
-        Of finite elements, which meet a plane where it is, other meshes, coarser and cut in another way, and the grids: what a mesh gets
-        wrong no mesh knows alone.
+        Material points are compared with a finer step, a finer grid, and higher colliders (or a coarser grid where there is no contact).
+        Finite elements meet a plane where it is declared. They are compared with a coarser mesh, one of other tetrahedra, and the grids of
+        material points, because all meshes may have an error in common.
         """
         able = [i for i, s in enumerate(SETTINGS[: self.settings]) if i != setting]
         if setting == COARSE:
@@ -209,7 +225,7 @@ class BodyRollouts(Problem):
         return [i for i in able if EVERY[i].solver == "material_points" and not without(EVERY[i])]
 
     def quick(self, setting: int) -> int:
-        """Material points with a longer step, finite elements with a coarser mesh."""
+        """Return the cheaper setting for a search: material points with a longer step, finite elements with a coarser mesh."""
         if self.settings == 1 or setting not in SOLVERS:
             return setting
         if SETTINGS[setting].solver == "finite_elements":
@@ -218,7 +234,7 @@ class BodyRollouts(Problem):
 
     @functools.cached_property
     def _longer(self) -> float:
-        """Times the suggested step that leaves a margin where the model is declared, and the frames where they are."""
+        """Factor on the suggested step that keeps the declared model stable and the frames on whole substeps; 1 if none does."""
 
         def fits(factor: float) -> bool:
             return all(substeps(r, r.scene.dt)[2] == substeps(r, r.scene.dt * factor)[2] for r in self.measured)
@@ -235,15 +251,18 @@ class BodyRollouts(Problem):
         return {**point, CONTACT_HEIGHT: float(np.clip(height + moved, -MOST_LIFT * dx, most))}
 
     def _lift(self, point: Point, recording: int, setting: int) -> np.ndarray:
-        """How much further along their normals the colliders are [m], (3,)."""
+        """Return the shift of the colliders of a recording along their normals [m], (3,)."""
         return (point.get(CONTACT_HEIGHT, 0.0) + EVERY[setting].lift * self.measured[recording].scene.dx) * self._ups[recording]
 
     def _full(self, point: Point) -> dict[str, float]:
-        """With what is declared beside it."""
+        """Complete a parameter set with the declared values and effects."""
         return {p.name: p.value for p in self.declared} | self.experiment.model.get("effects", {}) | dict(point)
 
     def _effects(self, simulator: Simulator, full: Sequence[Point], recordings: Sequence[int], always: Sequence[str]) -> Effects:
-        """The effects of each scene; what depends on the place in the body holds for the body as the first recording holds it."""
+        """Build the effects of each scene.
+
+        Fibres and gradients belong to the body in the pose of the first recording, and turn with it in the other recordings.
+        """
         x, count = simulator.state.x, len(full) // len(recordings)
         offsets = simulator.particles.offsets
         turned = torch.stack([self._turn(n) for n in recordings]).to(x)
@@ -258,11 +277,11 @@ class BodyRollouts(Problem):
         return effects._replace(fibre_direction=torch.einsum("sij,sj->si", turned.repeat_interleave(count, dim=0), direction))
 
     def laws(self, points: Sequence[Mapping[str, float]]):
-        """The declared laws of several points, a row each."""
+        """Build the declared laws for several parameter sets, one scene each."""
         return laws_of(self.experiment.model, points)
 
     def simulator(self, recordings: Sequence[int], setting: int, count: int) -> Simulator | FiniteElements:
-        """`count` copies of the scene of each recording, kept for the next call of this thread: they hold buffers."""
+        """Return a simulator of `count` copies of the scene of each recording; its buffers are kept for later calls of this thread."""
         key = (tuple(recordings), setting, count, threading.get_ident())
         with self._lock:
             found = self._simulators.pop(key, None)
@@ -270,11 +289,11 @@ class BodyRollouts(Problem):
                 found = self._made(recordings, setting, count, self.device)
                 while len(self._simulators) >= KEPT[torch.device(self.device).type]:
                     self._simulators.pop(next(iter(self._simulators)))
-            self._simulators[key] = found  # the last one used is the last one to go
+            self._simulators[key] = found  # put last: the one that was used longest ago is given up first
         return found
 
     def free(self) -> None:
-        """Give up the simulators that are kept, with their buffers and captured launches."""
+        """Release the memory of the simulators, with their buffers and captured launches."""
         with self._lock:
             self._simulators.clear()
         gc.collect()
@@ -299,7 +318,7 @@ class BodyRollouts(Problem):
         return Simulator(scenes, bodies, density=density, device=device)
 
     def _mesh(self, recording: int, elements: float, tetrahedra: int) -> Mesh:
-        """The body of a recording as finite elements have it; seconds of work, so that all simulators share it."""
+        """Return the mesh of the body of a recording, which all simulators share because meshing takes seconds."""
         key = recording, elements, tetrahedra
         if key not in self._meshes:
             body = self.measured[recording].body
@@ -308,7 +327,10 @@ class BodyRollouts(Problem):
         return self._meshes[key]
 
     def _start(self, simulator: Simulator, points: Sequence[Point], recordings: Sequence[int], lifts: np.ndarray) -> ParticleState:
-        """The start with the velocities and spins of each point and below the lifts (S, 3), those of the first recording first."""
+        """Return the start with the velocity and spin of each parameter set, and with the bodies lowered by `lifts` (S, 3) [m].
+
+        Scenes are ordered by recording, then by parameter set.
+        """
         count = len(points) // len(recordings)
         names = [self.measured[n].name for n in recordings for _ in range(count)]
         shift = [
@@ -334,9 +356,9 @@ class BodyRollouts(Problem):
         return ParticleState(x, v, C + skew[scene], F)
 
     def _turn(self, recording: int) -> Tensor:
-        """The rotation (3, 3) from the body of the first recording to that of another one: fibres and gradients turn with it.
+        """Return the rotation (3, 3) from the body of the first recording to that of another one.
 
-        The identity where the two are not the same particles in another pose (to 1 % of the body's size).
+        It is the identity where the two are not the same particles in another pose (to 1 % of the body's size).
         """
         x, y = (self.measured[n].body.x.double() for n in (0, recording))
         eye = torch.eye(3, dtype=torch.float64)
@@ -351,15 +373,15 @@ class BodyRollouts(Problem):
 
 
 def _finer(point: Point) -> tuple[int, ...]:
-    """Those of `FINER` that a full point is tried with."""
+    """Return the factors of `FINER` that are tried with a complete parameter set."""
     return FINER if any(point.get(name, 0.0) > 0.0 for name in STIFFENING) else FINER[:2]
 
 
 def _finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -> Frames:
-    """A rollout of one scene, with finer inner steps where the motion is not finite.
+    """Simulate one scene with finite elements, with more inner steps (`FINER`) where the motion is not finite.
 
     Raises:
-        UserError: As the rollout, with the finest of them.
+        UserError: The rollout fails with the most inner steps too.
     """
     *others, finest = _finer(point)
     for finer in others:
@@ -371,34 +393,37 @@ def _finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -
 
 
 def _up(r: Measured) -> np.ndarray:
-    """Along the colliders' normals, (3,): where those of a recording go when they are higher.
+    """Return the direction (3,) in which the contact height shifts the colliders of a recording: the sum of their normals.
 
-    Zero where there are none, where the body begins on one, and where it is clamped: it must not move along what holds it.
+    It is zero without colliders, where the body starts near one (`GAP`), and where the body is clamped, because clamps do not shift.
     """
     free = r.scene.colliders and not r.scene.clamps and _gap(r) > GAP * r.scene.dx
     return np.unique(_normals(r), axis=0).sum(axis=0) if free else np.zeros(3)
 
 
 def _normals(r: Measured) -> list[np.ndarray]:
-    """Of the colliders of a recording, of length one."""
+    """Return the unit normals of the colliders of a recording."""
     return [np.array(p.normal) / math.hypot(*p.normal) for p in r.scene.colliders]
 
 
 def _gap(r: Measured) -> float:
-    """How far the body of a recording begins from the colliders [m]."""
+    """Return the distance at the start between the body of a recording and its nearest collider [m]; infinite without colliders."""
     x = r.body.x.double().numpy()
     gaps = (float(((x - np.array(p.point)) @ n).min()) for p, n in zip(r.scene.colliders, _normals(r), strict=True))
     return min(gaps, default=math.inf)
 
 
 def _against(point: dict[str, float], lift: np.ndarray) -> dict[str, float]:
-    """A full point for a body that starts below a lift (3,) [m]: what has a place in space is below it too."""
+    """Return a complete parameter set for a body that starts lower by `lift` (3,) [m]: places in space are lowered too."""
     own = {f"position_force.{a}": d for a, d in zip("xyz", lift, strict=True)}
     return {name: value - own.get(name, 0.0) for name, value in point.items()} if lift.any() else point
 
 
 def substeps(r: Measured, dt: float) -> tuple[int, int, bool]:
-    """Substeps between kept frames, substeps in all, and whether the kept frames are the recorded ones."""
+    """Return the substeps between stored frames, those of the whole rollout, and whether stored frames are the recorded ones.
+
+    If not, stored frames are close to each other, to be interpolated. `dt` is the substep [s].
+    """
     t = r.t.double().numpy()
     every = round(r.frame_interval / dt)
     if every >= 1 and np.allclose(t, np.arange(len(t)) * every * dt, rtol=0.0, atol=1e-3 * r.frame_interval):
@@ -408,18 +433,18 @@ def substeps(r: Measured, dt: float) -> tuple[int, int, bool]:
 
 
 def segment_of(steps: int, every: int) -> int:
-    """Substeps of a piece of a rollout: a divisor of `steps` and a multiple of `every`, of `SEGMENT` at the most where there is one."""
+    """Return the number of substeps per piece of a rollout: a divisor of `steps` and multiple of `every`, if possible <= `SEGMENT`."""
     frames = steps // every
     return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
 
 
 def _of_particles(lifts: np.ndarray, simulator: Simulator | FiniteElements) -> Tensor:
-    """The lift (3,) of each scene at each of its particles, (P, 3)."""
+    """Spread the lift (3,) of each scene to its particles, (P, 3)."""
     return torch.from_numpy(lifts).to(simulator.state.x)[simulator.particles.scene.long()]
 
 
 def _at_times(frames: ParticleState, step: float, t: Tensor) -> ParticleState:
-    """Frames (K, S, P, ...) that are `step` apart at other times: cubic Hermite interpolation of x, linear of the rest."""
+    """Interpolate frames (K, S, P, ...) that are `step` [s] apart to the times t [s]: x by cubic Hermite polynomials, others linearly."""
     x, v, C, F = frames
     k = (t / step).floor().long().clamp(max=len(x) - 2)
     u = (t / step - k)[:, None, None, None]

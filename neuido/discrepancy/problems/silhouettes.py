@@ -1,8 +1,8 @@
-"""Silhouettes as data: where an outline lies along the normals of the measured one, and the moments of the area, in pixels.
+"""Silhouettes as data: the place of an outline along normals of the measured outline, and moments of the area, both in pixels.
 
-Both are smooth functionals of a soft mask, measured or rendered. A profile is the integral of the mask along a normal from inside to
-outside: that of a rendered mask less that of the measured one is the signed distance of the outlines, to a fraction of a pixel, as long as
-they are not further apart than the profile reaches. Moments (area, centroid, second moments) know no such limit.
+Both depend smoothly on a soft mask, measured or rendered. A profile is the integral of the mask along a normal from inside to outside. The
+profile of a rendered mask less that of the measured one is the signed distance of their outlines, to a fraction of a pixel, up to the
+length of the profile. The moments (area, centroid, second moments) have no such limit.
 """
 
 from typing import NamedTuple
@@ -13,57 +13,59 @@ import torch
 from torch import Tensor
 
 MOMENTS = 6
-"""Rows of moments of one image: centroid x, y; area over perimeter; second moments xx, xy, yy over the size."""
+"""Number of moments of an image: centroid x, y; area over perimeter; second moments xx, xy, yy over the size."""
 SAMPLES = 40
-"""Points of an outline."""
+"""Number of points on an outline."""
 REACH = 12.0
-"""Length of a profile to each side of the outline [px], at the most."""
+"""Largest length of a profile on each side of the outline [px]."""
 STEPS = 24
-"""Samples of a mask along a profile."""
+"""Number of samples of a mask along a profile."""
 LEVEL = 0.5
+"""Value of a soft mask on the outline."""
 FINER = 4
-"""An outline is traced on a mask so many times finer."""
+"""Factor by which a mask is enlarged before its outline is traced."""
 
 
 class Outlines(NamedTuple):
-    """The measured outlines of R images, and what is compared there. Pixel (i, j) has its centre at (j + 0.5, i + 0.5)."""
+    """Measured outlines of R images with M points each. Pixel (i, j) has its centre at (j + 0.5, i + 0.5)."""
 
     points: Tensor
-    """On the outline [px], (R, M, 2)."""
+    """Points on the outline [px], (R, M, 2)."""
     normals: Tensor
-    """Outward, of length one, (R, M, 2)."""
+    """Outward unit normals, (R, M, 2)."""
     inner: Tensor
-    """How far a profile reaches into the body [px], (R, M): no further than its middle."""
+    """Length of a profile inside the body [px], (R, M): at most to its middle."""
     outer: Tensor
-    """How far it reaches outside [px], (R, M): no further than half way to another part of the body."""
+    """Length of a profile outside the body [px], (R, M): at most half way to another part of the body."""
     perimeter: Tensor
-    """[px], (R,)"""
+    """Perimeter [px], (R,)."""
     size: Tensor
-    """Root of the sum of the second moments [px], (R,)."""
+    """Root of the sum of the second moments xx and yy [px], (R,)."""
     kept: Tensor
-    """Which rows of `features` count, (R, MOMENTS + M) bool: not those that the image's border cuts."""
+    """Mask of the values of `features` that count, (R, MOMENTS + M) bool: those that the border of the image does not cut."""
 
 
 class View(NamedTuple):
-    """By how much a camera and the drawn outline are off."""
+    """Errors of a camera and of the drawn outline."""
 
     x: float = 0.0
-    """Shift [px]."""
+    """Shift to the right [px]."""
     y: float = 0.0
+    """Shift downwards [px]."""
     scale: float = 0.0
-    """Relative."""
+    """Relative error of the magnification."""
     roll: float = 0.0
-    """[rad]"""
+    """Rotation about the viewing direction [rad]."""
     outline: float = 0.0
-    """The drawn outline lies so far outside [px]."""
+    """Distance by which the drawn outline is moved outwards [px]."""
 
 
 def outlines(masks: np.ndarray, cut: np.ndarray) -> Outlines:
-    """Trace soft masks.
+    """Trace the outlines of soft masks.
 
     Args:
-        masks: (R, H, W) in 0..1, each with some object.
-        cut: Rectangle in which the recorded image lies [px], (R, 4): left, top, right, bottom; what leaves it is not seen.
+        masks: Masks (R, H, W) in 0..1, each with an object.
+        cut: Rectangle of the recorded image [px], (R, 4): left, top, right, bottom. Nothing outside was recorded.
     """
     parts = [_trace(mask, box) for mask, box in zip(masks, cut, strict=True)]
     stacked = [torch.from_numpy(np.stack(column)) for column in zip(*parts, strict=True)]
@@ -71,7 +73,7 @@ def outlines(masks: np.ndarray, cut: np.ndarray) -> Outlines:
 
 
 def usable(mask: np.ndarray) -> bool:
-    """Whether a mask shows an object that is large enough for an outline."""
+    """Return whether the object of a mask is large enough for an outline."""
     return int((mask >= LEVEL).sum()) >= 12
 
 
@@ -91,7 +93,7 @@ def _trace(mask: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, ...]:
     normals = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     after = np.roll(points, -1, axis=0)
-    if np.sum(points[:, 0] * after[:, 1] - after[:, 0] * points[:, 1]) < 0:  # traced the other way round
+    if np.sum(points[:, 0] * after[:, 1] - after[:, 0] * points[:, 1]) < 0:  # traced in the opposite direction
         normals = -normals
     inner = _clear(mask, points, -normals, inside=True)
     outer = _clear(mask, points, normals, inside=False)
@@ -101,7 +103,7 @@ def _trace(mask: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _smooth(line: np.ndarray, width: int) -> np.ndarray:
-    """A closed line by its running mean."""
+    """Smooth a closed line (n, 2) by a running mean over about `width` points."""
     width = min(width, len(line) // 4)
     if width < 2:
         return line
@@ -111,7 +113,7 @@ def _smooth(line: np.ndarray, width: int) -> np.ndarray:
 
 
 def _clear(mask: np.ndarray, points: np.ndarray, direction: np.ndarray, *, inside: bool) -> np.ndarray:
-    """Half the way from each point until the mask changes again, within 1.5..REACH [px]."""
+    """Return half the distance from each point to the next change of the mask along a direction, within 1.5..REACH [px]."""
     s = np.arange(1.5, 2 * REACH, 0.5)
     at = (points[:, None] + s[:, None] * direction[:, None] - 0.5).astype(np.float32)
     seen = cv2.remap(mask.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0.0) >= LEVEL
@@ -127,7 +129,7 @@ def _uncut(mask: np.ndarray, points: np.ndarray, cut: np.ndarray) -> np.ndarray:
 
 
 def moments(masks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Area [px^2] (R,), centroid [px] (R, 2) and second central moments [px^2] (R, 2, 2) of soft masks (R, H, W)."""
+    """Return area [px^2] (R,), centroid [px] (R, 2) and second central moments [px^2] (R, 2, 2) of soft masks (R, H, W)."""
     height, width = masks.shape[-2:]
     y, x = (torch.arange(n, dtype=masks.dtype, device=masks.device) + 0.5 for n in (height, width))
     area = masks.sum((-2, -1)).clamp(min=1e-3)
@@ -139,12 +141,12 @@ def moments(masks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def profiles(masks: Tensor, at: Outlines, off: tuple[Tensor, Tensor] | None = None) -> Tensor:
-    """Integrals of masks (R, H, W) along the normals [px], (R, M).
+    """Integrate masks along the normals of outlines, (R, M) [px].
 
     Args:
-        masks: Soft masks.
-        at: Where.
-        off: A linear map (2, 2) and a shift (2,) that bring a pixel of the compared image to one of the mask.
+        masks: Soft masks (R, H, W).
+        at: Outlines with their normals.
+        off: Linear map (2, 2) and shift (2,) [px] from pixels of the measured image to pixels of the mask.
     """
     height, width = masks.shape[-2:]
     share = (torch.arange(STEPS, device=masks.device, dtype=masks.dtype) + 0.5) / STEPS
@@ -158,7 +160,7 @@ def profiles(masks: Tensor, at: Outlines, off: tuple[Tensor, Tensor] | None = No
 
 
 def features(masks: Tensor, at: Outlines, view: View = View()) -> Tensor:  # noqa: B008 (immutable)
-    """Moments and profiles of masks (R, H, W) [px], (R, MOMENTS + M), as a camera that is off by `view` and a drawn outline show them."""
+    """Return moments and profiles of masks (R, H, W), (R, MOMENTS + M) [px], as seen with the errors `view` of camera and outline."""
     height, width = masks.shape[-2:]
     area, centre, covariance = moments(masks)
     turn = masks.new_tensor([[np.cos(view.roll), -np.sin(view.roll)], [np.sin(view.roll), np.cos(view.roll)]]) * (1 + view.scale)
@@ -173,9 +175,10 @@ def features(masks: Tensor, at: Outlines, view: View = View()) -> Tensor:  # noq
 
 
 def displaced(at: Outlines, masks: Tensor) -> Tensor:
-    """What affine motions of the image do to `features`, to first order, (R, MOMENTS + M, 6): shifts and gradients x, y by x, y.
+    """Return the change of `features` by six affine motions of the image, (R, MOMENTS + M, 6), to first order.
 
-    A gradient moves the end of the body, at `size` from its centroid, by one pixel.
+    They are shifts by one pixel along x and y, and the gradients x by x, x by y, y by x, y by y. A gradient moves a point at the
+    distance `size` from the centroid by one pixel.
     """
     area, centre, covariance = moments(masks)
     columns = []
@@ -195,18 +198,18 @@ def displaced(at: Outlines, masks: Tensor) -> Tensor:
 
 
 class Score(NamedTuple):
-    """How well silhouettes agree, means over images."""
+    """Agreement of silhouettes, as means over images."""
 
     iou: float
-    """Area of both over area of either."""
+    """Overlap: area of the intersection over area of the union."""
     outline: float
-    """Mean distance from one outline to the other, both ways [px]."""
+    """Mean distance from each outline to the other [px]."""
     psnr: float
-    """Of the masks as images [dB]."""
+    """Peak signal-to-noise ratio of the masks as images [dB]."""
 
 
 def distances(masks: np.ndarray) -> np.ndarray:
-    """Signed distance from the outline of soft masks (R, H, W), positive outside [px], on a grid `FINER` times finer."""
+    """Return the signed distance from the outline of soft masks (R, H, W) [px], positive outside, on a grid `FINER` times finer."""
     out = []
     for mask in masks:
         size = (FINER * mask.shape[1], FINER * mask.shape[0])
@@ -217,14 +220,14 @@ def distances(masks: np.ndarray) -> np.ndarray:
 
 
 def inset(drawn: np.ndarray, measured: np.ndarray) -> float:
-    """How far inside the drawn outlines (R, H, W) a body ends whose area is that of the measured ones [px]."""
+    """Return the distance by which drawn outlines must move inwards to enclose the measured area [px]; masks are (R, H, W)."""
     far = np.sort(distances(drawn).ravel())
     wanted = int((distances(measured) <= 0).sum())
     return -float(far[min(max(wanted - 1, 0), far.size - 1)])
 
 
 def score(drawn: np.ndarray, measured: np.ndarray, inside: float = 0.0) -> Score:
-    """Compare drawn with measured masks, (R, H, W) in 0..1; the drawn body ends `inside` its outline [px]."""
+    """Compare drawn and measured masks, (R, H, W) in 0..1, with the drawn outlines moved inwards by `inside` [px]."""
     ious, apart = [], []
     for far, true in zip(distances(drawn) + inside, distances(measured), strict=True):
         a, b = far <= 0, true <= 0
@@ -236,5 +239,5 @@ def score(drawn: np.ndarray, measured: np.ndarray, inside: float = 0.0) -> Score
 
 
 def _edge(mask: np.ndarray) -> np.ndarray:
-    """The border pixels of a mask."""
+    """Return the border pixels of a mask."""
     return mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0).astype(bool)
