@@ -1,4 +1,4 @@
-"""The film of a recording as a diagnosis sees it: silhouettes cut to the body, their cameras, and a body where none is given."""
+"""Silhouettes of a filmed recording with their cameras, and a body reconstructed from them where the folder has none."""
 
 from typing import NamedTuple
 
@@ -21,50 +21,55 @@ from neuido.models.render.splatting import rasterize
 from neuido.types import Body, Cameras, ParticleState
 
 SIDE = 128
-"""Longest side of the silhouettes [px]; larger ones are made smaller."""
+"""Longest side of the silhouettes [px]. Larger ones are scaled down."""
 MOST_VIEWS, MOST_FRAMES = 3, 24
-"""Evenly taken where there are more."""
+"""Largest numbers of views and frames that are compared, evenly chosen where there are more."""
 MARGIN = 0.3
-"""Around the body, of its longest side in the images."""
+"""Margin of a silhouette around the body, in longest sides of the body in the images."""
 PARTICLES = 2000
-"""Of a body that is made from silhouettes."""
+"""Number of particles of a body that is reconstructed from silhouettes."""
 HULL_VIEWS = 12
+"""Largest number of views from which a body is reconstructed."""
 OPACITY = 0.9
+"""Opacity of the Gaussians of a body."""
 INSIDE, SPREAD = 0.2, 0.15
-"""Eight Gaussians stand for a particle: their places and standard deviation, in edges of its share of the body. What is drawn is about as
-large as the body where an edge is several pixels; what is left of it is the same in all frames, and the first one tells it."""
+"""Offsets and standard deviation of the eight Gaussians of a particle, in edges of the cube with the particle's volume.
+
+Where an edge spans several pixels, the drawn body is about as large as the true one. The remaining difference is the same in all frames and
+is measured in the first one.
+"""
 BLUR = 0.1
-"""Added to their covariance in the image [px^2]."""
+"""Variance added to the covariance of the Gaussians in the image [px^2]."""
 FINE = 1.5
-"""Edges of fewer pixels get one Gaussian."""
+"""Edge [px] below which a particle is drawn as one Gaussian."""
 
 
 class Film(NamedTuple):
-    """Silhouettes of one recording."""
+    """Silhouettes of a recording, cropped to the body."""
 
     masks: np.ndarray
-    """In 0..1, (T, V, H, W) float32."""
+    """Soft masks in 0..1, (T, V, H, W) float32 for T frames and V views."""
     cut: np.ndarray
-    """Where the recorded image lies in each view's cut-out [px]: left, top, right, bottom, (V, 4)."""
+    """Rectangle of the recorded image in the cropped image of each view [px]: left, top, right, bottom, (V, 4)."""
     cameras: Cameras
-    """Of the cut-outs."""
+    """Cameras of the cropped images."""
     times: Tensor
-    """[s], (T,) float64."""
+    """Times of the frames [s], (T,) float64."""
     factor: float
-    """Recorded pixels a pixel."""
+    """Size of a pixel of the masks in recorded pixels."""
     views: tuple[str, ...]
 
 
 class Look(NamedTuple):
-    """What the renderer draws of a body."""
+    """The Gaussians by which a body of P particles is drawn, M of them for each particle."""
 
     offset: Tensor
-    """Gaussians about each particle in the reference body [m], (P, M, 3)."""
+    """Offsets of the Gaussians from their particle in the reference body [m], (P, M, 3)."""
     spread: Tensor
-    """Their standard deviation [m], (P,)."""
+    """Standard deviation of the Gaussians of each particle [m], (P,)."""
 
     def draw(self, motion: ParticleState, cameras: Cameras) -> Tensor:
-        """Silhouettes (T, V, H, W) of T frames."""
+        """Draw the silhouettes of T frames in V views, (T, V, H, W)."""
         x, F = motion.x, motion.F
         means = (x.unsqueeze(2) + torch.einsum("tpij,pmj->tpmi", F, self.offset)).flatten(1, 2)
         covariances = (self.spread.square()[:, None, None] * (F @ F.mT)).repeat_interleave(self.offset.shape[1], dim=1)
@@ -73,7 +78,13 @@ class Look(NamedTuple):
 
 
 class Splats:
-    """The recorded first frame as Gaussians that the particles carry, drawn as `Look` draws particles."""
+    """The Gaussians of a 3DGS file, moved with the particles of a body and drawn like `Look`.
+
+    Args:
+        path: 3DGS PLY file of the body in the first frame.
+        body: Body in the first frame.
+        device: `cpu` or a CUDA device.
+    """
 
     def __init__(self, path, body: Body, device: str) -> None:
         self.gaussians = load_ply(path, device=device)
@@ -81,7 +92,7 @@ class Splats:
         self.back = None if body.F is None else torch.linalg.inv(body.F.to(device, torch.float32))
 
     def draw(self, motion: ParticleState, cameras: Cameras) -> Tensor:
-        """Silhouettes (T, V, H, W) of T frames."""
+        """Draw the silhouettes of T frames in V views, (T, V, H, W)."""
         F = motion.F if self.back is None else motion.F @ self.back
         moved = deform(self.gaussians._replace(harmonics=self.gaussians.harmonics[:, :1]), F, motion.x, self.binding)
         tint = motion.x.new_zeros(moved.means.shape[-2], 3)
@@ -89,7 +100,7 @@ class Splats:
 
 
 def look_of(body: Body, film: Film, device: str) -> Look:
-    """Gaussians for the particles of a body."""
+    """Return Gaussians for the particles of a body: eight for each, or one where a particle is smaller than `FINE`."""
     volume = body.volume.double() if body.F is None else body.volume.double() / torch.linalg.det(body.F.double())
     edge = volume.pow(1 / 3).float()
     _, depth = project(body.x.float(), film.cameras)
@@ -100,10 +111,10 @@ def look_of(body: Body, film: Film, device: str) -> Look:
 
 
 def read_film(experiment: Experiment, recording: Recording) -> Film:
-    """The silhouettes of a recording: alpha channels, masks, or what differs from a plain background.
+    """Read the silhouettes of a recording from alpha channels, masks, or the difference from a plain background.
 
     Raises:
-        UserError: No video, fewer than four frames, images that show no object, what the reader of images refuses.
+        UserError: No video, fewer than four frames, images that show no object, or unreadable images.
     """
     if recording.video is None:
         raise UserError(f"recording {recording.name} has no transforms.json: without tracked points its images are what is compared")
@@ -128,7 +139,7 @@ def _evenly(count: int, most: int) -> list[int]:
 
 
 def _masks(views: SceneViews, v: int, frames: list[int]) -> np.ndarray:
-    """(T, H, W)"""
+    """Return the masks of view v at the given frames, (T, H, W)."""
     images, masks = views.load([v], frames)
     if bool((masks == 1).all()):
         _, masks = masks_from_background(images)
@@ -136,7 +147,12 @@ def _masks(views: SceneViews, v: int, frames: list[int]) -> np.ndarray:
 
 
 def _boxes(masks: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, tuple[int, int]]:
-    """Where the images lie in the cut-outs, the cut-outs in the images [px] (V, 2 corners), recorded pixels a pixel, and (W, H)."""
+    """Choose the crops of masks (T, V, H, W) around the body.
+
+    Returns:
+        The rectangle of the recorded image in each crop [px], (V, 4); corners of each crop in the recorded image [px], (V, 2, 2); size of
+        a new pixel in recorded pixels; width and height of the crops [px].
+    """
     height, width = masks.shape[2:]
     low, high = [], []
     for v in range(masks.shape[1]):
@@ -155,11 +171,11 @@ def _boxes(masks: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, tuple[int,
 
 
 def _cut_out(masks: np.ndarray, boxes: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The parts of the masks in the boxes, averaged over each new pixel."""
+    """Crop masks (T, V, H, W) to boxes and scale them to `size` (width, height) [px], averaging over each new pixel."""
     out = np.zeros((*masks.shape[:2], size[1], size[0]), np.float32)
     for v, (low, high) in enumerate(boxes):
         factor = (high - low) / np.array(size)
-        finer = int(np.ceil(factor.max()))  # samples a pixel and axis, then their mean
+        finer = int(np.ceil(factor.max()))  # samples per new pixel along each axis, of which the mean is taken
         at = [low[a] + factor[a] * (np.arange(finer * size[a]) + 0.5) / finer - 0.5 for a in range(2)]
         x, y = np.meshgrid(*(a.astype(np.float32) for a in at))
         for t in range(len(masks)):
@@ -180,13 +196,14 @@ def _cameras(cameras: Cameras, boxes: np.ndarray, size: tuple[int, int]) -> Came
 
 
 def body_of(experiment: Experiment, recording: Recording) -> tuple[Body, bool]:
-    """The particles at t = 0, and whether their velocity is known.
+    """Return the body at t = 0, and whether its velocity is known.
 
-    Those of particles.npz, else of `neuido reconstruct`, else the visual hull of the first frame, filled. The velocity of a hull is that of
-    motion.yaml, else estimated from the path of the silhouettes' centroids in the first frames.
+    The particles come from particles.npz, else from `neuido reconstruct`, else they fill the visual hull of the first frame. The
+    velocity of a body without particles.npz comes from motion.yaml or the reconstruction, else it is estimated from the centroids of the
+    silhouettes in the first frames (and then counts as not known).
 
     Raises:
-        UserError: One view alone, or silhouettes that do not meet in one body.
+        UserError: There is one view alone, or the silhouettes have no common visual hull.
     """
     if recording.body is not None:
         return recording.body, True
@@ -221,7 +238,7 @@ def body_of(experiment: Experiment, recording: Recording) -> tuple[Body, bool]:
 
 
 def _velocity(masks: np.ndarray, cameras: Cameras, times: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Velocity at t = 0 [m/s] of a body in free flight whose silhouettes' centroids these are, by the rays through them."""
+    """Estimate the velocity at t = 0 [m/s], (3,), of a body in free flight, by the rays through the centroids of its silhouettes."""
     path = []
     rotation, shift = cameras.viewmats[:, :3, :3].double().numpy(), cameras.viewmats[:, :3, 3].double().numpy()
     eyes = -np.einsum("vba,vb->va", rotation, shift)
@@ -240,7 +257,7 @@ def _velocity(masks: np.ndarray, cameras: Cameras, times: np.ndarray, gravity: n
 
 
 def looks(recording: Recording, experiment: Experiment, body: Body, film: Film, device: str) -> "Look | Splats":
-    """Gaussians of the folder where it has them and a body of its own, else eight for each particle."""
+    """Return what is drawn of a body: the Gaussians of the folder where it has a matching file, else those of `look_of`."""
     ply = recording.gaussians
     if ply is None and recording.body is None and len(experiment.recordings) == 1:
         ply = experiment.folder / RECONSTRUCTION / "gaussians.ply"

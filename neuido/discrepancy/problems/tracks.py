@@ -1,4 +1,4 @@
-"""Tracks as `Problem`s, one for each body: a point mass under gravity, what the instruments may have off, and the effects it may lack."""
+"""Tracks as `Problem`s, one per body: a point mass under gravity, measured with errors of clock and length scale."""
 
 import math
 import os
@@ -18,33 +18,36 @@ from neuido.physics.effects.parameters import LIBRARY
 from neuido.physics.points.point_mass import Forces
 
 SURROUNDINGS = ("gravity", "uniform_acceleration", "position_force", "time_force")
-"""Effects of the surroundings, the same for all bodies of a folder; the others belong to a body."""
+"""Effects of the surroundings, which are the same for all bodies of a folder. All others belong to a body."""
 EARLY = 0.4
-"""Share of the frames of a held-out recording from which its start is estimated; they are not scored."""
+"""Share of the frames of a held-out recording that determine its start and are not scored."""
 AIR = 1.2
 """Density of air [kg/m^3]."""
 LIGHTEST, SMALLEST = 30.0, 0.02
-"""What a body whose figures are not given has at least: density [kg/m^3], diameter [m]."""
+"""Least density [kg/m^3] and diameter [m] of a body, assumed where the folder does not give them."""
 LARGEST_DRAG = 2.0
-"""Drag coefficient that no body of compact shape exceeds."""
+"""Upper limit of the drag coefficient of a compact body."""
 IMPACT = 4.0
-"""Loss of speed from frame to frame that is an impact, in standard deviations of the noise."""
+"""Loss of speed between two frames that counts as an impact, in standard deviations of the noise."""
 DISAGREE = 1e-3
-"""Level at which the bodies of a folder disagree on an effect of their surroundings."""
+"""Level of the test whether the bodies of a folder disagree on an effect of their surroundings."""
 LEAST_HALF = 0.3
-"""Typical steps that the range about a common estimate has on either side at the least."""
+"""Width added on each side to the range around a common estimate, in typical steps."""
 WITNESS = 5.0
-"""Standard deviations about their common estimate in which it may lie."""
+"""Half width of the range around a common estimate, in its standard deviations."""
 
 
 class TrackProblem(Problem):
     """One body of a folder of the format `neuido-track/1`.
 
-    The body is held until its release and then flies. Its position and velocity, the release time, length scale and time base of each
-    recording are nuisances that `predict` estimates anew for every point (`released.settle`), with the folder's priors and in the metric
-    of the tracking error: of a `fit` recording from all frames, of a held-out one from its first 40 %, the rest of which is scored.
-    So predictions are profiles, and the inference has no nuisances left. Frames after an impact at the end of a track (`flight_of`) are
-    left out. Times count from the first sample of each recording, whatever the origin of its clock.
+    The body is held until its release and then flies. Position, velocity, release time, length scale and time base of each recording are
+    nuisances. `predict` fits them anew for every parameter set (`released.settle`), with the priors of the folder: to all frames of a
+    `fit` recording, and to the first 40 % of a held-out one, of which only the later frames are scored. The inference has no nuisances.
+    Frames after an impact at the end of a track are left out (`flight_of`). Times count from the first sample of each recording.
+
+    Args:
+        tracks: The folder's content.
+        body: Name of the body.
     """
 
     def __init__(self, tracks: Tracks, body: str) -> None:
@@ -55,7 +58,7 @@ class TrackProblem(Problem):
         self._starts = [Released(track, tracks.nuisances, tracks.gravity, self.error_model) for track in self._flights]
         candidates = track_candidates(tracks, body, self._flights)
         self.axes = tuple(sorted({a for track in self._flights for a in track.axes}))
-        interval = max(float(np.ptp(track.t)) for track in tracks.recordings) / (KNOTS - 1)  # one for all: it is of the surroundings
+        interval = max(float(np.ptp(track.t)) for track in tracks.recordings) / (KNOTS - 1)  # the same for all bodies
         self._partners = {p.name: p.value for c in candidates for p in c.parameters} | {"time_force.interval": interval} | tracks.effects
         super().__init__(
             name=f"{tracks.name}: {body}",
@@ -69,7 +72,10 @@ class TrackProblem(Problem):
         )
 
     def _recording(self, track: Track, start: Released) -> Recording:
-        """The rows that are scored. Its noise is what the tracking error does to them, by way of the start too where that is held out."""
+        """Return the scored frames of a track as a recording.
+
+        The noise is the effect of the tracking error on these frames, for a held-out track also through the estimated start.
+        """
         early = _early(track) if track.role == "held_out" else 0
         count, axes = track.x[early:].shape
         noise = settled_error(start, self.forces([{}], track), early) if early else start.variance**0.5
@@ -84,19 +90,19 @@ class TrackProblem(Problem):
         return seen.reshape(len(points), -1)
 
     def _profile(self, points: Sequence[Point], recording: int) -> tuple[np.ndarray, np.ndarray]:
-        """The scored frames (P, n, A) of several points, and the nuisances (P, k) that were settled on."""
+        """Predict the scored frames (P, n, A) [m] of P parameter sets along A axes; return them with the fitted nuisances (P, k)."""
         track, start, forces = self._flights[recording], self._starts[recording], self.forces(points, self._flights[recording])
         early = _early(track) if track.role == "held_out" else 0
         values = settle(start, forces, len(points), early or len(track.t))
         return start.seen(values, forces, track.t)[:, early:], values
 
     def nuisances_of(self, point: Point, recording: int) -> dict[str, float]:
-        """What `predict` takes for the start and the instruments of a recording at one point, by name."""
+        """Return the nuisances that `predict` fits to a recording for one parameter set, by name."""
         _, values = self._profile([point], recording)
         return {p.name: float(v) for p, v in zip(self._starts[recording].parameters, values[0], strict=True)}
 
     def forces(self, points: Sequence[Point], track: Track) -> Forces:
-        """What acts on the body at several points, a row each."""
+        """Build the forces on the body for several parameter sets, a row each."""
 
         def rows(name: str) -> np.ndarray | None:
             values = np.array([float(point.get(name, self._partners.get(name, 0.0))) for point in points])
@@ -133,10 +139,14 @@ class TrackProblem(Problem):
         )
 
     def witness(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """What the `fit` recordings say of each effect of the surroundings by itself: its sizes (k,), and their information matrix (k, k).
+        """Estimate each effect of the surroundings alone from the `fit` recordings of this body.
 
-        Linearised about the declared model, in the metric of the tracking error, scaled down to the residual that remains; in the units of
-        the parameters. The place of `position_force` enters as one more uniform acceleration along each axis.
+        The model is linearised about the declared one, and the residuals are weighted by the tracking error. The information is reduced
+        where the residual is larger than the tracking error. The unknown place of `position_force` is replaced by a uniform acceleration
+        along each axis.
+
+        Returns:
+            For each effect its sizes (k,) and their information matrix (k, k), in the units of the parameters.
         """
         asked: list[dict[str, float]] = [{}]
         spans: dict[str, tuple[int, list[float]]] = {}
@@ -160,7 +170,8 @@ class TrackProblem(Problem):
         every, residual = (np.concatenate(columns), np.concatenate(left)) if spans else (np.empty((0, 0)), np.empty(0))
         for name, (first, steps) in spans.items():
             k = len(steps)
-            J = np.concatenate([every[:, first - 1 : first - 1 + k], 1e-3 * np.eye(k)])  # what does not show is not known, not singular
+            # a weak prior: a size without influence on the data stays unknown, and the matrix regular
+            J = np.concatenate([every[:, first - 1 : first - 1 + k], 1e-3 * np.eye(k)])
             r = np.concatenate([residual, np.zeros(k)])
             found = np.linalg.lstsq(J, -r, rcond=None)[0]
             after = r + J @ found
@@ -180,17 +191,17 @@ class TrackProblem(Problem):
 
 
 def track_problems(folder: str | os.PathLike | Tracks) -> tuple[TrackProblem, ...]:
-    """One problem for each body of a folder.
+    """Build one problem for each body of a folder.
 
-    An effect of the surroundings acts on every body. In a folder of several, their estimates of it (`TrackProblem.witness`) must agree:
-    Cochran's Q at the level `DISAGREE`. Where they do, its range is that about their common estimate; where they do not it is no candidate,
-    and `labels["excluded"]` says so. A wind beside a drag on some of the bodies is thus not found.
+    An effect of the surroundings acts on every body. In a folder of several bodies, their estimates of it (`TrackProblem.witness`) are
+    compared by Cochran's Q at the level `DISAGREE`. If they agree, the range of the effect is restricted to their common estimate. If not,
+    the effect is no candidate, with the reason in `labels["excluded"]`. A wind together with a drag on some bodies is therefore not found.
     """
     tracks = folder if isinstance(folder, Tracks) else read_tracks(folder)
     problems = tuple(TrackProblem(tracks, body) for body in tracks.bodies)
     if len(problems) > 1:
         votes = [problem.witness() for problem in problems]
-        for axes in dict.fromkeys(problem.axes for problem in problems):  # bodies with other axes do not vote together
+        for axes in dict.fromkeys(problem.axes for problem in problems):  # only bodies with the same measured axes are compared
             group = [i for i, problem in enumerate(problems) if problem.axes == axes]
             for name in SURROUNDINGS:
                 agreed = _agreement([votes[i][name] for i in group if name in votes[i]])
@@ -200,7 +211,10 @@ def track_problems(folder: str | os.PathLike | Tracks) -> tuple[TrackProblem, ..
 
 
 def _agreement(votes: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """The common estimate and its standard deviations of estimates with their information; none where they differ by more than chance."""
+    """Return the common estimate (k,) and its standard deviations (k,) of several estimates with their information matrices.
+
+    None where there are no estimates, or where they differ by more than chance (Cochran's Q).
+    """
     if not votes:
         return None
     total = sum(w for _, w in votes)
@@ -215,7 +229,7 @@ def _agreement(votes: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarr
 
 
 def _restrict(problem: TrackProblem, name: str, agreed: tuple[np.ndarray, np.ndarray] | None) -> None:
-    """Bring an effect of the surroundings into the range on which the bodies agree, or leave it out."""
+    """Restrict an effect of the surroundings to the range on which the bodies agree, or remove it where they do not (None)."""
     kept = []
     for candidate in problem.candidates:
         if candidate.name == name and agreed is None:
@@ -224,7 +238,7 @@ def _restrict(problem: TrackProblem, name: str, agreed: tuple[np.ndarray, np.nda
         if candidate.name == name and agreed is not None:
             sizes = candidate.size_parameters
             made = {}
-            for p, mean, deviation in zip(sizes, *agreed):  # position_force has more entries: those of its place
+            for p, mean, deviation in zip(sizes, *agreed):  # further entries of position_force belong to its place
                 half = WITNESS * float(deviation) + LEAST_HALF * p.scale
                 made[p.name] = replace(p, lower=max(p.lower, min(mean - half, p.value)), upper=min(p.upper, max(mean + half, p.value)))
             parameters = tuple(made.get(p.name, p) for p in candidate.parameters)
@@ -237,21 +251,21 @@ def _restrict(problem: TrackProblem, name: str, agreed: tuple[np.ndarray, np.nda
 
 
 def _inside(value: float, lower: float, upper: float, *, nonzero: bool) -> float:
-    """The value within a range; for one that must not vanish, in a range that ends at zero, a third of the way to the other end."""
+    """Clip a value to a range; if the result must not be zero but is, return a third of the farther end of the range."""
     inside = min(max(value, lower), upper)
     return (lower if abs(lower) > abs(upper) else upper) / 3 if nonzero and inside == 0 else inside
 
 
 def from_first_samples(tracks: Tracks) -> Tracks:
-    """Tracks whose clocks are zero at the first sample of each recording."""
+    """Shift the clocks of tracks to zero at the first sample of each recording."""
     return replace(tracks, recordings=tuple(replace(track, t=track.t - track.t[0]) for track in tracks.recordings))
 
 
 def flight_of(track: Track, gravity: Sequence[float]) -> Track:
-    """A track without the frames after an impact at its end.
+    """Remove the frames after an impact at the end of a track.
 
-    An impact is a loss of speed, along the mean motion of the five frames before, from one frame to the next, of more than four standard
-    deviations of the noise and more than three times what gravity could take. Only the last six frames are looked at.
+    An impact is a sudden loss of speed along the mean motion of the five frames before. It must exceed four standard deviations of the
+    noise (`IMPACT`) and three times the loss that gravity could cause. Only the last six frames are searched.
     """
     step, dt = np.diff(track.x, axis=0), np.diff(track.t)
     sigma = track.noise or high_pass([(track.t, channel) for channel in track.x.T]) or 0.0
@@ -273,18 +287,24 @@ def _cut(track: Track, n: int) -> Track:
 
 
 def _early(track: Track) -> int:
-    """How many frames of a held-out track its start is estimated from."""
+    """Return the number of frames of a held-out track that determine its start."""
     return max(math.ceil(EARLY * len(track.t)), 2)
 
 
 def tracking_error(tracks: Tracks) -> SeriesError:
-    """Noise and slow error of the tracking, from the `fit` recordings of all bodies; see `noise.correlation`."""
+    """Estimate noise and slow error of the tracking from the `fit` recordings of all bodies (`noise.correlation`)."""
     flights = [flight_of(track, tracks.gravity) for track in tracks.of("fit")]
     return correlation([(track.t, channel) for track in flights for channel in track.x.T])
 
 
 def track_candidates(tracks: Tracks, body: str, flights: Sequence[Track]) -> tuple[Candidate, ...]:
-    """The effects that a body may lack, in the scales of its motion. Only components along measured axes are asked for."""
+    """Return the effects that a body may lack, with ranges and starts scaled by its motion; vectors have the measured axes alone.
+
+    Args:
+        tracks: The folder's content.
+        body: Name of the body.
+        flights: Recordings of the body without impacts.
+    """
     fits = [track for track in flights if track.role == "fit"]
     duration = max(float(np.ptp(track.t)) for track in flights)
     speed = max(float(np.linalg.norm(np.ptp(track.x, axis=0))) / float(np.ptp(track.t)) for track in fits)
@@ -296,11 +316,11 @@ def track_candidates(tracks: Tracks, body: str, flights: Sequence[Track]) -> tup
     density = LIGHTEST
     if len(figures) == 2:
         density = figures["mass"] / (math.pi / 6 * diameter**3)
-    most = 0.75 * AIR * LARGEST_DRAG / (density * diameter)  # k of a sphere: cross-section over mass
+    most = 0.75 * AIR * LARGEST_DRAG / (density * diameter)  # drag per mass of a sphere [1/m]
     out: list[Candidate] = []
 
     def add(name: str, start: Mapping[str, float], *parameters: tuple, sizes: str = "", others: Sequence[Mapping[str, float]] = ()) -> None:
-        """Parameters as (name, typical step, lower, upper); `sizes` are those that vanish with the effect, all where empty."""
+        """Add a candidate with parameters (name, typical step, lower, upper); `sizes` are zero when it is absent (all where empty)."""
         entry = next(entry for entry in LIBRARY if entry.name == name)
         units = {p.name: p.unit for p in entry.parameters} | {"coefficient": "1"}
         made = []

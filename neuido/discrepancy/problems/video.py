@@ -1,8 +1,8 @@
-"""A filmed body as a `Problem`: silhouettes in place of tracked points, predicted by the same rollouts and the renderer.
+"""A filmed body as a `Problem`: silhouettes instead of tracked points, predicted by simulation and rendering.
 
-The data of an image are moments of the silhouette and the place of its outline along the normals of the measured one
-(`silhouettes.features`), all in pixels of the recording. The first frame, whose body is given, is no datum: it says where camera
-and outline are and how well body and images agree, which is taken for the noise of the later ones.
+The data of an image are moments of the silhouette and the place of its outline along the normals of the measured outline
+(`silhouettes.features`), in recorded pixels. The first frame is not fitted. Its body is known, so that it calibrates cameras and outline,
+and its residual is the noise of the later frames.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from neuido.discrepancy.problems.silhouettes import Outlines, Score, View, outli
 from neuido.errors import UserError
 from neuido.types import Cameras, ParticleState
 
-CAMERA = (  # name, unit, prior standard deviation in recorded pixels or relative
+CAMERA = (  # errors of a camera: name, unit, prior standard deviation in that unit (px: of the recording)
     ("x", "px", 0.5),
     ("y", "px", 0.5),
     ("scale", "1", 0.003),
@@ -33,39 +33,42 @@ CAMERA = (  # name, unit, prior standard deviation in recorded pixels or relativ
     ("outline", "px", 0.3),
 )
 LOOSE = 8.0
-"""So many times wider are these priors before the first frame has been seen."""
+"""Factor on the priors of `CAMERA` in the calibration by the first frame."""
 UNSEEN = 6.0
-"""And those of a launch that was estimated from the images."""
+"""Factor on the priors of velocity and spin where they were estimated from the images."""
 FAINT = 0.15
 """Least noise of an outline [px of the compared silhouettes]."""
 LEAST_OVERLAP = 0.4
-"""Of the drawn body and the silhouette of the first frame (area of both over that of either)."""
+"""Least overlap of drawn and measured silhouette in the first frame (area of the intersection over that of the union)."""
 TRACKED = 60
-"""Particles that stand for the body where a proposal for a further experiment wants points."""
+"""Number of particles that represent the body where points are needed: for typical speeds, and to propose the next experiment."""
 
 
 class Footage(NamedTuple):
-    """One recording's silhouettes, ready to be compared."""
+    """Silhouettes of a recording, prepared for comparison."""
 
     film: Film
     look: "Look | Splats"
+    """Gaussians by which the body is drawn."""
     cameras: Cameras
+    """Cameras of the silhouettes, on the device."""
     at: Outlines
-    """Of the images that count, frames after the first."""
+    """Measured outlines of the R images that are compared (frames after the first)."""
     images: Tensor
-    """Which they are: frame and view, (R, 2)."""
+    """Frame and view of each compared image, (R, 2)."""
     first: Outlines
-    """Of the first frame."""
+    """Measured outlines of the first frame."""
     first_views: list[int]
+    """Views whose first frame shows the body."""
     millimetres: float
-    """Of a recorded pixel at the body."""
+    """Size of a recorded pixel at the body [mm]."""
     inset: float = 0.0
-    """How far inside the drawn outline the measured one lies in the first frame [px]."""
+    """Distance of the measured outline inside the drawn one in the first frame [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class VideoProblem(BodyProblem):
-    """An experiment folder whose recordings are videos."""
+    """An experiment whose recordings are videos without tracked points."""
 
     tracked: bool = False
     footage: tuple[Footage, ...] = ()
@@ -74,7 +77,7 @@ class VideoProblem(BodyProblem):
         return float(np.sqrt(np.mean(residual**2)))
 
     def directions(self, recording: int) -> np.ndarray:
-        """Affine motions of each view's image in windows of time."""
+        """Return affine motions of the image of each view in windows of time, (n, k): patterns of an unknown discretisation error."""
         f = self.footage[recording]
         measured = torch.from_numpy(f.film.masks).to(f.at.points.device)[f.images[:, 0], f.images[:, 1]]
         columns = silhouettes.displaced(f.at, measured).cpu().numpy()
@@ -88,7 +91,7 @@ class VideoProblem(BodyProblem):
         return rows / np.sqrt(np.mean(np.sum(rows**2, axis=1)))
 
     def _scored(self, point: Point, recording: int, setting: int = 0) -> tuple[np.ndarray, dict[str, Score]]:
-        """Drawn silhouettes (T, V, H, W), and how well those of the fitted and of the other frames agree with the film's."""
+        """Draw the predicted silhouettes (T, V, H, W), and score the fitted frames (`fit`) and the others (`held_out`)."""
         f = self.footage[recording]
         drawn = self._drawn(_alone(self._moved(point, recording, setting), 0), recording, point)
         frames = self.fitted_frames(recording)
@@ -102,7 +105,15 @@ class VideoProblem(BodyProblem):
         return drawn, scores
 
     def silhouettes(self, d: Any) -> dict[str, dict[str, Any]]:
-        """Of each recording: measured masks, those drawn `before` and `after`, their times, and the scores of both by role."""
+        """Return the silhouettes of each recording for the report.
+
+        Args:
+            d: Diagnosis with the parameter sets `before` and `after`, and the setting.
+
+        Returns:
+            For each recording `masks`, `drawn_before` and `drawn_after` (T, V, H, W), `times` (T,) [s], `inset` [px], and the `scores`
+            before and after by role.
+        """
         out = {}
         for n, r in enumerate(self.recordings):
             f = self.footage[n]
@@ -117,20 +128,23 @@ class VideoProblem(BodyProblem):
         return out
 
     def fitted_frames(self, recording: int) -> np.ndarray:
-        """Which frames a fit may see (T,): all or none of a recording, or its first ones (`floors.split`)."""
+        """Return the mask (T,) of fitted frames.
+
+        It is all or none of a recording by its role. Without held-out recordings it is the first 60 % of the time, as in `floors.split`.
+        """
         t = self.footage[recording].film.times.numpy()
         if self.roles["held_out"]:
             return np.full(len(t), self.recordings[recording].role == "fit")
         return t <= t[1] + 0.6 * (t[-1] - t[1])
 
     def simulated(self, recording: int) -> Measured:
-        """All particles as the declared model moves them: nobody tracked a point."""
+        """Return the recording with all particles as tracked points, as the declared model moves them."""
         r = self.measured[recording]
         x = self._moved({}, recording).x[:, 0].cpu().float()
         return replace(r, x=x, track=torch.arange(x.shape[1]), noise=None, video=None, gaussians=None)
 
     def as_tracked(self) -> BodyProblem:
-        """The same bodies as if some of their particles were tracked, with the noise that a pixel is at their distance."""
+        """Return the same experiment as if some particles had been tracked, with the noise of the outlines as distance at the body."""
         recordings = []
         for r, own, f in zip(self.measured, self.recordings, self.footage, strict=True):
             y = r.x.double().numpy()[1:].reshape(-1)
@@ -167,14 +181,14 @@ class VideoProblem(BodyProblem):
         return point.get(f"release_time:{name}", 0.0), point.get(f"time_base:{name}", 0.0)
 
     def _shifted(self, motion: ParticleState, clock: tuple[float, float], recording: int) -> ParticleState:
-        """The motion as a clock sees it that is late and slow."""
+        """Return a motion at times shifted by the errors of the clock (release time [s], relative time base), to first order."""
         if not any(clock):
             return motion
         t = self.measured[recording].t.to(motion.x)[:, None, None]
         return motion._replace(x=motion.x + (clock[0] + clock[1] * t) * motion.v)
 
     def _seen(self, drawn: Tensor, point: Point, recording: int) -> np.ndarray:
-        """The data of drawn silhouettes (T, V, H, W), (n,) in recorded pixels."""
+        """Return the data (n,) of drawn silhouettes (T, V, H, W) [recorded px], with the errors of the cameras."""
         f = self.footage[recording]
         rows = torch.empty(f.at.kept.shape, dtype=drawn.dtype, device=drawn.device)
         for v in range(len(f.film.views)):
@@ -184,7 +198,7 @@ class VideoProblem(BodyProblem):
         return f.film.factor * rows[f.at.kept].double().cpu().numpy()
 
     def _view(self, point: Point, recording: int, view: int) -> View:
-        """How a camera is off, in pixels of the silhouettes."""
+        """Return the errors of a camera in a parameter set, in pixels of the silhouettes."""
         name, factor = self.measured[recording].name, self.footage[recording].film.factor
         given = {}
         for key, unit, _ in CAMERA:
@@ -198,7 +212,7 @@ class VideoProblem(BodyProblem):
         return {p.name: p.value for p in self.nuisances}
 
     def _drawn(self, motion: ParticleState, recording: int, point: Point) -> np.ndarray:
-        """Silhouettes where the cameras are, (T, V, H, W)."""
+        """Draw silhouettes as the cameras with their errors see them, (T, V, H, W)."""
         f = self.footage[recording]
         drawn = f.look.draw(motion, f.cameras)
         out = [_warped(drawn[:, v], self._view(point, recording, v)) for v in range(drawn.shape[1])]
@@ -206,12 +220,12 @@ class VideoProblem(BodyProblem):
 
 
 def _alone(frames: ParticleState, s: int) -> ParticleState:
-    """The frames of one point, (T, P, ...), of those of several."""
+    """Return the frames (T, P, ...) of the parameter set s from those of several."""
     return ParticleState(*(t[:, s].contiguous() for t in frames))
 
 
 def _warped(masks: Tensor, view: View) -> Tensor:
-    """Masks (T, H, W) as a camera shows them that is off."""
+    """Warp masks (T, H, W) by the errors of a camera."""
     height, width = masks.shape[-2:]
     y, x = torch.meshgrid(*(torch.arange(n, dtype=masks.dtype, device=masks.device) + 0.5 for n in (height, width)), indexing="ij")
     middle, shift = masks.new_tensor([0.5 * width, 0.5 * height]), masks.new_tensor([view.x, view.y])
@@ -222,10 +236,16 @@ def _warped(masks: Tensor, view: View) -> Tensor:
 
 
 def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0) -> VideoProblem:
-    """The problem of an experiment whose recordings have videos; tracked points that are there too are not looked at.
+    """Build the problem of an experiment with videos; tracked points are ignored.
+
+    Args:
+        experiment: The experiment.
+        device: `cpu` or a CUDA device.
+        batch: Number of motions per launch on a GPU; 0: the default of `BodyProblem`.
 
     Raises:
-        UserError: What `filmed.read_film` and `filmed.body_of` refuse, no recording to fit, a declared model that cannot run.
+        UserError: The silhouettes or the body cannot be read (`filmed.read_film`, `filmed.body_of`), no recording is to be fitted, or the
+            declared model cannot be simulated.
     """
     films, measured, known = [], [], []
     for r in experiment.recordings:
@@ -237,7 +257,7 @@ def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0
         measured.append(replace(r, x=still, t=films[-1].times, body=body, track=track, anchor=None, noise=None))
     plain = replace(experiment, recordings=tuple(measured))
     base = body_problem(plain, device=device, batch=batch)
-    # the declared motion of some particles stands for that of the body: typical speeds and places are taken from it
+    # typical speeds and places are those of some particles in the declared motion
     moved = [_alone(base._moved({}, n), 0) for n in range(len(measured))]
     tracked = [_some(r, m) for r, m in zip(measured, moved, strict=True)]
     base = body_problem(replace(experiment, recordings=tuple(tracked)), device=device, batch=batch)
@@ -260,7 +280,7 @@ def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0
 
 
 def _some(r: Measured, moved: ParticleState) -> Measured:
-    """The recording with the declared motion of some particles in place of measured points."""
+    """Return the recording with some particles in their declared motion as tracked points."""
     pick = torch.linspace(0, len(r.body.x) - 1, min(TRACKED, len(r.body.x))).round().long()
     return replace(r, x=moved.x[:, pick.to(moved.x.device)].cpu().float(), track=pick)
 
@@ -290,10 +310,13 @@ def _footage(r: Measured, experiment: Experiment, film: Film, moved: ParticleSta
 
 
 def _register(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Parameter], float]:
-    """Where the first frame puts cameras and outline, as nuisances about there, and what it leaves: the noise [px of the recording].
+    """Calibrate cameras and outline by the first frame.
+
+    Returns:
+        The errors of the cameras as nuisances around their calibrated values, and the noise [recorded px]: the residual of the first frame.
 
     Raises:
-        UserError: The body is not where the images show it.
+        UserError: Body and silhouette hardly overlap.
     """
     drawn = f.look.draw(ParticleState(*(t[:1] for t in moved)), f.cameras)[0]
     factor, out, left, overlap = f.film.factor, [], [], 1.0
@@ -320,7 +343,11 @@ def _register(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Param
 
 
 def _settle(drawn: Tensor, at: Outlines, target: Tensor, factor: float, steps: int = 6) -> tuple[list[float], np.ndarray]:
-    """Camera and outline that bring a drawn silhouette to the measured one [recorded px], and the rest [px], by Gauss and Newton."""
+    """Fit the errors of a camera so that a drawn silhouette matches the measured one, by Gauss-Newton steps with wide priors.
+
+    Returns:
+        The errors in the order of `CAMERA` (lengths in recorded px), and the residual [px of the silhouettes].
+    """
     spread = LOOSE * np.array([d / factor if unit == "px" else d for _, unit, d in CAMERA])
     kept = at.kept[0].cpu().numpy()
     values = np.zeros(len(CAMERA))
@@ -331,14 +358,14 @@ def _settle(drawn: Tensor, at: Outlines, target: Tensor, factor: float, steps: i
     for _ in range(steps):
         r = residual(values)
         J = np.stack([(residual(values + h) - r) / 0.1 for h in 0.1 * np.diag(spread)], axis=1)
-        A = np.concatenate([J, 0.5 * np.eye(len(values))])  # a pixel of noise is about two of these
+        A = np.concatenate([J, 0.5 * np.eye(len(values))])  # the priors, for residuals of about half a pixel
         values = values - spread * np.linalg.lstsq(A, np.concatenate([r, 0.5 * values / spread]), rcond=None)[0]
     given = [v * factor if unit == "px" else v for v, (_, unit, _) in zip(values, CAMERA, strict=True)]
     return [float(v) for v in given], residual(values)
 
 
 def _inset(f: Footage, moved: ParticleState) -> float:
-    """How far inside what is drawn of the first frame its measured outline lies [px]."""
+    """Return the distance of the measured outline inside the drawn one in the first frame [px]."""
     drawn = f.look.draw(ParticleState(*(t[:1] for t in moved)), f.cameras)[0].cpu().numpy()
     return silhouettes.inset(drawn[f.first_views], f.film.masks[0, f.first_views])
 
