@@ -32,7 +32,7 @@ def test_weights_come_with_neuido_or_a_command_makes_them(path, tmp_path, monkey
             assert PRETRAINED[name].is_file()
             continue
         if name.startswith(PREFIX):  # the paper's flow encoder, which nobody's training here makes
-            with pytest.raises(UserError, match="the CogVideoX VAE needs diffusers|there is no CogVideoX VAE"):
+            with pytest.raises(UserError, match=r"the CogVideoX VAE needs diffusers|there is no CogVideoX VAE"):
                 open_vae(name)
             continue
         with pytest.raises(UserError, match=r"create them with `neuido fit --config configs/[\w/]+\.yaml`") as error:
