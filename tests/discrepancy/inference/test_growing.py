@@ -56,7 +56,7 @@ def swing(p, recording):
 
 def without(monkeypatch):
     """Fits of the whole alone."""
-    monkeypatch.setattr(base_fits, "begun_anew", lambda search, made: [])
+    monkeypatch.setattr(base_fits, "refit_by_growing", lambda search, made: [])
     monkeypatch.setattr(refining, "growing", lambda *_, **__: {})
 
 

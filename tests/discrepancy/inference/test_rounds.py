@@ -155,7 +155,7 @@ def test_a_small_candidate_that_the_screening_passes_over_is_fitted(together, mo
     assert 1.0 / found.after["clip.inverse"] == pytest.approx(1.6, abs=0.02)
     monkeypatch.setattr(prospects, "SMALL", 0)
     with monkeypatch.context() as without:
-        without.setattr(stand_ins, "instead", lambda *_: {})
+        without.setattr(stand_ins, "candidates_in_place", lambda *_: {})
         assert "clip" not in [t.candidate.name for t in diagnose(Line(clipped, together=together), keep=1).rounds[0].trials]
     # where another one ends it is found all the same
     assert [t.candidate.name for t in diagnose(Line(clipped, together=together), keep=1).effects] == ["clip"]
@@ -538,12 +538,12 @@ def test_a_limit_of_the_leading_candidate_is_fitted_from_its_declared_values(mon
     far = Fit({"a": -3.0, "low.c": 0.0}, ("a", "low.c"), 1e9, np.zeros(1), 1, True)
     (chord,) = search.lab.fits([search.lab.request((*free, *by_key["chord"].parameters), start.fit.point)], start.floor)
     best = {"chord": (by_key["chord"], chord), "low": (by_key["low"], far)}
-    assert not stand_ins.limits(search.lab, free, best, search.lab.problem.candidates, start.floor)
+    assert not stand_ins.limiting_cases(search.lab, free, best, search.lab.problem.candidates, start.floor)
     monkeypatch.setitem(stand_ins.LIMITS, "chord", ("low",))
-    ((key, (_, fit)),) = stand_ins.limits(search.lab, free, best, search.lab.problem.candidates, start.floor).items()
+    ((key, (_, fit)),) = stand_ins.limiting_cases(search.lab, free, best, search.lab.problem.candidates, start.floor).items()
     assert key == "low" and fit.point["low.c"] == pytest.approx(0.5, abs=0.02) and "chord.c" not in fit.point
     near = replace(far, cost=1.2 * chord.cost)  # it is as good already
-    assert not stand_ins.limits(search.lab, free, best | {"low": (by_key["low"], near)}, search.lab.problem.candidates, start.floor)
+    assert not stand_ins.limiting_cases(search.lab, free, best | {"low": (by_key["low"], near)}, search.lab.problem.candidates, start.floor)
 
 
 @pytest.mark.parametrize("apart", ["pull.k", ""])
@@ -635,10 +635,15 @@ def test_a_member_of_a_class_is_fitted_from_its_leader():
         directions.slopes(search.lab, problem.declared, start.fit.point, [0]),
     )
     best = {"low": (leader, fit)}
-    more = stand_ins.alike(search.lab, problem.declared, best, candidates, {"low": 0}, columns, slopes, start.floor)
+    more = stand_ins.similar_candidates(search.lab, problem.declared, best, candidates, {"low": 0}, columns, slopes, start.floor)
     assert list(more) == ["high"]
     assert more["high"][1].point["high.c"] == pytest.approx(2 * fit.point["low.c"], rel=0.01)
-    assert stand_ins.alike(search.lab, problem.declared, best | more, candidates, {"low": 0, "high": 0}, columns, slopes, start.floor) == {}
+    assert (
+        stand_ins.similar_candidates(
+            search.lab, problem.declared, best | more, candidates, {"low": 0, "high": 0}, columns, slopes, start.floor
+        )
+        == {}
+    )
 
 
 def test_what_the_leading_one_is_a_limit_of_is_fitted_from_it_where_that_leaves_more_than_noise(monkeypatch):
@@ -660,7 +665,9 @@ def test_what_the_leading_one_is_a_limit_of_is_fitted_from_it_where_that_leaves_
         (cost,) = search.lab.costs([point := {"a": 3.0, "low.c": size}], start.floor)
         fit = Fit(point, ("a", "low.c"), cost, np.zeros(1), 1, True)
         return list(
-            stand_ins.alike(search.lab, problem.declared, {"low": (low, fit)}, (low, high), {"low": 0}, columns, slopes, start.floor)
+            stand_ins.similar_candidates(
+                search.lab, problem.declared, {"low": (low, fit)}, (low, high), {"low": 0}, columns, slopes, start.floor
+            )
         )
 
     assert asked(0.4) == ["high"] and asked(0.5) == []
@@ -693,17 +700,17 @@ def test_what_stands_in_for_an_effect_says_where_that_one_begins(monkeypatch):
     assert [p["tuned.c"] for p in stand_ins.scanned(search.lab, by_key["tuned"], astray.point)][:3] == pytest.approx([0.1, 0.15, 0.225])
     assert {p["tuned.c"] < 0 for p in stand_ins.scanned(search.lab, by_key["tuned"], astray.point)} == {True, False}
     assert not stand_ins.scanned(search.lab, by_key["clip"], astray.point)
-    more = stand_ins.instead(search.lab, free, best, problem.candidates, base, start.floor)
+    more = stand_ins.candidates_in_place(search.lab, free, best, problem.candidates, base, start.floor)
     assert more["tuned"][1].point["tuned.c"] == pytest.approx(0.5, abs=0.02) and "fixed.c" not in more["tuned"][1].point
     assert comparing.is_noise(search.lab, search.lab.mean_squares([more["tuned"][1].point], start.floor)[0])
     # not where the leading one leaves noise alone, nor where it says little of the declared values
-    assert not stand_ins.instead(search.lab, free, best | more, problem.candidates, base, start.floor)
+    assert not stand_ins.candidates_in_place(search.lab, free, best | more, problem.candidates, base, start.floor)
     monkeypatch.setattr(comparing, "moved", lambda lab, point: point["a"])
     for led, more, wanted in ((2.4, 1.5, True), (3.0, 1.05, True), (3.0, 1.5, False), (2.4, 2.0, False)):
-        assert stand_ins.leaves_no_more(search.lab, replace(base, point={"a": led}), more * search.lab.noise_squares) is wanted
+        assert stand_ins.leaves_only_noise(search.lab, replace(base, point={"a": led}), more * search.lab.noise_squares) is wanted
     near = replace(base, point={"a": fixed.point["a"]})
     little = {"fixed": (by_key["fixed"], replace(fixed, cost=0.6 * search.lab.costs([near.point], start.floor)[0]))}
-    assert not stand_ins.instead(search.lab, free, little, problem.candidates, near, start.floor)
+    assert not stand_ins.candidates_in_place(search.lab, free, little, problem.candidates, near, start.floor)
 
 
 @pytest.mark.parametrize("together", [True, False])
@@ -715,7 +722,9 @@ def test_what_promises_nothing_in_the_place_of_another_is_tried_where_that_is_on
     base = Fit({"a": 2.0}, ("a",), search.lab.costs([{"a": 2.0}], start.floor)[0], np.zeros(1), 1, True)
     free = (*problem.declared, *by_key["fixed"].parameters)
     (fixed,) = search.lab.fits([search.lab.request(free, {"a": 3.0, "fixed.c": 0.4})], start.floor)
-    more = stand_ins.instead(search.lab, problem.declared, {"fixed": (by_key["fixed"], fixed)}, problem.candidates, base, start.floor)
+    more = stand_ins.candidates_in_place(
+        search.lab, problem.declared, {"fixed": (by_key["fixed"], fixed)}, problem.candidates, base, start.floor
+    )
     assert ("tuned" in more) is together
 
 
@@ -874,14 +883,14 @@ def test_a_fit_goes_on_until_it_has_come_to_its_end(converged, monkeypatch):
     ends = iter([1.6, 1.66, 1.715, 1.762, 1.8])
     asked = []
 
-    def from_here(lab, entries, like):
+    def refit_from_starts(lab, entries, like):
         ((_, fit, _),) = entries
         asked.append(fit)
         return [(replace(fit, point={"a": 3.0, "square.c": next(ends)}, converged=converged), like)]
 
-    monkeypatch.setattr(refining, "from_here", from_here)
+    monkeypatch.setattr(refining, "refit_from_starts", refit_from_starts)
     monkeypatch.setattr(comparing, "is_noise", lambda *_, **__: False)
-    out = refining.polish(search.lab, search.lab.problem.declared, {"square": (square, fit)}, start.fit, start.floor)
+    out = refining.refine(search.lab, search.lab.problem.declared, {"square": (square, fit)}, start.fit, start.floor)
     assert len(asked) == (2 if converged else 1 + refining.ONWARD)
     assert out["square"][1].point["square.c"] == (1.66 if converged else 1.762)
 
@@ -913,7 +922,7 @@ def test_the_other_sign_of_the_leading_candidate_is_followed_to_its_end(monkeypa
     assert other[1].point["fold.c"] > 0
     assert best["fold"][1].point["fold.c"] == pytest.approx(-1.5, abs=0.05)
     assert best["fold"][1].cost < 0.5 * other[1].cost
-    refined = refining.polish(search.lab, free, {"fold": other}, start.fit, start.floor, other=best["fold"])
+    refined = refining.refine(search.lab, free, {"fold": other}, start.fit, start.floor, other=best["fold"])
     assert refined["fold"][1].point["fold.c"] == pytest.approx(-1.5, abs=0.05)
     alone, none, *_ = contests.contest(search.lab, free, starts[:1], start.floor)
     assert alone["fold"][1].point["fold.c"] > 0 and none is None
@@ -999,14 +1008,14 @@ def test_what_fits_beside_the_wrong_effect_is_tried_beside_the_others(monkeypatc
     assert first.chosen.candidate.name == "mix"
     second = next_effect.find(search, first.chosen.fit, first.chosen.stand.floor, [first.chosen])
     assert second.chosen is None
-    low, high = pairs.in_its_place(search, first, second, first.chosen.errors)
+    low, high = pairs.replace_first_effect(search, first, second, first.chosen.errors)
     assert (low.chosen.candidate.name, high.chosen.candidate.name) == ("low", "high") and low.members == [low.chosen]
     assert comparing.is_noise(search.lab, high.chosen.errors)
-    assert not pairs.in_its_place(search, first, second, high.chosen.errors), "no less than that"
+    assert not pairs.replace_first_effect(search, first, second, high.chosen.errors), "no less than that"
     found = diagnose(problem)
     assert names(found) == ["high", "low"]
     assert found.after["low.c"] == pytest.approx(0.9, abs=0.01) and found.after["high.c"] == pytest.approx(0.4, abs=0.01)
-    monkeypatch.setattr(pairs, "in_its_place", lambda *_: [])
+    monkeypatch.setattr(pairs, "replace_first_effect", lambda *_: [])
     assert names(diagnose(problem)) != ["high", "low"]
 
 
@@ -1123,7 +1132,7 @@ def test_where_two_were_found_the_other_method_alone_is_asked(unnamed, monkeypat
         raise AssertionError
 
     search, other, first, low = unnamed
-    for name in ("beside_members", "in_its_place"):
+    for name in ("beside_members", "replace_first_effect"):
         monkeypatch.setattr(pairs, name, fail)
     by, pair = pairs.two_effects(search, [first, first], [low, low], low.stand, {other: first})
     assert by is other and [r.chosen.candidate.name for r in pair] == ["low", "high"]
@@ -1223,12 +1232,12 @@ def test_beside_a_fit_that_was_given_up_a_second_effect_is_looked_for_where_it_e
     (fit,) = search.lab.fits([search.lab.request(parameters, {"a": 2.0, "low.c": 0.1}, iterations=0)], search.lab.noise())
     given_up = Trial(low, Stand(fit, *discretisation.stand(search.lab, fit.point)), 1.0)
     assert not fit.converged and fit.point["low.c"] == 0.1
-    there = pairs.at_its_end(search.lab, given_up)
+    there = pairs.continued_to_end(search.lab, given_up)
     (alone,) = search.lab.fits([search.lab.request(parameters, {"a": 2.0, "low.c": 0.1})], there.floor)
     assert alone.point["low.c"] > 0.8 and there.fit.point == pytest.approx(alone.point, rel=0.01)
     assert there.errors[0] < 0.2 * given_up.errors[0]
     ended = Trial(low, replace(there, fit=replace(there.fit, converged=True)), 1.0)
-    assert pairs.at_its_end(search.lab, ended).fit is ended.fit
+    assert pairs.continued_to_end(search.lab, ended).fit is ended.fit
 
 
 def test_the_other_method_goes_on_from_where_the_chosen_one_has_come():
@@ -1245,11 +1254,11 @@ def test_the_other_method_goes_on_from_where_the_chosen_one_has_come():
     low = problem.candidates[-1]
     (fit,) = search.lab.fits([search.lab.request(low.parameters, {"a": 1.0, "low.c": 0.5})], search.lab.noise())
     t = Trial(low, Stand(fit, *discretisation.stand(search.lab, fit.point)), 1.0)
-    there = pairs.from_there(search.lab, t, {"a": 2.9, "other.c": 1.0})
+    there = pairs.refit_from(search.lab, t, {"a": 2.9, "other.c": 1.0})
     assert comparing.is_noise(search.lab, there.errors) and there.fit.point["a"] == pytest.approx(3.0, abs=0.02)
     assert "other.c" not in there.fit.point
     better = Trial(low, there, 1.0)
-    assert pairs.from_there(search.lab, better, {"a": 1.0}).fit is there.fit
+    assert pairs.refit_from(search.lab, better, {"a": 1.0}).fit is there.fit
 
 
 @pytest.mark.parametrize(("left", "chosen"), [(0.8, 0), (0.5, 1)])
@@ -1369,7 +1378,7 @@ def test_a_parameter_of_the_problems_own_leaves_its_place_for_clearly_less_alone
 
     still, moved = stood([1.0, 5.0], {"a": 2.0}), stood([error, 5.0], {"a": 3.0, "height": 0.1})
     rough = stood([1.3, 5.0])
-    assert base_fits.plainest(search, [rough, still, moved]) is (moved if moves else still)
+    assert base_fits.best_base_fit(search, [rough, still, moved]) is (moved if moves else still)
     assert search.still == ({"a": 2.0} if moves else None)
 
 
@@ -1390,10 +1399,10 @@ def test_ends_from_elsewhere_are_weighed_by_the_floor_where_they_stand():
     request = search.lab.request((*problem.declared, *square.parameters), {"a": 3.0, "square.c": 2.0})
     (end,) = search.lab.fits([request], base.floor)
     wrong = replace(end, point={"a": 5.0, "square.c": -1.0}, cost=0.5 * end.cost)
-    found = refining.ahead(search.lab, [(square, end)], {"square": (square, wrong)}, base.floor)
+    found = refining.refit_at_own_floors(search.lab, [(square, end)], {"square": (square, wrong)}, base.floor)
     assert found["square"][1].point["square.c"] == pytest.approx(2.0, abs=0.1)
     assert (
-        refining.ahead(search.lab, [(square, wrong)], {"square": (square, end)}, base.floor)
+        refining.refit_at_own_floors(search.lab, [(square, wrong)], {"square": (square, end)}, base.floor)
         .get("square", (square, end))[1]
         .point["square.c"]
         > 1.0
@@ -1593,19 +1602,19 @@ def test_an_effect_of_many_parameters_that_leads_by_far_is_refined(cost, setting
     there = replace(base.fit, point={**base.fit.point, "a": 3.4})
     asked = []
 
-    def onward(lab, entries, floor):
+    def refit_repeatedly(lab, entries, floor):
         asked.extend(entries)
         return [(there, floor)]
 
-    monkeypatch.setattr(refining, "onward", onward)
+    monkeypatch.setattr(refining, "refit_repeatedly", refit_repeatedly)
     monkeypatch.setattr(search.lab, "costs", lambda points, floor: [1.0 for _ in points])
     errors = {True: [np.array([0.1])], False: [np.array([0.3])]}
     monkeypatch.setattr(search.lab, "mean_squares", lambda points, floor, fitted=False: errors[points[0] is there.point])
-    found = refining.widened(search.lab, search.lab.problem.declared, fits, base.floor)
+    found = refining.refine_large(search.lab, search.lab.problem.declared, fits, base.floor)
     assert {key: (c, fit.point, fit.cost) for key, (c, fit) in found.items()} == ({"wide": (wide, there.point, 1.0)} if refined else {})
     assert [fit.cost for _, fit, _ in asked] == [cost] * refined
     errors[True] = [np.array([0.4])]
-    assert refining.widened(search.lab, search.lab.problem.declared, fits, base.floor) == {}
+    assert refining.refine_large(search.lab, search.lab.problem.declared, fits, base.floor) == {}
 
 
 def test_what_leaves_far_more_than_the_best_is_not_refined(monkeypatch):
@@ -1615,11 +1624,13 @@ def test_what_leaves_far_more_than_the_best_is_not_refined(monkeypatch):
     by_key = {c.key: c for c in search.lab.problem.candidates}
     best = {key: (by_key[key], replace(base.fit, point={"a": 3.0, "square.c": c}, cost=1.0)) for key, c in (("square", 1.8), ("cube", 0.9))}
     asked = []
-    monkeypatch.setattr(refining, "onward", lambda lab, entries, floor: asked.extend(entries) or [(f, floor) for _, f, _ in entries])
-    refining.polish(search.lab, search.lab.problem.declared, best, base.fit, base.floor)
+    monkeypatch.setattr(
+        refining, "refit_repeatedly", lambda lab, entries, floor: asked.extend(entries) or [(f, floor) for _, f, _ in entries]
+    )
+    refining.refine(search.lab, search.lab.problem.declared, best, base.fit, base.floor)
     assert [fit.point["square.c"] for _, fit, _ in asked] == [1.8]
     monkeypatch.setattr(refining, "NEARBY", 10.0)
-    refining.polish(search.lab, search.lab.problem.declared, best, base.fit, base.floor)
+    refining.refine(search.lab, search.lab.problem.declared, best, base.fit, base.floor)
     assert [fit.point["square.c"] for _, fit, _ in asked] == [1.8, 1.8, 0.9]
 
 

@@ -100,7 +100,7 @@ def grown(
     return ended
 
 
-def scattered(lab: Laboratory, point: Point) -> list[Point]:
+def scaled_starts(lab: Laboratory, point: Point) -> list[Point]:
     """Return the point, and copies of it with each log-scaled declared parameter halved and doubled."""
     out: list[Point] = [dict(point)]
     for p in lab.problem.declared:
@@ -123,7 +123,7 @@ def base_fit(search: Search, near: Point | None = None) -> Stand | None:
     """
     lab = search.lab
     # the first fit only finds the point at which to measure the floor
-    begins = [{}, near] if near else scattered(lab, {})
+    begins = [{}, near] if near else scaled_starts(lab, {})
     with discretisation.quickly(lab):
         fit = fit_declared(lab, begins, lab.noise(), iterations=6, tolerance=ROUGH)
     if fit.setting != lab.own and not lab.runs(fit.point):
@@ -153,12 +153,12 @@ def base_fit(search: Search, near: Point | None = None) -> Stand | None:
             break
         floor, errors = discretisation.stand(lab, fit.point, like=floor, fitted=True)
         made.append(Stand(fit, floor, errors))
-    made += begun_anew(search, made)
-    best = plainest(search, made)
+    made += refit_by_growing(search, made)
+    best = best_base_fit(search, made)
     return Stand(best.fit, *discretisation.stand(lab, best.fit.point, like=best.floor))
 
 
-def begun_anew(search: Search, made: Sequence[Stand]) -> list[Stand]:
+def refit_by_growing(search: Search, made: Sequence[Stand]) -> list[Stand]:
     """Fit the declared model again by growing horizons, in case the fits so far ended in a wrong local minimum.
 
     This is done only where more than noise is left. The new fits use the floor at the end of the first horizon, because the differences of
@@ -193,7 +193,7 @@ def apart(lab: Laboratory, point: Point, other: Point) -> float:
     return max(abs(p.coordinate(point[p.name]) - p.coordinate(other[p.name])) for p in lab.problem.declared)
 
 
-def plainest(search: Search, made: Sequence[Stand]) -> Stand:
+def best_base_fit(search: Search, made: Sequence[Stand]) -> Stand:
     """Return the fitted model with the least error, preferring those whose extra parameters kept their first values.
 
     An extra parameter of the problem, such as the height of the colliders, may compensate for part of an effect and so hide it. It must

@@ -197,7 +197,7 @@ def tried(lab: Laboratory, start: Start, base: Fit, *, led_far: bool) -> list[St
     made = [{**begin, **value} for value in (far if begin == begun else near + far)]
     if led_far:
         made += [{**at_declared(lab, begin), **value} for value in near + far]
-        made += [{**between(lab, begin), **value} for value in far]
+        made += [{**half_way_to_declared(lab, begin), **value} for value in far]
     others = [{**begin, **shape} for shape in c.starts if c.shape({**begin, **shape}) != c.shape(begin)]
     made += [{**other, **value} for other in others for value in middle + far]
     made += [{**place, **value} for place in [begin, *others] for value in beyond] if others else []
@@ -223,7 +223,7 @@ def at_declared(lab: Laboratory, point: Point) -> Point:
     return {k: v for k, v in point.items() if "." in k} | lab.as_declared
 
 
-def between(lab: Laboratory, point: Point) -> Point:
+def half_way_to_declared(lab: Laboratory, point: Point) -> Point:
     """Return the point with the declared parameters half way to their stated values, in fit coordinates."""
     half = {p.name: p.physical(0.5 * (p.coordinate(point.get(p.name, p.value)) + p.coordinate(p.value))) for p in lab.problem.declared}
     return {**point, **half}

@@ -107,7 +107,7 @@ class SimulatedEnds:
         return base_fits.finished(self.lab, named)
 
     def alone(self, stand: Stand) -> np.ndarray:
-        return left_alone(self.lab, stand)
+        return errors_of_one_simulation(self.lab, stand)
 
 
 def judge(
@@ -177,7 +177,7 @@ def is_exact(search: Search, t: Trial) -> bool:
     return bool(np.all(alone < sure * lab.noise_squares))
 
 
-def left_alone(lab: Laboratory, stand: Stand) -> np.ndarray:
+def errors_of_one_simulation(lab: Laboratory, stand: Stand) -> np.ndarray:
     """Return the mean squares of the parts that one simulation leaves at the end of a fit, and record them in the journal."""
     squares = lab.mean_squares([stand.fit.point], stand.floor, plain=True)[0]
     lab.journal.alone[place(lab.own, stand)] = tuple(squares.tolist())

@@ -69,12 +69,12 @@ def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival:
     candidates, free, slopes, columns, chosen, *_ = look.asked
     best, other, errors = dict(look.contest.best), look.contest.other, lab.mean_squares([base.point], floor)[0]
     if not lab.budget.skips("refining the best fits"):
-        best |= stand_ins.limits(lab, free, best, candidates, floor)
-        best |= refining.polish(lab, free, best, base, floor, rival, other)
-        best |= stand_ins.alike(lab, free, best, candidates, chosen, columns, slopes, floor)
-        best |= refining.widened(lab, free, best, floor)
+        best |= stand_ins.limiting_cases(lab, free, best, candidates, floor)
+        best |= refining.refine(lab, free, best, base, floor, rival, other)
+        best |= stand_ins.similar_candidates(lab, free, best, candidates, chosen, columns, slopes, floor)
+        best |= refining.refine_large(lab, free, best, floor)
         if not found:
-            best |= stand_ins.instead(lab, free, best, candidates, base, floor)
+            best |= stand_ins.candidates_in_place(lab, free, best, candidates, base, floor)
     floors = discretisation.floors(lab, base.point, free, floor)
     model = linear_model(search, base.point, floor, floors - lab.noise_squares, slopes, columns, chosen, candidates)
     null, unfitted = model.null(errors, search.draws), look.contest.unfitted
@@ -93,7 +93,7 @@ def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival:
     promising = result.over > WITHIN and any(t.gain > judging.by_chance(lab, result) for t in result.trials)
     again = first and result.chosen is None and (promising or result.over > 1.0)
     if again and not lab.budget.skips("fits from elsewhere"):
-        best |= refining.elsewhere(lab, base, best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
+        best |= refining.refit_from_larger_sizes(lab, base, best, {c.key: c.starts[chosen.get(c.key, 0)] for c in candidates}, floor)
         result = judged(empty)
     if again and result.chosen is None and not every and not lab.budget.skips("measuring every fit where it ends"):
         every = True
@@ -102,7 +102,7 @@ def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival:
     if missed and not lab.budget.skips("growing fits"):
         with discretisation.quickly(lab, base.point, floor):
             grown = list(refining.growing(search, base, floor, candidates).values())
-        best |= refining.ahead(lab, grown, best, floor)
+        best |= refining.refit_at_own_floors(lab, grown, best, floor)
         result = judged(empty)
     plain = without_effect(lab, result, base, floor)
     if plain is not None:

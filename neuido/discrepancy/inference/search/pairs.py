@@ -59,7 +59,7 @@ def look_ahead(search: Search, first: Round) -> list[Round]:
     for t in (*bases, *blind):
         if lab.budget.skips(f"a second effect beside {t.candidate.key}"):
             break
-        here = at_its_end(lab, t)
+        here = continued_to_end(lab, t)
         second = next_effect.find(search, here.fit, here.floor, [t], most=MANY)
         if second.chosen is None or comparing.gain(lab, first.errors, second.chosen.errors) < 2.0 * LEAST_GAIN:
             continue
@@ -115,7 +115,7 @@ def two_effects(
         return elsewhere
     own = beside_members(search, rounds, at) if len(found) == 1 else []
     if not own and len(found) == 1 and len(rounds) > 1:
-        own = in_its_place(search, rounds[0], rounds[1], at.errors)
+        own = replace_first_effect(search, rounds[0], rounds[1], at.errors)
     if elsewhere is not None and (
         not own or comparing.gain(search.lab, own[-1].chosen.errors, elsewhere[1][-1].chosen.errors) > LEAST_GAIN
     ):
@@ -175,7 +175,7 @@ def as_rounds(
         return []
     t = able[0]
     (second,) = (c for c in both if c.key != t.candidate.key)
-    here = from_there(lab, t, there.fit.point)
+    here = refit_from(lab, t, there.fit.point)
     pair = fitted_with(search, first, t, here, Trial(second, there, comparing.gain(lab, here.errors, there.errors)), errors, least)
     if pair:
         t.stand, t.gain = here, comparing.gain(lab, first.errors, here.errors)
@@ -257,7 +257,7 @@ def by_another_method(
             continue
         if search.lab.budget.skips("two effects by the other method"):
             break
-        here = from_there(other.lab, lead, at.fit.point)
+        here = refit_from(other.lab, lead, at.fit.point)
         own = first if lead is first.chosen else replace(first, chosen=lead, members=[lead])
         pair = second_beside(other, own, few(own.members), at.errors, at=here, sure=None if within else lead)
         if pair and (not within or comparing.may_be_noise(other.lab, pair[-1].chosen.errors)):
@@ -266,7 +266,7 @@ def by_another_method(
     return min(made, key=lambda entry: entry[1][-1].chosen.score, default=None)
 
 
-def from_there(lab: Laboratory, t: Trial, point: Point) -> Stand:
+def refit_from(lab: Laboratory, t: Trial, point: Point) -> Stand:
     """Return the fit of an effect, or a new one from the values of `point` (declared ones and the effect's) if that leaves less."""
     free = (*lab.problem.declared, *t.candidate.parameters)
     here, begin = (
@@ -281,7 +281,7 @@ def from_there(lab: Laboratory, t: Trial, point: Point) -> Stand:
     )
 
 
-def at_its_end(lab: Laboratory, t: Trial) -> Stand:
+def continued_to_end(lab: Laboratory, t: Trial) -> Stand:
     """Return the fitted model of a trial, continued to the end of its fit.
 
     A fit that was given up early stands at a point beside which no second effect looks right.
@@ -310,7 +310,7 @@ def second_beside(
     for t in sorted(members, key=lambda t: t.penalised)[:BESIDE]:
         if lab.budget.skips(f"a second effect beside {t.candidate.key}"):
             break
-        here = at if at is not None and t is first.chosen else at_its_end(lab, t)
+        here = at if at is not None and t is first.chosen else continued_to_end(lab, t)
         if t is not sure and next_effect.promised(search, here, t) > PROMISED:
             continue
         second = next_effect.find(search, here.fit, here.floor, [t], most=MANY)
@@ -324,7 +324,7 @@ def second_beside(
     return min(pairs, key=lambda pair: pair[1].chosen.score, default=[])
 
 
-def in_its_place(search: Search, first: Round, second: Round, errors: np.ndarray) -> list[Round]:
+def replace_first_effect(search: Search, first: Round, second: Round, errors: np.ndarray) -> list[Round]:
     """Try other first effects beside a second one that improves the fitted recordings most, where no second one was named.
 
     Where there are two effects, the leading single one need be neither of them, nor share a class with one: a quadratic drag of a body that
@@ -340,7 +340,7 @@ def in_its_place(search: Search, first: Round, second: Round, errors: np.ndarray
     lead = min(tried, key=lambda t: comparing.fitted_score(lab, t.errors), default=None)
     if lead is None or here - comparing.fitted_score(lab, lead.errors) < 2.0 * LEAST_GAIN:
         return []
-    instead = [t for t in few(others(first)) if t.candidate.name != lead.candidate.name]
+    instead = [t for t in few(outside_class(first)) if t.candidate.name != lead.candidate.name]
     instead = sorted((t for t in instead if np.isfinite(t.score)), key=lambda t: t.penalised)[:IN_PLACE]
     if not instead or lab.budget.skips(f"effects in the place of {first.chosen.candidate.key}"):
         return []
@@ -358,7 +358,7 @@ def in_its_place(search: Search, first: Round, second: Round, errors: np.ndarray
     best, there = min(stands, key=lambda entry: score(entry[1].errors))
     if comparing.gain(lab, errors, there.errors) < LEAST_GAIN:
         return []
-    return fitted_with(search, first, best, at_its_end(lab, best), replace(lead, stand=there), errors)
+    return fitted_with(search, first, best, continued_to_end(lab, best), replace(lead, stand=there), errors)
 
 
 def simpler(r: Round, chosen: Trial) -> list[Trial]:
@@ -367,7 +367,7 @@ def simpler(r: Round, chosen: Trial) -> list[Trial]:
     A limiting case need not come close: what a force of many parameters gains beyond it may be due to the other effect.
     """
     sizes = len(chosen.candidate.size_parameters)
-    narrower = [t for t in others(r) if t.candidate.name in LIMITS.get(chosen.candidate.name, ())]
+    narrower = [t for t in outside_class(r) if t.candidate.name in LIMITS.get(chosen.candidate.name, ())]
     fewer = [t for t in close_to(r, chosen) if t not in narrower and len(t.candidate.size_parameters) < sizes]
     return narrower + fewer[:LOOKED_AHEAD]
 
@@ -383,12 +383,12 @@ def few(trials: Iterable[Trial]) -> list[Trial]:
     return [t for t in trials if len(t.candidate.parameters) <= MANY]
 
 
-def others(r: Round) -> list[Trial]:
+def outside_class(r: Round) -> list[Trial]:
     """Return the physically possible trials of a round outside the named class."""
     return [t for t in r.trials if t not in r.members and not unphysical(t.candidate, t.fit.point)]
 
 
 def close_to(r: Round, chosen: Trial) -> list[Trial]:
-    """Return those of `others` that came close to the chosen one, the best first."""
+    """Return those of `outside_class` that came close to the chosen one, the best first."""
     limit = chosen.score + 2.0 * math.log(CLOSE)
-    return sorted((t for t in others(r) if t.score < limit), key=lambda t: t.penalised)
+    return sorted((t for t in outside_class(r) if t.score < limit), key=lambda t: t.penalised)

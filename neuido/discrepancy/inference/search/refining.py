@@ -103,7 +103,7 @@ def growing(
     lab = search.lab
     free = (*lab.problem.declared, *(p for t in found for p in t.candidate.parameters))
     at = at_first(search, free, contests.at_declared(lab, base.point), floor, found)
-    starts = leading(lab, at, candidates, base_fits.early(lab, floor, HORIZONS[1]), free)
+    starts = ranked_starts(lab, at, candidates, base_fits.early(lab, floor, HORIZONS[1]), free)
     # one by one, the simulations for a candidate of many parameters take five times as long as for all others together
     large = [entry for entry in starts if len(entry[0].parameters) > MANY][: 1 if lab.problem.together else 0]
     live = [entry for entry in starts if entry in large or len(entry[0].parameters) <= MANY]
@@ -111,9 +111,8 @@ def growing(
     lab.tell(f"growing fits of {', '.join(c.key for c, _ in live)}")
     entries = [((*free, *c.parameters), point) for c, point in live]
     ended = [(live[i][0], fit) for i, fit in base_fits.grown(lab, entries, floor, until=until, reach=IN_REACH)]
-    costs = (
-        lab.costs([fit.point for _, fit in ended], floor) if ended else []
-    )  # the fits may have ended at an earlier horizon, so their costs are taken anew
+    # the fits may have ended at an earlier horizon, so their costs are taken anew
+    costs = lab.costs([fit.point for _, fit in ended], floor) if ended else []
     return {c.key: (c, replace(fit, cost=cost)) for (c, fit), cost in zip(ended, costs, strict=True) if np.isfinite(cost)}
 
 
@@ -127,7 +126,7 @@ def growing_pairs(search: Search, base: Point, floor: Floor) -> list[Pair]:
     free, breadth = lab.problem.declared, PAIRS if lab.problem.together else PAIRS_ONE_BY_ONE
     small = [c for c in lab.problem.candidates if len(c.parameters) <= breadth.parameters]
     wide = base_fits.early(lab, floor, HORIZONS[1])
-    firsts = leading(lab, at_first(search, free, contests.at_declared(lab, base), floor), small, wide, free)[: breadth.firsts]
+    firsts = ranked_starts(lab, at_first(search, free, contests.at_declared(lab, base), floor), small, wide, free)[: breadth.firsts]
     lab.tell(f"growing pairs beside {', '.join(c.key for c, _ in firsts)}")
     requests = [lab.request((*free, *c.parameters), point, iterations=base_fits.stepwise(lab)) for c, point in firsts]
     fits = lab.fits(requests, base_fits.early(lab, floor, HORIZONS[0]))
@@ -135,7 +134,7 @@ def growing_pairs(search: Search, base: Point, floor: Floor) -> list[Pair]:
     for (c, _), fit in zip(firsts, fits, strict=True):
         if np.isfinite(fit.cost):
             beside = [other for other in small if other.name != c.name]
-            for other, point in leading(lab, fit.point, beside, wide, (*free, *c.parameters))[: breadth.seconds]:
+            for other, point in ranked_starts(lab, fit.point, beside, wide, (*free, *c.parameters))[: breadth.seconds]:
                 begun.setdefault(frozenset((c.key, other.key)), ((c, other), point))
     live = list(begun.values())
     entries = [((*free, *c.parameters, *other.parameters), point) for (c, other), point in live]
@@ -154,7 +153,7 @@ def at_first(search: Search, free: Sequence[Parameter], point: Point, floor: Flo
     return search.begun
 
 
-def leading(
+def ranked_starts(
     lab: Laboratory, at: Point, candidates: Sequence[Candidate], floor: Floor, free: Sequence[Parameter]
 ) -> list[tuple[Candidate, Point]]:
     """Return the candidates with their best starts, those first that would improve the fit at a point most beside the free parameters."""
@@ -165,7 +164,7 @@ def leading(
     return list(starts.values())
 
 
-def polish(
+def refine(
     lab: Laboratory,
     free: Sequence[Parameter],
     best: Mapping[str, tuple[Candidate, Fit]],
@@ -220,7 +219,7 @@ def polish(
         if fit is not ranked[0][1]:
             starts.append({**fit.point, **{name: leading[name] for name in lab.as_declared}})
         entries.append(((*free, *c.parameters), fit, starts))
-    for (c, _), (found, own) in zip(able, onward(lab, entries, floor), strict=True):
+    for (c, _), (found, own) in zip(able, refit_repeatedly(lab, entries, floor), strict=True):
         left = score(lab.mean_squares([found.point], own, fitted=True)[0])
         if left < least.get(c.key, math.inf):
             least[c.key] = left
@@ -228,7 +227,7 @@ def polish(
     return out
 
 
-def widened(
+def refine_large(
     lab: Laboratory, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
 ) -> dict[str, tuple[Candidate, Fit]]:
     """Repeat a leading fit of many parameters with the floor at its end, if it is far ahead of all fits of few parameters.
@@ -244,7 +243,7 @@ def widened(
     if not lab.runs(fit.point) or lab.budget.skips(f"refining {lead.key}"):
         return {}
     lab.tell(f"refining {lead.key}")
-    ((found, own),) = onward(lab, [((*free, *lead.parameters), fit, [fit.point])], floor)
+    ((found, own),) = refit_repeatedly(lab, [((*free, *lead.parameters), fit, [fit.point])], floor)
     left, there = (score(lab.mean_squares([point], own, fitted=True)[0]) for point in (fit.point, found.point))
     return {lead.key: (lead, replace(found, cost=lab.costs([found.point], floor)[0]))} if there < left else {}
 
@@ -254,9 +253,9 @@ def runnable(lab: Laboratory, fits: Sequence[tuple[Candidate, Fit]]) -> list[tup
     return [entry for entry, ok in zip(fits, lab.which_run([fit.point for _, fit in fits]), strict=True) if ok]
 
 
-def onward(lab: Laboratory, entries: Sequence[Onset], floor: Floor) -> list[tuple[Fit, Floor]]:
-    """Refit each entry as `from_here` does, then repeat this from its end up to `ONWARD` times."""
-    ends = from_here(lab, entries, floor)
+def refit_repeatedly(lab: Laboratory, entries: Sequence[Onset], floor: Floor) -> list[tuple[Fit, Floor]]:
+    """Refit each entry as `refit_from_starts` does, then repeat this from its end up to `ONWARD` times."""
+    ends = refit_from_starts(lab, entries, floor)
     going = list(range(len(ends)))
     for _ in range(ONWARD):
         if lab.budget.ends():
@@ -266,7 +265,7 @@ def onward(lab: Laboratory, entries: Sequence[Onset], floor: Floor) -> list[tupl
         going = [i for i, ok in zip(going, run, strict=True) if ok and not comparing.is_noise(lab, left[i], fitted=True)]
         if not going:
             break
-        made = from_here(lab, [(entries[i][0], ends[i][0], [ends[i][0].point]) for i in going], floor)
+        made = refit_from_starts(lab, [(entries[i][0], ends[i][0], [ends[i][0].point]) for i in going], floor)
         further = []
         for i, (fit, there) in zip(going, made, strict=True):
             gained = score(left[i]) - score(lab.mean_squares([fit.point], there, fitted=True)[0])
@@ -277,7 +276,7 @@ def onward(lab: Laboratory, entries: Sequence[Onset], floor: Floor) -> list[tupl
     return ends
 
 
-def from_here(lab: Laboratory, entries: Sequence[Onset], like: Floor) -> list[tuple[Fit, Floor]]:
+def refit_from_starts(lab: Laboratory, entries: Sequence[Onset], like: Floor) -> list[tuple[Fit, Floor]]:
     """Fit each entry from its starts, and return its best fit with the floor at the end of the given fit.
 
     The fits of all entries run side by side.
@@ -330,7 +329,7 @@ def measured(lab: Laboratory, best: Mapping[str, tuple[Candidate, Fit]], floor: 
     return found
 
 
-def elsewhere(
+def refit_from_larger_sizes(
     lab: Laboratory, base: Fit, best: Mapping[str, tuple[Candidate, Fit]], starts: Mapping[str, Mapping[str, float]], floor: Floor
 ) -> dict[str, tuple[Candidate, Fit]]:
     """Repeat the fits of candidates with one size from the declared values and a larger size.
@@ -350,13 +349,12 @@ def elsewhere(
         race = Race(min((fit.cost for _, fit in best.values() if fit.setting == lab.setting), default=np.inf))
         requests = [lab.request((*lab.problem.declared, *c.parameters), begin, race=race) for c, begin in begins]
         ended = list(zip((c for c, _ in begins), lab.fits(requests, floor), strict=True))
-    found = better(
-        (entry for entry in ended if entry[1].setting == lab.own), best
-    )  # costs of quick fits belong to another motion and cannot be compared
-    return found | ahead(lab, ended, {**best, **found}, floor)
+    # costs of quick fits belong to another motion and cannot be compared
+    found = better((entry for entry in ended if entry[1].setting == lab.own), best)
+    return found | refit_at_own_floors(lab, ended, {**best, **found}, floor)
 
 
-def ahead(
+def refit_at_own_floors(
     lab: Laboratory, ended: Sequence[tuple[Candidate, Fit]], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
 ) -> dict[str, tuple[Candidate, Fit]]:
     """Repeat the fits that leave least with the floor at their ends, and return those that then beat the candidate's best fit.
@@ -375,7 +373,7 @@ def ahead(
         left = [score(squares) for squares in lab.mean_squares([fit.point for _, fit in ended], floor)]
     out: dict[str, tuple[Candidate, Fit]] = {}
     ends = runnable(lab, [ended[i] for i in np.argsort(left)[:POLISHED]])
-    made = from_here(lab, [((*lab.problem.declared, *c.parameters), fit, [fit.point]) for c, fit in ends], floor)
+    made = refit_from_starts(lab, [((*lab.problem.declared, *c.parameters), fit, [fit.point]) for c, fit in ends], floor)
     for (c, _), (further, own) in zip(ends, made, strict=True):
         rival, its = out.get(c.key) or best.get(c.key), math.inf
         if rival is not None:

@@ -97,7 +97,7 @@ class Ends(Protocol):
         ...
 
     def alone(self, stand: Stand) -> np.ndarray:
-        """Return the errors that one simulation leaves, as `judging.left_alone` does."""
+        """Return the errors that one simulation leaves, as `judging.errors_of_one_simulation` does."""
         ...
 
 

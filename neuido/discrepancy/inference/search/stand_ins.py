@@ -50,7 +50,7 @@ def is_behind(c: Candidate, best: Mapping[str, tuple[Candidate, Fit]], fit: Fit)
     return c.key not in best or best[c.key][1].cost >= NEAR_IT * fit.cost
 
 
-def limits(
+def limiting_cases(
     lab: Laboratory, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], candidates: Sequence[Candidate], floor: Floor
 ) -> dict[str, tuple[Candidate, Fit]]:
     """Fit limiting cases of the leading candidate from its declared values, with sizes that act about as strongly.
@@ -75,7 +75,7 @@ def limits(
     return better(zip(own, lab.fits(requests, floor), strict=True), best)
 
 
-def alike(
+def similar_candidates(
     lab: Laboratory,
     free: Sequence[Parameter],
     best: Mapping[str, tuple[Candidate, Fit]],
@@ -121,7 +121,7 @@ def alike(
     return better(zip(of, lab.fits(requests, floor), strict=True), best)
 
 
-def instead(
+def candidates_in_place(
     lab: Laboratory,
     free: Sequence[Parameter],
     best: Mapping[str, tuple[Candidate, Fit]],
@@ -143,7 +143,7 @@ def instead(
     before, squares = lab.mean_squares([base.point, fit.point], floor)
     if (
         fit.cost > HALF * lab.costs([base.point], floor)[0]
-        or leaves_no_more(lab, base, squares)
+        or leaves_only_noise(lab, base, squares)
         or comparing.gain(lab, before, squares) < LEAST_GAIN
     ):
         return {}
@@ -179,7 +179,7 @@ def instead(
     return better(((c, replace(end, cost=cost)) for (c, _), end, cost in zip(placed, fits, costs, strict=True)), best)
 
 
-def leaves_no_more(lab: Laboratory, base: Fit, squares: np.ndarray) -> bool:
+def leaves_only_noise(lab: Laboratory, base: Fit, squares: np.ndarray) -> bool:
     """Return whether only noise is left, so that no other effect is to be tried.
 
     Where the base fit is far from the declared values (`LED_AWAY`), the limit is stricter: a little more than noise may come from an effect
