@@ -43,11 +43,8 @@ FINER = (1, 2, 6)
 """Factors on the number of inner steps of finite elements, tried in turn until the motion stays finite; the last only with `STIFFENING`."""
 
 LEAST_LIFT, MOST_LIFT, GAP = 0.05, 0.8, 1.0
-"""Limits of the contact height, in suggested cells.
-
-They are its least change, its largest distance from the declared height, and the least distance at the start between the colliders and a
-body for which it may change.
-"""
+"""Contact height [suggested cells]: its least change, its largest distance from the declared height, and the least gap at the start between
+body and colliders with which it may change."""
 
 Motions = tuple[Sequence[Point], int]
 """Parameter sets, and the number of the recording that is simulated with each of them."""
@@ -73,10 +70,7 @@ class BodyRollouts(Problem):
         return float(len(r.body.x) * substeps(r, r.scene.dt * EVERY[setting].dt)[1])
 
     def margin(self, point: Point, setting: int = 0) -> float:
-        """Return the logarithm of the stability limit over the step, the least of all recordings; see `Problem.margin`.
-
-        For finite elements, the limit is that of the inner steps that they may take (`AFFORDED`).
-        """
+        """Return `Problem.margin`, the least of all recordings; of finite elements that of the inner steps they may take (`AFFORDED`)."""
         recordings = range(len(self.measured))
         full = [self._full(point)] * len(recordings)
         try:
@@ -259,10 +253,7 @@ class BodyRollouts(Problem):
         return {p.name: p.value for p in self.declared} | self.experiment.model.get("effects", {}) | dict(point)
 
     def _effects(self, simulator: Simulator, full: Sequence[Point], recordings: Sequence[int], always: Sequence[str]) -> Effects:
-        """Build the effects of each scene.
-
-        Fibres and gradients belong to the body in the pose of the first recording, and turn with it in the other recordings.
-        """
+        """Build the effects of each scene; fibres and gradients are those of the first recording's pose, and turn with the body."""
         x, count = simulator.state.x, len(full) // len(recordings)
         offsets = simulator.particles.offsets
         turned = torch.stack([self._turn(n) for n in recordings]).to(x)
