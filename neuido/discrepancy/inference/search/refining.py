@@ -232,8 +232,9 @@ def refine_large(
 ) -> dict[str, tuple[Candidate, Fit]]:
     """Repeat a leading fit of many parameters with the floor at its end, if it is far ahead of all fits of few parameters.
 
-    Its many parameters may fit what another grid does where the model is wrong: with the floor of the base, a time-dependent force came
-    down to the noise 53 mm away, and left more of the held-out data than a uniform force. Return the fit by key if it is better.
+    Its many parameters may fit what another grid does where the model is wrong. With the floor of a base that was 53 mm off, a force that
+    varies in time came down to the noise in the fitted recordings, and left more of the held-out ones than a uniform force. Return the fit
+    by key if it is better.
     """
     ranked = sorted(best.values(), key=lambda entry: entry[1].cost)
     few = min((fit.cost for c, fit in ranked if len(c.parameters) <= MANY), default=math.inf)
