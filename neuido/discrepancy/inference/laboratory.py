@@ -1,4 +1,4 @@
-"""What a diagnosis measures on one problem under one setting: fits, floors, and what is left."""
+"""Predictions, fits and errors of one problem under one setting of its discretisation."""
 
 import functools
 import math
@@ -19,16 +19,16 @@ Tell = Callable[[str], None]
 
 
 class Laboratory:
-    """One problem under one setting of its discretisation.
+    """Predicts, fits and computes errors for one problem under one setting of its discretisation.
 
     Args:
-        problem: What to diagnose.
-        setting: Setting of the discretisation that predicts; the others tell its error.
+        problem: The model and its data.
+        setting: Number of the setting that predicts; the other settings serve to estimate its error.
         tell: Called with a line of progress.
-        memo: Predictions that are shared with those of other settings.
-        budget: When fits end where they are.
-        journal: What was judged, shared too.
-        parts: What is fitted and what validates; None: as the roles of the recordings have it.
+        memo: Cache of predictions, shared by the methods of a diagnosis.
+        budget: Decides when fits must stop early.
+        journal: Records, shared by the methods of a diagnosis.
+        parts: Parts of the data; by default those of `split`.
     """
 
     def __init__(
@@ -48,23 +48,23 @@ class Laboratory:
         self.memo = memo or Memo(problem)
         self.parts = split(problem) if parts is None else list(parts)
         self.sealed = [Part(n, np.ones(len(problem.recordings[n].y), bool), False, problem.recordings[n].name) for n in sealed(problem)]
-        """Recordings that take no part in anything but the test error."""
+        """Recordings that serve for the test error alone."""
         self.fitted = [p.fitted for p in self.parts]
         self.scored_recordings = list(dict.fromkeys(p.recording for p in self.parts))
         self.fitted_recordings = list(dict.fromkeys(p.recording for p in self.parts if p.fitted))
         self.as_declared = {p.name: p.value for p in problem.declared}
-        """The declared parameters at the values that the model states."""
+        """The declared values of the declared parameters, by name."""
         self.noises = [_noise(r) for r in problem.recordings]
         self.noise_squares = np.array([self.noise_of(p.recording) ** 2 for p in self.parts])
-        """Mean squares of the noise of each part."""
+        """Mean square of the noise of each part, (parts,)."""
         self.unable: dict[int, list[int]] = {}
-        """The other settings that do not run where the floor of a recording was last taken."""
+        """By recording, the other settings that did not run where its floor was computed last."""
         self.scale = problem.error(np.ones(1), 0)
-        """What a root mean square of one is as an error of the problem."""
+        """Factor from a root mean square of the data to an error in the unit of the problem."""
 
     @contextmanager
     def under(self, setting: int) -> Iterator[None]:
-        """While it is open, this setting predicts."""
+        """Predict under another setting while the context is open."""
         before, self.setting = self.setting, setting
         try:
             yield
@@ -72,7 +72,7 @@ class Laboratory:
             self.setting = before
 
     def bears(self, point: Point, setting: int) -> bool:
-        """Whether a setting is the own one, or sure to run at a point in its place."""
+        """Return whether a setting is sure to run at a point: it is the suggested one, or `Problem.bears` says so."""
         return setting == self.own or self.problem.bears(point, setting)
 
     def fits(
@@ -83,9 +83,13 @@ class Laboratory:
         to: Sequence[Mapping[int, np.ndarray]] | None = None,
         step: str = "fits",
     ) -> list[Fit]:
-        """Run fits side by side, to the data or each to motions in their place; their work counts as that of `step`.
+        """Run fits together, so that they share their launches.
 
-        `floor`: what weighs the residuals, one for all fits or one for each.
+        Args:
+            requests: The fits, from `request`.
+            floor: Gives the weights of the residuals; one for all fits, or one for each.
+            to: Data of each fit by recording, (n,); by default the recordings themselves.
+            step: Name of the step of the search that this work is counted under.
         """
 
         def tick(count: int) -> None:
@@ -105,7 +109,10 @@ class Laboratory:
             )
 
     def costs(self, points: Sequence[Point], floor: Floor) -> list[float]:
-        """Sum of squares of the whitened residuals of the fitted parts, without priors; infinite where the model does not run."""
+        """Return the sum of squares of the whitened residuals of the fitted parts at each point, without priors.
+
+        It is infinite if the model does not run there.
+        """
         with self.memo.during("errors of fits"):
             rows = residuals(self.memo, points, floor.whitener(self.parts), self.fitted_recordings, self.setting)
         return [math.inf if row is None else float(row @ row) for row in rows]
@@ -113,15 +120,32 @@ class Laboratory:
     def predicted(
         self, points: Sequence[Point], recordings: Sequence[int], settings: Sequence[int] = ()
     ) -> dict[tuple[int, int], np.ndarray]:
-        """What points predict, (len(points), n), by recording and setting, its own if none is named: all of them side by side."""
-        of = [(n, s) for n in recordings for s in settings or (self.setting,)]
-        return dict(zip(of, self.memo.predict_several([(points, *one) for one in of]), strict=True))
+        """Predict recordings at several points, in one launch.
+
+        Args:
+            points: Parameter values.
+            recordings: Numbers of the recordings.
+            settings: Numbers of the settings; by default the one in use.
+
+        Returns:
+            (recording, setting) -> predictions (len(points), n), not finite if the model does not run.
+        """
+        pairs = [(n, s) for n in recordings for s in settings or (self.setting,)]
+        return dict(zip(pairs, self.memo.predict_several([(points, *pair) for pair in pairs]), strict=True))
 
     def mean_squares(self, points: Sequence[Point], floor: Floor, *, fitted: bool = False, plain: bool = False) -> list[np.ndarray]:
-        """Of each part, or of the fitted ones alone, at several points, the nuisances at their most probable values.
+        """Return the mean square of the residual of each part at each point, after the most probable nuisances are subtracted.
 
-        So are the amounts of the differences of the settings, as the fitted parts have them (`Floor.amounts`), unless `plain`: what is left
-        then is that of one setting alone.
+        The differences between settings are subtracted too, in the amounts of the fitted parts (`Floor.amounts`).
+
+        Args:
+            points: Parameter values.
+            floor: Gives nuisances and differences.
+            fitted: Whether to return the fitted parts alone.
+            plain: Whether to leave the differences between settings in, which gives the error of one setting alone.
+
+        Returns:
+            An array (parts,) for each point, infinite for a recording that does not run.
         """
         wanted = self.fitted_recordings if fitted else self.scored_recordings
         with self.memo.during("errors of fits"):
@@ -136,24 +160,24 @@ class Laboratory:
         return [squares[self.fitted] if fitted else squares for squares in found]
 
     def left(self, residuals: Mapping[int, np.ndarray], floor: Floor, amounts: np.ndarray | None) -> np.ndarray:
-        """Mean squares of the parts of settled residuals (n,) by recording; infinite for a recording that is not there."""
+        """Return the mean square of each part, (parts,), of residuals (n,) after `Floor.settle`; infinite for a recording without one."""
         return np.array([
             np.mean(floor.settle(residuals[p.recording], p, amounts)[p.rows] ** 2) if p.recording in residuals else np.inf
             for p in self.parts
         ])  # fmt: skip
 
     def amounts(self, point: Point, floor: Floor) -> np.ndarray:
-        """How much of each difference of the settings the fitted recordings hold there, (k,); see `Floor.amounts`."""
+        """Estimate the amount of each difference between settings at a point, (k,), as in `Floor.amounts`; empty if it does not run."""
         rows = {n: self.residual(point, n) for n in self.fitted_recordings}
         return floor.amounts(rows, self.parts) if all(np.isfinite(row).all() for row in rows.values()) else np.zeros(0)
 
     def recentred(self, point: Point, floor: Floor) -> Point:
-        """The point where its own amounts of the differences lead, as far as the problem has a parameter for that."""
+        """Move a point by its amounts of the differences between settings, if a parameter can take them over (`Problem.recentred`)."""
         amounts = self.amounts(point, floor)
         return self.problem.recentred(point, self.setting, amounts) if len(amounts) else point
 
     def noise(self, of: Sequence[int] | None = None) -> Floor:
-        """The floor without any discretisation error, of the recordings that are scored, or of those that are named."""
+        """Return a floor of noise alone, without discretisation error, of all scored recordings or of those in `of`."""
         noise = {n: self.noise_of(n) for n in of or self.scored_recordings}
         ones = {n: np.ones(len(self.problem.recordings[n].y)) for n in noise}
         return Floor(
@@ -164,45 +188,50 @@ class Laboratory:
         )
 
     def noise_of(self, n: int) -> float:
-        """Standard deviation of the noise of a recording: what is stated, or found in the data, or assumed (`noise_from`)."""
+        """Return the standard deviation of the noise of a recording; `noise_from` says where it comes from."""
         return self.noises[n][0]
 
     def noise_uncertainty(self, n: int) -> float:
-        """Relative standard deviation of that noise; zero for one that is stated."""
+        """Return the relative standard deviation of `noise_of`; zero for a stated noise."""
         count = max(len(self.problem.recordings[n].y), 1)
         return {"stated": 0.0, "estimated": math.sqrt(noises.OVERLAP / count), "assumed": noises.UNSURE}[self.noise_from(n)]
 
     def noise_from(self, n: int) -> str:
-        """Where that comes from: `stated`, `estimated` or `assumed`."""
+        """Return where the noise of a recording comes from: `stated`, `estimated` or `assumed`."""
         return self.noises[n][1]
 
     def request(self, parameters: Sequence[Parameter], start: Point, *, until: float = 1.0, **options: Any) -> Request:
-        """A fit, which ends where it is when this share of the search's work is done; options of `levenberg_marquardt`.
+        """Prepare a fit for `fits`.
 
-        `until`: infinite for a fit that nothing ends early.
+        Args:
+            parameters: Parameters to fit.
+            start: Point to start from.
+            until: Share of the work of the search after which the fit stops early; infinite: it never does.
+            options: Further options of `levenberg_marquardt`.
         """
         margin = functools.partial(self.problem.margin, setting=self.setting)
         together = self.problem.together
         return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.budget.ends(until), **options)
 
     def runs(self, point: Point) -> bool:
-        """Whether every recording can be predicted there: finite elements tangle where sand flows, and now and then elsewhere."""
+        """Return whether the model runs at a point for every scored recording; finite elements fail if they tangle, as in flowing sand."""
         return self.which_run([point])[0]
 
     def which_run(self, points: Sequence[Point]) -> list[bool]:
-        """`runs` of several points, in one launch."""
+        """Return `runs` of each of several points, by one launch."""
         rows = self.predicted(points, self.scored_recordings)
         return [all(bool(np.isfinite(of[i]).all()) for of in rows.values()) for i in range(len(points))]
 
     def residual(self, point: Point, n: int) -> np.ndarray:
+        """Return predicted minus measured of a recording at a point, (n,)."""
         return self.memo.predict([point], n, self.setting)[0] - self.problem.recordings[n].y
 
 
 def _noise(r: Recording) -> tuple[float, str]:
-    """The noise of a recording, and where it comes from."""
+    """Return the standard deviation of the noise of a recording, and where it comes from (`Laboratory.noise_from`)."""
     if r.noise:
         return r.noise, r.noise_from
-    found = noises.of_series(r.y, r.groups, r.times)
-    if found:
-        return found, "estimated"
+    estimate = noises.of_series(r.y, r.groups, r.times)
+    if estimate:
+        return estimate, "estimated"
     return max(noises.ASSUMED * noises.moved(r.y, r.groups), 1e-12), "assumed"

@@ -16,7 +16,7 @@ import numpy as np
 from neuido.data.files.writing import write_arrays
 from neuido.discrepancy.inference import directions, discretisation
 from neuido.discrepancy.inference.floors import Floor, score
-from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, Journal, fit_of, from_json, to_json
+from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, Journal, fit_from_dict, from_json, to_json
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.errors import UserError
 
@@ -118,7 +118,7 @@ def read(arrays: Mapping[str, np.ndarray]) -> list[FitStatistics]:
     """Return the fits from the arrays of `statistics_of`."""
     out = []
     for k, text in enumerate(arrays["fits"]):
-        record = fit_of(json.loads(str(text)))
+        record = fit_from_dict(json.loads(str(text)))
         parts = []
         for i, noise in enumerate(arrays["noise"]):
             common = arrays[f"common-{record.method}-{i}"].astype(float)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, times_over
-from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, RoundRecord, as_candidate, described, place
+from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, RoundRecord, candidate_from_dict, place, problem_to_dicts
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
 from neuido.discrepancy.inference.search import judging, next_effect
@@ -72,7 +72,7 @@ def case_of(
 ) -> CaseRecord:
     """Return all that the decision of a diagnosis rests on."""
     problem, journal, parts = lab.problem, lab.journal, lab.parts
-    declared, candidates = described(problem)
+    declared, candidates = problem_to_dicts(problem)
     stands = [journal.fit(lab.own, s.fit.point, None, s, parts) for s in (before, after)]
     return CaseRecord(
         problem.name,
@@ -157,7 +157,7 @@ def stored_problem(case: CaseRecord) -> Problem:
         for name, role, count, noise, origin in case.recordings
     )
     settings = 2 if case.discretised else 1
-    return Problem(case.name, "", "", declared, (), tuple(map(as_candidate, case.candidates)), recordings, settings)
+    return Problem(case.name, "", "", declared, (), tuple(map(candidate_from_dict, case.candidates)), recordings, settings)
 
 
 def stand_of(lab: Laboratory, record: FitRecord) -> Stand:
