@@ -74,8 +74,8 @@ def main() -> None:
         print(f"{row['run']} {row['case']} ({row['kind']}): {verdict.answer} {named}, lead {verdict.lead:.1f}, p = {verdict.p_value:.3f}")
     whole = calibration_of(rows)
     print(f"a model is named from a lead of {whole.least_lead():.1f} on ({len(whole.nulls)} nulls)")
-    print(f"sets are told apart by {whole.apart():.1f} ({len(whole.effects)} cases with effects)")
-    print(f"something unknown adds more than {whole.foreign():.1f} ({len(rows)} cases)")
+    print(f"sets are told apart by {whole.class_margin():.1f} ({len(whole.effects)} cases with effects)")
+    print(f"something unknown adds more than {whole.unknown_threshold():.1f} ({len(rows)} cases)")
 
 
 if __name__ == "__main__":

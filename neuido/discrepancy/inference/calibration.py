@@ -35,11 +35,11 @@ class Calibration:
         """Return the lead over the declared model, as a difference of log-evidence, above which a model is named."""
         return quantile(self.nulls, alpha)
 
-    def apart(self, alpha: float = ALPHA) -> float:
+    def class_margin(self, alpha: float = ALPHA) -> float:
         """Return the difference of log-evidence above which the data distinguish a set of effects from the best one."""
         return quantile(self.effects, alpha)
 
-    def foreign(self, alpha: float = ALPHA) -> float:
+    def unknown_threshold(self, alpha: float = ALPHA) -> float:
         """Return the value of `evidence.Evidence.beyond` above which an unknown effect is missing.
 
         It is never below log(1 / alpha). If nothing is missing, the ratio of densities with a free and with the least scale has mean one,

@@ -22,14 +22,14 @@ def moved(lab: Laboratory, point: Point) -> float:
     return max((max(r, 1.0 / r) for r in ratios), default=1.0)
 
 
-def tell_lead(lab: Laboratory, key: str, squares: np.ndarray, before: np.ndarray) -> None:
+def report_lead(lab: Laboratory, key: str, squares: np.ndarray, before: np.ndarray) -> None:
     """Report the leading candidate and the errors with and without it to the progress display, if that shows them."""
     lead = getattr(lab.tell, "lead", None)
     if lead is not None:
-        lead(key, typical(lab, squares), typical(lab, before), lab.problem.unit)
+        lead(key, typical_error(lab, squares), typical_error(lab, before), lab.problem.unit)
 
 
-def typical(lab: Laboratory, squares: np.ndarray) -> float:
+def typical_error(lab: Laboratory, squares: np.ndarray) -> float:
     """Return the geometric mean over the parts of their root mean squares, in the unit of the problem."""
     return lab.scale * math.exp(0.5 * score(squares))
 
@@ -55,7 +55,7 @@ def gain(lab: Laboratory, before: np.ndarray, after: np.ndarray) -> float:
     return bootstrap.gain(before, after, lab.fitted, lab.noise_squares)
 
 
-def foretold(lab: Laboratory, before: np.ndarray, after: np.ndarray) -> float:
+def held_out_gain(lab: Laboratory, before: np.ndarray, after: np.ndarray) -> float:
     """Return the logarithm of the error before over the error after of the held-out parts, or of all parts if none is held out."""
     fitted = np.array(lab.fitted)
     return bootstrap.ratio(before, after, fitted if fitted.all() else ~fitted)

@@ -95,7 +95,7 @@ def sharpened(lab: Laboratory, floor: Floor, errors: np.ndarray) -> Floor:
     return floor.weighed(min(UNSEEN, math.sqrt(above / max(float(spread), 1e-300))))
 
 
-def foresee(lab: Laboratory, points: Sequence[Point], *, fitted: bool = False) -> None:
+def prefetch(lab: Laboratory, points: Sequence[Point], *, fitted: bool = False) -> None:
     """Run the simulations that `floor_at` and `stand` of several points need, in one launch, and keep them in the memo."""
     with lab.memo.during("discretisation"):
         wanted = lab.fitted_recordings if fitted else lab.scored_recordings

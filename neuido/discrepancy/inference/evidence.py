@@ -210,11 +210,11 @@ def judged(found: Sequence[Evidence], calibration: Calibration, alpha: float = A
     top = next(iter(best.values()))
     lead = top.value - best[()].value
     p = calibration.p_value(lead)
-    if top.beyond > calibration.foreign(alpha):
+    if top.beyond > calibration.unknown_threshold(alpha):
         return Verdict("unknown", (), lead, p)
     if lead <= calibration.least_lead(alpha):
         return Verdict("none", (), lead, p)
-    near = [key for key, e in best.items() if key and top.value - e.value <= calibration.apart(alpha)]
+    near = [key for key, e in best.items() if key and top.value - e.value <= calibration.class_margin(alpha)]
     sets = tuple(key for key in near if not any(set(other) < set(key) for other in near))
     names = {tuple(sorted(key.partition(":")[0] for key in own)) for own in sets}
     return Verdict("effect" if len(names) == 1 else "class", sets, lead, p)

@@ -93,8 +93,8 @@ def statistics_of(
     for lab, floor in zip(laboratories, floors, strict=True):
         own = [fit for fit in chosen if fit.method == lab.own]
         with lab.under(lab.own):
-            discretisation.foresee(lab, [fit.point for fit in own])
-            _foresee_slopes(lab, own)
+            discretisation.prefetch(lab, [fit.point for fit in own])
+            _prefetch_slopes(lab, own)
             common = _common(lab, floor)
             for i, (part, (_, factor, sizes)) in enumerate(zip(lab.parts, common, strict=True)):
                 arrays[f"common-{lab.own}-{i}"] = factor.astype(np.float32)
@@ -194,7 +194,7 @@ def _columns(lab: Laboratory, fit: FitRecord, floor: Floor) -> dict[int, np.ndar
     return out if all(np.isfinite(c).all() for c in out.values()) else None
 
 
-def _foresee_slopes(lab: Laboratory, fits: Sequence[FitRecord]) -> None:
+def _prefetch_slopes(lab: Laboratory, fits: Sequence[FitRecord]) -> None:
     """Run the simulations for the slopes of all fits in one launch, and keep them in the memo."""
     points = []
     for fit in fits:

@@ -275,7 +275,7 @@ def test_the_shipped_table_judges():
     own = calibration()
     assert len(own.nulls) >= 10 and len(own.effects) >= 9 and min(own.nulls + own.effects) >= 0.0
     assert own.least_lead() == max(own.nulls) and own.p_value(max(own.nulls) + 1.0) == 1 / (1 + len(own.nulls))
-    assert 0.0 < own.apart() < own.least_lead()
+    assert 0.0 < own.class_margin() < own.least_lead()
 
 
 def test_prior_weights_of_all_models_sum_to_one():

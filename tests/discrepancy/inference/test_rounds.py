@@ -258,7 +258,7 @@ def test_all_fits_or_the_leading_ones_are_measured_where_they_end(every, monkeyp
     problem = Line(lambda t: 3.0 * t + 0.5 * np.sin(40.0 * t))
     search, seen = next_effect.new_search(problem), []
     start = base_fits.base_fit(search)
-    monkeypatch.setattr(discretisation, "foresee", lambda lab, points, **_: seen.append(len(points)))
+    monkeypatch.setattr(discretisation, "prefetch", lambda lab, points, **_: seen.append(len(points)))
     best = {c.key: (c, replace(start.fit, point={**start.fit.point, **c.starts[0]})) for c in problem.candidates[:3]}
     refining.measured(search.lab, best, start.floor, every=every)
     assert seen == [3 if every else 1]
@@ -1334,7 +1334,7 @@ def test_so_many_places_without_an_effect_are_weighed(count, monkeypatch):
     errors, floors = np.array([1.0, 400.0]) * NOISE**2, np.full(2, NOISE**2)
     r = Round(start.fit.point, errors, trials, members[0], members, 0.01, start.floor, floors)
     asked = []
-    monkeypatch.setattr(discretisation, "foresee", lambda lab, points, **_: asked.extend(points))
+    monkeypatch.setattr(discretisation, "prefetch", lambda lab, points, **_: asked.extend(points))
     next_effect.without_effect(search.lab, r, start.fit, start.floor)
     own = [{"a": t.fit.point["a"]} for t in members[:3]]
     assert asked[: len(own)] == own and len(asked) == max(len(own), 2)

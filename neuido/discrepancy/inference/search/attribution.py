@@ -98,7 +98,7 @@ def drop(search: Search, base: Fit, floor: Floor, found: list[Trial]) -> tuple[F
             requests.append(lab.request(free, trial.candidate.without(base.point)))
         fits = lab.fits(requests, floor)
         with_all, *squares = lab.mean_squares([base.point, *(fit.point for fit in fits)], floor)
-        lost = [comparing.foretold(lab, without, with_all) for without in squares]
+        lost = [comparing.held_out_gain(lab, without, with_all) for without in squares]
         least = min(range(len(found)), key=lambda i: lost[i])
         if lost[least] > FORETELLS:
             break

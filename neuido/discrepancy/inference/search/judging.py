@@ -209,11 +209,11 @@ def over_grids(lab: Laboratory, errors: np.ndarray, at: Trial) -> float:
 
 def verdict(lab: Laboratory, r: Round) -> str:
     """Return one line about the outcome of a round."""
-    before = f"{comparing.typical(lab, r.errors):.3g} {lab.problem.unit}"
+    before = f"{comparing.typical_error(lab, r.errors):.3g} {lab.problem.unit}"
     if not r.trials:
         return f"{before} left, no candidate runs"
     top = r.chosen or r.trials[0]
-    left = f"{top.candidate.key} leaves {comparing.typical(lab, top.errors):.3g} of {before}"
+    left = f"{top.candidate.key} leaves {comparing.typical_error(lab, top.errors):.3g} of {before}"
     return f"named: {left}" if r.chosen else f"nothing named: {left}"
 
 
@@ -258,7 +258,7 @@ def above_noise(lab: Laboratory, before: np.ndarray, t: Trial) -> float:
         return t.gain
     above = [np.maximum(errors - lab.noise_squares, SEEN * lab.noise_squares) for errors in (before, t.errors)]
     fitted = np.array(lab.fitted)
-    return max(t.gain, min(bootstrap.ratio(*above, fitted), comparing.foretold(lab, before, t.errors)))
+    return max(t.gain, min(bootstrap.ratio(*above, fitted), comparing.held_out_gain(lab, before, t.errors)))
 
 
 def by_chance(lab: Laboratory, r: Round) -> float:

@@ -86,7 +86,7 @@ def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival:
         lab.tell(judging.verdict(lab, result))
         if result.trials:
             lead = result.chosen or result.trials[0]
-            comparing.tell_lead(lab, lead.candidate.key, lead.errors, result.errors)
+            comparing.report_lead(lab, lead.candidate.key, lead.errors, result.errors)
         return result
 
     result = judged(empty)
@@ -140,7 +140,7 @@ def without_effect(lab: Laboratory, result: Round, base: Fit, floor: Floor) -> S
         wanted = own + [place for place in wanted if place not in own][: max(PLAIN - len(own), 0)]
     if not wanted:
         return None
-    discretisation.foresee(lab, wanted)
+    discretisation.prefetch(lab, wanted)
     stands = [Stand(replace(base, point=place), *discretisation.stand(lab, place, like=floor)) for place in wanted]
     if lost and not lab.budget.skips("the declared model again from where effects were fitted"):
         free = [lab.problem.parameter(name) for name in base.names]

@@ -203,10 +203,10 @@ def refine(
     gains = max(comparing.gain(lab, before, square) for square in squares)
     if (top[0][1].cost > 0.7 * lab.costs([base.point], floor)[0] and gains < SOME_GAIN) or comparing.is_noise(lab, squares[0]):
         return {}
-    ends = (f"{c.key} ({comparing.typical(lab, square):.3g})" for (c, _), square in zip(top, squares, strict=True))
-    lab.tell(f"refining {', '.join(ends)} of {comparing.typical(lab, before):.3g} {lab.problem.unit}")
+    ends = (f"{c.key} ({comparing.typical_error(lab, square):.3g})" for (c, _), square in zip(top, squares, strict=True))
+    lab.tell(f"refining {', '.join(ends)} of {comparing.typical_error(lab, before):.3g} {lab.problem.unit}")
     first = min(range(len(top)), key=lambda i: score(squares[i]))
-    comparing.tell_lead(lab, top[first][0].key, squares[first], before)
+    comparing.report_lead(lab, top[first][0].key, squares[first], before)
     leading = ranked[0][1].point
     out: dict[str, tuple[Candidate, Fit]] = {}
     least: dict[str, float] = {}
@@ -282,7 +282,7 @@ def refit_from_starts(lab: Laboratory, entries: Sequence[Onset], like: Floor) ->
 
     The fits of all entries run side by side.
     """
-    discretisation.foresee(lab, [fit.point for _, fit, _ in entries], fitted=True)
+    discretisation.prefetch(lab, [fit.point for _, fit, _ in entries], fitted=True)
     owns, requests, of = [], [], []
     for k, (free, fit, starts) in enumerate(entries):
         (own, _), race = discretisation.stand(lab, fit.point, like=like, fitted=True), Race()
@@ -322,7 +322,7 @@ def measured(lab: Laboratory, best: Mapping[str, tuple[Candidate, Fit]], floor: 
     order = order if every else order[:MEASURED]
     limit = score(found[order[0]].errors) + 2.0 * math.log(NEAR)
     leading = [i for i in order if score(found[i].errors) < limit and not comparing.is_noise(lab, found[i].errors)]
-    discretisation.foresee(lab, [points[i] for i in leading])
+    discretisation.prefetch(lab, [points[i] for i in leading])
     for i in leading:
         if lab.runs(points[i]):
             there = Stand(found[i].fit, *discretisation.stand(lab, points[i], like=floor))
