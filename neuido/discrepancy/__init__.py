@@ -1,4 +1,4 @@
-"""The closed loop: from measured data to the effect that a model lacks."""
+"""Diagnosis: from measured data to the physical effect that a model lacks."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

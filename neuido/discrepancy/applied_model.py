@@ -1,4 +1,4 @@
-"""A model applied: recordings simulated under it, and its effects on top of a law that is fitted to images."""
+"""Use of a diagnosed model: simulation of an experiment's recordings, and its effects beside a law that is fitted to images."""
 
 import os
 from dataclasses import replace
@@ -20,23 +20,23 @@ from neuido.physics.runtime.events import Event
 def replay(
     folder: str, out: str | os.PathLike, *, model: str | None = None, device: str = "auto", progress: bool = True
 ) -> tuple[dict[str, float | None], dict[str, list[Event]]]:
-    """Simulate the recordings of an experiment under a model, and write them as an experiment's folder without noise.
+    """Simulate the recordings of an experiment with a model, and write them as an experiment folder without noise.
 
-    The tracked points are those of the experiment; of a video, whose points nobody tracked, they are all particles.
+    The folder has the tracked points of the experiment. For videos without tracked points it has all particles.
 
     Args:
-        folder: The experiment.
-        out: Folder to write; it appears when it is whole.
-        model: File with the model, for example a model_after.yaml; the experiment's own where absent.
+        folder: Folder of the experiment.
+        out: Folder to write. It appears when it is complete.
+        model: File with the model, for example a model_after.yaml. None: the model of the experiment.
         device: auto, cpu or cuda.
         progress: Show a progress bar.
 
     Returns:
-        The RMS distance of each recording's points from the measured ones [m], none where no points were tracked; and what makes the
-        motion of a recording doubtful, where there is anything.
+        The RMS distance between simulated and measured points of each recording [m], None where no points were tracked; and the events
+        that make a motion doubtful, of the recordings that have any.
 
     Raises:
-        UserError: What readers and rollouts refuse, or a folder that is there already.
+        UserError: The experiment or model cannot be read or simulated, or the output folder is there already.
     """
     target = Path(out).expanduser()
     check_unused(target)
@@ -51,19 +51,19 @@ def replay(
                     doubtful[recordings[-1].name] = events
                 work.update()
         write_experiment(replace(experiment, model=beside(hidden, experiment.model), recordings=tuple(recordings)), hidden)
-        read_experiment(hidden)  # what cannot be read again is not published
+        read_experiment(hidden)  # a folder that cannot be read again does not appear
     return {r.name: _distance(r, experiment[r.name]) for r in recordings}, doubtful
 
 
 def _distance(simulated: Recording, measured: Recording) -> float | None:
-    """Return the RMS distance of the points of a recording from those of another [m]."""
+    """Return the RMS distance between simulated and measured points [m]; None where their numbers differ or none were tracked."""
     if measured.x is None or simulated.x is None or measured.x.shape != simulated.x.shape:
         return None
     return float((simulated.x - measured.x)[measured.seen].square().sum(-1).mean().sqrt())
 
 
 class DiagnosedEffects(EffectSource):
-    """The effects of a model; its law is left aside.
+    """The effects of a model without its law, for fits of a law to images.
 
     Args:
         path: A `model_after.yaml` of `neuido diagnose`, or a file with the key `model`.
@@ -77,7 +77,7 @@ class DiagnosedEffects(EffectSource):
         self._made: tuple[Simulator, Effects] | None = None
 
     def of(self, scene: PreparedScene) -> Effects:
-        """The effects on the scene's body."""
+        """Return the effects for the body of a scene."""
         if self._made is None or self._made[0] is not scene.simulator:
             times = scene.source.batch.times
             effects = ready(self.model, scene.simulator, duration=float(times[-1] - times[0])).effects

@@ -1,4 +1,4 @@
-"""Measured arrays as a folder of one of the three formats, so that a diagnosis of arrays is read and checked as one of files is."""
+"""Measured arrays written as a folder of one of the three formats, so that arrays are read and checked like files."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,19 +19,20 @@ BODY_NAME = "body"
 def write_arrays(
     data: Mapping[str, Mapping[str, Any]], model: Mapping[str, Any] | None, folder: Path, *, scene: Mapping[str, Any] | None = None
 ) -> Path:
-    """Write measured arrays as a folder that `neuido diagnose` takes; return it.
+    """Write measured arrays as a folder that `neuido diagnose` takes, and return the folder.
 
     Args:
-        data: Of each recording its columns by the names that the formats use, and the other keys of its entry: `role` (`fit` where absent),
-            `noise`, `mode`. A track has `t` [s] and some of `x`, `y`, `z` [m], each (n,). A material test has `stretch` and
-            `nominal_stress` [Pa] or their like, and maybe `time`. A body has `x` (T, N, 3) [m], `t` (T,), `x0`, `v0`, `volume`, and
-            `track` or `anchor`.
-        model: The declared model, as the key `model` of the format; of a track also `mass` and `diameter` of the body.
-        folder: An empty folder.
-        scene: Of bodies: the keys of `scene` and `discretisation` (`domain`, `gravity`, `colliders`, `grid`, `dt`) together.
+        data: Recordings by name. Each is a mapping with its columns, named as in the formats, and the other keys of its entry, such as
+            `role` (`fit` where absent), `noise` or `mode`. A track has `t` [s] and some of `x`, `y`, `z` [m], each (n,). A material test
+            has for example `stretch` and `nominal_stress` [Pa], and possibly `time` [s]. A body has `x` (T, N, 3) [m], `t` (T,) [s], `x0`,
+            `v0`, `volume`, and `track` or `anchor`.
+        model: Declared model, as the key `model` of the format. For a track it may also have `mass` and `diameter` of the body.
+        folder: Empty folder.
+        scene: For bodies only: the keys of `scene` and `discretisation` (`domain`, `gravity`, `colliders`, `grid`, `dt`) together.
 
     Raises:
-        UserError: No recordings, columns of no known kind or of different lengths, no model, a scene that is needed or not.
+        UserError: There are no recordings, columns are of an unknown kind or of different lengths, the model is missing, or a scene is
+            missing or not allowed.
     """
     if not data or not all(isinstance(columns, Mapping) for columns in data.values()):
         raise UserError("arrays: give each recording's columns by its name: {'drop': {'t': t, 'y': y}}")
@@ -51,7 +52,7 @@ def write_arrays(
 
 
 def _table(path: Path, columns: Mapping[str, Any]) -> None:
-    """Write columns of one length, each figure with all its digits."""
+    """Write columns of one length as CSV, with all digits of each number."""
     arrays = {key: np.asarray(values, dtype=np.float64) for key, values in columns.items()}
     if len({a.shape for a in arrays.values()}) != 1 or next(iter(arrays.values())).ndim != 1:
         shapes = ", ".join(f"{key} {a.shape}" for key, a in arrays.items())
@@ -105,7 +106,7 @@ def _write_bodies(data: Mapping[str, Mapping[str, Any]], model: dict[str, Any], 
 
 
 def _plain(value: Any) -> Any:
-    """The same with Python's own numbers, lists and strings."""
+    """Return a value with Python's own numbers, lists and strings, as YAML needs them."""
     if isinstance(value, Mapping):
         return {str(key): _plain(own) for key, own in value.items()}
     if isinstance(value, list | tuple):

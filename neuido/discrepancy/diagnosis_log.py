@@ -1,4 +1,4 @@
-"""What a diagnosis tells while it runs: progress on stderr, and a row of log.csv for each stage."""
+"""Progress of a running diagnosis: a line on stderr, and a row of log.csv for each stage."""
 
 import csv
 import math
@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 
 
 class Budgeted(Progress):
-    """Progress that says what leads, how much of the work of a body's search is done, and how much time is left."""
+    """Progress that shows the leading candidate, the share of the effort that is spent, and the time that is left."""
 
     leads = ""
+    """Text on the leading candidate; empty where none leads."""
     budget: "Budget | None" = None
-    """Of the search that runs."""
+    """Budget of the running search."""
     until = math.inf
-    """When the time is up, in `time.monotonic`."""
+    """End of the time limit, on the clock of `time.monotonic` [s]."""
 
     def line(self, now: float) -> str:
         parts = [super().line(now)]
@@ -42,9 +43,9 @@ class Log:
     """Show progress on stderr, and write each stage as a row of log.csv.
 
     Args:
-        path: The CSV file; a resumed run adds to it.
+        path: The CSV file. A resumed run appends to it.
         shown: Whether progress is shown.
-        begun: When the work began, in `time.monotonic`.
+        begun: Start of the work, on the clock of `time.monotonic` [s].
     """
 
     def __init__(self, path: Path, *, shown: bool, begun: float) -> None:
@@ -65,12 +66,12 @@ class Log:
         self.progress.close()
 
     def begin(self, name: str, seconds: float) -> None:
-        """Begin a body with a name, empty where there is one alone, and a time limit [s]."""
+        """Start the log of a body with its name (empty if there is only one) and its time limit [s]."""
         self.name, self.progress.leads, self.progress.budget = name, "", None
         self.progress.until = time.monotonic() + seconds
 
     def watch(self, budget: "Budget") -> None:
-        """Show how much of the work of a search is done."""
+        """Show from now on which share of the budget of a search is spent."""
         self.progress.budget = budget
 
     def tick(self, count: int) -> None:
@@ -79,7 +80,7 @@ class Log:
         self.progress.update(count)
 
     def lead(self, key: str, left: float, before: float, unit: str) -> None:
-        """Show which candidate leads, and what it leaves of the error."""
+        """Show the leading candidate, with the error that it leaves (`left`) of the error before, both in `unit`."""
         from neuido.discrepancy.report.reader_units import Units
         from neuido.discrepancy.report.wording import title
 
@@ -90,7 +91,7 @@ class Log:
         self._row(self.progress.leads)
 
     def __call__(self, stage: str) -> None:
-        if not stage.endswith(" simulations") and stage != self.stage:  # counts are shown anyway
+        if not stage.endswith(" simulations") and stage != self.stage:  # the number of simulations is shown anyway
             self.stage = stage
             self._row(stage)
             self.progress.say(f"{self.name}{': ' if self.name else ''}{self.stage}")
@@ -100,7 +101,7 @@ class Log:
         self.file.flush()
 
     def work(self, steps: "Mapping[str, Work]") -> None:
-        """Write what each step of a diagnosis ran, the most expensive first."""
+        """Write the simulations, cost and time of each step of a diagnosis, the most expensive first."""
         for step, w in sorted(steps.items(), key=lambda item: -item[1].effort):
             line = f"{step}: {w.simulations} simulations, {w.reused} reused, {w.effort:.3g} particle-substeps or data, {w.seconds:.1f} s"
             self._row(line)

@@ -1,4 +1,4 @@
-"""Candidates of one's own: an effect that is told by what of the library it amounts to, such as a tilted table by a steady acceleration."""
+"""User-defined candidates: effects expressed by effects of the library, such as a tilted table by a steady acceleration."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,30 +10,31 @@ from neuido.errors import UserError
 
 @dataclass(frozen=True)
 class OwnEffect:
-    """An effect that is not of the library, for `neuido.diagnose(..., candidates=[...])`.
+    """A user-defined effect for `neuido.diagnose(..., candidates=[...])`.
 
-    At `low <= value <= high` it acts as effects of the library do, by `acts_as`; at zero it must be absent.
+    It has one size between `low` and `high` and acts like the effects of the library that `acts_as` returns. At size zero it is absent.
     """
 
     name: str
-    """A word of letters, digits and underscores, which no effect of the library has; the report says it with spaces."""
+    """Name of letters, digits and underscores that no effect of the library has. The report shows spaces for underscores."""
     parameter: str
-    """Name of its size."""
+    """Name of the size."""
     unit: str
+    """Unit of the size."""
     start: float
-    """A plausible size, where its fits begin; its scale too."""
+    """Plausible size, at which fits start; its absolute value is the typical step."""
     low: float
     high: float
     acts_as: Callable[[float], Mapping[str, float]]
-    """From the size to figures of the library by flat names, such as {"uniform_acceleration.x": 9.81 * sin(size)}."""
+    """Function from the size to parameters of library effects, such as {"uniform_acceleration.x": 9.81 * sin(size)}."""
     where: str = "flight"
-    """The stage of the motion that gives it away."""
+    """Stage of the motion in which the effect shows."""
 
     def candidate(self) -> Candidate:
-        """Return what a search tries: starts of either sign where the range has both.
+        """Return the candidate for a search, with starts of both signs if the range has both.
 
         Raises:
-            UserError: A name that is taken or is no word, a start outside its range or at zero, a range without zero.
+            UserError: The name is taken or has other characters, the start is zero or outside the range, or the range lacks zero.
         """
         from neuido.physics.effects.library import LIBRARY
 
@@ -57,10 +58,10 @@ class OwnEffect:
 
 
 def with_own_effects(problem: Problem, effects: Sequence[OwnEffect]) -> Problem:
-    """Return the problem with further candidates.
+    """Return the problem with user-defined effects as further candidates.
 
     Raises:
-        UserError: A candidate that is none, or two of one name.
+        UserError: An object is no `OwnEffect`, or two have the same name.
     """
     if not effects:
         return problem
@@ -72,17 +73,17 @@ def with_own_effects(problem: Problem, effects: Sequence[OwnEffect]) -> Problem:
         raise UserError(f"candidates: {', '.join(c.name for c in made)}: each needs a name of its own")
     kind = type(problem)
     own = type(f"{kind.__name__}WithOwnEffects", (kind,), _methods(kind, effects))
-    object.__setattr__(problem, "__class__", own)  # `dataclasses.replace` then keeps the own effects
+    object.__setattr__(problem, "__class__", own)  # so that `dataclasses.replace` keeps the own effects
     object.__setattr__(problem, "candidates", (*problem.candidates, *made))
     return problem
 
 
 FIRST, SEVERAL = ("margin", "motion", "_scored"), ("predict", "forces", "_specimen")
-"""Methods of the kinds of problems whose first argument is a point, and several points."""
+"""Methods of problems whose first argument is one parameter set, and those where it is several."""
 
 
 def _methods(kind: type, effects: Sequence[OwnEffect]) -> dict[str, Any]:
-    """Return the methods of a problem that take points, with own effects translated into those of the library."""
+    """Return the methods of a problem that take parameter sets, with own effects translated into effects of the library."""
 
     def translated(point: Point) -> dict[str, float]:
         out = dict(point)

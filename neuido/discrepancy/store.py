@@ -1,4 +1,4 @@
-"""Predictions kept in memory and on disk, what each step ran, and the work and the time that a diagnosis may take."""
+"""Predictions stored in memory and on disk, counts of the simulations of each step, and the budget of a search."""
 
 import contextlib
 import functools
@@ -24,31 +24,31 @@ from neuido.discrepancy.problems.problem import Ask, Point, Problem, Recording, 
 from neuido.errors import shortened
 
 IN_MEMORY = 500_000_000
-"""Bytes of the predictions that are kept; the one that was used longest ago goes first."""
+"""Largest size of the predictions in memory [bytes]. The one that was used longest ago is dropped first."""
 
 
 @dataclass
 class Work:
-    """What one step of a diagnosis asked for."""
+    """Counts of the simulations of one step of a diagnosis."""
 
     simulations: int = 0
-    """Points times recordings that were run."""
+    """Number of simulations (one parameter set and one recording each)."""
     reused: int = 0
-    """Those that were there already."""
+    """Number of predictions that were in memory already."""
     effort: float = 0.0
-    """`Problem.effort` of the runs: particle-substeps of a body."""
+    """Cost of the simulations, in the unit of `Problem.effort` (particle-substeps of a body)."""
     seconds: float = 0.0
 
 
 class Memo:
-    """The predictions of a problem, each computed once while there is room for it.
+    """Predictions of a problem in memory, each computed once while there is room.
 
     Args:
-        problem: What predicts.
-        limit: Bytes that are kept.
+        problem: The problem that predicts.
+        limit: Largest size of the stored predictions [bytes].
 
     Attributes:
-        work: What each step ran, by its name; see `during`.
+        work: Counts of the simulations of each step, by its name (`during`).
     """
 
     def __init__(self, problem: Problem, *, limit: int = IN_MEMORY) -> None:
@@ -64,22 +64,22 @@ class Memo:
 
     @property
     def simulations(self) -> int:
-        """Points times recordings that were run so far."""
+        """Number of simulations so far."""
         return sum(w.simulations for w in self.work.values())
 
     @property
     def effort(self) -> float:
-        """Work so far, in the unit of `Problem.effort`."""
+        """Cost of the simulations so far, in the unit of `Problem.effort`."""
         return sum(w.effort for w in self.work.values())
 
     @property
     def pace(self) -> float:
-        """Seconds that a run has taken so far, mean."""
+        """Mean time of a simulation so far [s]."""
         return sum(w.seconds for w in self.work.values()) / max(self.simulations, 1)
 
     @contextmanager
     def during(self, step: str) -> Iterator[None]:
-        """Runs count for this step while it is open, unless an outer one is open already."""
+        """Count simulations for a step while its context is open; steps inside count for the outermost one."""
         before = self._step
         self._step = step if before == "other" else before
         try:
@@ -88,12 +88,12 @@ class Memo:
             self._step = before
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
-        """As `Problem.predict`."""
+        """Predict like `Problem.predict`, from memory where possible."""
         (rows,) = self.predict_several([(points, recording, setting)])
         return rows
 
     def predict_several(self, asks: Sequence[Ask]) -> list[np.ndarray]:
-        """As `Problem.predict_several`, all at once."""
+        """Predict like `Problem.predict_several`, from memory where possible, and return all at once."""
         keys = [[(n, s, tuple(sorted(point.items()))) for point in points] for points, n, s in asks]
         found = {key: self._kept[key] for own in keys for key in own if key in self._kept}
         missing: dict[tuple[int, int], dict[tuple, Point]] = {}
@@ -120,7 +120,7 @@ class Memo:
 
     def _keep(self, key: tuple, row: np.ndarray) -> None:
         if key not in self._kept:
-            self._kept[key] = row.copy()  # not a view that keeps its whole batch alive
+            self._kept[key] = row.copy()  # a view would keep its whole batch in memory
             self._size += row.nbytes
         self._kept.move_to_end(key)
         while self._size > self.limit and len(self._kept) > 1:
@@ -128,24 +128,24 @@ class Memo:
 
 
 CHUNK = 32
-"""Points in one stored call: what a kill can cost. It holds with and without a store, so that both compute the same."""
+"""Largest number of parameter sets per stored file, which an interrupted run may lose. Runs without a folder use it too: equal results."""
 HEAVY, FEWEST = 2e8, 4
-"""Particle-substeps of one stored call, about a minute or two of a CPU, and the points that one has at the least."""
+"""Particle-substeps per stored file, about a minute or two of a CPU, and the least number of its parameter sets."""
 ON_DISK = 2_000_000_000
-"""Bytes that a store may take; what comes after is computed again by a run that is resumed."""
+"""Largest size of the stored files [bytes]. Later predictions are not stored, and a resumed run computes them again."""
 
 
 class CachedProblem(Problem):
-    """A problem whose predictions are kept in a folder, one file a call.
+    """A problem whose predictions are stored in a folder, a file for each call of `predict`.
 
-    The key of a call is its points in their order, its recording and its setting: a batch is computed together, and a resumed run asks in
-    the same order, so that it gets the same bits. All else is the problem's own.
+    The name of a file is a hash of the parameter sets in their order, the recording and the setting. A resumed run makes the same calls
+    in the same order, so that it gets the same bits. Everything else is passed on to the problem.
 
     Args:
-        problem: What predicts.
-        folder: Where the files go; it is made. None: nothing is kept.
-        limit: Bytes of all files.
-        tick: Called with the number of points after every call.
+        problem: The problem that predicts.
+        folder: Folder for the files, made where missing. None: nothing is stored.
+        limit: Largest size of all files [bytes].
+        tick: Function that is called with the number of parameter sets after every call.
     """
 
     def __init__(
@@ -155,13 +155,13 @@ class CachedProblem(Problem):
         folder = None if folder is None else Path(folder)
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            for path in folder.glob(".*.tmp"):  # of a run that was killed
+            for path in folder.glob(".*.tmp"):  # left by an interrupted run
                 path.unlink(missing_ok=True)
         used = sum(path.stat().st_size for path in folder.glob("*.npy")) if folder is not None else 0
         self.problem, self.folder, self.limit, self.tick = problem, folder, limit, tick
         self.used, self.found, self.computed = used, 0, 0
 
-    def __getattr__(self, name: str) -> Any:  # for what only one kind of problem has, as `motion`
+    def __getattr__(self, name: str) -> Any:  # for what only some kinds of problems have, such as `motion`
         if name == "problem":
             raise AttributeError(name)
         return getattr(self.problem, name)
@@ -211,14 +211,14 @@ class CachedProblem(Problem):
         return self.problem.model_after(values, effects)
 
     def _calls(self, points: Sequence[Point], recording: int, setting: int) -> list[Ask]:
-        """An ask in the parts in which it is stored."""
+        """Divide a request into the calls that are stored as one file each."""
         size = CHUNK
-        if not self.problem.together:  # each point runs alone: long ones are stored, and told of, in smaller calls
+        if not self.problem.together:  # parameter sets are simulated one by one: long simulations are stored in smaller calls
             size = min(max(int(HEAVY / max(self.problem.effort(recording, setting), 1.0)), FEWEST), CHUNK)
         return [(points[i : i + size], recording, setting) for i in range(0, len(points), size)]
 
     def _stored(self, calls: Sequence[Ask]) -> Rows:
-        """What is kept of calls; the rest is computed, and kept as it comes."""
+        """Yield the predictions of each call, from its file where there is one; others are computed and stored at once."""
         paths = [None if self.folder is None else self.folder / f"{_key(*call)}.npy" for call in calls]
         shapes = [(len(points), len(self.recordings[recording].y)) for points, recording, _ in calls]
         kept = [None if path is None else _load(path, shape) for path, shape in zip(paths, shapes, strict=True)]
@@ -239,7 +239,7 @@ class CachedProblem(Problem):
     def _keep(self, path: Path, values: np.ndarray) -> None:
         with np.errstate(over="ignore"):
             short = values.astype(np.float32)
-        stored = short if np.array_equal(short.astype(np.float64), values, equal_nan=True) else values  # the simulators work in float32
+        stored = short if np.array_equal(short.astype(np.float64), values, equal_nan=True) else values  # mostly exact in float32
         if self.used + stored.nbytes > self.limit:
             return
         content = io.BytesIO()
@@ -263,14 +263,14 @@ def _load(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
         values = np.load(io.BytesIO(content[:-32]), allow_pickle=False)
         if values.shape != shape:
             raise ValueError(f"it has the shape {values.shape}, not {shape}")
-    except Exception as error:  # numpy's answers to a file that is cut short or damaged are of several types
+    except Exception as error:  # NumPy raises several types for a truncated or damaged file
         warnings.warn(f"{path} is left aside and computed again: {shortened(str(error))}", stacklevel=2)
         return None
     return values.astype(np.float64)
 
 
 def plan_of(folder: str | os.PathLike, options: dict[str, Any], *, out: Path) -> str:
-    """A name for what a run computes: its options and the bytes of every file of the measured folder, apart from those in `out`."""
+    """Return a hash that names a run: of its options and of every file in the measured folder except those in `out`."""
     digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
     folder = Path(folder)
     inside = (p for p in folder.rglob("*") if p.is_file() and not p.resolve().is_relative_to(out.resolve()))
@@ -283,12 +283,12 @@ def plan_of(folder: str | os.PathLike, options: dict[str, Any], *, out: Path) ->
 
 
 RELEVANT = ("errors.py", "types.py", "data", "discrepancy", "models", "physics")
-"""Parts of the package that predictions come from."""
+"""Parts of the package on which predictions depend."""
 
 
 @functools.cache
 def code_digest() -> str:
-    """Return a digest of the sources that predictions come from: those of another version, or changed by hand, are not to be reused."""
+    """Return a hash of the sources on which predictions depend, so that those of other code are not reused."""
     root = Path(neuido.__file__).parent
     digest = hashlib.sha256(neuido.__version__.encode())
     for name in RELEVANT:
@@ -299,13 +299,13 @@ def code_digest() -> str:
 
 
 def outdated(out: Path, plan: str) -> list[str]:
-    """Return the plans whose predictions are kept in `out` and are of other data, options or code than `plan`."""
+    """Return the names (`plan_of`) of other runs whose predictions are in `out`: of other data, options or code."""
     root = out / ".work"
     return sorted(path.name for path in root.iterdir() if path.name != plan) if root.is_dir() else []
 
 
 def workplace(out: Path, plan: str, *, resume: bool) -> Path:
-    """The folder of a plan's predictions in `out`; those of other plans go, and its own too where nothing is to be resumed."""
+    """Make the folder in `out` for the predictions of the run named `plan`; remove those of other runs, and its own unless `resume`."""
     root = make_real_folder(out / ".work", "the folder of predictions")
     for other in root.iterdir():
         if other.name != plan or not resume:
@@ -314,35 +314,35 @@ def workplace(out: Path, plan: str, *, resume: bool) -> Path:
 
 
 def clear(out: Path) -> None:
-    """Remove what only a resumed run would need."""
+    """Remove the stored predictions from `out`, which only a resumed run needs."""
     remove(out / ".work")
 
 
 SEARCH = 0.8
-"""Share of the time at which a search is stopped, at the most; the rest is for the last fit, the intervals and the report."""
+"""Largest share of the time limit for the search. The rest is for the last fit, the intervals and the report."""
 LEAST_SEARCH = 0.6
-"""The same at the least."""
+"""Least share of the time limit for the search."""
 AFTER = 200
-"""Simulations that follow it: what was begun is weighed, the best is fitted to its end, and its intervals are taken."""
+"""Number of simulations expected after the search: for open decisions, the last fit and its intervals."""
 
 
 class Budget:
-    """The work that a search may take, and the time after which it is stopped.
+    """The work that a search may do, and its time limit.
 
-    Its work decides what a search does, and is the same on a fast machine and a slow one. The time decides nothing but that a search is cut
-    off. What follows the search (the last fit, intervals) is little and is no part of the work.
+    The work decides what a search does, and is the same on fast and slow machines. The time limit only cuts a search off. What follows the
+    search (last fit, intervals) is short and is not counted.
 
     Args:
-        work: Of the search, in the unit of `spent`; infinite: as much as it takes.
-        spent: The work so far.
-        seconds: From now on; infinite: as long as it takes.
-        clock: Seconds on a clock that never goes back.
-        pace: Seconds that a simulation has taken so far; where one is slow the search is stopped earlier.
+        work: Work of the search, in the unit of `spent`. Infinite: no limit.
+        spent: Function that returns the work so far.
+        seconds: Time limit from now on [s]. Infinite: no limit.
+        clock: Monotonic clock [s].
+        pace: Function that returns the mean time of a simulation so far [s]. The slower it is, the earlier the search stops.
 
     Attributes:
-        left_out: What the search has not done, in words.
+        left_out: Steps that the search has not done, in words.
         cut: Whether a step or a fit ended early, so that more work could change the answer.
-        ended_by: What ended it: `effort`, `time`, or empty where nothing did.
+        ended_by: What ended the search: `effort` or `time`; empty where nothing did.
     """
 
     def __init__(
@@ -363,20 +363,20 @@ class Budget:
 
     @property
     def share(self) -> float:
-        """Share of the time that counts: that of the search, or all of it."""
+        """Share of the time limit that is available now: that of the search, or all of it after `conclude`."""
         if self.concluding or math.isinf(self.seconds):
             return 1.0
         return min(max(1.0 - AFTER * self.pace() / max(self.seconds, 1e-9), LEAST_SEARCH), SEARCH)
 
     @property
     def over(self) -> bool:
-        """Whether the work of the search is done or the time is up; nothing is noted."""
+        """Whether the work is spent or the time is up; unlike `ends` it does not mark the search as cut off."""
         return bool(self._end(1.0))
 
     def ends(self, share: float = 1.0) -> bool:
-        """Whether something ends here, since this share of the work is done or the time is up; the search counts as cut off then.
+        """Return whether this share of the work is spent or the time is up, and if so mark the search as cut off.
 
-        An infinite share never ends.
+        An infinite share is never spent.
         """
         end = self._end(share)
         if end:
@@ -391,7 +391,7 @@ class Budget:
         return "effort" if not self.concluding and self.spent() > share * self.work else ""
 
     def skips(self, what: str, until: float = 1.0) -> bool:
-        """Whether there is nothing left for a step, or it is past this share of the work; which is noted then."""
+        """Return whether a step must be skipped because this share of the work is spent or the time is up, and if so note its name."""
         if not self.ends(until):
             return False
         if what not in self.left_out:
@@ -399,5 +399,5 @@ class Budget:
         return True
 
     def conclude(self) -> None:
-        """End the search: from here on the whole time counts, and no work."""
+        """End the search: from now on the whole time limit counts, and the work is not limited."""
         self.concluding = True

@@ -1,4 +1,4 @@
-"""The work of a diagnosis: from measured data, in a folder or read already, to the folder of its results."""
+"""The steps of a diagnosis, from measured data (a folder, objects or arrays) to the folder of results."""
 
 import hashlib
 import json
@@ -29,8 +29,11 @@ if TYPE_CHECKING:
 DATA = ("auto", "points", "video")
 SOLVERS = ("both", "material_points", "finite_elements")
 EFFORTS = {"quick": 1_000.0, "normal": 10_000.0, "thorough": 100_000.0}
-"""Work of a search, in runs of the declared model through all recordings. In a blind seed of thirty cases the 24 searches that came to
-their end simulated each recording 35 to 10,900 times, in the median 1,200 times; a simulation took two thirds of such a run."""
+"""Work of a search, in simulations of all recordings with the declared model.
+
+In thirty blind cases, the 24 searches that were completed simulated each recording 35 to 10,900 times (median 1,200). A simulation cost two
+thirds of one with the declared model.
+"""
 KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}
 
 
@@ -123,7 +126,7 @@ def diagnose(
     names = effects if effects is None or isinstance(effects, str) else ",".join(effects)
     problems = [with_own_effects(restricted(solved_by(p, solver), names), candidates) for p in problems]
     for problem in problems:
-        if problem.margin({}, problem.solvers[0]) < 0.0:  # refused before anything is written
+        if problem.margin({}, problem.solvers[0]) < 0.0:  # before anything is written
             raise UserError(problem.refusal(problem.solvers[0]))
     temporary = tempfile.TemporaryDirectory(prefix="neuido-diagnosis-") if out is None else None
     target = Path(temporary.name if temporary else out or "").expanduser()
@@ -133,10 +136,10 @@ def diagnose(
     plan = "read-data" if folder is None else store.plan_of(place, options, out=target)
     untouched = not target.is_dir() or not any(target.iterdir())
     with made_folder(target), held_folder(target):
-        resumes = resume and folder is not None and not arrays and not candidates  # what a function does has no name to keep it by
+        resumes = resume and folder is not None and not arrays and not candidates  # functions of candidates cannot be hashed
         outdated = store.outdated(target, plan) if resumes else []
         work = store.workplace(target, plan, resume=resumes)
-        if not any(work.iterdir()):  # a run that continues keeps its log
+        if not any(work.iterdir()):  # a resumed run keeps its log
             (target / "log.csv").unlink(missing_ok=True)
         if outdated:
             print(f"{target / '.work'}: stored predictions of other data, options or code are ignored", file=sys.stderr)
@@ -160,7 +163,7 @@ def diagnose(
                     write_fits(make_real_folder(target / "fits", "the folder of fits") / f"{i}.npz", own.case, own.statistics)
             log.begin("", math.inf)
             answer.write(target, found, kind=kind, device=chosen, seed=seed, tell=log)
-            if not any(own.left_out or own.budget.cut for own, _ in found):  # else more effort or minutes go on from it
+            if not any(own.left_out or own.budget.cut for own, _ in found):  # else a call with more effort continues
                 store.clear(target)
             for own, _ in found:
                 log.work(own.work)
@@ -171,7 +174,7 @@ def diagnose(
 
 
 def _forget(target: Path) -> None:
-    """Remove what a diagnosis that is refused has written."""
+    """Remove the files of a diagnosis that stopped with an error."""
     from neuido.discrepancy import store
 
     store.clear(target)
@@ -179,7 +182,7 @@ def _forget(target: Path) -> None:
 
 
 def _content(given: str | os.PathLike | Mapping[str, Any] | None) -> str | None:
-    """Return what identifies the content of a file or a mapping."""
+    """Return a hash of the content of a file or mapping; None stays None."""
     if given is None:
         return None
     if isinstance(given, Mapping):
@@ -188,10 +191,10 @@ def _content(given: str | os.PathLike | Mapping[str, Any] | None) -> str | None:
 
 
 def kind_of(folder: str) -> tuple[str, Path]:
-    """Return which of the three formats a folder has, and the folder.
+    """Return the kind of data in a folder (a value of `KINDS`) and its path.
 
     Raises:
-        UserError: It is missing, or holds none of the three files or several.
+        UserError: The folder is missing, or it contains none or several of the three files.
     """
     given = Path(folder).expanduser()
     if given.is_file() and given.name in KINDS:
@@ -214,10 +217,10 @@ def problems_of(
     law: str | os.PathLike | None = None,
     data: str = "auto",
 ) -> "Sequence[Problem]":
-    """Return the problems of a folder: one, or one for each body of a track folder.
+    """Read a folder and return its problems: one, or one for each body of a track folder.
 
     Raises:
-        UserError: The folder, the model's file or the law is not as its format says, or an option that is for experiments alone.
+        UserError: The folder, the file of the model or the law is invalid, or `law` or `data` is given for other data than experiments.
     """
     if data not in DATA:
         raise UserError(f"data = {data!r} is not known; use {', '.join(DATA)}")
@@ -250,10 +253,10 @@ def problems_of(
 def problems_of_data(
     source: Any, device: str, *, model: Any = None, law: str | os.PathLike | None = None, data: str = "auto"
 ) -> "tuple[str, Sequence[Problem]]":
-    """Return the kind and the problems of data that are read already: one problem, or one for each body of tracks.
+    """Return kind and problems of data that are read already: one problem, or one for each body of tracks.
 
     Raises:
-        UserError: An object that is none of the three kinds of data, or an option that it does not take.
+        UserError: The object is none of the three kinds of data, or it does not take an option that is given.
     """
     from neuido.data.measured.experiment import Experiment
     from neuido.data.measured.material_test import MaterialTests
@@ -281,10 +284,12 @@ def problems_of_data(
 
 
 def experiment_problem(experiment: "Experiment", data: str, device: str) -> "BodyProblem":
-    """Return the problem of an experiment: its tracked points, or its videos.
+    """Return the problem of an experiment, with its tracked points or its videos as data.
+
+    `data` is `points`, `video` or `auto` (points where every recording has them, or where no video is there).
 
     Raises:
-        UserError: Recordings that lack what is asked for.
+        UserError: A recording lacks the data that are asked for.
     """
     from neuido.discrepancy.problems.body import body_problem
 
@@ -299,10 +304,10 @@ def experiment_problem(experiment: "Experiment", data: str, device: str) -> "Bod
 
 
 def solved_by(problem: "Problem", solver: str) -> "Problem":
-    """Return the problem with one method of prediction alone.
+    """Return the problem with one simulation method, or unchanged for `both`.
 
     Raises:
-        UserError: Another name, or a problem where nothing is discretised.
+        UserError: The method is unknown, or the problem is not discretised.
     """
     if solver not in SOLVERS:
         raise UserError(f"solver = {solver!r}: choose from {', '.join(SOLVERS)}")
@@ -313,17 +318,17 @@ def solved_by(problem: "Problem", solver: str) -> "Problem":
     from neuido.discrepancy.problems.settings import SETTINGS
 
     own = tuple(i for i in problem.solvers if SETTINGS[i].solver == solver)
-    if solver == "material_points":  # the other settings come after these
+    if solver == "material_points":  # these settings are the first ones
         object.__setattr__(problem, "settings", sum(s.solver == solver for s in SETTINGS))
     object.__setattr__(problem, "solvers", own)
     return problem
 
 
 def restricted(problem: "Problem", effects: str | None) -> "Problem":
-    """Return the problem with the named candidates alone.
+    """Return the problem with only the named candidates (separated by commas); None keeps all.
 
     Raises:
-        UserError: A name that is no effect, or none that this problem could show.
+        UserError: A name is no effect, or the problem can show none of them.
     """
     if effects is None:
         return problem
@@ -343,10 +348,10 @@ def restricted(problem: "Problem", effects: str | None) -> "Problem":
 
 
 def choose_device(device: str) -> str:
-    """Return `cpu` or `cuda`, or the device that is named.
+    """Return the name of the device; `auto` becomes `cuda` where there is one, else `cpu`.
 
     Raises:
-        UserError: Another name, or cuda where there is none.
+        UserError: The name is unknown, or there is no CUDA device.
     """
     import torch
 
