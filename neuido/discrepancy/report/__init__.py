@@ -1,1 +1,1 @@
-"""What a diagnosis leaves behind: its answer, its page, and what to measure next."""
+"""Results of a diagnosis: files, words, the HTML page, and a proposal for the next experiment."""

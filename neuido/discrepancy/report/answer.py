@@ -1,4 +1,4 @@
-"""What a diagnosis leaves behind: diagnosis.json, model_after.yaml, trace.json, the predicted motion, the report."""
+"""The files that a diagnosis writes: diagnosis.json, model_after.yaml, trace.json, predicted motions and the report."""
 
 import json
 import time
@@ -34,16 +34,16 @@ def write(
     seconds: float | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> None:
-    """Write all files; each appears when it is whole, diagnosis.json last.
+    """Write all files of a diagnosis; each appears when it is complete, diagnosis.json last.
 
     Args:
-        out: Folder.
-        found: Diagnoses with the seconds that each took; several are the bodies of a track folder.
+        out: Folder for the files.
+        found: Diagnoses with the time that each took [s]. Several are the bodies of a track folder.
         kind: `experiment`, `material test` or `track`.
-        device: Where it ran.
-        seed: Of the ceiling's network.
-        seconds: In place of the measured ones.
-        tell: Called with a line of progress.
+        device: Device of the simulations.
+        seed: Seed of the network that estimates the ceiling.
+        seconds: Time to report [s] in place of the measured one.
+        tell: Function that is called with a line of progress.
     """
     tell = tell or (lambda line: None)
     made: list[tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]] = []
@@ -57,7 +57,7 @@ def write(
     motions = {f"{file_name(name, 'the name of a recording')}.npz": arrays for _, motion in made for name, arrays in motion.items()}
     for name, arrays in motions.items():
         _save(predicted / name, arrays)
-    for other in predicted.glob("*.npz"):  # of an earlier diagnosis of other recordings
+    for other in predicted.glob("*.npz"):  # left by a diagnosis of other recordings
         if other.name not in motions:
             remove(other)
     models = {_body(d): beside(out, d.problem.model_after(d.after, [t.candidate.name for t in d.effects])) for d, _ in found}
@@ -77,7 +77,7 @@ def write(
 
 
 def trace(d: Diagnosis) -> dict[str, Any]:
-    """Every figure that the decisions rest on, for benchmarks and ablations."""
+    """Return all numbers on which the decisions rest, for benchmarks and ablations."""
     names = [
         {"name": p.name, "recording": d.problem.recordings[p.recording].name, "fitted": p.fitted, "rows": int(p.rows.sum())}
         for p in d.parts
@@ -133,7 +133,11 @@ def _trial(r: Round, t: Trial) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON all at once; figures that are not finite become null."""
+    """Write JSON to a file, which appears when it is complete.
+
+    Raises:
+        ValueError: A number is not finite (`plain` makes it null).
+    """
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 

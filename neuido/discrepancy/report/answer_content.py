@@ -1,4 +1,4 @@
-"""The content of diagnosis.json (`neuido-diagnosis/2`) from what an inference found, and the motions that its page shows."""
+"""The content of diagnosis.json (`neuido-diagnosis/2`) of a finished diagnosis, and the motions that its page shows."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -22,16 +22,22 @@ from neuido.errors import UserError
 VERSION = neuido.__version__
 UNSURE = ("insufficient", "unknown")
 P_VALUE = "chance of the largest gain over all effects in a linear model of the fits, without the search and the refits of its draws"
-"""What the p-value is of; a fit is not linear, and a search tries more than one start."""
+"""Meaning of the p-value. Fits are not linear, and a search tries more than one start."""
 PATHS = {"biaxial": "stretch along the stress", "simple_shear": "amount of shear"}
 COMPONENTS = "xyz"
 Motion = dict[str, dict[str, np.ndarray]]
 
 
 def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], None] | None = None) -> tuple[dict[str, Any], Motion]:
-    """Return the content of diagnosis.json without its words, and the arrays of each recording: measured, before, after, over what.
+    """Return the content of diagnosis.json for one body, and the arrays of each recording for its plots (`motions`).
 
-    The words are in the units of all bodies that are diagnosed together.
+    The words are still empty, because their units depend on all bodies that are diagnosed together.
+
+    Args:
+        d: Result of the inference.
+        device: Device of the simulations.
+        seed: Seed of the network that estimates the ceiling.
+        tell: Function that is called with a line of progress.
     """
     tell = tell or (lambda line: None)
     tell("motion before and after")
@@ -97,12 +103,12 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
 
 
 def inner(problem: Problem) -> Any:
-    """Return the problem that a store of predictions wraps."""
+    """Return the problem itself, without the store of predictions around it."""
     return getattr(problem, "problem", problem)
 
 
 def recordings_of(problem: Problem) -> dict[str, dict[str, Any]]:
-    """Return what diagnosis.json says of each recording."""
+    """Return the entry of each recording in diagnosis.json: role, quantity, scene, channels."""
     own = inner(problem)
     out = {}
     for n, recording in enumerate(problem.recordings):
@@ -119,7 +125,7 @@ def recordings_of(problem: Problem) -> dict[str, dict[str, Any]]:
 
 
 def _test(test: Any) -> dict[str, Any]:
-    """What a material test was of, and over what it is drawn."""
+    """Return the entry of a material test: mode of loading, stress that was measured, and axis of its plots."""
     shear = test.mode == "simple_shear"
     channels = test.stress.shape[1]
     out = {
@@ -137,7 +143,7 @@ def _plane(plane: Any) -> Mapping[str, Any]:
 
 
 def abscissa(problem: Problem, n: int) -> np.ndarray | None:
-    """Return the stretch or shear of each datum of a material test, (rows,); None of other data, which are drawn over time."""
+    """Return the stretch or shear of each value of a material test, (n,); None for other data, which are drawn over time."""
     own = inner(problem)
     if not hasattr(own, "tests"):
         return None
@@ -146,7 +152,7 @@ def abscissa(problem: Problem, n: int) -> np.ndarray | None:
 
 
 def _models(d: Diagnosis, r: Round, step: int) -> list[dict[str, Any]]:
-    """Every effect that a round has fitted, the named one and its class first, then by score."""
+    """Return the effects that a step has fitted, first the named one, then its class, then the others by score."""
     kept = {id(t) for t in r.members} if r.chosen is not None else set()
     leads = {id(t) for t in d.leads}
     out = []
@@ -162,24 +168,24 @@ def _models(d: Diagnosis, r: Round, step: int) -> list[dict[str, Any]]:
 
 
 def _chance(r: Round, step: int) -> dict[str, Any]:
-    """What chance brings in a step."""
+    """Return the p-value of a step, and the error ratio that chance exceeds in 5 % of the draws."""
     return {"step": step, "p_value": r.p_value, "error_ratio95": math.exp(min(r.by_chance(ALPHA), 700.0)), "of": P_VALUE}
 
 
 def _power(d: Diagnosis, one: Compatible) -> dict[str, Any]:
-    """The largest compatible size of an effect, and the end of its range."""
+    """Return the largest size of an effect that the data allow, with the largest size of its range."""
     p = d.problem.parameter(f"{one.name}.{one.parameter}")
     return {**one._asdict(), "largest": max(abs(p.lower), abs(p.upper))}
 
 
 def _series(s: residual.Series) -> dict[str, Any]:
-    """One stage in the course of time."""
+    """Return the missing quantity of one stage over time, before, after and by noise alone."""
     own = {key: list(getattr(s, key)) for key in ("times", "before", "after", "noise")}
     return {"stage": s.name, "unit": s.unit} | own
 
 
 def _work(d: Diagnosis) -> dict[str, Any]:
-    """What was run."""
+    """Return the numbers of simulations, their cost, and what ended the search."""
     unit = "particle-substeps" if d.problem.settings > 1 else "data"
     sums = {key: sum(getattr(w, key) for w in d.work.values()) for key in ("simulations", "reused", "effort")}
     steps = {step: {"simulations": w.simulations, "effort": w.effort} for step, w in d.work.items()}
@@ -188,7 +194,7 @@ def _work(d: Diagnosis) -> dict[str, Any]:
 
 
 def _settings(d: Diagnosis) -> dict[str, Any]:
-    """Of what is discretised: the amounts of the other settings in the prediction, and the errors without them."""
+    """Return the amounts of other settings in the predictions, and the errors without them; empty if nothing is discretised."""
     if d.problem.settings == 1:
         return {}
     names = [d.problem.setting_name(s) for s in d.problem.others(d.setting)]
@@ -199,12 +205,16 @@ def _settings(d: Diagnosis) -> dict[str, Any]:
 
 
 def errors(d: Diagnosis, when: str, *, one_setting: bool = False) -> dict[str, Any]:
-    """Errors of the parts that are fitted, of those that are held out, and by recording; joined ones weigh each datum alike.
+    """Return the errors of fitted and held-out data, and of each recording; every value has the same weight.
 
-    Of what is held out the `validation` part has steered the search, and the `test` part, where there is one, has not.
+    Args:
+        d: Result of the inference.
+        when: `before` or `after`.
+        one_setting: Whether the prediction is one simulation, without the differences of other settings in fitted amounts.
 
-    The prediction is a simulation under the setting in use, and the differences of the others to it in the amounts that the fitted
-    recordings hold; `one_setting`: the simulation alone.
+    Returns:
+        `fit`, `held_out` and its parts `validation` (which steered the search) and `test` (which did not), and `by_recording`. An error
+        without data is None.
     """
     own = (d.one_setting if one_setting else d.errors)[when]
 
@@ -218,9 +228,9 @@ def errors(d: Diagnosis, when: str, *, one_setting: bool = False) -> dict[str, A
 
 
 def rejected(d: Diagnosis) -> list[dict[str, str]]:
-    """Every candidate that is neither an effect nor in the class of one, with the reason of the round that weighed it best.
+    """Return the candidates that are neither named nor in a class, each with the first reason that a step gave.
 
-    A search that was cut off rejects nothing (`untried`).
+    A search that was cut off rejects only what was excluded before it (see `untried`).
     """
     ruled_out = [{"name": name, "reason": reason} for name, reason in d.problem.labels.get("excluded", {}).items()]
     if d.answer == "unfinished":
@@ -245,7 +255,7 @@ def rejected(d: Diagnosis) -> list[dict[str, str]]:
 
 
 def untried(d: Diagnosis) -> list[str]:
-    """Candidates that a search which was cut off has not fitted."""
+    """Return the candidates that a search did not fit before it was cut off; empty if it was completed."""
     if d.answer != "unfinished":
         return []
     fitted = {t.candidate.name for r in d.rounds for t in r.trials}
@@ -253,13 +263,13 @@ def untried(d: Diagnosis) -> list[str]:
 
 
 def _lead(t: Trial) -> dict[str, Any]:
-    """What leads in a search that was cut off: its figures so far, without intervals, and how far it lowers the error."""
+    """Return the entry of a leading effect in a search that was cut off: parameters without intervals, and error ratio."""
     own = {p.name.partition(".")[2]: {"value": t.fit.point.get(p.name, p.value), "unit": p.unit} for p in t.candidate.parameters}
     return {"name": t.candidate.name, "error_ratio": math.exp(min(t.gain, 700.0)), "parameters": own}
 
 
 def _effect(d: Diagnosis, r: Round, series: Mapping[str, list[residual.Series]], step: int) -> dict[str, Any]:
-    """One entry of `effects`."""
+    """Return the entry of the effect that a step has named."""
     c = r.chosen.candidate
     parameters = {}
     for p in c.parameters:
@@ -283,7 +293,7 @@ def _effect(d: Diagnosis, r: Round, series: Mapping[str, list[residual.Series]],
 
 
 def _derived(d: Diagnosis, name: str, own: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The parameters, and those figures of them that people use."""
+    """Add quantities in common use to the parameters of an effect, such as a yield stress or a damping ratio."""
 
     def mapped(key: str, unit: str, f: Callable[[float], float]) -> dict[str, Any]:
         ends = sorted(f(v) for v in own[key]["interval90"])
@@ -309,7 +319,7 @@ def _derived(d: Diagnosis, name: str, own: dict[str, dict[str, Any]]) -> dict[st
 
 
 def _where(stage: str, series: Mapping[str, list[residual.Series]]) -> str:
-    """The stage, and the place in time where the residual stood out most."""
+    """Return the stage in which an effect shows, with the recording and time at which the residual exceeds its noise most."""
     best = None
     for name, rows in series.items():
         s = residual.telling(rows)
@@ -333,7 +343,7 @@ def _declared(d: Diagnosis, point: Mapping[str, float], intervals: Mapping[str, 
 
 
 def doubts(d: Diagnosis) -> dict[str, list[str]]:
-    """Return for each recording what makes its motion before or after doubtful, as matter that turned inside out or collapsed."""
+    """Return the events that make a predicted motion doubtful, such as matter that turned inside out, by recording."""
     problem, out = inner(d.problem), dict[str, list[str]]()
     if not hasattr(problem, "doubts"):
         return out
@@ -341,7 +351,7 @@ def doubts(d: Diagnosis) -> dict[str, list[str]]:
         for when, point in (("before", d.before), ("after", d.after)):
             try:
                 events = problem.doubts(point, n, d.setting)
-            except UserError:  # `motions` tells why it does not move
+            except UserError:  # `motions` reports this error
                 continue
             if events:
                 out.setdefault(recording.name, []).extend(f"{when}: {event.words}" for event in events)
@@ -349,14 +359,11 @@ def doubts(d: Diagnosis) -> dict[str, list[str]]:
 
 
 def motions(d: Diagnosis) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, str]]:
-    """What was measured and what is predicted before and after, for each recording, as the errors of the diagnosis count it.
+    """Return the measured and predicted arrays of each recording, and the error message of each that cannot be simulated.
 
-    And why, of each recording that is left out because it does not move there.
-
-    Bodies: `positions` (1), `measured`, `before` and `after` (T, N, 3) [m], the clock, the ruler and the launch at their most probable
-    values and the other settings in their amounts, `before_model` and `after_model` without all that, `t` (T,). Others: the data as
-    vectors, with `times` and `groups` (which channel a row is of), and of a material test `axis`, the stretch or shear of
-    each datum.
+    Tracked bodies have `positions` (1), `t` (T,) [s], and `measured`, `before` and `after` (T, N, 3) [m]. Predictions include the most
+    probable nuisances and the other settings in their amounts; `before_model` and `after_model` are without them. Other data are vectors
+    (n,) with `times`, `groups` (channel of each value) and, of a material test, `axis` (stretch or shear).
     """
     out: dict[str, dict[str, np.ndarray]] = {}
     failed: dict[str, str] = {}
@@ -393,7 +400,7 @@ def _stages(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> list[r
 
 
 def _place(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Where on the body the force that is missing before is largest."""
+    """Return the place on the body where the missing force (before) is largest, from the centre [m], and its ratio to the median."""
     n = [r.name for r in d.problem.recordings].index(name)
     where, excess = residual.place(arrays["measured"], arrays["t"], arrays["before"], sigma=d.final["before"].noise[n])
     centre = d.problem.measured[n].body.x.double().mean(dim=0).numpy()
@@ -401,7 +408,7 @@ def _place(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> dict[st
 
 
 def plain(value: Any) -> Any:
-    """The same with Python's own numbers; what is not finite becomes null."""
+    """Return a value with Python's own numbers and lists, as JSON needs them; numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

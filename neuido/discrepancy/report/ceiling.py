@@ -1,7 +1,7 @@
-"""How much of a residual is reproducible at all: a small network, fitted to the residual of the fitted recordings, scored on the others.
+"""Ceiling: the share of a residual that any further effect could explain, estimated by a small network.
 
-It is the ceiling of what any further effect could explain, and the detector of an effect that no candidate is: a share well above
-zero on held-out recordings means that something lawful is left. It corrects the state only; it is no explanation.
+The network is fitted to the residual of the fitted recordings and scored on the held-out ones. A share well above zero there means that
+something systematic is left that no candidate describes. The network does not explain it.
 """
 
 from collections.abc import Mapping
@@ -16,27 +16,33 @@ from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.physics.runtime.threads import one_thread_each
 
 WIDTH = 32
+"""Neurons per hidden layer."""
 ROWS = 12_000
-"""Samples that are drawn for the training, at the most."""
+"""Largest number of training samples."""
 STEPS = 400
+"""Largest number of training steps."""
 PATIENCE = 6
-"""Checks without a better figure that end the training; one check every 20 steps."""
+"""Checks without improvement that end the training (one check every 20 steps)."""
 BLOCK = 0.2
-"""Share of the time of each recording, one block in its middle, by which the training stops."""
+"""Share of each recording, in the middle of its time, that is not trained on and decides when the training stops."""
 
 
 @dataclass(frozen=True)
 class Ceiling:
-    """Shares of the residual's mean square that the network explains, beyond its mean noise; at most 1, below 0 where it does harm."""
+    """Shares of the mean square residual above noise that the network explains: at most 1, negative where it does harm."""
 
     fit: float
+    """Share of the fitted data."""
     held_out: float
+    """Share of the held-out data."""
     steps: int
+    """Number of training steps of the network."""
     by_part: Mapping[str, float] = field(default_factory=dict)
+    """Share of each part of the data."""
 
 
 def of(d: Diagnosis, when: str, *, seed: int = 0) -> Ceiling:
-    """The ceiling of a problem's residual; `when`: before or after. NaN where a part is not predicted."""
+    """Estimate the ceiling of the residual `before` or `after` (`when`); NaN where a part of the data is not predicted."""
     floor = d.final[when]
     rows = []
     for part in d.parts:
@@ -50,9 +56,9 @@ def of(d: Diagnosis, when: str, *, seed: int = 0) -> Ceiling:
 
 
 def as_seen(d: Diagnosis, when: str, n: int) -> np.ndarray:
-    """What is predicted of recording n, as the errors of a diagnosis count it, (n,); `when`: before or after.
+    """Predict the data of recording n, (rows,), `before` or `after` (`when`), as the errors of a diagnosis use them.
 
-    The nuisances are at their most probable values, and the other settings take part in the amounts that the fitted recordings hold.
+    The prediction includes the most probable nuisances, and the differences of other settings in the amounts of the fitted recordings.
     """
     point, floor = {"before": d.before, "after": d.after}[when], d.final[when]
     predicted, y = d.problem.predict([point], n, d.setting)[0], d.problem.recordings[n].y
@@ -66,7 +72,7 @@ def as_seen(d: Diagnosis, when: str, n: int) -> np.ndarray:
 def _samples(
     d: Diagnosis, part: Part, predicted: np.ndarray, left: np.ndarray, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Features (n, k), residuals (n, c) and weights (n,) of a part."""
+    """Return the inputs (n, k), residuals (n, c) and weights (n,) of the network for a part of the data."""
     problem, n = d.problem, part.recording
     r = problem.recordings[n]
     if not getattr(problem, "tracked", hasattr(problem, "motion")):
@@ -81,7 +87,7 @@ def _samples(
 
 
 def _body_features(d: Diagnosis, n: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place in the body at t = 0 and predicted velocity of each datum."""
+    """Return the place in the body at t = 0 [m], relative to its centre, and the predicted velocity [m/s] of the tracked points."""
     r = d.problem.recordings[n]
     first = d.problem.measured[n].x.double().numpy()
     whole = d.problem.measured[n].body.x.double().numpy()
@@ -91,7 +97,7 @@ def _body_features(d: Diagnosis, n: int, predicted: np.ndarray) -> tuple[np.ndar
 
 
 def _slope(values: np.ndarray, times: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Differences in the order of time within each group."""
+    """Return the time derivative of values (n,) by finite differences within each series (`groups`)."""
     order = np.lexsort((times, groups))
     v, t, g = values[order], times[order], groups[order]
     out = np.zeros_like(values)
@@ -103,13 +109,13 @@ def _slope(values: np.ndarray, times: np.ndarray, groups: np.ndarray) -> np.ndar
 
 
 def train(parts: list[tuple[bool, np.ndarray, np.ndarray, np.ndarray]], *, noises: list[float], names: list[str], seed: int = 0) -> Ceiling:
-    """Fit a network to the fitted parts and score it on all.
+    """Fit a network to the fitted parts of the data, and score it on all parts.
 
     Args:
-        parts: (fitted, features (n, k), residuals (n, c), weights (n,)) of each, its rows in the order of time.
-        noises: Standard deviation of each part's noise, which no network can explain.
-        names: Of the parts.
-        seed: Of the first weights and of the samples.
+        parts: For each part whether it is fitted, inputs (n, k), residuals (n, c) and weights (n,), with rows in the order of time.
+        noises: Standard deviation of the noise of each part, which no network can explain.
+        names: Names of the parts.
+        seed: Seed of the initial weights and of the samples.
     """
     generator = torch.Generator().manual_seed(seed)
     fitted = [p for p in parts if p[0]]
@@ -146,7 +152,7 @@ def train(parts: list[tuple[bool, np.ndarray, np.ndarray, np.ndarray]], *, noise
 
 
 def _block(count: int) -> Tensor:
-    """The middle fifth of the rows, which are in the order of time."""
+    """Return the mask of the middle fifth (`BLOCK`) of `count` rows."""
     at = torch.arange(count) / max(count, 1)
     return (at - 0.5).abs() < BLOCK / 2
 

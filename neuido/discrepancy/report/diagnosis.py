@@ -1,4 +1,4 @@
-"""What a diagnosis found, read from the folder of its results (`neuido-diagnosis/2`, or the older `/1`)."""
+"""The result of a diagnosis, read from its folder (`neuido-diagnosis/2`, or the older `/1`)."""
 
 import json
 import math
@@ -28,7 +28,7 @@ MOST_PANELS = 4
 
 
 class Quantity(NamedTuple):
-    """A fitted figure."""
+    """A fitted value with its interval and unit."""
 
     value: float | list[float]
     interval: tuple[Any, Any]
@@ -40,7 +40,7 @@ class Quantity(NamedTuple):
 class Effect:
     """An effect that the declared model lacks.
 
-    `value`, `interval` and `unit` are those of its leading figure, `parameter`.
+    `value`, `interval` and `unit` are those of its leading parameter, whose name is `parameter`.
     """
 
     name: str
@@ -48,47 +48,47 @@ class Effect:
     """Other effects that the data cannot tell apart from it."""
     parameters: dict[str, Quantity]
     p_value: float
-    """Probability of such a gain by chance, over all candidates."""
+    """Probability that any candidate lowers the error as much by chance."""
     where: str
-    """Stage of the motion in which the residual stands out."""
+    """Stage of the motion in which the effect shows."""
     body: str = ""
-    """Body of a track folder that holds several."""
+    """Name of the body, in a track folder with several bodies."""
 
     @property
     def parameter(self) -> str:
-        """Name of the leading figure."""
+        """Name of the leading parameter."""
         return next((name for name in LEADING if name in self.parameters), next(iter(self.parameters)))
 
     @property
     def value(self) -> float | list[float]:
-        """Value of the leading figure."""
+        """Value of the leading parameter."""
         return self.parameters[self.parameter].value
 
     @property
     def interval(self) -> tuple[Any, Any]:
-        """90 % interval of the leading figure."""
+        """90 % interval of the leading parameter."""
         return self.parameters[self.parameter].interval
 
     @property
     def unit(self) -> str:
-        """Unit of the leading figure."""
+        """Unit of the leading parameter."""
         return self.parameters[self.parameter].unit
 
     def __str__(self) -> str:
-        """Return the name, and the leading figure with its interval and unit."""
+        """Return the name, and the leading parameter with its interval and unit."""
         return f"{self.name}: {self.parameter} = {_figure(self.parameters[self.parameter])}"
 
 
 class ErrorChange(NamedTuple):
-    """The error of the prediction before and after the effects were added."""
+    """Error of the prediction before and after the effects were added."""
 
     before: float
     after: float
     unit: str
     floor: float
-    """What noise and discretisation leave."""
+    """Error that noise and discretisation alone leave."""
     held_out: bool
-    """Whether it is that of recordings that no fit has seen; otherwise of the fitted ones."""
+    """Whether the error is that of held-out recordings; otherwise that of the fitted ones."""
 
 
 class Diagnosis:
@@ -96,13 +96,13 @@ class Diagnosis:
 
     Args:
         folder: Folder of the results.
-        content: Content of its diagnosis.json, or of one body's part.
-        keep: What has to live as long as the diagnosis, for example a temporary folder.
+        content: Content of its diagnosis.json, or the part of one body.
+        keep: Object that must live as long as the diagnosis, for example a temporary folder.
     """
 
     def __init__(self, folder: Path, content: Mapping[str, Any], keep: Any = None) -> None:
         self.folder, self._content, self._keep = folder, content, keep
-        self._units: Units | None = None  # of a page that several bodies share
+        self._units: Units | None = None  # set where several bodies share a page
 
     @classmethod
     def read(cls, folder: str | os.PathLike, *, keep: Any = None) -> "Diagnosis":
@@ -123,7 +123,7 @@ class Diagnosis:
 
     @property
     def bodies(self) -> "dict[str, Diagnosis]":
-        """The diagnosis of each body of a track folder; of other data one, by the name of what was measured."""
+        """The diagnosis of each body of a track folder; for other data one diagnosis under the name of the experiment."""
         if "bodies" not in self._content:
             return {self._content.get("body", self.name): self}
         out = {own["body"]: Diagnosis(self.folder, own, self._keep) for own in self._content["bodies"]}
@@ -142,7 +142,7 @@ class Diagnosis:
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
-        """The effects that were added, the one of the largest gain first."""
+        """Effects that were added, in the order in which they were found."""
         if "bodies" in self._content:
             return tuple(effect for own in self.bodies.values() for effect in own.effects)
         return tuple(
@@ -159,7 +159,7 @@ class Diagnosis:
 
     @cached_property
     def error(self) -> ErrorChange:
-        """The error before and after: of held-out recordings where there are any. Of several bodies: their root mean square."""
+        """Error before and after, of held-out recordings where there are any; for several bodies the root mean square."""
         if "bodies" in self._content:
             own = [body.error for body in self.bodies.values()]
             before, after, floor = (
@@ -175,17 +175,17 @@ class Diagnosis:
 
     @property
     def why(self) -> tuple[str, ...]:
-        """Why the data say too little, or what is wrong with them."""
+        """Reasons why the data say too little, or what is wrong with them."""
         return tuple(self._content.get("why", ()))
 
     @property
     def leads(self) -> tuple[str, ...]:
-        """Effects that lead in a search that was cut off; none of them is an answer."""
+        """Effects that lead in a search that was cut off; they are no answer."""
         return tuple(lead["name"] for lead in self._content.get("leads", ()))
 
     @property
     def leaves_more(self) -> bool:
-        """Whether the named effects leave more than `MORE` times what noise and discretisation would."""
+        """Whether the error with the named effects is more than `MORE` times that of noise and discretisation."""
         over = self._content["error"].get("left_over_floor")
         return bool(self.effects) and over is not None and over > MORE
 
@@ -198,12 +198,12 @@ class Diagnosis:
 
     @property
     def model_after(self) -> Path:
-        """File of the model with the effects added; `diagnose(..., model=...)` takes it."""
+        """File of the model with the added effects, which `diagnose(..., model=...)` takes."""
         return self.folder / "model_after.yaml"
 
     @property
     def line(self) -> str:
-        """The answer in one line; of several bodies a line each."""
+        """The answer in one line; for several bodies a line each."""
         if "bodies" in self._content:
             return "\n".join(f"{body}: {own.line}" for body, own in self.bodies.items())
         error = self.error
@@ -218,31 +218,35 @@ class Diagnosis:
 
     @property
     def words(self) -> Words:
-        """The answer in plain words: finding, error, how sure, what is not excluded, what to measure next. Of one body alone."""
+        """The answer for one body in plain words: finding, error, certainty, effects not excluded, next experiment.
+
+        Raises:
+            UserError: There are several bodies.
+        """
         if "bodies" in self._content:
             raise UserError(f"{self.name} has several bodies: take the words of one of `bodies`")
         return words_of(self._content, self._units or Units.of([self._content]))
 
     def summary(self) -> str:
-        """Return the answer in plain words, as the command prints it and the page opens with it; of several bodies a paragraph each."""
+        """Return the answer in plain words, as on the terminal and at the top of the page; for several bodies a paragraph each."""
         if "bodies" in self._content:
             return "\n\n".join(f"{body}: {own.summary()}" for body, own in self.bodies.items())
         return "\n".join(self.words.paragraphs)
 
     @property
     def kind(self) -> str:
-        """What was measured: `experiment`, `material test` or `track`."""
+        """Kind of the data: `experiment`, `material test` or `track`."""
         return self._content["kind"]
 
     def page(self) -> str:
-        """Return the page of the diagnosis, made anew from diagnosis.json and the predicted motion."""
+        """Return the HTML page of the diagnosis, made anew from diagnosis.json and the predicted motion."""
         from neuido.discrepancy.report import page
 
         parts = [own._content for own in self.bodies.values()]
         return page.page(parts, [own.motion() for own in self.bodies.values()], kind=self.kind, name=self.name)
 
     def motion(self) -> "dict[str, dict[str, np.ndarray]]":
-        """Return the arrays of each recording that is stored: what was measured, what is predicted before and after, over what."""
+        """Return the stored arrays of each recording: measured, predicted before and after, and their times."""
         out = {}
         for name in self._content["recordings"] or self._content["error"]["after"]["by_recording"]:
             path = self._motion(name)
@@ -251,7 +255,7 @@ class Diagnosis:
         return out
 
     def plot(self) -> "Figure":
-        """Return a matplotlib figure: the error over time before and after, or the data with both predictions, a panel a recording."""
+        """Return a matplotlib figure with a panel per recording: error over time, or the data with the predictions before and after."""
         from matplotlib.figure import Figure
 
         shown = [(name, own, arrays) for own in self.bodies.values() for name, arrays in own.motion().items() if "before" in arrays]
@@ -272,10 +276,10 @@ class Diagnosis:
 
     def _motion(self, name: str) -> Path | None:
         path = self.folder / "predicted" / f"{name}.npz"
-        return path if path.name == f"{name}.npz" and path.is_file() else None  # a name is no path
+        return path if path.name == f"{name}.npz" and path.is_file() else None  # names with slashes are refused
 
     def report(self, path: str | os.PathLike | None = None) -> Path:
-        """Copy the report, one self-contained HTML page, to a path; return where it is.
+        """Copy the report, one self-contained HTML page, to a path, and return the path.
 
         Args:
             path: File, or an existing folder. None: the report stays in the folder of the results.
@@ -320,7 +324,7 @@ def _curves(ax: Any, arrays: Mapping[str, Any], error: ErrorChange, units: Units
 
 
 def _data(ax: Any, arrays: Mapping[str, Any], content: Mapping[str, Any], name: str, units: Units) -> None:
-    """Draw the data and the predictions over their physical axis; a channel after the other."""
+    """Draw the data and the predictions of each channel over time, stretch or shear."""
     told = content["recordings"].get(name, {})
     factor, unit = units.scaled(content["error"]["unit"])
     x, label = axis_of(arrays, told, units)

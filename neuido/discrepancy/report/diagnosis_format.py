@@ -1,4 +1,4 @@
-"""The format of diagnosis.json: its JSON Schema, which checks a file and stands in the documentation, and what older files lack."""
+"""The format of diagnosis.json: its JSON Schema, the check of a file, and the conversion of older files."""
 
 import copy
 from collections.abc import Mapping
@@ -12,8 +12,11 @@ FORMAT = "neuido-diagnosis/2"
 OLDER = "neuido-diagnosis/1"
 ANSWERS = ("effect", "class", "none", "unknown", "insufficient", "unfinished")
 VERDICTS = ("named", "class", "lead", "rejected", "weighed")
-"""Of an effect that was tried: it is named; the data cannot tell it from the named one; it leads a search that was cut off; it is rejected,
-for a reason; or it was weighed and stays behind."""
+"""Verdicts on an effect that was tried.
+
+It is named; the data cannot tell it from the named one (class); it leads in a search that was cut off; it is rejected for a stated reason;
+or it was compared and explains less (weighed).
+"""
 KINDS = ("experiment", "material test", "track")
 Schema = dict[str, Any]
 TEXT: Schema = {"type": "string", "minLength": 1}
@@ -36,7 +39,7 @@ def mapping(entry: Schema) -> Schema:
 
 
 def record(required: Schema, optional: Schema | None = None) -> Schema:
-    """Return the schema of a mapping; further keys, of later versions, are allowed."""
+    """Return the schema of a mapping with fixed keys; later versions may add keys."""
     return {"type": "object", "properties": required | (optional or {}), "required": list(required)}
 
 
@@ -156,10 +159,10 @@ def schema() -> Schema:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Return the content of a diagnosis.json in the form of `neuido-diagnosis/2`; what an older file does not tell is empty.
+    """Read a diagnosis.json in the form of `neuido-diagnosis/2`; what an older file lacks is empty.
 
     Raises:
-        UserError: No valid JSON, another format, or content that is not as the format says.
+        UserError: The file is no valid JSON, has another format, or does not match its schema.
     """
     content = read_json(path)
     found = content.get("format") if isinstance(content, dict) else None
@@ -172,10 +175,10 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def check(content: Mapping[str, Any], path: Path | str) -> None:
-    """Hold content against the schema.
+    """Check content against the schema.
 
     Raises:
-        UserError: The first place where it differs; one line.
+        UserError: The content does not match; the message names the place.
     """
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import best_match
@@ -187,7 +190,7 @@ def check(content: Mapping[str, Any], path: Path | str) -> None:
 
 
 def upgraded(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a `neuido-diagnosis/1` in the form of the next version."""
+    """Convert a `neuido-diagnosis/1` to `neuido-diagnosis/2`."""
     out = copy.deepcopy(dict(content))
     out["format"] = FORMAT
     parts = out.get("bodies", [out])
@@ -218,5 +221,5 @@ def upgraded(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _kind(c: Mapping[str, Any]) -> str:
-    """What an older file is of, by the unit of its errors."""
+    """Guess the kind of data of an older file by the unit of its errors."""
     return "material test" if c["error"]["unit"] == "Pa" else "track" if "body" in c else "experiment"
