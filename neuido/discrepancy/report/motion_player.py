@@ -1,4 +1,4 @@
-"""The motion before and after in space, packed for the page's player, and a map of what is left on the body."""
+"""Data for the player of motions on the page, and for the map of the residual on the body."""
 
 import base64
 from collections.abc import Mapping
@@ -12,24 +12,24 @@ from neuido.discrepancy.report.reader_units import Units
 MOST_POINTS, MOST_FRAMES = 400, 60
 LEAST_POINTS, LEAST_FRAMES = 60, 24
 ROOM = 700_000
-"""Bytes of a page for all motions."""
+"""Size of all motions on a page [bytes]."""
 STEP = 32_000
-"""Whole numbers on either side of the middle into which a coordinate is rounded."""
+"""Integer that stands for the largest distance of a coordinate from the middle."""
 HIDDEN = -32_768
-"""Of a point that was not seen."""
+"""Integer that stands for a coordinate of a point that was not seen."""
 NEAR = 0.5
-"""Sizes of the motion within which a collider is drawn."""
+"""Largest gap between the motion and a drawn collider, less half a diameter of the motion [diameters]."""
 SETS = ("measured", "before", "after")
 
 
 def player(motion: Mapping[str, Mapping[str, np.ndarray]], c: Mapping[str, Any], units: Units, *, room: float = ROOM) -> dict[str, Any]:
-    """Return what the page plays: each recording's points, measured and predicted before and after.
+    """Return the data of the player: points of each recording, measured and predicted before and after.
 
     Args:
-        motion: Arrays of each recording of a body.
-        c: Part of diagnosis.json.
-        units: Of the page.
-        room: Bytes that it may take.
+        motion: Arrays of each recording of a body, as in `predicted`.
+        c: Part of diagnosis.json for the body.
+        units: Units of the page.
+        room: Largest size [bytes].
     """
     factor, unit = units.scaled("m")
     most = room / max(len(motion), 1)
@@ -66,7 +66,7 @@ def _packed(name: str, arrays: Mapping[str, np.ndarray], c: Mapping[str, Any], f
 
 
 def _budget(frames: int, points: int, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """The frames and points that fit into some bytes: three sets of three coordinates of two bytes, a third more as text."""
+    """Choose frames and points that fit into `most` bytes: 24 for each point and frame (three sets, base64 text)."""
     count, times = min(points, MOST_POINTS), min(frames, MOST_FRAMES)
     while count * times * 24 > most and (count > LEAST_POINTS or times > LEAST_FRAMES):
         if count > LEAST_POINTS:
@@ -83,7 +83,7 @@ def most_telling(measured: np.ndarray, before: np.ndarray) -> int:
 
 
 def _plane(plane: Mapping[str, Any], low: np.ndarray, high: np.ndarray, size: float, factor: float) -> dict[str, Any] | None:
-    """A rectangle of a collider under the motion; none where it is far from it."""
+    """Return the rectangle of a collider that is drawn near the motion; None where the collider is far from it."""
     normal = np.array(plane["normal"], dtype=float)
     normal /= np.linalg.norm(normal)
     middle = 0.5 * (low + high)
@@ -101,7 +101,7 @@ def _plane(plane: Mapping[str, Any], low: np.ndarray, high: np.ndarray, size: fl
 
 
 def residual_map(motion: Mapping[str, Mapping[str, np.ndarray]], c: Mapping[str, Any], units: Units) -> dict[str, Any]:
-    """Return the root mean square of what is left at each point of the body, before and after, at the points' first places."""
+    """Return the data of the map: root mean square residual of each point before and after, and the first place of the points."""
     factor, unit = units.scaled("m")
     recordings = []
     for name, arrays in motion.items():

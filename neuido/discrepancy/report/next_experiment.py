@@ -1,8 +1,8 @@
-"""Which further recording would best tell apart the members of a class: the rivals are simulated in a catalogue of changed experiments.
+"""Proposal of the next experiment: the change that would best tell apart the members of a class.
 
-The best change has the largest distance between the two rivals that are nearest to each other (T-optimal design: Box and Hill 1967,
-Atkinson and Fedorov 1975), in the metric of noise and discretisation, after the rival's own parameters were refitted within what is
-known of them. Half the squared distance is the expectation of the logarithm of the odds.
+The members (rivals) are simulated in a list of changed experiments. The best change has the largest distance between the two rivals that
+are nearest to each other (T-optimal design: Box and Hill 1967, Atkinson and Fedorov 1975). The distance is weighted by noise and
+discretisation, after a refit of the rival's parameters within their intervals. Half its square is the expected logarithm of the odds.
 """
 
 import itertools
@@ -22,9 +22,9 @@ from neuido.types import AttachedMass, Body, Box
 
 MOST_RIVALS = 4
 FINALISTS = 3
-"""Changes whose distances are computed with a refit."""
+"""Number of changes whose distances are computed with a refit."""
 RUNS = 2.0
-"""Length of a run of data whose error is one, in units of a frame: neighbouring frames are not independent."""
+"""Number of neighbouring data that count as one, because their errors are not independent."""
 
 
 class Rival(NamedTuple):
@@ -33,14 +33,15 @@ class Rival(NamedTuple):
     name: str
     point: Point
     names: tuple[str, ...]
-    """The parameters that a refit may move."""
+    """Names of the parameters that a refit may change."""
 
 
 def propose(d: Diagnosis) -> dict[str, Any] | None:
-    """The best change for the last class of several members; None where there is nothing to tell apart, no change runs or the time is up.
+    """Propose the change that best tells apart the last class with several members.
 
     Returns:
-        `change`, `tells_apart` (the two nearest rivals), `expected_log_odds` (natural), and `others`, the runners-up.
+        `change`, `tells_apart` (the two nearest rivals), `expected_log_odds` (natural logarithm), and `others`, the next best changes.
+        None where there is no such class, no change can be simulated, or the time is up.
     """
     rivals = rivals_of(d)
     if len(rivals) < 2:
@@ -81,7 +82,7 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
 
 
 def rivals_of(d: Diagnosis) -> list[Rival]:
-    """The best fit of each name of the last class that has several."""
+    """Return the best fit of each effect in the last class with several; an empty list where there is none."""
     for r in reversed(d.rounds):
         members = r.members if r.chosen is not None else []
         best: dict[str, Rival] = {}
@@ -94,13 +95,19 @@ def rivals_of(d: Diagnosis) -> list[Rival]:
 
 
 def _nearest(rows: np.ndarray, slopes: Sequence[np.ndarray], sigma: np.ndarray) -> tuple[float, tuple[int, int]]:
-    """Half the smallest squared distance of two rivals, each of which may refit to the other, and who they are."""
+    """Return the expected log odds of the two nearest rivals, after a refit of either to the other, and their numbers.
+
+    Args:
+        rows: Predictions of the rivals, (R, n).
+        slopes: For each rival the change of its data by one standard deviation of each parameter, (n, p).
+        sigma: Standard deviation of each value, (n,).
+    """
     best = (math.inf, (0, 1))
     for i, j in itertools.combinations(range(len(rows)), 2):
         r = (rows[i] - rows[j]) / sigma
         left = []
         for J in (slopes[i], slopes[j]):
-            A = np.concatenate([J / sigma[:, None], np.eye(J.shape[1])])  # coordinates in standard deviations of what is known
+            A = np.concatenate([J / sigma[:, None], np.eye(J.shape[1])])  # parameters in standard deviations
             b = np.concatenate([r, np.zeros(J.shape[1])])
             rest = b - A @ np.linalg.lstsq(A, b, rcond=None)[0] if J.shape[1] else b
             left.append(float(rest @ rest))
@@ -109,7 +116,7 @@ def _nearest(rows: np.ndarray, slopes: Sequence[np.ndarray], sigma: np.ndarray) 
 
 
 def _slopes(d: Diagnosis, problem: Problem, rival: Rival, setting: int) -> np.ndarray:
-    """Changes of the data by one standard deviation of each parameter of a rival, (n, p)."""
+    """Return the change of the data by one standard deviation of each parameter of a rival, (n, p)."""
     asked, here = [], dict(rival.point)
     for name in rival.names:
         p = d.problem.parameter(name)
@@ -126,7 +133,10 @@ def _slopes(d: Diagnosis, problem: Problem, rival: Rival, setting: int) -> np.nd
 
 
 def _bodies(problem: Problem, point: Point, setting: int) -> Iterator[tuple[str, Problem, Any]]:
-    """Changes of the first fitted recording of a body; the discretisation's share of the error is that of another setting at `point`."""
+    """Yield changed experiments of a body: name, problem, and function from predictions to their standard deviations (n,).
+
+    They are changes of the first fitted recording. The discretisation error is the difference of another setting at `point`.
+    """
     n = problem.roles["fit"][0]
     base = problem.measured[n]
     noise = problem.recordings[n].noise or 1e-3
@@ -143,7 +153,7 @@ def _bodies(problem: Problem, point: Point, setting: int) -> Iterator[tuple[str,
 
 
 def changes(r: Measured, density: float) -> Iterator[tuple[str, Measured]]:
-    """The catalogue: a recording, launched in another way; those that leave the domain are left out."""
+    """Yield changes of a recording with their names: other launches, poses, loads or lengths; turned bodies must fit the scene."""
     x = r.body.x.double()
     centre = x.mean(dim=0)
     velocity = r.body.v.double()
@@ -182,7 +192,10 @@ def _moved(r: Measured, velocity: torch.Tensor) -> Measured:
 
 
 def _turned(r: Measured, axis: int) -> Measured | None:
-    """The body turned by a right angle about its centre; the velocity keeps its mean and turns its spin. None: it leaves the domain."""
+    """Turn the body of a recording by a right angle about its centre; None if it then leaves the domain or meets a collider.
+
+    The mean velocity stays, and the spin turns with the body.
+    """
     R = torch.eye(3, dtype=torch.float64)
     i, j = [a for a in range(3) if a != axis]
     R[i, i], R[i, j], R[j, i], R[j, j] = 0.0, -1.0, 1.0, 0.0
@@ -210,7 +223,7 @@ def _turned(r: Measured, axis: int) -> Measured | None:
 
 
 class _Launches(Problem):
-    """A point mass thrown in another way; what its start would absorb is taken out of the data."""
+    """A point mass that is thrown in another way, with data from which the part that a change of the start would explain is removed."""
 
     def __init__(self, problem: Problem, velocity: np.ndarray, t: np.ndarray) -> None:
         super().__init__("", "rmse", "m", (), (), (), ())
@@ -227,7 +240,7 @@ class _Launches(Problem):
 
 
 def _tracks(problem: Problem) -> Iterator[tuple[str, Problem, Any]]:
-    """Throws of a point mass."""
+    """Yield throws of a point mass: name, problem, and function from predictions to their standard deviations (n,)."""
     t = np.linspace(0.0, max(float(r.times.max()) for r in problem.recordings), 60)
     speed = max(float(np.ptp(r.y)) / max(float(np.ptp(r.times)), 1e-9) for r in problem.recordings)
     noise = problem.error_model
@@ -256,13 +269,16 @@ class _Loads(Problem):
         time = None if self.time is None else torch.from_numpy(self.time)
         try:
             out = stress_along(self.inner._specimen(points), self.mode, path, time=time)
-        except UserError:  # a law that cannot go there
+        except UserError:  # outside of what the law admits
             return np.full((len(points), path.numel()), np.nan)
         return out.reshape(len(points), -1).numpy()
 
 
 def _materials(problem: Problem) -> Iterator[tuple[str, Problem, Any]]:
-    """Tests of a material in other modes, over the range of stretch that was measured, and beyond, there and back."""
+    """Yield material tests: name, problem, and function from predictions to their standard deviations (n,).
+
+    They are of all modes, up to the measured stretch and beyond it, with and without the way back.
+    """
     tests = [t for t in problem.tests.tests if t.role == "fit"]
     largest = max(float(np.abs(t.path if t.mode == "simple_shear" else np.log(t.path)).max()) for t in tests)
     timed = all(t.time is not None for t in tests)

@@ -1,4 +1,4 @@
-"""The page of a diagnosis: one self-contained HTML file, made from diagnosis.json and the predicted motion, with nothing to load."""
+"""The page of a diagnosis: one HTML file, made from diagnosis.json and the predicted motions, that loads nothing from elsewhere."""
 
 import json
 import math
@@ -15,9 +15,9 @@ from neuido.discrepancy.report.reader_units import WRITTEN, Units, reach, rounde
 from neuido.discrepancy.report.wording import FIGURES, Words, leading, listed, scored_by, title, worded, words_of
 
 LIMIT = 6_000_000
-"""Most bytes of a page."""
+"""Largest size of a page [bytes]."""
 CURVE_POINTS = 24_000
-"""Points of all curves of a page; with many recordings each has fewer."""
+"""Number of points of all curves on a page. With many recordings each curve has fewer."""
 PARTS = Path(__file__).parent / "page_parts"
 ANSWERS = {
     "effect": "an effect is missing",
@@ -32,7 +32,7 @@ HELD_OUT = {
     "validation": "validation: held out of the fits, not of the choice of effects",
     "test": "test: not looked at before the answer was there",
 }
-"""What each error of held-out recordings is of."""
+"""Descriptions of the errors of held-out recordings."""
 Motion = Mapping[str, Mapping[str, np.ndarray]]
 
 
@@ -44,11 +44,11 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[str]]
     note: str = ""
     more: Sequence[str] = ()
-    """Paragraphs after it."""
+    """Paragraphs below the table."""
 
 
 class Section(NamedTuple):
-    """What the page says of one body, or of the only one."""
+    """Content of the page for one body."""
 
     name: str
     answer: str
@@ -57,19 +57,19 @@ class Section(NamedTuple):
     tables: Sequence[Table]
     notes: Sequence[str]
     parts: Sequence[Mapping[str, Any]]
-    """Headings with the numbers of the plots under them."""
+    """Headings, each with the numbers of its plots."""
     pictures: Sequence[tuple[str, str]]
     """Captions and data URLs of silhouettes."""
 
 
 def page(contents: Sequence[Mapping[str, Any]], motions: Sequence[Motion], *, kind: str = "", name: str = "") -> str:
-    """Return the whole page.
+    """Return the page as HTML; curves and motions are thinned out until it is smaller than `LIMIT`.
 
     Args:
-        contents: Part of diagnosis.json of each body, one mostly, in the form of `neuido-diagnosis/2`.
-        motions: Arrays of the recordings of each, as in `predicted`.
+        contents: Part of diagnosis.json for each body, in the form of `neuido-diagnosis/2`.
+        motions: Arrays of the recordings of each body, as in `predicted`.
         kind: `experiment`, `material test` or `track`.
-        name: Of what was measured; of the first part where absent.
+        name: Name of the experiment. Empty: that of the first part.
     """
     units = Units.of(contents, reach=max(reach(m, c["error"]["unit"]) for c, m in zip(contents, motions)))
     share = 1.0
@@ -109,7 +109,7 @@ def _page(contents: Sequence[Mapping[str, Any]], motions: Sequence[Motion], kind
 
 @cache
 def environment() -> Any:
-    """Return the templates; what is put into them is escaped."""
+    """Return the Jinja environment of the page's templates, which escapes all inserted text."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(loader=FileSystemLoader(PARTS), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
@@ -124,7 +124,7 @@ def _part(name: str) -> Any:
 
 @cache
 def plotly_script() -> Any:
-    """Return Plotly's JavaScript, from the package of that name."""
+    """Return Plotly's JavaScript from the Python package, safe inside a script element."""
     from markupsafe import Markup
 
     text = files("plotly").joinpath("package_data/plotly.min.js").read_text(encoding="utf-8")
@@ -132,7 +132,7 @@ def plotly_script() -> Any:
 
 
 def json_in_html(value: Any) -> Any:
-    """Return JSON for a script element: nothing in it ends the element or begins a comment."""
+    """Return a value as JSON for a script element; characters that could end the element are escaped."""
     from markupsafe import Markup
 
     text = json.dumps(value, allow_nan=False, separators=(",", ":"))
@@ -201,7 +201,7 @@ def _places(c: Mapping[str, Any], units: Units) -> str:
 
 
 def _quantity(value: Any, unit: str, units: Units) -> str:
-    """A figure of a table without its unit; a vector in brackets."""
+    """Return a value for a table in the unit of the page, without the unit; a vector in brackets."""
     factor = units.scaled(unit)[0]
     if isinstance(value, list):
         return f"({', '.join(_quantity(v, unit, units) for v in value)})"
@@ -254,7 +254,7 @@ def _silhouettes(c: Mapping[str, Any]) -> Table:
 
 
 def _settings(e: Mapping[str, Any], units: Units) -> list[str]:
-    """What other settings take part in the predictions, and what one simulation leaves without them."""
+    """Return sentences on the amounts of other settings in the predictions, and on the error of one simulation without them."""
     amounts = [
         f"{name}: {rounded(e['amounts']['before'][name], 2)} before, {rounded(v, 2)} after" for name, v in e["amounts"]["after"].items()
     ]
@@ -272,7 +272,7 @@ def _settings(e: Mapping[str, Any], units: Units) -> list[str]:
 
 
 def _models(c: Mapping[str, Any], units: Units) -> list[Table]:
-    """The effects that were tried in each step, the best first, with what they were fitted to."""
+    """Return a table for each step with the effects that were tried and their fitted values, the best first."""
     steps: dict[int, list[Mapping[str, Any]]] = {}
     for m in c["models"]:
         steps.setdefault(m["step"], []).append(m)

@@ -1,4 +1,4 @@
-"""The plots of a diagnosis' page as Plotly's traces and layouts; colours are names such as "@before", which the page fills in."""
+"""The plots of a diagnosis as traces and layouts of Plotly; colours are names such as "@before", which the page replaces."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,19 +12,20 @@ from neuido.discrepancy.report.wording import title
 Arrays = Mapping[str, np.ndarray]
 Plot = dict[str, Any]
 MOST_ROWS = 400
-"""Points of a curve; more are thinned out evenly."""
+"""Largest number of points of a curve; longer ones are thinned out evenly."""
 MOST_BARS = 16
+"""Largest number of effects in the ranking."""
 LOG_FROM = 10.0
-"""Times the noise above which errors are drawn by their logarithms, so that the floor shows."""
+"""Ratio of error to noise above which the axis is logarithmic, so that the floor remains visible."""
 
 
 def safe(name: Any) -> str:
-    """Return a name as Plotly shows it: its labels know some HTML, of which a name may contain nothing."""
+    """Return a name with HTML characters escaped, because Plotly's labels interpret some HTML."""
     return str(name).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
 def numbers(values: Iterable[float], digits: int = 5) -> list[float | None]:
-    """Return figures for JSON; what is not finite leaves a gap."""
+    """Return numbers for JSON with some significant digits; those that are not finite become None, a gap in a curve."""
     return [
         float(f"{v:.{digits}g}") if math.isfinite(v) else None
         for v in np.array([math.nan if v is None else v for v in values], dtype=float)
@@ -32,42 +33,45 @@ def numbers(values: Iterable[float], digits: int = 5) -> list[float | None]:
 
 
 def line(name: str, x: Iterable[float], y: Iterable[float], role: str, *, width: float = 2, dash: str = "solid", **more: Any) -> Plot:
-    """Return a curve."""
+    """Return a trace that draws a curve in the colour of a role, such as `before`."""
     shape = {"color": f"@{role}", "width": width, "dash": dash}
     return {"type": "scatter", "mode": "lines", "name": safe(name), "x": numbers(x), "y": numbers(y), "line": shape, **more}
 
 
 def dots(name: str, x: Iterable[float], y: Iterable[float], role: str, *, symbol: str = "circle", size: int = 5, **more: Any) -> Plot:
-    """Return points."""
+    """Return a trace that draws points in the colour of a role, such as `measured`."""
     marker = {"color": f"@{role}", "size": size, "symbol": symbol}
     return {"type": "scatter", "mode": "markers", "name": safe(name), "x": numbers(x), "y": numbers(y), "marker": marker, **more}
 
 
 def predictions(c: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return which predictions are drawn, and how they are called; without an effect there is one."""
+    """Return the keys of the predictions that are drawn, with their labels: before and after, or one without an effect."""
     return [("before", "before"), ("after", "after")] if c["effects"] else [("before", "predicted")]
 
 
 def plot(heading: str, x: str, y: str, traces: Sequence[Plot], **layout: Any) -> Plot:
-    """Return a plot with a title, two labelled axes and a legend."""
+    """Return a plot of traces with a title, two labelled axes and a legend."""
     axes = {name: {"title": {"text": safe(label)}} | layout.pop(name, {}) for name, label in (("xaxis", x), ("yaxis", y))}
     return {"data": list(traces), "layout": {"title": {"text": safe(heading)}, "showlegend": True} | axes | layout}
 
 
 def thinned(count: int, most: int) -> np.ndarray:
-    """Return the rows of a long curve that are drawn."""
+    """Return the indices of at most `most` evenly spaced rows of `count`."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def distance_over_time(arrays: Arrays, when: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times at which any point is seen, and the root mean square distance of its points from a prediction then [m]."""
+    """Return the times [s] at which any point was seen, and the root mean square distance between measured and predicted points [m].
+
+    `when` is the prediction, `before` or `after`.
+    """
     square = np.sum((arrays["measured"] - arrays[when]) ** 2, axis=-1)
     seen = np.isfinite(square).any(axis=1)
     return arrays["t"][seen], np.sqrt(np.nanmean(square[seen], axis=1))
 
 
 def error_over_time(name: str, arrays: Arrays, c: Mapping[str, Any], units: Units, most: int = MOST_ROWS) -> Plot:
-    """Return the root mean square distance of a recording's points over time, before and after, with the floors."""
+    """Return the plot of a recording's root mean square distance over time, before and after, with the floors."""
     factor, unit = units.scaled("m")
     times, traces = arrays["t"], []
     for when, called in predictions(c):
@@ -87,13 +91,13 @@ def error_over_time(name: str, arrays: Arrays, c: Mapping[str, Any], units: Unit
 
 
 def heading(name: str, c: Mapping[str, Any]) -> str:
-    """Return the name of a recording with its part in the diagnosis."""
+    """Return the name of a recording with its role in brackets."""
     role = c["recordings"].get(name, {}).get("role")
     return f"{name} ({role.replace('_', ' ')})" if role else name
 
 
 def data_plots(name: str, arrays: Arrays, c: Mapping[str, Any], units: Units, most: int = MOST_ROWS) -> list[Plot]:
-    """Return what was measured and predicted in a track or a material test, and what is left, over a physical axis."""
+    """Return two plots of a track or material test over time, stretch or shear: the data with the predictions, and the residual."""
     told = c["recordings"].get(name, {})
     factor, unit = units.scaled(c["error"]["unit"])
     quantity = told.get("quantity", "measured")
@@ -133,14 +137,14 @@ def data_plots(name: str, arrays: Arrays, c: Mapping[str, Any], units: Units, mo
 
 
 def _is_scattered(x: np.ndarray) -> bool:
-    """Whether neighbours in a list lie far from each other, so that no line through them says anything."""
+    """Return whether successive values lie so far apart that a line through them would mean nothing."""
     if len(x) < 3 or not np.ptp(x) > 0:
         return False
     return float(np.median(np.abs(np.diff(x)))) > 0.2 * float(np.ptp(x))
 
 
 def stage_plots(c: Mapping[str, Any]) -> list[Plot]:
-    """Return what is missing in each stage of each recording over time, before and after, with what noise alone makes of it."""
+    """Return a plot of the missing quantity over time for each stage of each recording, before, after and by noise alone."""
     out = []
     for recording, rows in c["stages"].items():
         for s in rows:
@@ -167,7 +171,10 @@ STAGE_QUANTITIES = {
 
 
 def ranking(models: Sequence[Mapping[str, Any]], chance: float | None) -> Plot | None:
-    """Return by how much each model divides the error, the named ones in the colour of `after`."""
+    """Return a bar chart of the error ratios of the effects that were tried, the named ones in the colour of `after`.
+
+    `chance` is the error ratio that chance exceeds in 5 % of the draws. None where fewer than two effects were tried.
+    """
     rows = [m for m in models if m.get("error_ratio")][:MOST_BARS]
     if len(rows) < 2:  # nothing to compare
         return None
@@ -210,5 +217,5 @@ def ranking(models: Sequence[Mapping[str, Any]], chance: float | None) -> Plot |
 
 
 def label_of(m: Mapping[str, Any]) -> str:
-    """Return an effect that was tried in words, with its form where there are several."""
+    """Return the title of an effect that was tried, with its form where it has several."""
     return f"{title(m['name'])}, {m['form']}" if m.get("form") else title(m["name"])

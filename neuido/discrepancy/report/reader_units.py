@@ -1,4 +1,4 @@
-"""The units in which a person reads a diagnosis: one for each quantity of a page, chosen by the sizes that stand on it."""
+"""The units of a page: one for each quantity, chosen by the values on the page."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,9 +7,9 @@ from typing import Any
 LENGTHS = ((1e-6, "µm"), (1e-3, "mm"), (1.0, "m"), (1e3, "km"))
 PRESSURES = ((1e-3, "mPa"), (1.0, "Pa"), (1e3, "kPa"), (1e6, "MPa"), (1e9, "GPa"))
 FAR = {"m": 1e4, "Pa": 1e6}
-"""Largest figure that stands in a unit: a flight of less than 10 m in mm, a modulus of steel in MPa."""
+"""Largest number in front of a unit: a flight below 10 m is in mm, a modulus of steel in MPa."""
 LEAST = 0.3
-"""Smallest figure for whose sake no smaller unit is taken."""
+"""Smallest number in front of a unit; for smaller ones a smaller unit is chosen."""
 SPOKEN = {"1/s": "per second", "1/m": "per metre", "1": "", "m/s^2": "m/s²", "1/s^2": "per s²", "m/s": "m/s", "rad": "rad"}
 WRITTEN = {"1": "–", "m/s^2": "m/s²", "1/s^2": "1/s²", "rad/s^2": "rad/s²", "Pa s": "Pa s"}
 DIGITS = 3
@@ -19,8 +19,8 @@ class Units:
     """The units of a page.
 
     Args:
-        lengths: Sizes of lengths on the page [m].
-        pressures: Sizes of stresses and moduli [Pa].
+        lengths: Lengths on the page [m].
+        pressures: Stresses and moduli on the page [Pa].
     """
 
     def __init__(self, lengths: Iterable[float] = (), pressures: Iterable[float] = ()) -> None:
@@ -32,8 +32,8 @@ class Units:
         """Return the units for diagnoses that share a page.
 
         Args:
-            contents: Parts of diagnosis.json, one a body.
-            reach: Largest coordinate or length that is drawn [m], where the parts do not tell it.
+            contents: Parts of diagnosis.json, one per body.
+            reach: Largest coordinate or length that is drawn [m], where the parts do not contain it.
         """
         found: dict[str, list[float]] = {"m": [reach, *(c.get("reach", 0.0) for c in contents)], "Pa": []}
         for c in contents:
@@ -48,17 +48,17 @@ class Units:
         return cls(found["m"], found["Pa"])
 
     def scaled(self, unit: str) -> tuple[float, str]:
-        """Return the factor from an SI unit to that of the page, and its name."""
+        """Return the factor from an SI unit to the unit of the page, and the name of that unit."""
         (length, metre), (pressure, pascal) = self.length, self.pressure
         own = {"m": (1 / length, metre), "Pa": (1 / pressure, pascal), "1/Pa": (pressure, f"1/{pascal}")}
         return own.get(unit, (1.0, WRITTEN.get(unit, unit)))
 
     def label(self, unit: str) -> str:
-        """Return a unit as a table's or an axis' label has it; a dash where there is none."""
+        """Return the name of the page's unit for a table or axis; a dash for dimensionless quantities."""
         return self.scaled(unit)[1]
 
     def said(self, value: float | None, unit: str, *, digits: int = DIGITS) -> str:
-        """Return a figure with its unit, in words where the unit has any."""
+        """Return a value with its unit for a sentence, such as "3.00 per second"."""
         if value is None or not math.isfinite(value):
             return "infinite"
         factor, label = self.scaled(unit)
@@ -66,7 +66,7 @@ class Units:
         return f"{rounded(value * factor, digits)}{f' {spoken}' if spoken else ''}"
 
     def figures(self, value: float, interval: Sequence[float | None], unit: str) -> tuple[str, str]:
-        """Return a figure and its interval in the unit of the page, as many digits as the interval bears."""
+        """Return a value and its interval in the unit of the page, with as many digits as the interval justifies."""
         factor = self.scaled(unit)[0]
         low, high = (None if end is None or not math.isfinite(end) else end * factor for end in interval)
         if low is None or high is None or not high > low:
@@ -82,11 +82,11 @@ class Units:
 
 
 def reach(motion: Mapping[str, Mapping[str, Any]], unit: str) -> float:
-    """Return the largest length that plots of motions show [m]: an extent in space, or a coordinate of a track; 0 of other data.
+    """Return the largest length in the plots of motions [m]: extent of a body's motion, or coordinate of a track; 0 for other data.
 
     Args:
-        motion: Arrays of each recording.
-        unit: Of the errors.
+        motion: Arrays of each recording, as in `predicted`.
+        unit: Unit of the errors.
     """
     import numpy as np
 
@@ -103,12 +103,12 @@ def reach(motion: Mapping[str, Mapping[str, Any]], unit: str) -> float:
 
 
 def axis_of(arrays: Mapping[str, Any], told: Mapping[str, Any], units: Units) -> tuple[Any, str]:
-    """Return the physical abscissa of each datum and its label; the time, or the order of the rows, where a file tells no more.
+    """Return the abscissa of each value of a recording, and its label: stretch, shear, time, or the order of the rows.
 
     Args:
-        arrays: Of a recording in `predicted`.
-        told: Its entry of `recordings` in diagnosis.json.
-        units: Of the page.
+        arrays: Arrays of the recording, as in `predicted`.
+        told: Entry of the recording in diagnosis.json.
+        units: Units of the page.
     """
     if "axis" in arrays and told.get("axis"):
         factor, unit = units.scaled(told["axis"]["unit"])
@@ -117,14 +117,14 @@ def axis_of(arrays: Mapping[str, Any], told: Mapping[str, Any], units: Units) ->
 
 
 def rounded(value: float, digits: int = DIGITS) -> str:
-    """Return a figure with some significant digits, without an exponent where it can be read without one."""
+    """Return a number with some significant digits, with an exponent only if it is very large or small."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     return fixed(value, digits - 1 - math.floor(math.log10(abs(value))))
 
 
 def fixed(value: float, decimals: int) -> str:
-    """Return a figure with some decimals; fewer than none rounds to tens. Beyond a million, or below a ten-thousandth, with an exponent."""
+    """Return a number with some decimals; -1 rounds to tens. From a million, and below 1e-4, it has an exponent."""
     shown = round(value, decimals)
     if shown and not 1e-4 <= abs(shown) < 1e6:
         size = math.floor(math.log10(abs(shown)))
@@ -133,7 +133,10 @@ def fixed(value: float, decimals: int) -> str:
 
 
 def _chosen(units: Sequence[tuple[float, str]], sizes: Iterable[float], far: float, usual: tuple[float, str]) -> tuple[float, str]:
-    """The largest unit in which the smallest size reads well, if the largest is no number of too many digits in it."""
+    """Return the largest unit in which the smallest size is at least `LEAST`, of those in which the largest size is below `far`.
+
+    `usual` is the unit where there are no sizes.
+    """
     own = sorted(abs(v) for v in sizes if v and math.isfinite(v))
     if not own:
         return usual

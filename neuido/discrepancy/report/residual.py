@@ -1,13 +1,13 @@
-"""What a residual says by itself: the weak residual of a body's motion, and its stages (flight, rotation, modes, contact, power, rest).
+"""The weak residual of a body's motion, divided into stages: flight, contact, rotation, internal modes, power and rest.
 
-The weak residual tests the balance of momentum with a field w over the body times a bump phi(t) that vanishes with its slope at both
-ends, and moves both time derivatives on to the bump, so that measured positions are never differentiated:
+The weak residual tests the balance of momentum with a field w over the body times a bump phi(t). The bump and its slope vanish at both
+ends. Integration by parts moves both time derivatives to the bump, so that measured positions are never differentiated:
 
     R[w, phi] = sum_p m_p w_p . INT x_p phi'' dt + sum_p V_p INT phi P_p : grad w_p dt - sum_p m_p w_p . INT phi b dt,
 
-which is zero where nothing is missing. Its noise is known in closed form: sigma^2 sum_p m_p^2 |w_p|^2 INT phi''^2 dt. Of a measured motion
-less a predicted one with the same forces the last two terms cancel (exactly for w = 1, else to first order in their distance), and R is
-the missing force. Weak forms against noise: Messenger and Bortz, Weak SINDy, 2021.
+which is zero where nothing is missing. Its variance by noise is sigma^2 sum_p m_p^2 |w_p|^2 INT phi''^2 dt. For the difference of a
+measured and a predicted motion with the same forces, the last two terms cancel (exactly for w = 1, else to first order in the difference),
+and R is the missing force. Source: Messenger and Bortz, Weak SINDy, 2021.
 """
 
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ import numpy as np
 from neuido.types import Plane
 
 WINDOWS = 12
-"""Bumps over a recording, half overlapping."""
+"""Number of bumps over a recording, which overlap by half."""
 FEWEST = 7
-"""Frames in a window."""
+"""Least number of frames in a window."""
 POWER = 4
-"""Of the bump (1 - s^2)^4."""
+"""Exponent of the bump (1 - s^2)^4."""
 REST = 0.1
-"""Share of the recording, at its end, whose mean residual is the stage `rest`."""
+"""Share of the recording at its end whose mean residual is the stage `rest`."""
 
 
 class Window(NamedTuple):
@@ -32,20 +32,20 @@ class Window(NamedTuple):
 
     frames: slice
     second: np.ndarray
-    """Weights [1/s] of the frames that make INT x phi'' dt of samples x, exact for paths up to t^2."""
+    """Weights of the frames for the integral INT x phi'' dt [1/s], exact for paths up to t^2."""
     value: np.ndarray
-    """Weights [s] of the frames that make INT f phi dt."""
+    """Weights of the frames for the integral INT f phi dt [s]."""
     time: float
-    """Its middle [s]."""
+    """Middle of the window [s]."""
 
     @property
     def area(self) -> float:
-        """INT phi dt [s]."""
+        """Integral of the bump, INT phi dt [s]."""
         return float(self.value.sum())
 
 
 def window(t: np.ndarray, frames: slice) -> Window:
-    """The bump over the frames of a slice, at times t (T,) [s]."""
+    """Return the bump over the frames of a slice, for a recording with times t (T,) [s]."""
     at = t[frames]
     half = 0.5 * (at[-1] - at[0])
     s = np.clip((at - at[0]) / half - 1.0, -1.0, 1.0)
@@ -54,7 +54,7 @@ def window(t: np.ndarray, frames: slice) -> Window:
     u = 1.0 - s**2
     value = step * u**POWER
     second = step * (4 * POWER * (POWER - 1) * s**2 * u ** (POWER - 2) - 2 * POWER * u ** (POWER - 1)) / half**2
-    # sampled at few frames the weights miss a little: rest and steady motion must vanish, and a steady acceleration a give a times the area
+    # corrected for few frames: rest and steady motion must give exactly zero, and a steady acceleration a exactly a times the area
     basis = np.stack([np.ones_like(s), s, s**2], axis=1)
     wanted = np.array([0.0, 0.0, 2 * value.sum() / half**2])
     shape = basis * u[:, None] ** 2
@@ -63,7 +63,7 @@ def window(t: np.ndarray, frames: slice) -> Window:
 
 
 def windows(t: np.ndarray, count: int = WINDOWS) -> list[Window]:
-    """Half-overlapping bumps over a recording; fewer where it is short."""
+    """Return half-overlapping bumps over a recording with times t (T,) [s]; fewer than `count` where it is short."""
     length = max(2 * len(t) // (count + 1), FEWEST)
     if length > len(t):
         return [window(t, slice(0, len(t)))] if len(t) >= 5 else []
@@ -83,21 +83,24 @@ def weak_residual(
     gradients: np.ndarray | None = None,
     volume: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """R[w, phi] of some fields, and its standard deviation from noise of the positions.
+    """Compute the weak residual R[w, phi] of K fields, and its standard deviation by noise of the positions.
 
     Args:
-        x: Positions, or measured less predicted ones, (T, N, 3) [m]; a point that is not seen (NaN) in the window is left out.
+        x: Positions, or measured less predicted ones, (T, N, 3) [m]. A point that is not seen (NaN) in the window is left out.
         bump: The window.
-        fields: w, (K, N, 3).
-        mass: Of the points [kg], (N,).
-        sigma: Standard deviation of a coordinate [m].
-        force: b, per mass [m/s^2].
-        stress: First Piola-Kirchhoff stress of the points [Pa], (T, N, 3, 3), with
-        gradients: of w by the reference positions, (K, N, 3, 3), and
-        volume: of the points [m^3], (N,).
+        fields: Fields w, (K, N, 3).
+        mass: Masses of the points [kg], (N,).
+        sigma: Standard deviation of the noise of a coordinate [m].
+        force: Force b per mass [m/s^2].
+        stress: First Piola-Kirchhoff stress of the points [Pa], (T, N, 3, 3). It needs `gradients` and `volume`.
+        gradients: Derivatives of w by the reference positions, (K, N, 3, 3).
+        volume: Volumes of the points [m^3], (N,).
 
     Returns:
-        (K,) and (K,) in [N s] times the unit of w.
+        Residuals (K,) and standard deviations (K,), in N s times the unit of w.
+
+    Raises:
+        ValueError: Stress is given without gradients or volume.
     """
     own = x[bump.frames]
     seen = np.isfinite(own).all(axis=(0, 2))
@@ -113,12 +116,12 @@ def weak_residual(
 
 
 def deformation_gradients(reference: np.ndarray, x: np.ndarray, neighbours: int = 12) -> np.ndarray:
-    """F of every point from its neighbours by weighted least squares, (T, N, 3, 3); exact for affine motions.
+    """Estimate F of each point, (T, N, 3, 3), from its neighbours by weighted least squares; exact for affine motions.
 
     Args:
-        reference: (N, 3) [m].
-        x: (T, N, 3) [m]; NaN makes F of a point and its neighbours NaN.
-        neighbours: How many count; the weight falls to exp(-2) at the last.
+        reference: Points at rest, (N, 3) [m].
+        x: Moved points, (T, N, 3) [m]. NaN makes F of a point and its neighbours NaN.
+        neighbours: Number of neighbours. The weight of the farthest one is exp(-2).
     """
     distance = np.linalg.norm(reference[:, None] - reference[None], axis=-1)
     index = np.argsort(distance, axis=1)[:, 1 : neighbours + 1]
@@ -131,7 +134,7 @@ def deformation_gradients(reference: np.ndarray, x: np.ndarray, neighbours: int 
 
 
 def hats(reference: np.ndarray, nodes: int = 3) -> np.ndarray:
-    """Piecewise linear fields of compact support on a lattice over the body, (nodes^3, N), that add up to one."""
+    """Return piecewise linear shape functions of a lattice over the body at its points, (nodes^3, N), which add up to one."""
     low, size = reference.min(axis=0), np.maximum(np.ptp(reference, axis=0), 1e-12)
     s = (reference - low) / size * (nodes - 1)
     one = np.maximum(0.0, 1.0 - np.abs(s[:, None, :] - np.arange(nodes)[None, :, None]))
@@ -139,17 +142,20 @@ def hats(reference: np.ndarray, nodes: int = 3) -> np.ndarray:
 
 
 def place(x: np.ndarray, t: np.ndarray, predicted: np.ndarray, *, sigma: float) -> tuple[np.ndarray, float]:
-    """Where on the body the missing force is largest: the centre of that hat [m] at t = 0, and by how much it exceeds the median hat.
+    """Find the part of the body where the missing force per mass is largest, among the shape functions of `hats`.
 
     Args:
-        x: Measured points (T, N, 3) [m], NaN where not seen.
-        t: (T,) [s].
-        predicted: (T, N, 3) [m].
-        sigma: Noise of a coordinate [m].
+        x: Measured points, (T, N, 3) [m], NaN where not seen.
+        t: Times, (T,) [s].
+        predicted: Predicted points, (T, N, 3) [m].
+        sigma: Standard deviation of the noise of a coordinate [m].
+
+    Returns:
+        The centre of the part at t = 0, (3,) [m], and the ratio of its squared force to the median of all parts.
     """
     shape = hats(predicted[0])
     points = shape.sum(axis=1)
-    shape = shape[points > min(1.0, 0.5 * float(points.max()))]  # those with hardly a point are noise
+    shape = shape[points > min(1.0, 0.5 * float(points.max()))]  # parts with hardly a point show noise alone
     fields = np.einsum("kn,ac->kanc", shape, np.eye(3)).reshape(-1, *predicted.shape[1:])
     total = np.zeros(len(shape))
     for bump in windows(t):
@@ -160,20 +166,20 @@ def place(x: np.ndarray, t: np.ndarray, predicted: np.ndarray, *, sigma: float) 
 
 
 class Parts(NamedTuple):
-    """A residual field split in its affine part about the mean and a remainder; each over frames."""
+    """Affine part of a residual field and its remainder, for each of T frames."""
 
     centre: np.ndarray
-    """(T, 3) [m]"""
+    """Translation, (T, 3) [m]."""
     rotation: np.ndarray
-    """Infinitesimal rotation (T, 3) [rad]."""
+    """Infinitesimal rotation, (T, 3) [rad]."""
     strain: np.ndarray
-    """xx, yy, zz, yz, xz, xy, (T, 6) [-]."""
+    """Strains xx, yy, zz, yz, xz, xy, (T, 6) [-]."""
     remainder: np.ndarray
     """Root mean square distance that no affine motion explains, (T,) [m]."""
 
 
 def decompose(x: np.ndarray, predicted: np.ndarray) -> Parts:
-    """Least squares x - predicted = a + A (predicted - its mean), frame by frame; both (T, N, 3) [m], NaN where not seen."""
+    """Fit x - predicted = a + A (predicted - mean) in each frame by least squares; both are (T, N, 3) [m], NaN where not seen."""
     out = np.full((len(x), 13), np.nan)
     for k, (a, b) in enumerate(zip(x, predicted)):
         seen = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
@@ -190,7 +196,7 @@ def decompose(x: np.ndarray, predicted: np.ndarray) -> Parts:
 
 
 def in_contact(x: np.ndarray, planes: Sequence[Plane], margin: float) -> np.ndarray:
-    """Frames in which a point is within a margin [m] of a plane, (T,)."""
+    """Return the mask (T,) of frames in which a point of x (T, N, 3) [m] is nearer to a plane than `margin` [m]."""
     out = np.zeros(len(x), dtype=bool)
     for plane in planes:
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
@@ -200,26 +206,27 @@ def in_contact(x: np.ndarray, planes: Sequence[Plane], margin: float) -> np.ndar
 
 
 class Series(NamedTuple):
-    """One stage in the course of time."""
+    """Missing quantity of one stage over W windows of time, such as a missing acceleration in flight."""
 
     name: str
     unit: str
     times: np.ndarray
     """Middles of the windows [s], (W,)."""
     before: np.ndarray
-    """Size of what is missing, (W,)."""
+    """Root mean square of the missing quantity without the effects, (W,)."""
     after: np.ndarray
+    """Root mean square of the missing quantity with the effects, (W,)."""
     noise: np.ndarray
-    """What noise alone makes of it, (W,)."""
+    """Value that noise alone causes, (W,)."""
     degrees: int
-    """Numbers in each value."""
+    """Number of components of the quantity."""
 
     def size(self, values: np.ndarray) -> float:
-        """Root mean square over the windows."""
+        """Return the root mean square over the windows."""
         return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
 
     def excess(self, values: np.ndarray) -> float:
-        """Mean square in units of the noise, per number: 1 where there is noise alone."""
+        """Return the mean square in units of the noise: about 1 where there is noise alone."""
         return float(np.mean((values / np.maximum(self.noise, 1e-300)) ** 2)) if len(values) else 0.0
 
 
@@ -234,22 +241,22 @@ def stages(
     planes: Sequence[Plane],
     margin: float,
 ) -> list[Series]:
-    """What is missing from two predictions, by stage.
+    """Compute what two predictions lack, by stage.
 
     Args:
         x: Measured points, (T, N, 3) [m], NaN where not seen.
-        t: (T,) [s].
-        before: Predicted, without the effects.
-        after: With them.
-        mass: Of the body [kg], spread evenly over the points.
-        sigma: Noise of a coordinate [m].
-        planes: What the body may touch.
-        margin: How near counts as contact [m].
+        t: Times, (T,) [s].
+        before: Points predicted without the effects, (T, N, 3) [m].
+        after: Points predicted with the effects, (T, N, 3) [m].
+        mass: Mass of the body [kg], spread evenly over the points.
+        sigma: Standard deviation of the noise of a coordinate [m].
+        planes: Colliders that the body may touch.
+        margin: Distance that counts as contact [m].
 
     Returns:
-        flight (missing acceleration of the centre where no window frame has contact), contact (impulse where one has), rotation
-        (angular acceleration), internal modes (acceleration of the six affine strains), power (of the missing force along the predicted
-        motion), rest (mean distance at the end).
+        The stages that occur: flight (missing acceleration of the centre, in windows without contact), contact (missing impulse, in windows
+        with contact), rotation (angular acceleration), internal modes (acceleration of the six affine strains), power (of the missing
+        force along the predicted motion) and rest (mean distance at the end).
     """
     masses = np.full(x.shape[1], mass / x.shape[1])
     touch = in_contact(x, planes, margin)
@@ -296,12 +303,12 @@ def _rest(x: np.ndarray, t: np.ndarray, before: np.ndarray, after: np.ndarray, s
 
 
 def _rotations(place: np.ndarray) -> np.ndarray:
-    """e_k x r, (3, N, 3)."""
+    """Return the velocity fields e_k x r of unit rotations about the three axes, (3, N, 3)."""
     return np.stack([np.cross(axis, place) for axis in np.eye(3)])
 
 
 def _strains(place: np.ndarray) -> np.ndarray:
-    """The six symmetric linear fields, (6, N, 3)."""
+    """Return the six symmetric linear fields (unit strains) at the points, (6, N, 3)."""
     out = []
     for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)):
         field = np.zeros_like(place)
@@ -313,6 +320,6 @@ def _strains(place: np.ndarray) -> np.ndarray:
 
 
 def telling(series: Sequence[Series]) -> Series | None:
-    """The stage in which the effects cut most of what was above the noise."""
+    """Return the stage whose excess over the noise the effects lower most; None where there is none."""
     able = [s for s in series if len(s.times)]
     return max(able, key=lambda s: s.excess(s.before) - s.excess(s.after), default=None)

@@ -1,4 +1,4 @@
-"""Silhouettes in the report: outlines before and after over the measured mask."""
+"""Pictures of silhouettes in the report: predicted outlines before and after, over the measured mask."""
 
 import base64
 from collections.abc import Mapping
@@ -12,15 +12,16 @@ from neuido.discrepancy.problems.silhouettes import distances
 BEFORE, AFTER = (192, 57, 43), (31, 119, 180)
 """Red and blue of the report, RGB."""
 FRAMES = 8
-"""Of a view that are shown, evenly taken."""
+"""Number of frames shown per view, evenly chosen."""
 ENLARGED = 2
+"""Factor by which masks are enlarged."""
 
 
 def pictures(motion: Mapping[str, Mapping[str, np.ndarray]], c: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the caption and the data URL of each recording's picture: frames in a row, views below each other.
+    """Return caption and data URL of the picture of each recording, with frames in a row and views below each other.
 
     Args:
-        motion: Of each recording `masks`, `drawn_before`, `drawn_after` (T, V, H, W) uint8.
+        motion: For each recording `masks`, `drawn_before` and `drawn_after`, (T, V, H, W) uint8.
         c: Part of diagnosis.json, whose `recordings` have `inset` [px] and `frame_times` [s].
     """
     out = []
@@ -39,7 +40,7 @@ def pictures(motion: Mapping[str, Mapping[str, np.ndarray]], c: Mapping[str, Any
 
 
 def _overlay(own: Mapping[str, np.ndarray], t: int, v: int, inset: float) -> np.ndarray:
-    """One image (H, W, 3) uint8."""
+    """Return the picture of frame t and view v, (H, W, 3) uint8; predicted outlines are moved inwards by `inset` [px]."""
     mask = own["masks"][t, v] / 255.0
     size = (ENLARGED * mask.shape[1], ENLARGED * mask.shape[0])
     image = np.repeat((255 - 90 * cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR))[..., None], 3, axis=2).round().astype(np.uint8)

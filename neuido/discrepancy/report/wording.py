@@ -1,4 +1,4 @@
-"""The answer of a diagnosis in plain words: what the command prints, and what its page opens with."""
+"""The answer of a diagnosis in plain words, for the terminal and the top of the page."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,21 +7,21 @@ from typing import Any, NamedTuple
 from neuido.discrepancy.report.reader_units import Units, rounded
 
 LEADING = ("yield_stress", "damping_ratio", "coefficient", "ratio")
-"""Derived figures that say more about an effect than the fitted ones."""
+"""Derived quantities that replace the fitted parameters of an effect in words."""
 MORE = 3.0
-"""Times its floor above which what named effects leave is more than they explain."""
+"""Ratio of the residual with the named effects to its floor, above which something more is missing."""
 STANDS_ABOVE = 1.5
-"""Times the noise above which the answer `none` says where the residual stands."""
+"""Ratio of residual to noise above which the answer `none` states the ratio."""
 MOST_SAID = 4
-"""Figures or effects that a sentence lists; a table has all of them."""
+"""Largest number of values or effects in a sentence. A table lists all."""
 TELLING = 1.05
-"""Times the error of the named effect at which a rival is worth a sentence."""
+"""Least ratio of a rival's error to that of the named effect at which a sentence compares them."""
 NUMBERS = ("no", "one", "two", "three")
 Content = Mapping[str, Any]
 
 
 class Words(NamedTuple):
-    """The answer, a paragraph each; empty where there is nothing to say."""
+    """Paragraphs of an answer, each empty where there is nothing to say."""
 
     finding: str
     """What is missing, and how large it is."""
@@ -38,18 +38,18 @@ class Words(NamedTuple):
 
     @property
     def paragraphs(self) -> tuple[str, ...]:
-        """Those that say something."""
+        """Paragraphs that are not empty."""
         return tuple(part for part in self if part)
 
 
 def words_of(c: Content, units: Units | None = None) -> Words:
-    """Return the words of one part of diagnosis.json."""
+    """Return the words for one part of diagnosis.json."""
     units = units or Units.of([c])
     return Words(_finding(c, units), _error(c, units), _sure(c), _not_excluded(c, units), _next(c), _notes(c))
 
 
 def _notes(c: Content) -> str:
-    """Return what was left out, and what makes a motion doubtful."""
+    """Return sentences on skipped steps, and on doubtful motions."""
     out = []
     if c["left_out"]:
         out.append(f"The search ended before {listed([worded(step) for step in c['left_out']])}: the same command with {more(c)} goes on.")
@@ -58,24 +58,24 @@ def _notes(c: Content) -> str:
 
 
 def more(c: Mapping[str, Any]) -> str:
-    """Return what lets a search that was cut off go on."""
+    """Return what a search that was cut off needs to continue: more effort or more minutes."""
     return "more effort" if c.get("work", {}).get("ended_by") == "effort" else "more minutes"
 
 
 def titles() -> dict[str, str]:
-    """Return the words for each effect of the library."""
+    """Return the titles of the effects of the library, by name."""
     from neuido.physics.effects.library import LIBRARY
 
     return {entry.name: entry.title for entry in LIBRARY}
 
 
 def title(name: str) -> str:
-    """Return the words for an effect; for one that is not of the library its name."""
+    """Return the title of an effect; for one outside the library its name with spaces."""
     return titles().get(name, name.replace("_", " "))
 
 
 def named(name: str) -> str:
-    """Return the words for an effect with its identifier beside, which options and files take: "linear air drag (drag_linear)"."""
+    """Return the title of an effect with its identifier for options and files: "linear air drag (drag_linear)"."""
     return f"{title(name)} ({name})"
 
 
@@ -88,11 +88,11 @@ FIGURES = {
     "gravity": "gravity",
     "stiffness": "factor on the law's stress",
 }
-"""Words for the figures of a declared model."""
+"""Names of the declared values in words."""
 
 
 def worded(text: str) -> str:
-    """Return a text in which the identifiers of effects are replaced by words."""
+    """Replace the identifiers of effects in a text by their titles."""
     import re
 
     words = titles()
@@ -104,13 +104,13 @@ def worded(text: str) -> str:
 
 
 def listed(parts: Sequence[str], last: str = "and") -> str:
-    """Return "a, b and c"."""
+    """Join parts to a list in words: "a, b and c"."""
     parts = list(parts)
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} {last} {parts[-1]}" if parts else ""
 
 
 def leading(parameters: Mapping[str, Any]) -> list[str]:
-    """Return the names of the figures that say how large an effect is, one mostly; the parts of a vector all."""
+    """Return the names of the parameters that give the size of an effect: mostly one, and all components of a vector."""
     derived = [key for key in LEADING if key in parameters]
     if derived:
         return derived[:1]
@@ -120,7 +120,7 @@ def leading(parameters: Mapping[str, Any]) -> list[str]:
 
 
 def size_of(parameters: Mapping[str, Any], units: Units) -> str:
-    """Return the leading figures of an effect with their 90 % intervals: "k = 3.00 per second (90 %: 2.98–3.02)"."""
+    """Return the leading parameters of an effect with their 90 % intervals: "k = 3.00 per second (90 %: 2.98–3.02)"."""
     from neuido.discrepancy.report.reader_units import SPOKEN
 
     out = []
@@ -134,7 +134,7 @@ def size_of(parameters: Mapping[str, Any], units: Units) -> str:
 
 
 def _class_of(e: Content) -> str:
-    """Return the words for an effect, or for all that cannot be told from it."""
+    """Return the title of an effect, or the titles of all effects of its class."""
     return listed([title(name) for name in e["class"]], "or")
 
 
@@ -171,7 +171,7 @@ def _finding(c: Content, units: Units) -> str:
 
 
 def _missing(effects: Sequence[Content], units: Units, *, name: str) -> str:
-    """Return what is missing in one sentence, or two where the data cannot tell effects apart."""
+    """Return a sentence on the missing effects, and a second one where the data cannot tell effects apart."""
     if len(effects) == 1:
         (e,) = effects
         size = size_of(e["parameters"], units)
@@ -187,7 +187,7 @@ def _missing(effects: Sequence[Content], units: Units, *, name: str) -> str:
 
 
 def scored_by(scores: Content) -> str:
-    """Return which error of some scores counts: `held_out` where anything is, else `fit`."""
+    """Return the key of the error that counts: `held_out` where there is one, else `fit`."""
     return "held_out" if scores.get("held_out") is not None else "fit"
 
 
@@ -249,7 +249,7 @@ def _not_excluded(c: Content, units: Units) -> str:
 
 
 def _share(row: Content) -> float:
-    """How much of its range an effect may fill unseen."""
+    """Return the share of its range that an effect may reach without being excluded."""
     if row["up_to"] is None:
         return math.inf
     return row["up_to"] / row["largest"] if row.get("largest") else 0.0
