@@ -78,7 +78,7 @@ def with_own_effects(problem: Problem, effects: Sequence[OwnEffect]) -> Problem:
     return problem
 
 
-FIRST, SEVERAL = ("margin", "motion", "_scored"), ("predict", "forces", "_specimen")
+TAKE_ONE, TAKE_SEVERAL = ("margin", "motion", "_scored"), ("predict", "forces", "_specimen")
 """Methods of problems whose first argument is one parameter set, and those where it is several."""
 
 
@@ -110,6 +110,6 @@ def _methods(kind: type, effects: Sequence[OwnEffect]) -> dict[str, Any]:
                 kept += [key.partition(".")[0] for key in effect.acts_as(values.get(f"{effect.name}.{effect.parameter}", 0.0))]
         return kind.model_after(self, translated(values), list(dict.fromkeys(kept)))
 
-    made = {name: of_one(getattr(kind, name)) for name in FIRST if hasattr(kind, name)}
-    made |= {name: of_several(getattr(kind, name)) for name in SEVERAL if hasattr(kind, name)}
+    made = {name: of_one(getattr(kind, name)) for name in TAKE_ONE if hasattr(kind, name)}
+    made |= {name: of_several(getattr(kind, name)) for name in TAKE_SEVERAL if hasattr(kind, name)}
     return made | {"predict_several": predict_several, "model_after": model_after}

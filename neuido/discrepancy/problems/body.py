@@ -91,7 +91,7 @@ class BodyProblem(BodyRollouts):
             yield from (self._side_by_side if self.device == "cpu" else self._in_one_launch)(self._runs(asks))
 
     def _runs(self, asks: Sequence[Ask]) -> list[Run]:
-        return [Run(points, self._alike(points, n), n, s, np.empty((len(points), len(self.recordings[n].y)))) for points, n, s in asks]
+        return [Run(points, self._groups(points, n), n, s, np.empty((len(points), len(self.recordings[n].y)))) for points, n, s in asks]
 
     def _side_by_side(self, runs: Sequence[Run]) -> Iterator[np.ndarray]:
         """Simulate each motion alone on the CPU, as many at a time as there are cores, and yield the predictions of each run."""
@@ -128,7 +128,7 @@ class BodyProblem(BodyRollouts):
                 self._predict([part for part in parts if part.groups])
             yield run.out
 
-    def _alike(self, points: Sequence[Point], recording: int) -> list[list[int]]:
+    def _groups(self, points: Sequence[Point], recording: int) -> list[list[int]]:
         """Group parameter sets with the same motion, those that differ only in `instruments` or in nuisances of other recordings."""
         name = self.measured[recording].name
         instruments = tuple(f"{kind}:{name}" for kind in self.instruments)
@@ -161,7 +161,7 @@ class BodyProblem(BodyRollouts):
 
     def motion(self, point: Point, recording: int, setting: int = 0) -> np.ndarray:
         """Predict the tracked points [m], (T, N, 3), without errors of the instruments."""
-        ((x, _),) = self._roll([([point], recording)], setting)
+        ((x, _),) = self._tracked_motion([([point], recording)], setting)
         return x[0]
 
     def simulated(self, recording: int) -> Measured:
@@ -173,7 +173,7 @@ class BodyProblem(BodyRollouts):
     def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
         model = {key: dict(value) if isinstance(value, Mapping) else value for key, value in self.experiment.model.items()}
         for p in self.declared:
-            _place(model, p.name, values.get(p.name, p.value))
+            _set_value(model, p.name, values.get(p.name, p.value))
         own = {key: float(value) for key, value in values.items() if key.split(".")[0] in effects}
         if any(key.startswith("time_force.") and key[-1].isdigit() for key in own):
             own.setdefault("time_force.interval", self.duration / (KNOTS - 1))
@@ -219,7 +219,7 @@ class BodyProblem(BodyRollouts):
 
     def _simulate(self, runs: Sequence[Motions], setting: int) -> Sequence[Any]:
         """Simulate each recording, and return its motions in the form that `_fill` takes."""
-        return self._roll(runs, setting)
+        return self._tracked_motion(runs, setting)
 
     def _fill(self, run: Run, moved: Any) -> None:
         """Fill in the predictions of a run from its motions."""
@@ -238,7 +238,7 @@ class BodyProblem(BodyRollouts):
         centre = x[0].mean(axis=0)
         return centre + (1.0 + value["length_scale"]) * (x + (value["release_time"] + value["time_base"] * t) * v - centre)
 
-    def _roll(self, runs: Sequence[Motions], setting: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _tracked_motion(self, runs: Sequence[Motions], setting: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Simulate, and return positions [m] and velocities [m/s] of the tracked points of each recording, (S, T, N, 3) each."""
         out = []
         for (_, recording), frames in zip(runs, self._move(runs, setting), strict=True):
@@ -381,7 +381,7 @@ def _parts(model: Mapping[str, Any]) -> list[Any]:
     return [model["elasticity"], model["plasticity"], model.get("law", {}), model]
 
 
-def _place(model: dict[str, Any], name: str, value: float) -> None:
+def _set_value(model: dict[str, Any], name: str, value: float) -> None:
     for part in _parts(model):
         if name in part:
             part[name] = float(value)

@@ -143,9 +143,9 @@ class SeriesError(NamedTuple):
 
 DEGREE = 5
 """Degree of the local polynomials by which the slow error is estimated."""
-WIDER = 4 / 3
+WINDOW_GROWTH = 4 / 3
 """Ratio of the lengths of successive windows for the slow error."""
-AT_ONCE = 1.6
+LARGEST_GROWTH = 1.6
 """Largest growth of the residual variance from one window length to the next that is attributed to a slow error.
 
 The residual variance of a smooth motion grows by (4/3)^12 = 32 with polynomials of degree five; that of a slow error grows far less.
@@ -156,7 +156,7 @@ def correlation(series: list[tuple[np.ndarray, np.ndarray]]) -> SeriesError:
     """Estimate the measurement error of series whose true course is smooth, without a model of the motion.
 
     The independent noise is the median over the series of the estimates of `high_pass`. The slow error is the residual of polynomials of
-    degree five in windows that grow up to the whole series. They grow only while the residual variance does so slowly (`AT_ONCE`): a
+    degree five in windows that grow up to the whole series. They grow only while the residual variance does so slowly (`LARGEST_GROWTH`): a
     sudden growth comes from the motion. The correlation time follows from the covariance of neighbouring residuals in the longest window.
 
     Args:
@@ -172,10 +172,10 @@ def correlation(series: list[tuple[np.ndarray, np.ndarray]]) -> SeriesError:
     longest = max((len(t) for t, _ in series), default=0)
     while longest >= 3 * (DEGREE + 1) and width <= longest:
         wider = _left_by_windows(series, width)
-        if wider is None or wider[0] > AT_ONCE * variance:
+        if wider is None or wider[0] > LARGEST_GROWTH * variance:
             break
         variance, slow = max(wider[0], sigma**2), wider
-        width = min(math.ceil(WIDER * width), longest) if width < longest else longest + 1
+        width = min(math.ceil(WINDOW_GROWTH * width), longest) if width < longest else longest + 1
     amount = 0.0 if slow is None else slow[0] - sigma**2
     if slow is None or not amount > 0:
         return SeriesError(sigma, 0.0, 1.0)

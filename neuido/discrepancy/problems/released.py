@@ -9,15 +9,15 @@ from neuido.discrepancy.problems.noise import SeriesError
 from neuido.discrepancy.problems.problem import Parameter
 from neuido.physics.points.point_mass import Forces, fly
 
-RANGE = 2.0
+LARGEST_ERROR = 2.0
 """Largest error of a clock or length scale, in standard deviations of its prior."""
-FIRST = 4
+VELOCITY_FRAMES = 4
 """Number of frames for the first estimate of the velocity."""
 ITERATIONS = 25
 """Largest number of steps of the least-squares fit."""
 PROBE = 1e-3
 """Step of the finite differences, in units of `Parameter.scale`."""
-STILL = 1e-5
+CONVERGED = 1e-5
 """Step at which the fit has converged, in units of `Parameter.scale`."""
 LONGEST, LEAST_STEPS = 0.05, 60
 """Largest time step of the integration [s], and least number of steps per recording."""
@@ -41,7 +41,7 @@ class Released:
     def __init__(self, track: Track, nuisances: Mapping[str, float], gravity: Sequence[float], error: SeriesError) -> None:
         self.track, self.error = track, error
         sigma = error.sigma if track.noise is None else track.noise
-        n = min(FIRST, len(track.t))
+        n = min(VELOCITY_FRAMES, len(track.t))
         span = float(track.t[n - 1] - track.t[0])
         slope = np.polyfit(track.t[:n], track.x[:n], 1)[0]
         extent = max(float(np.ptp(track.x)), 10 * sigma)
@@ -58,7 +58,7 @@ class Released:
         for name, unit in (("release_time", "s"), ("length_scale", "1"), ("time_base", "1")):
             sd = nuisances[name]
             if sd > 0:
-                out.append(Parameter(f"{name}:{track.name}", unit, 0.0, sd / 4, -RANGE * sd, RANGE * sd, prior=4.0))
+                out.append(Parameter(f"{name}:{track.name}", unit, 0.0, sd / 4, -LARGEST_ERROR * sd, LARGEST_ERROR * sd, prior=4.0))
         self.parameters: tuple[Parameter, ...] = tuple(out)
 
     def seen(self, values: np.ndarray, forces: Forces, t: np.ndarray) -> np.ndarray:
@@ -149,7 +149,7 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
         J = np.where(better[:, None, None], J_new, J)
         cost = np.where(better, cost_new, cost)
         damping = np.clip(np.where(better, damping / 10, damping * 30), 1e-6, 1e8)
-        if ((moved < STILL) | (damping > 1e4)).all():
+        if ((moved < CONVERGED) | (damping > 1e4)).all():
             break
     best = cost.reshape(len(begun), count).argmin(0)
     return values.reshape(len(begun), count, k)[best, np.arange(count)]

@@ -86,14 +86,14 @@ class BodyRollouts(Problem):
         return math.log(ratio)
 
     def refusal(self, setting: int) -> str:
-        margin, line = self.margin({}, setting), self._strict(setting)
+        margin, line = self.margin({}, setting), self._failure_message(setting)
         if -math.inf < margin < 0.0:
             line += f"; it would run with discretisation.dt times {0.9 * math.exp(margin):.2g}"
             if "stiffness" in line:
                 line += f", or with its moduli over its density times {0.8 * math.exp(2.0 * margin):.2g}"
         return f"the declared model cannot run: {line}"
 
-    def _strict(self, setting: int) -> str:
+    def _failure_message(self, setting: int) -> str:
         """Simulate the declared model, and return the simulator's message why the motion is not finite."""
         for n in range(len(self.measured)):
             simulator = self._made([n], setting, 1, "cpu")
@@ -145,7 +145,7 @@ class BodyRollouts(Problem):
         simulator = self.simulator(tuple(n for _, n in runs), setting, size)
         filled = [(point, n) for points, n in runs for point in [*points, *[points[-1]] * (size - len(points))]]
         lifts = np.array([self._lift(point, n, setting) for point, n in filled])
-        full = [_against(self._full(point), lift) for (point, _), lift in zip(filled, lifts, strict=True)]
+        full = [_for_lowered_body(self._full(point), lift) for (point, _), lift in zip(filled, lifts, strict=True)]
         elasticity, plasticity = self.laws(full)
         always = () if self.device == "cpu" or len(full) == 1 else [p.name for c in self.candidates for p in c.parameters]
         effects = self._effects(simulator, full, [n for _, n in runs], always)
@@ -155,7 +155,7 @@ class BodyRollouts(Problem):
         elements = EVERY[setting].solver == "finite_elements"
         with torch.no_grad():
             if elements and len(full) == 1 and finer == 0:
-                out = _finite(simulator, full[0], steps, elasticity, plasticity, **given)
+                out = _rollout_until_finite(simulator, full[0], steps, elasticity, plasticity, **given)
             else:
                 more = {"inner_factor": FINER[finer]} if elements else {}
                 out = simulator.rollout(steps, elasticity, plasticity, nan_on_failure=len(full) > 1 or finer > 0, **given, **more)
@@ -368,7 +368,7 @@ def _finer(point: Point) -> tuple[int, ...]:
     return FINER if any(point.get(name, 0.0) > 0.0 for name in STIFFENING) else FINER[:2]
 
 
-def _finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -> Frames:
+def _rollout_until_finite(simulator: FiniteElements, point: Point, *args: Any, **given: Any) -> Frames:
     """Simulate one scene with finite elements, with more inner steps (`FINER`) where the motion is not finite.
 
     Raises:
@@ -404,7 +404,7 @@ def _gap(r: Measured) -> float:
     return min(gaps, default=math.inf)
 
 
-def _against(point: dict[str, float], lift: np.ndarray) -> dict[str, float]:
+def _for_lowered_body(point: dict[str, float], lift: np.ndarray) -> dict[str, float]:
     """Return a complete parameter set for a body that starts lower by `lift` (3,) [m]: places in space are lowered too."""
     own = {f"position_force.{a}": d for a, d in zip("xyz", lift, strict=True)}
     return {name: value - own.get(name, 0.0) for name, value in point.items()} if lift.any() else point

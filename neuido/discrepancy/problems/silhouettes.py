@@ -78,6 +78,7 @@ def usable(mask: np.ndarray) -> bool:
 
 
 def _trace(mask: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Trace the outline of the largest object in a mask (H, W); return the fields of `Outlines` for one image."""
     height, width = mask.shape
     fine = cv2.resize(mask, (FINER * width, FINER * height), interpolation=cv2.INTER_LINEAR)
     found, _ = cv2.findContours((fine >= LEVEL).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -95,11 +96,11 @@ def _trace(mask: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, ...]:
     after = np.roll(points, -1, axis=0)
     if np.sum(points[:, 0] * after[:, 1] - after[:, 0] * points[:, 1]) < 0:  # traced in the opposite direction
         normals = -normals
-    inner = _clear(mask, points, -normals, inside=True)
-    outer = _clear(mask, points, normals, inside=False)
+    inner = _half_way_to_change(mask, points, -normals, inside=True)
+    outer = _half_way_to_change(mask, points, normals, inside=False)
     _, _, covariance = moments(torch.from_numpy(mask)[None].double())
     size = float(torch.diagonal(covariance[0]).sum().sqrt())
-    return points, normals, inner, outer, np.array(length[-1]), np.array(size), _uncut(mask, points, cut)
+    return points, normals, inner, outer, np.array(length[-1]), np.array(size), _inside_image(mask, points, cut)
 
 
 def _smooth(line: np.ndarray, width: int) -> np.ndarray:
@@ -112,7 +113,7 @@ def _smooth(line: np.ndarray, width: int) -> np.ndarray:
     return np.stack([np.convolve(padded[:, a], kernel, mode="same") for a in range(2)], axis=1)[width:-width]
 
 
-def _clear(mask: np.ndarray, points: np.ndarray, direction: np.ndarray, *, inside: bool) -> np.ndarray:
+def _half_way_to_change(mask: np.ndarray, points: np.ndarray, direction: np.ndarray, *, inside: bool) -> np.ndarray:
     """Return half the distance from each point to the next change of the mask along a direction, within 1.5..REACH [px]."""
     s = np.arange(1.5, 2 * REACH, 0.5)
     at = (points[:, None] + s[:, None] * direction[:, None] - 0.5).astype(np.float32)
@@ -122,7 +123,8 @@ def _clear(mask: np.ndarray, points: np.ndarray, direction: np.ndarray, *, insid
     return np.clip(0.5 * first, 1.5, REACH)
 
 
-def _uncut(mask: np.ndarray, points: np.ndarray, cut: np.ndarray) -> np.ndarray:
+def _inside_image(mask: np.ndarray, points: np.ndarray, cut: np.ndarray) -> np.ndarray:
+    """Return `Outlines.kept` of an image: points off the border of the recorded image, and the moments if all points are."""
     low, high = cut[:2], cut[2:]
     own = ((points > low + 1.5) & (points < high - 1.5)).all(axis=1)
     return np.concatenate([np.full(MOMENTS, bool(own.all())), own])

@@ -31,9 +31,9 @@ IMPACT = 4.0
 """Loss of speed between two frames that counts as an impact, in standard deviations of the noise."""
 DISAGREE = 1e-3
 """Level of the test whether the bodies of a folder disagree on an effect of their surroundings."""
-LEAST_HALF = 0.3
+LEAST_HALF_WIDTH = 0.3
 """Width added on each side to the range around a common estimate, in typical steps."""
-WITNESS = 5.0
+HALF_WIDTH = 5.0
 """Half width of the range around a common estimate, in its standard deviations."""
 
 
@@ -138,7 +138,7 @@ class TrackProblem(Problem):
             added_mass=rows("added_mass.c"),
         )
 
-    def witness(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def surroundings_estimates(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Estimate each effect of the surroundings alone from the `fit` recordings of this body.
 
         The model is linearised about the declared one, and the residuals are weighted by the tracking error. The information is reduced
@@ -193,14 +193,14 @@ class TrackProblem(Problem):
 def track_problems(folder: str | os.PathLike | Tracks) -> tuple[TrackProblem, ...]:
     """Build one problem for each body of a folder.
 
-    An effect of the surroundings acts on every body. In a folder of several bodies, their estimates of it (`TrackProblem.witness`) are
-    compared by Cochran's Q at the level `DISAGREE`. If they agree, the range of the effect is restricted to their common estimate. If not,
+    An effect of the surroundings acts on every body. In a folder of several bodies, their estimates of it are compared by
+    Cochran's Q at the level `DISAGREE`. If they agree, the range of the effect is restricted to their common estimate. If not,
     the effect is no candidate, with the reason in `labels["excluded"]`. A wind together with a drag on some bodies is therefore not found.
     """
     tracks = folder if isinstance(folder, Tracks) else read_tracks(folder)
     problems = tuple(TrackProblem(tracks, body) for body in tracks.bodies)
     if len(problems) > 1:
-        votes = [problem.witness() for problem in problems]
+        votes = [problem.surroundings_estimates() for problem in problems]
         for axes in dict.fromkeys(problem.axes for problem in problems):  # only bodies with the same measured axes are compared
             group = [i for i, problem in enumerate(problems) if problem.axes == axes]
             for name in SURROUNDINGS:
@@ -239,7 +239,7 @@ def _restrict(problem: TrackProblem, name: str, agreed: tuple[np.ndarray, np.nda
             sizes = candidate.size_parameters
             made = {}
             for p, mean, deviation in zip(sizes, *agreed):  # further entries of position_force belong to its place
-                half = WITNESS * float(deviation) + LEAST_HALF * p.scale
+                half = HALF_WIDTH * float(deviation) + LEAST_HALF_WIDTH * p.scale
                 made[p.name] = replace(p, lower=max(p.lower, min(mean - half, p.value)), upper=min(p.upper, max(mean + half, p.value)))
             parameters = tuple(made.get(p.name, p) for p in candidate.parameters)
             limits = {p.name: (p.lower, p.upper) for p in parameters}

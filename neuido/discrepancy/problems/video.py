@@ -93,7 +93,7 @@ class VideoProblem(BodyProblem):
     def _scored(self, point: Point, recording: int, setting: int = 0) -> tuple[np.ndarray, dict[str, Score]]:
         """Draw the predicted silhouettes (T, V, H, W), and score the fitted frames (`fit`) and the others (`held_out`)."""
         f = self.footage[recording]
-        drawn = self._drawn(_alone(self._moved(point, recording, setting), 0), recording, point)
+        drawn = self._drawn(_motion_of(self._moved(point, recording, setting), 0), recording, point)
         frames = self.fitted_frames(recording)
         scores = {}
         for name, chosen in (("fit", frames), ("held_out", ~frames)):
@@ -165,7 +165,7 @@ class VideoProblem(BodyProblem):
     def _fill(self, run: Run, moved: Any) -> None:
         f = self.footage[run.recording]
         for s, group in enumerate(run.groups):
-            motion = _alone(moved, s)
+            motion = _motion_of(moved, s)
             if not bool(torch.isfinite(motion.x[-1]).all()):
                 run.out[group] = np.nan
                 continue
@@ -219,7 +219,7 @@ class VideoProblem(BodyProblem):
         return torch.stack(out, 1).cpu().numpy()
 
 
-def _alone(frames: ParticleState, s: int) -> ParticleState:
+def _motion_of(frames: ParticleState, s: int) -> ParticleState:
     """Return the frames (T, P, ...) of the parameter set s from those of several."""
     return ParticleState(*(t[:, s].contiguous() for t in frames))
 
@@ -258,15 +258,15 @@ def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0
     plain = replace(experiment, recordings=tuple(measured))
     base = body_problem(plain, device=device, batch=batch)
     # typical speeds and places are those of some particles in the declared motion
-    moved = [_alone(base._moved({}, n), 0) for n in range(len(measured))]
-    tracked = [_some(r, m) for r, m in zip(measured, moved, strict=True)]
+    moved = [_motion_of(base._moved({}, n), 0) for n in range(len(measured))]
+    tracked = [_with_tracked_particles(r, m) for r, m in zip(measured, moved, strict=True)]
     base = body_problem(replace(experiment, recordings=tuple(tracked)), device=device, batch=batch)
     footage = [_footage(r, experiment, film, m, device) for r, film, m in zip(tracked, films, moved, strict=True)]
-    nuisances = [_launch(p, dict(zip((r.name for r in tracked), known, strict=True))) for p in base.nuisances]
+    nuisances = [_widened_launch(p, dict(zip((r.name for r in tracked), known, strict=True))) for p in base.nuisances]
     nuisances = [p for p in nuisances if not p.name.startswith("length_scale:")]
     recordings = []
     for n, r in enumerate(tracked):
-        cameras, noise = _register(r, footage[n], moved[n])
+        cameras, noise = _calibrate(r, footage[n], moved[n])
         nuisances += cameras
         recordings.append(_recording(r, footage[n], noise))
         footage[n] = footage[n]._replace(inset=_inset(footage[n], moved[n]))
@@ -279,13 +279,14 @@ def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0
     )  # fmt: skip
 
 
-def _some(r: Measured, moved: ParticleState) -> Measured:
+def _with_tracked_particles(r: Measured, moved: ParticleState) -> Measured:
     """Return the recording with some particles in their declared motion as tracked points."""
     pick = torch.linspace(0, len(r.body.x) - 1, min(TRACKED, len(r.body.x))).round().long()
     return replace(r, x=moved.x[:, pick.to(moved.x.device)].cpu().float(), track=pick)
 
 
-def _launch(p: Parameter, known: dict[str, bool]) -> Parameter:
+def _widened_launch(p: Parameter, known: dict[str, bool]) -> Parameter:
+    """Widen the prior of a velocity or spin by `UNSEEN` if it was estimated from images; other nuisances stay as they are."""
     kind, _, name = p.name.partition(":")
     if known[name] or not kind.startswith(("velocity", "spin")):
         return p
@@ -293,6 +294,11 @@ def _launch(p: Parameter, known: dict[str, bool]) -> Parameter:
 
 
 def _footage(r: Measured, experiment: Experiment, film: Film, moved: ParticleState, device: str) -> Footage:
+    """Prepare the silhouettes of a recording for comparison.
+
+    Raises:
+        UserError: The object is seen in too few frames, or the body lies behind a camera.
+    """
     images = [(t, v) for t in range(1, len(film.times)) for v in range(len(film.views)) if silhouettes.usable(film.masks[t, v])]
     if len({t for t, _ in images}) < 3:
         raise UserError(f"recording {r.name}: the object is seen in {len({t for t, _ in images})} frames after the first; 3 are needed")
@@ -309,7 +315,7 @@ def _footage(r: Measured, experiment: Experiment, film: Film, moved: ParticleSta
     return Footage(film, look, cameras, at, torch.from_numpy(index).to(device), begun, first, 1e3 * scale)
 
 
-def _register(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Parameter], float]:
+def _calibrate(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Parameter], float]:
     """Calibrate cameras and outline by the first frame.
 
     Returns:
@@ -327,7 +333,7 @@ def _register(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Param
             at = Outlines(*(t[i : i + 1] for t in f.first))
             measured = torch.from_numpy(f.film.masks[:1, v]).to(drawn.device)
             target = silhouettes.features(measured, at)
-            given, rest = _settle(drawn[v][None], at, target, factor)
+            given, rest = _fit_view(drawn[v][None], at, target, factor)
             left.append(rest)
             overlap = min(overlap, silhouettes.score(drawn[v][None].cpu().numpy(), f.film.masks[:1, v]).iou)
         for (key, unit, deviation), value in zip(CAMERA, given, strict=True):
@@ -342,7 +348,7 @@ def _register(r: Measured, f: Footage, moved: ParticleState) -> tuple[list[Param
     return out, factor * float(np.hypot(FAINT, np.sqrt(np.mean(rest**2))))
 
 
-def _settle(drawn: Tensor, at: Outlines, target: Tensor, factor: float, steps: int = 6) -> tuple[list[float], np.ndarray]:
+def _fit_view(drawn: Tensor, at: Outlines, target: Tensor, factor: float, steps: int = 6) -> tuple[list[float], np.ndarray]:
     """Fit the errors of a camera so that a drawn silhouette matches the measured one, by Gauss-Newton steps with wide priors.
 
     Returns:
@@ -371,6 +377,7 @@ def _inset(f: Footage, moved: ParticleState) -> float:
 
 
 def _recording(r: Measured, f: Footage, noise: float) -> Recording:
+    """Return the measured features of the silhouettes as data [recorded px], with their noise."""
     kept = f.at.kept.cpu().numpy()
     frame, view = f.images.cpu().numpy().T
     measured = torch.from_numpy(f.film.masks[frame, view]).to(f.at.points.device)

@@ -281,7 +281,7 @@ def _models(c: Mapping[str, Any], units: Units) -> list[Table]:
         rows = []
         for m in models:
             said = [
-                f"{key} = {_quantity(p['value'], p['unit'], units)}{_behind(units.label(p['unit']))}"
+                f"{key} = {_quantity(p['value'], p['unit'], units)}{_unit_suffix(units.label(p['unit']))}"
                 for key, p in list(m["parameters"].items())[:6]
             ]
             ratio = "" if not m.get("error_ratio") else rounded(m["error_ratio"])
@@ -301,7 +301,7 @@ def _models(c: Mapping[str, Any], units: Units) -> list[Table]:
     return out
 
 
-def _behind(unit: str) -> str:
+def _unit_suffix(unit: str) -> str:
     return "" if unit == WRITTEN["1"] else f" {unit}"
 
 
@@ -363,7 +363,7 @@ def _summary(contents: Sequence[Mapping[str, Any]], units: Units) -> list[tuple[
 
 def _summary_figure(key: str, p: Mapping[str, Any], units: Units) -> str:
     value, interval = units.figures(p["value"], p["interval90"], p["unit"])
-    return f"{key.replace('_', ' ')} = {value}{_behind(units.label(p['unit']))}{f' ({interval})' if interval else ''}"
+    return f"{key.replace('_', ' ')} = {value}{_unit_suffix(units.label(p['unit']))}{f' ({interval})' if interval else ''}"
 
 
 def _footer(contents: Sequence[Mapping[str, Any]]) -> str:
