@@ -97,6 +97,7 @@ def trace(d: Diagnosis) -> dict[str, Any]:
 
 
 def _round(d: Diagnosis, r: Round) -> dict[str, Any]:
+    """Return the numbers of one step of a search: noise, floors, the null distribution and every trial."""
     quantiles = (0.5, 0.9, 0.95, 0.99)
     null = np.asarray(r.null)
     return {
@@ -114,6 +115,7 @@ def _round(d: Diagnosis, r: Round) -> dict[str, Any]:
 
 
 def _trial(r: Round, t: Trial) -> dict[str, Any]:
+    """Return the numbers of the fit of one candidate."""
     c = t.candidate
     return {
         "key": c.key,

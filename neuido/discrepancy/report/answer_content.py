@@ -392,6 +392,7 @@ def motions(d: Diagnosis) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, s
 
 
 def _stages(d: Diagnosis, name: str, arrays: Mapping[str, np.ndarray]) -> list[residual.Series]:
+    """Compute the missing quantity of each stage of a recording (`residual.stages`)."""
     n = [r.name for r in d.problem.recordings].index(name)
     r = d.problem.measured[n]
     mass = float(r.body.volume.double().sum()) * float(d.after.get("density", d.problem.experiment.model["density"]))

@@ -159,6 +159,7 @@ def _block(count: int) -> Tensor:
 
 @one_thread_each()
 def _fit(x: Tensor, y: Tensor, w: Tensor, own: Tensor, aside: Tensor, generator: torch.Generator) -> tuple[nn.Module, int]:
+    """Train the network on the rows `own`, until the loss of the rows `aside` no longer falls; return it with its training steps."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
         net = nn.Sequential(nn.Linear(x.shape[1], WIDTH), nn.SiLU(), nn.Linear(WIDTH, WIDTH), nn.SiLU(), nn.Linear(WIDTH, y.shape[1]))

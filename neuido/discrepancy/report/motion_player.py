@@ -38,6 +38,7 @@ def player(motion: Mapping[str, Mapping[str, np.ndarray]], c: Mapping[str, Any],
 
 
 def _packed(name: str, arrays: Mapping[str, np.ndarray], c: Mapping[str, Any], factor: float, most: float) -> dict[str, Any]:
+    """Pack one recording for the player into at most `most` bytes; `factor` leads from metres to the unit of the page."""
     frames, points = _budget(*arrays["measured"].shape[:2], most)
     sets = [arrays[key][np.ix_(frames, points)] for key in SETS[: 1 + len(predictions(c))]]
     finite = np.concatenate([s[np.isfinite(s).all(axis=-1)] for s in sets])

@@ -289,6 +289,7 @@ def stages(
 
 
 def _rest(x: np.ndarray, t: np.ndarray, before: np.ndarray, after: np.ndarray, sigma: float) -> Series:
+    """Return the stage `rest`: the distance of the mean places at the end of the recording (`REST`) from the predicted ones."""
     late = t >= t[-1] - REST * (t[-1] - t[0])
     late &= np.isfinite(x).any(axis=(1, 2))
     if not late.any():
