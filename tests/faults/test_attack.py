@@ -17,9 +17,9 @@ def samples(tmp_path_factory):
     return {}, tmp_path_factory.mktemp("attacks")
 
 
-@pytest.mark.parametrize("kind", dict.fromkeys(KINDS))
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k == "signal" else k for k in dict.fromkeys(KINDS)])
 def test_quick_commands(kind, samples):
-    """One input for each command."""
+    """One input for each command; signals, whose moment is that of the machine, in the slow tier."""
     known, folder = samples
     first = KINDS.index(kind) * len(QUICK)
     found = list(attacks(range(first, first + len(QUICK)), folder, QUICK, known))
