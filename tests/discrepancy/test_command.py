@@ -17,6 +17,7 @@ import neuido
 from neuido.commands.main import main
 from neuido.data.measured.experiment import read_experiment
 from neuido.discrepancy import diagnose
+from neuido.discrepancy.inference.calibration import calibration
 from neuido.discrepancy.inference.evidence import evidences, judged
 from neuido.discrepancy.inference.search.decision import decide
 from neuido.discrepancy.inference.statistics import read_fits
@@ -295,7 +296,7 @@ def test_what_a_decision_rests_on_is_kept_and_decided_again(folders, tmp_path):
     case, fits = read_fits(tmp_path / "out" / "fits" / "0.npz")
     decision = decide(case)
     assert (decision.answer, list(decision.effects)) == (found.answer, [e.name for e in found.effects])
-    assert ("drag_quadratic",) in judged(evidences(case, fits)).sets
+    assert ("drag_quadratic",) in judged(evidences(case, fits), calibration()).sets
 
 
 @pytest.mark.slow
