@@ -29,7 +29,11 @@ def parser_errors(path: str | os.PathLike, what: str) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except Exception as error:  # parsers raise undocumented exceptions: zlib.error, TokenError, RecursionError, ...
+    except BaseException as error:
+        # Parsers raise undocumented exceptions: zlib.error, TokenError, RecursionError, and, where they are written in Rust, a panic, which
+        # is no Exception and which no module exports.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         raise UserError(f"{path} is not a valid {what}: {one_line(error)}") from error
 
 

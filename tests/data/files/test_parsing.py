@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neuido.data.files.parsing import image_size, read_arrays, read_image, read_json, read_table, read_yaml
+from neuido.data.files.parsing import image_size, parser_errors, read_arrays, read_image, read_json, read_table, read_yaml
 from neuido.errors import UserError
 from neuido.physics.runtime.limits import limit
 
@@ -151,3 +151,14 @@ def test_images(tmp_path):
     path.write_bytes(io.BytesIO(b"no image").getvalue())
     for call in (image_size, read_image):
         refused(call, path, "not an image")
+
+
+def test_a_panic_of_a_parser_is_a_refusal_and_an_interruption_is_none(tmp_path):
+    """Parsers in Rust panic by an exception that is no `Exception`."""
+    panic = type("PanicException", (BaseException,), {})
+    with pytest.raises(UserError, match=r"book\.xlsx is not a valid spreadsheet: byte index 9 is out of bounds"):
+        with parser_errors(tmp_path / "book.xlsx", "spreadsheet"):
+            raise panic("byte index 9 is\nout of bounds")
+    for stop in (KeyboardInterrupt, SystemExit):
+        with pytest.raises(stop), parser_errors(tmp_path / "book.xlsx", "spreadsheet"):
+            raise stop

@@ -40,15 +40,8 @@ def read_spreadsheet(path: Path) -> dict[str, list[list[str]]]:
     with parser_errors(path, "spreadsheet"):
         if zipfile.is_zipfile(path):
             _check_size(path)
-        try:
-            book = calamine.CalamineWorkbook.from_path(str(path))
-            sheets = {name: book.get_sheet_by_name(name).to_python(skip_empty_area=True) for name in book.sheet_names}
-        except Exception:
-            raise
-        except BaseException as error:  # a panic of the library is no Exception
-            if isinstance(error, KeyboardInterrupt | SystemExit):
-                raise
-            raise ValueError(one_line(error)) from error
+        book = calamine.CalamineWorkbook.from_path(str(path))
+        sheets = {name: book.get_sheet_by_name(name).to_python(skip_empty_area=True) for name in book.sheet_names}
     out = {}
     for name, cells in sheets.items():
         count = len(cells) * max((len(row) for row in cells), default=0)
