@@ -73,9 +73,10 @@ def prepare(
     _check_zero(columns, how.zero, summary, area)
     columns = _zeroed(columns, how.zero, summary, area)
     if how.average > 1:
-        count = len(next(iter(columns.values()))) // how.average
+        count, rest = divmod(len(next(iter(columns.values()))), how.average)
         columns = {key: values[: count * how.average].reshape(count, how.average).mean(1) for key, values in columns.items()}
-        summary.append(f"means of {how.average} rows each: {count} rows, whose noise is independent")
+        left = f"; the last {rest} rows, too few for a mean, are left out" if rest else ""
+        summary.append(f"means of {how.average} rows each: {count} rows, whose noise is independent{left}")
     count = len(next(iter(columns.values())))
     every = max(1, -(-count // MAX_ROWS))
     if every > 1:

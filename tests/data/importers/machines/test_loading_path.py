@@ -67,8 +67,9 @@ def test_rows_means_and_thinning():
     notes: list[str] = []
     columns, _ = prepare(raw, Preparation(), notes)
     assert len(columns["time"]) == MAX_ROWS and columns["time"][0] == 0 and "one row in 10" in " ".join(notes)
-    columns, _ = prepare(raw, Preparation(rows="100:2100", average=20), [])
-    assert len(columns["time"]) == 100
+    notes = []
+    columns, _ = prepare(raw, Preparation(rows="100:2105", average=20), notes)
+    assert len(columns["time"]) == 100 and "the last 5 rows, too few for a mean, are left out" in " ".join(notes)
     left = columns["true_stress"] - np.polyval(np.polyfit(columns["time"], columns["true_stress"], 1), columns["time"])
     assert left.std() == pytest.approx(1e3 / np.sqrt(20), rel=0.3)
     with pytest.raises(UserError, match="the time does not increase in"):
