@@ -36,7 +36,8 @@ def _wrong(path: Path) -> str:
     elif path.suffix == ".ply":
         PlyData.read(str(path))
     elif path.suffix in (".png", ".jpg"):
-        return "" if cv2.imread(str(path), cv2.IMREAD_UNCHANGED) is not None and path.read_bytes()[-8:-4] == b"IEND" else "no image"
+        ended = path.read_bytes()[-8:-4] == b"IEND" if path.suffix == ".png" else path.read_bytes().endswith(b"\xff\xd9")
+        return "" if cv2.imread(str(path), cv2.IMREAD_UNCHANGED) is not None and ended else "no image"
     elif path.suffix == ".mp4":
         film = cv2.VideoCapture(str(path))
         return "" if film.read()[0] else "no frame"
