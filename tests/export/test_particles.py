@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData
 
 import neuido
+from neuido.data.formats.ply import read_ply_vertices
 from neuido.errors import UserError
 from neuido.types import ParticleState
 
@@ -31,7 +31,7 @@ def test_sequence_has_a_file_for_each_frame_and_replaces_a_longer_one(tmp_path):
     names = ["motion_0000.ply", "motion_0001.ply", "motion_0002.ply", "motion_final.ply"]
     assert sorted(p.name for p in tmp_path.iterdir()) == names
     assert first.name == "motion_0000.ply"
-    vertices = PlyData.read(str(tmp_path / "motion_0002.ply"))["vertex"]
+    vertices = read_ply_vertices(tmp_path / "motion_0002.ply")
     read = np.stack([vertices[name] for name in ("x", "y", "z", "vx", "vy", "vz")], 1)
     assert np.array_equal(read, torch.cat([FRAMES.x, FRAMES.v], 2)[2].numpy())
 

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import torch
 import yaml
-from plyfile import PlyData
 
 from neuido.commands.cli.checkpoint_options import check_checkpoint, numbers_of
 from neuido.commands.cli.sweep_file import command_of, read_sweep, runs_of
@@ -21,6 +20,7 @@ from neuido.data.files.results import figures, logged_curves, open_runs, scenes_
 from neuido.data.files.score_tables import read_rows
 from neuido.data.files.sweep_run import FORMAT as SWEEP_RUN
 from neuido.data.formats.neuma import read_assets
+from neuido.data.formats.ply import read_ply_vertices
 from neuido.data.importers.importing import import_file
 from neuido.data.measured.columns import errors_of
 from neuido.data.measured.experiment import read_declared_model, read_experiment
@@ -53,6 +53,7 @@ from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import FlowVAE
 from tests.data import samples
 from tests.data.footage import drawn
+from tests.data.formats.ply_samples import write_ply
 from tests.data.importers import test_importing as exports
 from tests.data.importers import test_pandas_hdf5 as hdf5
 from tests.data.importers.fields import test_fields as fields
@@ -168,7 +169,9 @@ def _gaussians(folder: Path) -> None:
     save_ply(folder / "gaussians.ply", attach_gaussians(x, torch.full((12,), 1e-3)))
     content = (folder / "gaussians.ply").read_bytes()
     (folder / "commented.ply").write_bytes(content.replace(b"end_header", "comment é\nend_header".encode()))
-    PlyData(PlyData.read(str(folder / "gaussians.ply")).elements, text=True).write(str(folder / "text.ply"))
+    vertices = read_ply_vertices(folder / "gaussians.ply")
+    write_ply(folder / "text.ply", vertices, form="text", faces=[[0, 1, 2], [3, 2, 1, 0]])
+    write_ply(folder / "faces.ply", vertices, form="big", faces=[[0, 1, 2]])
 
 
 def _read_gaussians(folder: Path) -> object:

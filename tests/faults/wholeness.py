@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import torch
 import yaml
-from plyfile import PlyData
 from safetensors import safe_open
+
+from neuido.data.formats.ply import read_ply_vertices
 
 
 def not_whole(path: Path) -> str:
@@ -34,7 +35,7 @@ def _wrong(path: Path) -> str:
     elif path.suffix == ".yaml":
         yaml.compose(path.read_text(), yaml.SafeLoader)  # Lightning writes tuples with their tag
     elif path.suffix == ".ply":
-        PlyData.read(str(path))
+        read_ply_vertices(path)
     elif path.suffix in (".png", ".jpg"):
         ended = path.read_bytes()[-8:-4] == b"IEND" if path.suffix == ".png" else path.read_bytes().endswith(b"\xff\xd9")
         return "" if cv2.imread(str(path), cv2.IMREAD_UNCHANGED) is not None and ended else "no image"

@@ -10,24 +10,22 @@ import torch
 from torch import Tensor
 
 from neuido.data.files.writing import atomic_write, write_png
+from neuido.data.formats.ply import ply_bytes
 from neuido.errors import UserError
 from neuido.types import ParticleState
 
 
 def write_plys(folder: str | os.PathLike, motion: ParticleState) -> None:
     """Write the particles of each frame to `000.ply`, `001.ply`, ... with x, y, z [m] and vx, vy, vz [m/s]."""
-    from plyfile import PlyData, PlyElement
-
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     x, v = motion.x.detach().cpu().numpy(), motion.v.detach().cpu().numpy()
     digits = max(3, len(str(len(x) - 1)))
     for k, (position, velocity) in enumerate(zip(x, v)):
-        vertices = np.empty(len(position), [(name, "f4") for name in ("x", "y", "z", "vx", "vy", "vz")])
-        for name, column in zip(vertices.dtype.names, np.concatenate([position, velocity], 1).T):
-            vertices[name] = column
+        columns = np.concatenate([position, velocity], 1, dtype=np.float32)
+        vertices = np.rec.fromarrays(columns.T, names=["x", "y", "z", "vx", "vy", "vz"])
         with atomic_write(folder / f"{k:0{digits}d}.ply") as hidden:
-            PlyData([PlyElement.describe(vertices, "vertex")]).write(str(hidden))
+            hidden.write_bytes(ply_bytes(vertices))
     for old in folder.glob("*.ply"):  # left by an earlier, longer run
         if old.stem.isdigit() and int(old.stem) >= len(x):
             old.unlink()

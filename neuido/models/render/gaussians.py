@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neuido.data.files.writing import atomic_write
 from neuido.data.formats.gaussian_ply import column_names, read_gaussian_vertices
+from neuido.data.formats.ply import ply_bytes
 from neuido.errors import UserError
 from neuido.physics.linalg.decompositions import polar
 from neuido.physics.runtime.device import as_device
@@ -196,8 +197,6 @@ def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
     Raises:
         UserError: There are several frames, or rotations relative to the harmonics, neither of which the format can hold.
     """
-    from plyfile import PlyData, PlyElement
-
     if gaussians.means.dim() != 2:
         raise UserError(f"means have shape {tuple(gaussians.means.shape)}; a PLY file holds one frame, (N, 3)")
     if gaussians.rotations is not None and degree_of(gaussians.harmonics) > 0:
@@ -208,11 +207,9 @@ def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
     shape = [opacities[:, None], scales.clamp(min=1e-12).log(), quaternions]
     columns = [gaussians.means, torch.zeros_like(gaussians.means), base, rest, *shape]
     table = torch.cat([c.detach().double().cpu() for c in columns], 1).numpy().astype(np.float32)
-    vertices = np.empty(len(table), [(name, "f4") for name in column_names(rest.shape[1])])
-    for name, column in zip(vertices.dtype.names or (), table.T, strict=True):
-        vertices[name] = column
+    vertices = np.rec.fromarrays(table.T, names=column_names(rest.shape[1]))
     with atomic_write(path) as hidden:
-        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(hidden))
+        hidden.write_bytes(ply_bytes(vertices))
 
 
 def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device: str | torch.device = "auto") -> Gaussians:

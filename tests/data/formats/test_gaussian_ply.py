@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from plyfile import PlyData, PlyElement
 
 from neuido.data.formats.gaussian_ply import column_names, read_gaussian_vertices
 from neuido.errors import UserError
+from tests.data.formats.ply_samples import write_ply
 
 
 def write(path: Path, rows: int = 5, *, names=None, text: bool = False, comments=(), change=lambda v: None) -> Path:
@@ -20,8 +20,7 @@ def write(path: Path, rows: int = 5, *, names=None, text: bool = False, comments
     for i, name in enumerate(names):
         vertices[name] = np.arange(rows) + 0.1 * i
     change(vertices)
-    PlyData([PlyElement.describe(vertices, "vertex")], text=text, comments=list(comments)).write(str(path))
-    return path
+    return write_ply(path, vertices, form="text" if text else "little", comments=comments)
 
 
 def refused(path: Path, match: str) -> None:
@@ -116,8 +115,7 @@ def test_any_kind_of_gaussians_is_read_as_it_was_written(tmp_path, rest, normals
     for row, value in bad.items():
         vertices[column][row] = value
     path = tmp_path / "a.ply"
-    byte_order = ">" if form == "big" else "<"
-    PlyData([PlyElement.describe(vertices, "vertex")], text=form == "text", byte_order=byte_order).write(str(path))
+    write_ply(path, vertices, form=form)
     path.write_bytes(path.read_bytes().replace(b"end_header", f"comment {comment}\nend_header".encode(), 1))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

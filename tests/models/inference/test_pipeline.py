@@ -8,10 +8,10 @@ import pytest
 import torch
 import yaml
 from lightning.pytorch import Trainer, seed_everything
-from plyfile import PlyData
 
 import neuido
 from neuido.data.files.score_tables import folder_of
+from neuido.data.formats.ply import read_ply_vertices
 from neuido.errors import UserError
 from neuido.models.inference.law_file import load_law, save_law
 from neuido.models.inference.outputs import write_plys
@@ -107,7 +107,7 @@ def test_predict_writes_law_particles_and_video(tools, tmp_path):
     assert [Path(answer["folder"]).name for answer in answers] == ["tiny-0", "tiny-1"]
     folder = tmp_path / "out" / "tiny-0"
     assert len(list((folder / "particles").glob("*.ply"))) == 6
-    vertices = PlyData.read(str(folder / "particles" / "005.ply"))["vertex"]
+    vertices = read_ply_vertices(folder / "particles" / "005.ply")
     assert len(vertices) == len(tools[2][0].source.body.x)
     video = cv2.VideoCapture(str(folder / "prediction.mp4"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 6 and video.get(cv2.CAP_PROP_FRAME_WIDTH) == 64  # recorded and predicted, side by side

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData, PlyElement
 
 from neuido.errors import UserError
 from neuido.models.render.gaussians import (
@@ -22,6 +21,7 @@ from neuido.models.render.gaussians import (
     scales_and_quaternions,
 )
 from neuido.types import Gaussians
+from tests.data.formats.ply_samples import write_ply
 
 
 def gaussians(count=7, degree=3, seed=0):
@@ -83,7 +83,7 @@ def test_ply_is_read_as_3dgs_writes_it(tmp_path):
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(9)), "opacity"]
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     values = [1, 2, 3, 0, 0, 0, 0.1, 0.2, 0.3, 11, 12, 13, 21, 22, 23, 31, 32, 33, math.log(3.0), *np.log([0.1, 0.2, 0.4]), 2, 0, 0, 2]
-    PlyData([PlyElement.describe(np.array([tuple(values)], [(n, "f4") for n in names]), "vertex")]).write(str(tmp_path / "b.ply"))
+    write_ply(tmp_path / "b.ply", np.array([tuple(values)], [(n, "f4") for n in names]))
     read = load_ply(tmp_path / "b.ply", device="cpu")
     assert read.means.tolist() == [[1, 2, 3]]
     assert read.opacities.item() == pytest.approx(0.75)
@@ -98,7 +98,7 @@ def test_ply_errors_name_the_file_and_what_it_lacks(tmp_path):
     with pytest.raises(UserError, match=r"text\.ply is not a PLY file"):
         load_ply(tmp_path / "text.ply")
     vertices = np.zeros(2, [("x", "f4"), ("y", "f4"), ("z", "f4")])
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "points.ply"))
+    write_ply(tmp_path / "points.ply", vertices)
     with pytest.raises(UserError, match="not a 3DGS file: its vertices lack the columns f_dc_0"):
         load_ply(tmp_path / "points.ply")
     with pytest.raises(UserError, match="holds one frame"):
