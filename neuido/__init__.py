@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from neuido.types import ParticleState as ParticleState
     from neuido.types import Plane as Plane
     from neuido.types import Scene as Scene
+    from neuido.types import Skin as Skin
     from neuido.types import Walls as Walls
 
 __version__ = "0.1.0"
@@ -45,7 +46,7 @@ __version__ = "0.1.0"
 _PLACES = {  # name: its module, and after a colon its name there; a module alone: the module itself
     **{
         name: f"types:{name}"
-        for name in ("AttachedMass", "Body", "Box", "Cameras", "Gaussians", "ParticleState", "Plane", "Scene", "Walls")
+        for name in ("AttachedMass", "Body", "Box", "Cameras", "Gaussians", "ParticleState", "Plane", "Scene", "Skin", "Walls")
     },
     "Diagnosis": "discrepancy.report.diagnosis:Diagnosis",
     "Encoder": "models.video.encoder:DynamicsEncoder",
@@ -87,6 +88,7 @@ __all__ = [
     "Plane",
     "Scene",
     "Simulator",
+    "Skin",
     "UserError",
     "Walls",
     "__version__",

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 Vector = tuple[float, float, float]
@@ -62,6 +63,36 @@ class Body(NamedTuple):
     """Volume [m^3], (P,)."""
     F: Tensor | None = None
     """Deformation gradient [-], (P, 3, 3); None: the identity."""
+
+    def __repr__(self) -> str:
+        return brief_fields(self)
+
+
+class Skin(NamedTuple):
+    """A surface mesh that moves with the particles of a body: each vertex is a fixed linear combination of particles near it.
+
+    The combination of a vertex gives its own place at rest, so a skin follows every affine motion of its particles exactly (moving least
+    squares; Schaefer et al. 2006). `neuido.shapes.mesh` makes one, and `neuido.data.bind_skin` for particles of your own.
+    """
+
+    vertices: Tensor
+    """Position at rest [m], (V, 3)."""
+    faces: Tensor
+    """Vertices of the triangles, anticlockwise as seen from outside, (T, 3) int64."""
+    indices: Tensor
+    """Particles that each vertex is bound to, (V, k) int64; indices of all particles of the frames."""
+    weights: Tensor
+    """Their weights, which sum to one and may be negative, (V, k)."""
+
+    def vertices_at(self, frames: "ParticleState | Tensor") -> Tensor:
+        """Compute the vertices [m] in each frame, (K, V, 3); differentiable.
+
+        Args:
+            frames: Frames of a simulation, or positions of the particles [m], (K, P, 3).
+        """
+        x = frames if isinstance(frames, Tensor) else frames.x
+        weights, indices = self.weights.to(x), self.indices.to(x.device)
+        return torch.stack([torch.einsum("vk,vkc->vc", weights, frame[indices]) for frame in x])
 
     def __repr__(self) -> str:
         return brief_fields(self)

@@ -34,7 +34,7 @@ def imported_names() -> set[str]:
 def test_extras_are_imported_by_code():
     names = {
         re.split(r"[<>=!\[]", part)[0].replace("-", "_")
-        for extra in ("video", "colmap", "gpu", "import")
+        for extra in ("video", "colmap", "gpu", "import", "mesh")
         for part in PROJECT["optional-dependencies"][extra]
     }
     assert names <= imported_names()

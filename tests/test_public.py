@@ -18,13 +18,13 @@ import neuido
 ROOT = Path(__file__).parents[1]
 PUBLIC = {
     "neuido": """
-        AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Operator OwnEffect ParticleState Plane Scene
-        Simulator UserError Walls __version__ configs_root diagnose effects export import_file laws load_scene rasterize read_experiment
-        read_law read_material_tests read_recording read_tracks render shapes
+        AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Operator OwnEffect ParticleState Plane
+        Scene Simulator Skin UserError Walls __version__ configs_root diagnose effects export import_file laws load_scene
+        rasterize read_experiment read_law read_material_tests read_recording read_tracks render shapes
     """,
     "neuido.data": """
         Experiment FilmDataModule MaterialTest MaterialTests MultiView MultiViewDataModule Recording SceneSetup Track Tracks
-        TrajectoryDataModule VisualDataModule cameras load_scene read_experiment read_material_tests read_recording read_tracks
+        TrajectoryDataModule VisualDataModule bind_skin cameras load_scene read_experiment read_material_tests read_recording read_tracks
         scene_names shapes write_experiment
     """,
     "neuido.models": """

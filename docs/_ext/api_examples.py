@@ -268,6 +268,15 @@ frames = simulator.rollout(100, laws.FixedCorotated(young, 0.3), every=10)
 frames.x[-1, :, 1].mean().backward()
 print(young.grad)
 """,
+    "Skin": """
+import torch
+
+from neuido import Skin
+
+x = torch.rand(1, 50, 3)  # one frame of 50 particles
+corner = Skin(x[0, :3], torch.tensor([[0, 1, 2]]), indices=torch.tensor([[0], [1], [2]]), weights=torch.ones(3, 1))
+print(corner.vertices_at(x).shape)  # one triangle between three particles
+""",
     "UserError": """
 from neuido import Scene, Simulator, UserError, laws, shapes
 

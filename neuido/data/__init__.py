@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from neuido.data import cameras
     from neuido.data.bodies import shapes
     from neuido.data.bodies.scene_files import SceneSetup, load_scene, scene_names
+    from neuido.data.bodies.skinning import bind_skin
     from neuido.data.clips import FilmDataModule
     from neuido.data.formats.layout import MultiView
     from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
@@ -33,6 +34,7 @@ __all__ = [
     "Tracks",
     "TrajectoryDataModule",
     "VisualDataModule",
+    "bind_skin",
     "cameras",
     "load_scene",
     "read_experiment",
@@ -57,6 +59,7 @@ _PLACES = {
     "Tracks": "measured.track",
     "TrajectoryDataModule": "trajectories.trajectory_module",
     "VisualDataModule": "scenes.filmed_scene_module",
+    "bind_skin": "bodies.skinning",
     "cameras": "cameras",
     "load_scene": "bodies.scene_files",
     "read_experiment": "measured.experiment",
