@@ -1,11 +1,14 @@
 """Data types shared by all packages. SI units; shapes with P particles, S scenes, B samples, K frames."""
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from neuido.errors import UserError
 
 Vector = tuple[float, float, float]
 
@@ -52,20 +55,84 @@ class Particles(NamedTuple):
         return brief_fields(self)
 
 
-class Body(NamedTuple):
-    """One body at t = 0."""
-
+class _BodyFields(NamedTuple):
     x: Tensor
-    """Position [m], (P, 3)."""
     v: Tensor
-    """Velocity [m/s], (P, 3)."""
     volume: Tensor
-    """Volume [m^3], (P,)."""
     F: Tensor | None = None
-    """Deformation gradient [-], (P, 3, 3); None: the identity."""
+    name: str = ""
+    law: Any = None
+    plasticity: Any = None
+    density: float | Tensor | None = None
+    fields: Any = None
+    skin: Any = None
+
+
+class Body(_BodyFields):
+    """One body at t = 0: its particles, and optionally its material.
+
+    `Body(x, v, volume)` gives the particles, `Body(shape=...)` takes those of another body, such as one of `shapes`. A body whose law is
+    given needs no law in `Simulator.rollout`.
+
+    Args:
+        x: Position [m], (P, 3).
+        v: Velocity [m/s], (P, 3); by default at rest.
+        volume: Volume [m^3], (P,).
+        F: Deformation gradient [-], (P, 3, 3); None: the identity.
+        name: Name of the body in messages and results.
+        law: Elastic law, or a list of laws between which the field `law` chooses; None: that of the rollout. Parameters of a classical law
+            may be a field, (P,).
+        plasticity: Plastic law, or a list of them; None: purely elastic.
+        density: Mass density [kg/m^3], a number or (P,); None: that of the simulator.
+        fields: Material fields by name: `law`, the index of each particle's law, (P,); those of a law of one's own that takes them.
+        skin: Surface mesh bound to the particles, for pictures and files.
+        shape: A body whose particles and other properties are taken where they are not given here.
+        velocity: Velocity of the centre of volume [m/s], in place of `v`.
+        spin: Angular velocity about the centre of volume [rad/s], added to `velocity` or `v`.
+
+    Raises:
+        UserError: Neither particles nor a shape.
+    """
+
+    def __new__(
+        cls,
+        x: Tensor | None = None,
+        v: Tensor | None = None,
+        volume: Tensor | None = None,
+        F: Tensor | None = None,
+        name: str = "",
+        law: Any = None,
+        plasticity: Any = None,
+        density: float | Tensor | None = None,
+        fields: Any = None,
+        skin: Any = None,
+        *,
+        shape: "Body | None" = None,
+        velocity: Vector | None = None,
+        spin: Vector | None = None,
+    ) -> "Body":
+        """Create a body; the class describes the arguments."""
+        given = {"x": x, "v": v, "volume": volume, "F": F, "name": name or None, "law": law, "plasticity": plasticity}
+        given |= {"density": density, "fields": fields, "skin": skin}
+        if shape is not None:
+            given = {key: getattr(shape, key) if value is None else value for key, value in given.items()}
+        if given["x"] is None or given["volume"] is None:
+            raise UserError(f"body {name!r} has no particles; give `shape`, or `x` and `volume`")
+        given["name"] = given["name"] or ""
+        if velocity is not None or given["v"] is None:
+            given["v"] = torch.zeros_like(given["x"]) + torch.tensor(velocity or (0.0, 0.0, 0.0)).to(given["x"])
+        if spin is not None:
+            given["v"] = given["v"] + _turning(given["x"], given["volume"], spin)
+        return super().__new__(cls, **given)
 
     def __repr__(self) -> str:
-        return brief_fields(self)
+        return brief_fields(self if self.name else self._replace(name=None))
+
+
+def _turning(x: Tensor, volume: Tensor, spin: Vector) -> Tensor:
+    """Return the velocity [m/s], (P, 3), of a rotation about the centre of volume."""
+    r = x - (volume[:, None] * x).sum(0) / volume.sum()
+    return torch.linalg.cross(torch.tensor(spin).to(r).expand_as(r), r)
 
 
 class Skin(NamedTuple):
@@ -219,6 +286,11 @@ class Scene:
         walls: Walls of the domain; None: the domain is open, and a particle that leaves it is an error.
         clamps: Boxes whose particles and nodes are held at rest.
         attached_masses: Masses that are added to the body.
+        bodies: The bodies, if the scene brings them; `Simulator(scene)` then needs no other.
+        contact: Contact between the bodies: `sticky` (they share one velocity field and never part) or `separate` (they push, slide with
+            friction, and part).
+        body_friction: Coulomb's coefficient between the bodies for `separate` [-], or a list of (name, name, coefficient) for pairs; pairs
+            that are not named slide freely.
     """
 
     lower: Vector = (0.0, 0.0, 0.0)
@@ -230,6 +302,9 @@ class Scene:
     walls: Walls | None = Walls()
     clamps: tuple[Box, ...] = ()
     attached_masses: tuple[AttachedMass, ...] = ()
+    bodies: Sequence[Body] = field(default=(), compare=False)
+    contact: str = "separate"
+    body_friction: float | Sequence[tuple[str, str, float]] = 0.0
 
     @property
     def dx(self) -> float:

@@ -31,6 +31,10 @@ class Frames(ParticleState):
         history: History of the effects, (K, P, width), with width 0 if no effect has one; None if the solver does not return it.
         marks: Record of det F in every step; None: `events` uses the frames alone.
         strain_limit: Largest logarithmic stretch for which the law is known; None: no limit.
+        body: Index of each particle's body, (P,) int32; None: one body in each scene. In several scenes the bodies are counted on.
+        body_names: Name of each body.
+        skins: Surface meshes bound to the particles.
+        colliders: What is drawn of the colliders: name, mesh or primitive, and poses.
 
     Attributes:
         dt: Time between two frames [s], (S,).
@@ -44,6 +48,10 @@ class Frames(ParticleState):
     history: Tensor | None
     marks: Marks | None
     strain_limit: float | None
+    body: Tensor | None
+    body_names: tuple[str, ...]
+    skins: tuple
+    colliders: tuple
 
     def __new__(
         cls,
@@ -57,11 +65,16 @@ class Frames(ParticleState):
         *,
         marks: Marks | None = None,
         strain_limit: float | None = None,
+        body: Tensor | None = None,
+        body_names: Sequence[str] = (),
+        skins: Sequence = (),
+        colliders: Sequence = (),
     ) -> "Frames":
         """Create frames; the class describes the arguments."""
         frames = super().__new__(cls, x, v, C, F)
         frames.dt = torch.as_tensor(dt, dtype=torch.float64).detach().cpu().reshape(-1)
         frames.particles, frames.history, frames.marks, frames.strain_limit = particles, history, marks, strain_limit
+        frames.body, frames.body_names, frames.skins, frames.colliders = body, tuple(body_names), tuple(skins), tuple(colliders)
         return frames
 
     @classmethod
@@ -106,9 +119,10 @@ class Frames(ParticleState):
         """Write the frames to a file; its extension selects the format. A file is complete or absent, never cut.
 
         Args:
-            path: The file; missing folders are created. `.npz`: arrays x, v, C, F, times and scene (C and F if the motion has them).
-                `.ply`: one point cloud per frame, `NAME_0000.ply`, `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; other
-                files of a series of that name are deleted. `.csv`: one row per frame and particle.
+            path: The file; missing folders are created. `.npz`: arrays x, v, C, F, times and scene (C and F if the motion has them),
+                with body and body_names where there are several bodies. `.ply`: one point cloud per frame, `NAME_0000.ply`,
+                `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; other files of a series of that name are deleted. `.csv`:
+                one row per frame and particle.
 
         Returns:
             The files that were written.
@@ -128,6 +142,8 @@ class Frames(ParticleState):
 
     def _save_npz(self, path: Path) -> list[Path]:
         arrays: dict[str, Any] = {name: t.detach().cpu().numpy() for name, t in zip(self._fields, self) if t is not None}
+        if self.body is not None:
+            arrays |= {"body": self.body.cpu().numpy(), "body_names": np.array(self.body_names)}
         with whole_file(path) as hidden, open(hidden, "wb") as file:
             np.savez_compressed(file, times=self.times.numpy(), scene=self._scene(), **arrays)
         return [path]
