@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neuido.errors import UserError
-
 Vector = tuple[float, float, float]
 
 
@@ -91,7 +89,7 @@ class Body(_BodyFields):
         spin: Angular velocity about the centre of volume [rad/s], added to `velocity` or `v`.
 
     Raises:
-        UserError: Neither particles nor a shape.
+        TypeError: Neither particles nor a shape.
     """
 
     def __new__(
@@ -116,9 +114,9 @@ class Body(_BodyFields):
         given |= {"density": density, "fields": fields, "skin": skin}
         if shape is not None:
             given = {key: getattr(shape, key) if value is None else value for key, value in given.items()}
-        if given["x"] is None or given["volume"] is None:
-            raise UserError(f"body {name!r} has no particles; give `shape`, or `x` and `volume`")
         given["name"] = given["name"] or ""
+        if given["x"] is None or given["volume"] is None:
+            raise TypeError(f"body {name!r} has no particles; give `shape`, or `x` and `volume`")
         if velocity is not None or given["v"] is None:
             given["v"] = torch.zeros_like(given["x"]) + torch.tensor(velocity or (0.0, 0.0, 0.0)).to(given["x"])
         if spin is not None:

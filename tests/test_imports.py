@@ -17,7 +17,7 @@ LIGHTNING = ("neuido.models.stages", "neuido.commands", "neuido.data.trajectorie
              "neuido.models.reconstruct")  # fmt: skip
 """The rooms whose modules may import Lightning: the training modules, the data modules and the commands."""
 ROOMS = {  # room: the parts of neuido that it may import, itself included
-    "neuido.types": ("neuido.errors",),
+    "neuido.types": (),
     "neuido.errors": (),
     "neuido.physics": (*GROUND, "neuido.physics"),
     "neuido.data": (*GROUND, "neuido.physics", "neuido.data"),
