@@ -189,7 +189,11 @@ def schemas() -> dict[str, Schema]:
                 "body": {
                     "anyOf": [
                         record({"particles": TEXT}),
-                        {"type": "object", "properties": {"shape": one_of(["cube", "box", "ball", "cylinder"])}, "required": ["shape"]},
+                        {
+                            "type": "object",
+                            "properties": {"shape": one_of(["cube", "box", "ball", "cylinder", "mesh"])},
+                            "required": ["shape"],
+                        },
                     ]
                 },
                 "discretisation": GRID,

@@ -9,7 +9,8 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import NoneType
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -96,7 +97,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
             raise UserError(f"on_inversion must be report or error, got {on_inversion!r}")
         scene = scene_from_dict(content["scene"], content["discretisation"])
         model = model_from_dict(content["model"])
-        body = body_from_dict(content["body"], root)
+        body = body_from_dict(content["body"], root, path.parent)
         outside = ((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any(dim=1)
         if outside.any():
             raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain: enlarge the domain or move the body")
@@ -210,19 +211,20 @@ def scenes_folder() -> Path:
     return checkout if checkout.is_dir() else package / "configs" / "scenes"
 
 
-def body_from_dict(given: Any, root: str | os.PathLike | None) -> Body:
+def body_from_dict(given: Any, root: str | os.PathLike | None, folder: Path | None = None) -> Body:
     """Build a body from the key `body` of a scene file.
 
     Args:
-        given: `shape` (cube, box, ball or cylinder) with the arguments of that function in `shapes`; or `particles`, the path of an .npz
-            file with x and v, relative to the data folder.
-        root: Data folder (`data_root`); used by `particles` alone.
+        given: `shape` (cube, box, ball, cylinder or mesh) with the arguments of that function in `shapes`; or `particles`, the path of an
+            .npz file with x, v and optionally volume. Paths are relative to the scene file, or else to the data folder.
+        root: Data folder (`data_root`); used for paths alone.
+        folder: Folder of the scene file.
 
     Raises:
         UserError: The shape, a key or a value is not accepted, or the particle file is missing or malformed.
     """
     given = mapping(given, "body")
-    makers = {"cube": shapes.cube, "box": shapes.box, "ball": shapes.ball, "cylinder": shapes.cylinder}
+    makers = {"cube": shapes.cube, "box": shapes.box, "ball": shapes.ball, "cylinder": shapes.cylinder, "mesh": shapes.mesh}
     if "shape" in given:
         options = {key: value for key, value in given.items() if key != "shape"}
         maker = makers.get(given["shape"]) if isinstance(given["shape"], str) else None
@@ -239,13 +241,61 @@ def body_from_dict(given: Any, root: str | os.PathLike | None) -> Body:
                 raise UserError(f"body lacks the key {key!r}, which a {given['shape']} needs")
             if key in options:
                 options[key] = _shape_option(options[key], f"body.{key}", parameter.annotation)
+        if "file" in options:
+            options["file"] = named_file(options["file"], "body.file", root, folder)
         return maker(**options)
     check_keys(given, "body", ("particles",))
-    return _particles(str(given["particles"]), data_root(root))
+    return _particles(named_file(str(given["particles"]), "body.particles", root, folder))
+
+
+def named_file(relative: str, where: str, root: str | os.PathLike | None, folder: Path | None = None) -> Path:
+    """Return a file that a scene file names: beside the scene file, or else in the data folder.
+
+    Args:
+        relative: The path in the scene file.
+        where: Name of the key in error messages.
+        root: Data folder (`data_root`).
+        folder: Folder of the scene file.
+
+    Raises:
+        UserError: The path leaves the folder, or neither folder has the file.
+    """
+    if folder is not None:
+        beside = _inside(folder, relative, where)
+        if isinstance(beside, Path) and beside.is_file():
+            return beside
+        if not root and not os.environ.get(VARIABLE):
+            if isinstance(beside, UserError):
+                raise beside
+            raise UserError(f"{where}: the folder of the scene file, {folder}, has no file {relative}, and there is no data folder: set "
+                            f"the option data_root or the environment variable {VARIABLE}")  # fmt: skip
+    path = path_inside(data_root(root), relative, where, kind="data folder")
+    if not path.is_file():
+        raise UserError(f"{where}: the data folder {data_root(root)} has no file {relative}: check data_root or {VARIABLE}")
+    return path
+
+
+def _inside(folder: Path, relative: str, where: str) -> Path | UserError:
+    """Return a path inside a folder, or the error of one that leaves it."""
+    try:
+        return path_inside(folder, relative, where, kind="folder of the scene file")
+    except UserError as error:
+        return error
 
 
 def _shape_option(value: Any, where: str, kind: Any) -> Any:
     """Return an option of a shape, checked against the type that its function declares."""
+    kinds = get_args(kind)
+    if NoneType in kinds:
+        if value is None:
+            return None
+        kind = next(each for each in kinds if each is not NoneType)
+    if kinds and os.PathLike in kinds:
+        kind = str
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise UserError(f"{where} must be true or false, got {value!r}")
+        return value
     if kind is float:
         return number(value, where)
     if kind is int:
@@ -259,12 +309,9 @@ def _shape_option(value: Any, where: str, kind: Any) -> Any:
     return vector(value, where)
 
 
-def _particles(relative: str, root: Path) -> Body:
-    path = path_inside(root, relative, "body.particles", kind="data folder")
-    if not path.is_file():
-        raise UserError(f"body.particles: the data folder {root} has no file {relative}: check data_root or {VARIABLE}")
+def _particles(path: Path) -> Body:
     try:
-        arrays = read_arrays(path, ("x", "v"), what="archive with x and v")
+        arrays = read_arrays(path, ("x", "v"), ("volume",), what="archive with x and v")
     except UserError as error:
         raise UserError(f"body.particles: {error}") from error
     x, v = arrays["x"], arrays["v"]
@@ -275,11 +322,16 @@ def _particles(relative: str, root: Path) -> Body:
         raise UserError(f"body.particles: {path} contains a NaN or an infinity")
     if not len(x):
         raise UserError(f"body.particles: {path} has no particles")
+    if "volume" in arrays:
+        volume = arrays["volume"]
+        if volume.shape != x.shape[:1] or not (np.isfinite(volume) & (volume > 0)).all():
+            raise UserError(f"body.particles: {path}: volume must be {len(x)} positive numbers")
+        return Body(torch.from_numpy(x).float(), torch.from_numpy(v).float(), torch.from_numpy(volume).float())
     try:
-        volume = body_volume(x) / len(x)
+        each = body_volume(x) / len(x)
     except UserError as error:
         raise UserError(f"body.particles: {path}: {error}") from error
-    return Body(torch.from_numpy(x).float(), torch.from_numpy(v).float(), torch.full((len(x),), volume))
+    return Body(torch.from_numpy(x).float(), torch.from_numpy(v).float(), torch.full((len(x),), each))
 
 
 def _plane(given: Any, where: str) -> Plane:

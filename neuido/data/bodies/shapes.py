@@ -1,8 +1,10 @@
-"""Cube, box, ball and cylinder filled with particles; at t = 0 they move as rigid bodies."""
+"""Cube, box, ball, cylinder and mesh filled with particles; at t = 0 they move as rigid bodies."""
 
 import math
+import os
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -146,6 +148,77 @@ def cylinder(
     across = [i for i in range(3) if "xyz"[i] != axis]
     x = x[(x - torch.tensor(centre, dtype=torch.float64))[:, across].square().sum(-1) <= radius**2]
     return _body(x, math.pi * radius**2 * height, centre, velocity, angular_velocity)
+
+
+def mesh(
+    *,
+    file: str | os.PathLike,
+    spacing: float | None = None,
+    particles: int | None = None,
+    scale: float | None = None,
+    size: float | None = None,
+    up: str | None = None,
+    rotation: Vector = (0.0, 0.0, 0.0),
+    centre: Vector | None = None,
+    repair: bool = False,
+    velocity: Vector = (0.0, 0.0, 0.0),
+    angular_velocity: Vector = (0.0, 0.0, 0.0),
+) -> Body:
+    """Fill the mesh of a file with particles; the body has the mesh as its skin.
+
+    In the depth the particles are a regular lattice. Under the surface they are relaxed to share the space evenly, and their volumes are
+    what they share. The volumes sum to the volume of the mesh.
+
+    Args:
+        file: An .obj, .stl, .ply, .glb (trimesh) or .usd, .usda, .usdc, .usdz (usd-core) file, with a closed surface.
+        spacing: Distance between particles [m]; alternatively
+        particles: Approximate number of particles.
+        scale: Metres per unit of the file; by default what a USD file says, else 1. Alternatively
+        size: Longest side of the box around the mesh [m].
+        up: The axis of the file that points up: x, y or z; it becomes y. By default what a USD file says, else y.
+        rotation: Axis of a rotation times its angle [degrees], applied after `up`: (0, 90, 0) turns by a right angle about y.
+        centre: Where the centre of the box around the mesh is put [m]; None: the mesh stays where its file has it.
+        repair: Whether to close holes and orient the triangles alike first.
+        velocity: Velocity of the centre of mass [m/s].
+        angular_velocity: Angular velocity about the centre of mass [rad/s].
+
+    Raises:
+        UserError: The file cannot be read, the mesh is not closed, an option is out of its range, or the spacing is too coarse for it.
+    """
+    from neuido.data.bodies.mesh_files import read_mesh
+    from neuido.data.bodies.mesh_filling import closed_mesh, fill_mesh
+    from neuido.data.bodies.scanlines import enclosed_volume
+    from neuido.data.bodies.skinning import bind_skin
+
+    if (spacing is None) == (particles is None):
+        raise UserError("a mesh needs either spacing or particles")
+    if scale is not None and size is not None:
+        raise UserError("a mesh takes scale or size, not both")
+    for name, value in (("spacing", spacing), ("size", size)):
+        if value is not None:
+            _positive(name, value)
+    if particles is not None and particles < 1:
+        raise UserError(f"particles must be positive, got {particles}")
+    surface = closed_mesh(read_mesh(file, scale=scale, up=up), str(file), repair=repair)
+    turned = surface.vertices @ _rotation(_vector("rotation", rotation)).T
+    if size is not None:
+        turned = turned * (size / np.ptp(turned, axis=0).max())
+    if centre is not None:
+        turned = turned + np.array(_vector("centre", centre)) - (turned.min(axis=0) + turned.max(axis=0)) / 2
+    surface = surface._replace(vertices=turned)
+    x, volume = fill_mesh(surface, spacing or (enclosed_volume(surface) / particles) ** (1 / 3), str(file))  # type: ignore[operator]
+    middle = tuple(np.average(x, axis=0, weights=volume).tolist())
+    at = torch.from_numpy(x)
+    v = rigid_velocity(at, centre=middle, velocity=velocity, angular_velocity=angular_velocity)
+    skin = bind_skin(surface.vertices, surface.faces, at.float())
+    return Body(at.float(), v.float(), torch.from_numpy(volume).float(), skin=skin)
+
+
+def _rotation(degrees: Vector) -> np.ndarray:
+    """Return the rotation matrix of an axis times an angle in degrees."""
+    x, y, z = (math.radians(angle) for angle in degrees)
+    cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    return torch.linalg.matrix_exp(cross).numpy()
 
 
 def rigid_velocity(x: Tensor, *, centre: Vector, velocity: Vector, angular_velocity: Vector) -> Tensor:

@@ -182,6 +182,35 @@ def test_bad_scene_files(ball_folder, changes, word):
     assert "\n" not in str(error.value)
 
 
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+def test_mesh_in_a_scene_file(ball_folder, monkeypatch):
+    pytest.importorskip("trimesh")
+    root, write = ball_folder
+    (root / "body.obj").write_text(TETRAHEDRON)
+    body = {"shape": "mesh", "file": "body.obj", "particles": 500, "size": 0.4, "centre": [0.5, 0.5, 0.5]}
+    monkeypatch.delenv("NEUIDO_DATA")  # the file lies beside the scene
+    setup = scenes.load_scene(write(body=body))
+    assert float(setup.body.volume.sum()) == pytest.approx(0.4**3 / 6, rel=1e-4)
+    assert len(setup.body.skin.vertices) == 4
+    for change, word in (({"file": "../body.obj"}, "leaves"), ({"file": "/etc/hostname"}, "leaves"), ({"file": "none.obj"}, "data_root"),
+                         ({"file": 3}, "must be text"), ({"repair": "yes"}, "true or false"), ({"spacing": "a"}, "spacing"),
+                         ({"particles": 1.5}, "whole number"), ({"colour": 1}, "colour"), ({"up": 1}, "text")):  # fmt: skip
+        with pytest.raises(UserError, match=word):
+            scenes.load_scene(write(body=body | change))
+
+
+def test_particles_with_volumes(ball_folder):
+    root, write = ball_folder
+    x = np.random.default_rng(0).uniform(0.4, 0.6, (10, 3))
+    np.savez(root / "own.npz", x=x, v=0 * x, volume=np.arange(1.0, 11.0))
+    assert scenes.load_scene(write(body={"particles": "own.npz"}), root).body.volume.tolist() == list(range(1, 11))
+    np.savez(root / "own.npz", x=x, v=0 * x, volume=np.zeros(10))
+    with pytest.raises(UserError, match="volume must be 10 positive numbers"):
+        scenes.load_scene(write(body={"particles": "own.npz"}), root)
+
+
 def test_missing_things(tmp_path, monkeypatch):
     monkeypatch.delenv("NEUIDO_DATA", raising=False)
     with pytest.raises(UserError, match=r"data_root.*NEUIDO_DATA"):
