@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from neuido.discrepancy.report.diagnosis import Diagnosis as Diagnosis
     from neuido.discrepancy.workflow import diagnose as diagnose
     from neuido.errors import UserError as UserError
-    from neuido.export.particles import export as export
+    from neuido.export.exporting import export as export
     from neuido.models.inference.video_law import read_law as read_law
     from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator as Operator
     from neuido.models.render.splatting import rasterize as rasterize

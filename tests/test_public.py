@@ -90,7 +90,7 @@ def test_import_and_listing_load_no_torch():
 
 
 def test_export_is_a_function_whatever_was_imported_first():
-    code = "import neuido.export.particles, neuido; from neuido import export; print(callable(neuido.export), callable(export))"
+    code = "import neuido.export.exporting, neuido; from neuido import export; print(callable(neuido.export), callable(export))"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert answer.stdout.split() == ["True", "True"]
 

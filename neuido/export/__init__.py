@@ -8,11 +8,11 @@ from typing import Any
 
 
 class _Export(ModuleType):
-    def __call__(self, frames: Any, path: str | os.PathLike, *, frame_interval: float | None = None) -> Path:
-        """Write the frames of a rollout; see `neuido.export.particles.export`."""
-        from neuido.export.particles import export
+    def __call__(self, frames: Any, path: str | os.PathLike, **options: Any) -> Path:
+        """Write the frames of a rollout; see `neuido.export.exporting.export`, which has the options."""
+        from neuido.export.exporting import export
 
-        return export(frames, path, frame_interval=frame_interval)
+        return export(frames, path, **options)
 
 
 sys.modules[__name__].__class__ = _Export  # a folder and a function have one name in `neuido`

@@ -192,9 +192,21 @@ def _rows_of_lists(rows: Iterable[Numbers], element: Element) -> np.ndarray:
     return np.array(found, np.dtype([(p.name, "O" if p.length else p.type) for p in element.properties]))
 
 
-def ply_bytes(vertices: np.ndarray) -> bytes:
-    """Return the content of a binary PLY file with the columns of a structured array, each of 32-bit floats."""
+def ply_bytes(vertices: np.ndarray, faces: np.ndarray | None = None) -> bytes:
+    """Return the content of a binary PLY file.
+
+    Args:
+        vertices: Structured array; columns of whole numbers are written as 32-bit integers, others as 32-bit floats.
+        faces: Vertices of triangles, (T, 3); None: there are no faces.
+    """
     names = vertices.dtype.names or ()
-    columns = "".join(f"property float {name}\n" for name in names)
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{columns}end_header\n"
-    return head.encode("ascii") + vertices.astype([(name, "<f4") for name in names]).tobytes()
+    whole = [vertices.dtype[name].kind in "iu" for name in names]
+    columns = "".join(f"property {'int' if own else 'float'} {name}\n" for name, own in zip(names, whole))
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{columns}"
+    body = vertices.astype([(name, "<i4" if own else "<f4") for name, own in zip(names, whole)]).tobytes()
+    if faces is not None:
+        head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
+        rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", (3,))])
+        rows["count"], rows["corners"] = 3, faces
+        body += rows.tobytes()
+    return f"{head}end_header\n".encode("ascii") + body

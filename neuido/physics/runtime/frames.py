@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.errors import UserError
+import neuido
 from neuido.physics.runtime import events
 from neuido.physics.runtime.atomic_files import whole_file
 from neuido.physics.runtime.events import Event, Marks
@@ -122,7 +122,7 @@ class Frames(ParticleState):
             path: The file; missing folders are created. `.npz`: arrays x, v, C, F, times and scene (C and F if the motion has them),
                 with body and body_names where there are several bodies. `.ply`: one point cloud per frame, `NAME_0000.ply`,
                 `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; other files of a series of that name are deleted. `.csv`:
-                one row per frame and particle.
+                one row per frame and particle. Other endings, such as `.usd`, are those of `neuido.export`.
 
         Returns:
             The files that were written.
@@ -133,7 +133,7 @@ class Frames(ParticleState):
         path = Path(path)
         writers = {".npz": self._save_npz, ".ply": self._save_ply, ".csv": self._save_csv}
         if path.suffix.lower() not in writers:
-            raise UserError(f"frames cannot be saved as {str(path)!r}: let the name end with {', '.join(writers)}")
+            return [neuido.export(self, path)]
         return writers[path.suffix.lower()](path)
 
     def _scene(self) -> np.ndarray:

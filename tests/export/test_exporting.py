@@ -1,5 +1,6 @@
 """The frames of a rollout as files that other programs read."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,7 +29,8 @@ def test_sequence_has_a_file_for_each_frame_and_replaces_a_longer_one(tmp_path):
     (tmp_path / "motion_0007.ply").touch()
     (tmp_path / "motion_final.ply").touch()
     first = neuido.export(FRAMES, tmp_path / "motion.ply")
-    names = ["motion_0000.ply", "motion_0001.ply", "motion_0002.ply", "motion_final.ply"]
+    names = ["motion.json", "motion_0000.ply", "motion_0001.ply", "motion_0002.ply", "motion_final.ply"]
+    assert json.loads((tmp_path / "motion.json").read_text())["series"] == {"motion": names[1:4]}
     assert sorted(p.name for p in tmp_path.iterdir()) == names
     assert first.name == "motion_0000.ply"
     vertices = read_ply_vertices(tmp_path / "motion_0002.ply")
