@@ -22,7 +22,8 @@ from torch import Tensor
 
 from neuido.data.bodies import shapes
 from neuido.errors import UserError
-from neuido.physics.effects import LIBRARY, Effects, ball_inclusion, linear_gradient
+from neuido.physics.effects import LIBRARY as ALL_EFFECTS
+from neuido.physics.effects import Effects, ball_inclusion, linear_gradient
 from neuido.physics.fem.finite_elements import FiniteElements
 from neuido.physics.laws import ElasticLaw, PlasticLaw, material
 from neuido.physics.laws.neural.symbolic import SymbolicElastic
@@ -57,6 +58,9 @@ LIFTING = (
 GROWTH, DRIFT, PRECISION = 0.05, 2e-4, 0.02
 """Allowed: growth of the energy as a share of what there was, error of the momentum, difference of float32 from float64 in cells."""
 LINE = 300
+
+LIBRARY = tuple(entry for entry in ALL_EFFECTS if not entry.only)
+"""The effects that bodies have."""
 
 
 class Case(NamedTuple):

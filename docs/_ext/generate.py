@@ -99,7 +99,7 @@ def effect_page() -> str:
     ]
     rows = []
     for e in LIBRARY:
-        marks = ["✓" if ok else "" for ok in (True, e.name in OF_TESTS, e.name in OF_TRACKS, True, True)]
+        marks = ["✓" if ok else "" for ok in (not e.only, e.name in OF_TESTS, e.name in OF_TRACKS, not e.only, not e.only)]
         alike = ", ".join(e.confusions) + (f"; needs {e.needs}" if e.needs else "")
         rows.append([f"[{e.name}](#{anchor(e.name)})", *marks, alike])
     head = ["effect", "points or video of a body", "stress and stretch", "track of a point", "MPM", "finite elements", "looks like"]

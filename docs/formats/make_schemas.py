@@ -99,7 +99,7 @@ def schemas() -> dict[str, Schema]:
     from neuido.discrepancy.report import diagnosis_format
     from neuido.physics.effects import LIBRARY
 
-    names = [entry.name for entry in LIBRARY]
+    names = [entry.name for entry in LIBRARY if not entry.only]
     role = one_of(ROLES)
     material = {"elasticity": ELASTICITY}
     extra = {"plasticity": PLASTICITY, "free": FREE}

@@ -196,7 +196,7 @@ def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Validate the declared model of a file's key `model`; return it with the names of its free parameters."""
     given = mapping(given, "model")
     free = given.pop("free", [])
-    effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY))
+    effects = read_effects(given.pop("effects", None), "model.effects", known=tuple(entry.name for entry in LIBRARY if not entry.only))
     for part in ("elasticity", "plasticity"):
         if isinstance(given.get(part), Mapping):
             read_text(given[part].get("law"), f"model.{part}.law")

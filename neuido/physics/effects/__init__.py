@@ -4,9 +4,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from neuido.physics.effects.entry import Entry as Entry
+    from neuido.physics.effects.entry import Parameter as Parameter
     from neuido.physics.effects.library import LIBRARY as LIBRARY
-    from neuido.physics.effects.library import Entry as Entry
-    from neuido.physics.effects.library import Parameter as Parameter
     from neuido.physics.effects.parameters import Effects as Effects
     from neuido.physics.effects.parameters import ball_inclusion as ball_inclusion
     from neuido.physics.effects.parameters import linear_gradient as linear_gradient
@@ -22,9 +22,9 @@ __all__ = [
 
 _PLACES = {
     "Effects": "parameters:Effects",
-    "Entry": "library:Entry",
+    "Entry": "entry:Entry",
     "LIBRARY": "library:LIBRARY",
-    "Parameter": "library:Parameter",
+    "Parameter": "entry:Parameter",
     "ball_inclusion": "parameters:ball_inclusion",
     "linear_gradient": "parameters:linear_gradient",
 }

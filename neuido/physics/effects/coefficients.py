@@ -4,7 +4,9 @@ A table has one row per scene. `Tables` and `Layout` define the columns for the 
 `flow_kernels`) and for the implementation in torch (`constitutive`).
 """
 
+import functools
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -12,6 +14,7 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
+from neuido.physics.effects.point_library import BODIES_TOO
 from neuido.physics.laws import classical_kernels
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, StackedElastic
@@ -25,6 +28,12 @@ BAND = (0.5, 200.0)
 """Band of frequencies [Hz] in which `hysteresis` has a constant loss factor."""
 BRANCHES, MARGIN = 6, 1.8
 """Number of Maxwell branches of `hysteresis`, and how far their relaxation times extend beyond the band, in ln of the time."""
+
+
+PRONY = 5
+"""Number of Maxwell branches of `relaxation_spectrum`."""
+SPACING, DECADES = 1.535, 6
+"""Distance in ln T of the Maxwell branches of `fractional` (three in two decades), and their number on either side of its time."""
 
 
 class Layout(NamedTuple):
@@ -202,6 +211,7 @@ def tables(
     like: Tensor,
     *,
     shear: Tensor | float | None = None,
+    point: bool = False,
 ) -> Tables:
     """Compute the tables of the effects that act on the law, differentiable in the effects and in the parameters of the base laws.
 
@@ -212,15 +222,19 @@ def tables(
         count: Number of scenes S.
         like: A tensor of the dtype and device of the tables.
         shear: Shear modulus of the elastic base law [Pa], () or (S,); `shear_modulus(elasticity)` by default.
+        point: Whether a material point asks, which computes the other effects of `point_library` itself.
 
     Raises:
-        UserError: An effect that the base law does not admit (hardening without a yield stress, cohesion without a Drucker-Prager
-            law), a parameter out of its range, or one parameter of a pair without the other.
+        UserError: An effect that only a material point has, or that the base law does not admit (hardening without a yield stress, cohesion
+            without a Drucker-Prager law), a parameter out of its range, or one parameter of a pair without the other.
     """
     for pair in (("maxwell_ratio", "maxwell_time"), ("fibre", "fibre_direction")):
         missing = [name for name in pair if getattr(effects, name) is None]
         if len(missing) == 1:
             raise UserError(f"{pair[0]} and {pair[1]} come together; give {missing[0]} too")
+    alone = {name.partition(".")[0]: None for name in effects.point or {}}
+    if not point and (refused := [name for name in alone if name not in BODIES_TOO]):
+        raise UserError(f"{refused[0]} is an effect of material tests, and no body has it yet: leave it out")
     if not effects.changes_law:
         return Tables(Layout(), None, False, None, None, (), like.new_zeros(count))
     mu = torch.as_tensor(shear_modulus(elasticity) if shear is None else shear, dtype=like.dtype, device=like.device)
@@ -240,6 +254,27 @@ def tables(
     return Tables(layout, material, effects.tension_compression is not None, branches, flow, kinds, stiff.detach())
 
 
+def _prony(value: Callable[[str], Tensor]) -> tuple[Tensor, Tensor]:
+    """Return weights and relaxation times (S, 5) of `relaxation_spectrum`; `value` gives a parameter (S,)."""
+    g = torch.stack([value(f"g{i}") for i in range(1, PRONY + 1)], dim=1)
+    first, last = (torch.where(t > 0, t, 1.0)[:, None] for t in (value("first"), value("last")))  # any time serves a weight of zero
+    share = torch.linspace(0.0, 1.0, PRONY, dtype=g.dtype, device=g.device)
+    return g, torch.exp(first.log() + share * (last / first).log())
+
+
+def _power(value: Callable[[str], Tensor]) -> tuple[Tensor, Tensor]:
+    """Return weights and relaxation times (S, B) of `fractional`, whose sum is a power law of time; `value` gives a parameter (S,).
+
+    (t/t0)^-a is the integral over ln T of (T/t0)^-a exp(-t/T) / Gamma(a). The sum over branches `SPACING` apart in ln T differs from it by
+    less than 1 % within three decades of t0.
+    """
+    ratio, a, t0 = value("ratio")[:, None], value("exponent")[:, None], value("time")[:, None]
+    a, t0 = torch.where(a > 0, a, 0.5), torch.where(t0 > 0, t0, 1.0)
+    at = SPACING * torch.arange(-DECADES, DECADES + 1, dtype=a.dtype, device=a.device)
+    slower = torch.cat([torch.zeros_like(at[1:]), torch.ones_like(at[:1])]) / torch.expm1(a * SPACING)  # all beyond the slowest
+    return ratio * SPACING * torch.exp(-a * at - torch.lgamma(a)) * (1 + slower), t0 * at.exp()
+
+
 def _branches(effects: Effects, count: int, like: Tensor, mu: Tensor) -> Tensor | None:
     """Return `Tables.branches`; None without a Maxwell branch."""
     weights, times = [], []
@@ -254,6 +289,11 @@ def _branches(effects: Effects, count: int, like: Tensor, mu: Tensor) -> Tensor 
         g, T = hysteresis_spectrum(effects.rows("hysteresis", count, like)[:, 0])
         weights.append(g)
         times.append(T.expand_as(g))
+    for name, spectrum in (("relaxation_spectrum", _prony), ("fractional", _power)):
+        if any(key.startswith(name) for key in effects.point or {}):
+            g, T = spectrum(functools.partial(effects.point_rows, name, scene_count=count, like=like))
+            weights.append(g)
+            times.append(T)
     return torch.stack([2 * mu[:, None] * torch.cat(weights, 1), torch.cat(times, 1)], dim=-1) if weights else None
 
 

@@ -112,6 +112,9 @@ class Constitutive:
         UserError: As `coefficients.tables`.
     """
 
+    point = False
+    """Whether the effects that only a material point has are computed too (`points.point_law`)."""
+
     def __init__(
         self,
         elasticity: ElasticLaw,
@@ -131,7 +134,7 @@ class Constitutive:
             like = like.to(particles.scene.device)
         self.particles, self.like, self.scene = particles, like, particles.scene.long()
         scenes = len(particles.offsets) - 1
-        self.tables = coefficients.tables(effects, elasticity, plasticity, scenes, like, shear=shear_modulus)
+        self.tables = coefficients.tables(effects, elasticity, plasticity, scenes, like, shear=shear_modulus, point=self.point)
         self.plasticity = None if self.tables.flow is not None or plasticity is None or plasticity.identity else plasticity
         self._kinds = torch.tensor(self.tables.kinds, device=like.device)[self.scene] if self.tables.kinds else None
         viscosity = effects.viscosity(scenes, like)
@@ -154,6 +157,14 @@ class Constitutive:
             scale = scale * torch.exp(self._rate * time)
         return scale
 
+    def _elastic(self, F: Tensor, history: History) -> tuple[Tensor, Tensor]:
+        """Return the gradient that the elastic law sees, (P, 3, 3), and a factor on its stress, (P,)."""
+        return F, self.like.new_ones(self.count)
+
+    def _further(self, F: Tensor) -> Tensor | None:
+        """Return a further elastic stress [Pa], (P, 3, 3); None where there is none."""
+        return None
+
     def stress(self, F: Tensor, C: Tensor, history: History, time: Tensor | float = 0.0) -> Tensor:
         """Compute the Kirchhoff stress [Pa], (P, 3, 3), viscous stress included.
 
@@ -163,8 +174,11 @@ class Constitutive:
             history: The history at F.
             time: Time [s].
         """
+        F, factor = self._elastic(F, history)
         tau = self.elasticity(F, self.particles)
-        scale = self._scale(time)
+        if (further := self._further(F)) is not None:
+            tau = tau + further
+        scale = self._scale(time) * factor
         if self.tables.material is not None:
             k, c, r, fibre, x, y, z, damage, lock = self.tables.material[self.scene][..., None, None].unbind(1)
             J = torch.linalg.det(F)[:, None, None]

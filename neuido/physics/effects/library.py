@@ -5,42 +5,9 @@ rejects an explanation whose value lies outside. The confusions were measured in
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
-
-class Parameter(NamedTuple):
-    """One parameter of an effect, "<effect>.<name>"."""
-
-    name: str
-    field: str
-    """The field of `Effects` that it sets, or sets a component of."""
-    unit: str
-    low: float
-    """Lower end of the physical range, inclusive."""
-    high: float
-    """Upper end of the physical range, inclusive."""
-    signed: bool = False
-    """Whether both signs are possible."""
-
-
-class Entry(NamedTuple):
-    """One effect: its equation, its parameters with ranges, where it shows, and which effects it is confused with."""
-
-    name: str
-    title: str
-    """The effect in words, as they stand after "the model lacks"."""
-    equation: str
-    parameters: tuple[Parameter, ...]
-    stage: str
-    """The part of a motion in which it shows: flight, rotation, internal modes, contact, rest or power."""
-    confusions: tuple[str, ...]
-    """Effects that explain similar data."""
-    source: str
-    """Reference of the equation."""
-    limits: tuple[str, ...] = ()
-    """Effects with fewer parameters that this one becomes at an end of its range."""
-    needs: str = ""
-    """What must be measured for it to show, beside what `stage` says."""
+from neuido.physics.effects.entry import Entry, Parameter
+from neuido.physics.effects.point_library import POINT_ENTRIES
 
 
 def _vector(field: str, unit: str, size: float, names: Sequence[str] = "xyz") -> tuple[Parameter, ...]:
@@ -336,6 +303,7 @@ LIBRARY = (
         "Landau and Lifshitz, Fluid Mechanics, 20: torque on a rotating sphere",
         needs="the orientation of a body that rotates; the track of one point has none",
     ),
+    *POINT_ENTRIES,
 )
 """One entry for each effect, grouped by kind."""
 

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics.effects.library import LIBRARY, Entry, Parameter
+from neuido.physics.effects.entry import Entry, Parameter
+from neuido.physics.effects.library import LIBRARY
+from neuido.physics.effects.point_library import FIELD, POINT_ENTRIES
 from neuido.types import brief_fields
 
 __all__ = ["LIBRARY", "Effects", "Entry", "Parameter", "ball_inclusion", "linear_gradient"]
@@ -38,6 +40,7 @@ _MATERIAL = (
     "kinematic_hardening",
     "rate_yield",
     "cohesion",
+    "point",
 )
 _LOWER_BOUNDS = {
     "added_mass": (-1.0, ""),
@@ -140,6 +143,8 @@ class Effects(NamedTuple):
     """Factor of each particle's mass and elastic stress [-], (P,) in the order of the bodies. It describes a foam or a hollow body,
     whose modulus is proportional to its relative density (Gibson and Ashby, exponent 1), or particles that lie closer together than
     their volumes imply. The yield strain is that of the solid."""
+    point: Mapping[str, Tensor | float] | None = None
+    """Parameters of the effects of `point_library` by name, such as "mullins.share"; most of them only a material point has."""
 
     @classmethod
     def of(cls, values: Mapping[str, Tensor | float], *, x: Tensor | None = None, scene: Tensor | None = None) -> "Effects":
@@ -180,6 +185,24 @@ class Effects(NamedTuple):
             bound = "zero" if least == 0.0 else f"{least:g}"
             raise UserError(f"{name} is {worst:g}{unit}; it must be {bound} or more")
         return rows.expand(scene_count, width)
+
+    def point_rows(self, effect: str, part: str, scene_count: int, like: Tensor) -> Tensor:
+        """Return a parameter of an effect of `point_library`, (S,), in the type and on the device of `like`; zero where absent.
+
+        Raises:
+            UserError: Outside its range, not a number, or neither one value nor one for each scene.
+        """
+        value = (self.point or {}).get(f"{effect}.{part}")
+        if value is None:
+            return like.new_zeros(scene_count)
+        rows = _tensor(value).to(like.device, like.dtype).reshape(-1)
+        if len(rows) not in (1, scene_count):
+            raise UserError(f"{effect}.{part} has {len(rows)} values for {scene_count} scenes; give one value or one for each scene")
+        p = _POINT[f"{effect}.{part}"]
+        wrong = ~((rows >= p.low) & (rows <= p.high))
+        if bool(wrong.any()):
+            raise UserError(f"{effect}.{part} is {rows[wrong][0].item():g} {p.unit}; it must be from {p.low:g} to {p.high:g}")
+        return rows.expand(scene_count)
 
     def particle_stiffness(self, count: int, like: Tensor) -> Tensor | None:
         """Return the factor on each particle's elastic stress, (P,), from `stiffness` and `relative_density`; None without either.
@@ -365,6 +388,8 @@ def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tenso
             if bool((intervals != intervals[0]).any()):
                 raise UserError(f"time_force.interval is {intervals.tolist()}; all scenes share one, so give one value")
             out["time_force_interval"] = intervals[0].item()
+        elif _FIELDS[name] == FIELD:
+            out.setdefault(FIELD, {})[name] = value
         elif part in ("x", "y", "z"):
             vectors.setdefault(_FIELDS[name], {})[part] = value
         else:
@@ -417,6 +442,7 @@ def _stiffness(part: Mapping[str, Tensor | float], x: Tensor | None, scene: Tens
     return factor
 
 
+_POINT = {f"{entry.name}.{p.name}": p for entry in POINT_ENTRIES for p in entry.parameters}
 _NAMES = {f"{entry.name}.{parameter.name}" for entry in LIBRARY for parameter in entry.parameters}
 
 

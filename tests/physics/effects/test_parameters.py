@@ -361,6 +361,8 @@ def test_the_library_has_the_vocabulary():
         gravity uniform_acceleration drag_linear drag_quadratic magnus position_force time_force viscosity_shear viscosity_bulk maxwell
         hysteresis strain_stiffening second_invariant tension_compression fibre yield hardening softening kinematic_hardening rate_yield
         stiffness_gradient stiffness_change friction stick restitution cohesion added_mass swelling spin_decay
+        relaxation_spectrum fractional mullins permanent_set compaction creep nonlinear_backstress cyclic_hardening rate_power
+        power_law carreau bingham herschel_bulkley thixotropy
     """.split()
     assert sorted(entry.name for entry in LIBRARY) == sorted(names)
     stages = {"flight", "rotation", "internal modes", "contact", "rest", "power"}
