@@ -5,6 +5,7 @@ object serves S scenes at once; with S = 1 it serves all particles. A rollout ca
 autograd. Calling the law itself runs a slower implementation in plain torch, which autograd differentiates.
 """
 
+import copy
 from collections.abc import Callable, Hashable, Sequence
 from itertools import pairwise
 
@@ -157,6 +158,10 @@ class ElasticLaw(Law):
         """Return the P-wave modulus d tau_11 / d F_11 at F = I [Pa], (S,); it bounds the stable time step."""
         raise NotImplementedError
 
+    def particle_modulus(self) -> Tensor | None:
+        """Return the P-wave modulus at each particle [Pa], (P,) float64, where it differs within a scene; else None."""
+        return None
+
 
 class PlasticLaw(Law):
     """Map the trial deformation gradient to the corrected one."""
@@ -171,8 +176,9 @@ class AutogradLaw(Law):
     law is slower than one with kernels, and its launches are not captured in a CUDA graph.
     """
 
-    def __init__(self, function: Callable[..., Tensor], tensors: Sequence[Tensor] = ()):
-        self.function = function
+    def __init__(self, function: Callable[..., Tensor], tensors: Sequence[Tensor] = (), *, fields: Sequence[str] = ()):
+        self.function, self.fields = function, tuple(fields)
+        self._given: tuple[tuple[Tensor, Tensor], ...] = ()
         self._tensors = tuple(tensors)
         sizes = {t.shape[0] if t.ndim else 0 for t in self._tensors}
         if len(sizes) > 1 or 0 in sizes:
@@ -183,7 +189,22 @@ class AutogradLaw(Law):
         self._scenes = sizes.pop() if sizes else 1
 
     def tensors(self) -> tuple[Tensor, ...]:
-        return self._tensors
+        if self.fields:
+            raise UserError(
+                f"{type(self).__name__} takes the fields {', '.join(self.fields)}; give the law to a `Body` with these `fields`"
+            )
+        return (*self._tensors, *(value[rows][None] for value, rows in self._given))
+
+    def with_fields(self, values: Sequence[Tensor], rows: Tensor) -> "AutogradLaw":
+        """Return this law for some particles of a body.
+
+        Args:
+            values: Values of its fields at all particles of the body, (P, ...) each.
+            rows: The particles, (n,).
+        """
+        law = copy.copy(self)
+        law.fields, law._given = (), tuple((value, rows) for value in values)
+        return law
 
     def _ranges(self, particles: Particles) -> list[tuple[int, int, int]]:
         """List the row of the tensors, the first particle and the end of each scene."""
@@ -222,7 +243,7 @@ class AutogradLaw(Law):
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
         if self._scenes == 1:
-            return self.function(F, *(t[0] for t in self._tensors))
+            return self.function(F, *(t[0] for t in self.tensors()))
         if particles is None:
             raise UserError(f"{type(self).__name__} has {self._scenes} scenes: give `particles`, the scene of each F")
         return torch.cat([self.function(F[a:b], *(t[s] for t in self._tensors)) for s, a, b in self._ranges(particles)])
@@ -234,17 +255,18 @@ class AutogradLaw(Law):
 class AutogradElastic(AutogradLaw, ElasticLaw):
     """An elastic law from a torch function F -> tau."""
 
-    def __init__(self, function: Callable[..., Tensor], tensors: Sequence[Tensor] = (), *, modulus: Parameter):
+    def __init__(self, function: Callable[..., Tensor], tensors: Sequence[Tensor] = (), *, modulus: Parameter, fields: Sequence[str] = ()):
         """
         Args:
             function: Maps F (n, 3, 3) and the tensors of one scene to tau [Pa], (n, 3, 3).
             tensors: Differentiable inputs, each with a leading axis of S scenes.
             modulus: P-wave modulus at F = I [Pa], a number or (S,); it bounds the time step.
+            fields: Names of `Body.fields` that the function takes after the tensors, (n, ...) each.
 
         Raises:
             UserError: Tensors without a common leading axis.
         """
-        super().__init__(function, tensors)
+        super().__init__(function, tensors, fields=fields)
         self._modulus = torch.as_tensor(modulus).reshape(-1).expand(self._scenes)
 
     def modulus(self) -> Tensor:
@@ -257,6 +279,7 @@ class AutogradPlastic(AutogradLaw, PlasticLaw):
     Args:
         function: Maps the trial F (n, 3, 3) and the tensors of one scene to the corrected F (n, 3, 3).
         tensors: Differentiable inputs, each with a leading axis of S scenes.
+        fields: Names of `Body.fields` that the function takes after the tensors, (n, ...) each.
 
     Raises:
         UserError: Tensors without a common leading axis.

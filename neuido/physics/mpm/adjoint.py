@@ -10,8 +10,8 @@ from torch import Tensor
 
 from neuido.physics.effects import swelling_kernels
 from neuido.physics.laws.base import Engine
-from neuido.physics.mpm.plan import FIXED, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step
-from neuido.physics.mpm.rollout import Tape, flow_inputs, grid_inputs, stress, stress_inputs, swell, to_grid, update_nodes
+from neuido.physics.mpm.plan import BODY_FRICTION, FIXED, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step
+from neuido.physics.mpm.rollout import Tape, flow_inputs, grid_inputs, meet, stress, stress_inputs, swell, to_grid, update_nodes
 from neuido.physics.runtime.device import real_of, torch_stream
 
 
@@ -35,7 +35,7 @@ def run_backward(
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
     a_fixed = [torch.zeros_like(t) for t in inputs[STATES:FIXED]]
     a_mass, a_pull, a_force, a_friction, a_viscosity = a_fixed[:5]
-    a_shrinkage, a_loss = a_fixed[SHRINKAGE - STATES], a_fixed[SPIN_LOSS - STATES]
+    a_shrinkage, a_loss, a_body_friction = a_fixed[SHRINKAGE - STATES :]
     parameters = any(wanted[STATES + 1 : STATES + 4])
     now = [torch.zeros_like(t) for t in inputs[:STATES]]
     then = [torch.empty_like(t) for t in now]
@@ -58,7 +58,7 @@ def run_backward(
             if spin is not None and damped is not None:
                 spin.damp(inputs[SPIN_LOSS], mass, x, v, C, *damped, every=True)
                 v_in, C_in = damped
-            tau, grid, velocity = recompute(plan, inputs, tape, n, state, (v_in, C_in), elastic, material, scratch)
+            tau, grid, met, velocity = recompute(plan, inputs, tape, n, state, (v_in, C_in), elastic, material, scratch)
             shrinkage = at_step(inputs[SHRINKAGE], n)
             a_x, a_v, a_C, a_F, a_history = then
             a_out = now[3]
@@ -76,14 +76,19 @@ def run_backward(
                 swelling = swelling_kernels.build(real_of(setup.dtype))
                 plan.launch(swelling.swell_adjoint, len(x), [setup.particles.scene, setup.dt, *arguments])
             plan.launch(k.grid_to_particles_adjoint, len(x),
-                        [setup.particles.scene, setup.sorted_held, setup.origin, setup.dx, setup.dt, setup.nodes, velocity, x, F, v_next,
-                         C_next, *now[:3], a_out, a_velocity.zero_(), a_x, a_F], plan.block)  # fmt: skip
-            arguments = [grid, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters]
+                        [setup.field, setup.sorted_held, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, velocity, x, F,
+                         v_next, C_next, *now[:3], a_out, a_velocity.zero_(), a_x, a_F], plan.block)  # fmt: skip
+            arguments = [met, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters]
             inputs_n = grid_inputs(plan, at_step(pull, n), force, friction)
             plan.launch(k.update_grid_adjoint, setup.node_count // setup.chunk, [*inputs_n, *arguments])
+            a_before = a_grid
+            if setup.contact is not None:
+                particles = [setup.field, setup.particles.scene, setup.field_origin, setup.field_dx, x, setup.sorted_volume]
+                adjoints = [a_grid, setup.scratch("a_before"), a_x, a_body_friction]
+                a_before = setup.contact.exchange_adjoint(plan.launch, particles, grid, inputs[BODY_FRICTION], *adjoints)
             plan.launch(k.particles_to_grid_adjoint, len(x),
-                        [setup.particles.scene, setup.origin, setup.dx, setup.dt, setup.nodes, mass, setup.sorted_volume, x, v_in, C_in,
-                         tau, a_grid, a_mass, a_x, a_v, a_C, a_tau], plan.block)  # fmt: skip
+                        [setup.field, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, mass, setup.sorted_volume, x,
+                         v_in, C_in, tau, a_before, a_mass, a_x, a_v, a_C, a_tau], plan.block)  # fmt: skip
             if spin is not None:
                 spin.adjoint(inputs[SPIN_LOSS], mass, x, v, C, a_loss, a_mass, a_x, a_v, a_C)
             if viscosity.numel():
@@ -112,8 +117,8 @@ def recompute(
     elastic: Engine,
     material: Material | None,
     scratch: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return stress, nodal momentum and nodal velocity of a substep, from the tape or recomputed from the state before it.
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return stress, nodal momentum before and after contact of bodies, and nodal velocity of a substep, from the tape or recomputed.
 
     Args:
         plan: The rollout.
@@ -133,10 +138,11 @@ def recompute(
     if tape.tau is None:
         stress(plan, elastic, F, C, history, viscosity, material, tau)
     grid = to_grid(plan, x, *moving, tau, mass, setup.scratch("grid")) if tape.grid is None else tape.grid[n]
+    met = meet(plan, x, grid, inputs[BODY_FRICTION])
     velocity = setup.scratch("velocity") if tape.velocity is None else tape.velocity[n]
     if tape.velocity is None:
-        update_nodes(plan, grid, at_step(pull, n), force, friction, velocity)
-    return tau, grid, velocity
+        update_nodes(plan, met, at_step(pull, n), force, friction, velocity)
+    return tau, grid, met, velocity
 
 
 def update_history_adjoint(

@@ -142,11 +142,16 @@ def waves(
     Raises:
         UserError: A modulus that is negative or not a number.
     """
-    modulus = elasticity.modulus().detach().to(solver.device, torch.float64).expand(solver.scene_count)
-    if stiffening is not None:
-        modulus = (modulus + stiffening[0]) * stiffening[1]
     rho = (solver.mass if mass is None else mass.detach()).double() / solver.volume.double()
     least = torch.stack([rho[i:j].min() for i, j in pairwise(solver.particles.offsets)])
+    each = elasticity.particle_modulus()
+    if each is None:
+        modulus = elasticity.modulus().detach().to(solver.device, torch.float64).expand(solver.scene_count)
+    else:  # that of the fastest wave, scaled to the smallest density
+        speed2 = each.to(rho) / rho
+        modulus = torch.stack([speed2[i:j].max() for i, j in pairwise(solver.particles.offsets)]) * least
+    if stiffening is not None:
+        modulus = (modulus + stiffening[0]) * stiffening[1]
     out = []
     for s, (value, density) in enumerate(torch.stack([modulus, least], dim=1).tolist()):  # one transfer for all scenes
         if not value >= 0.0:

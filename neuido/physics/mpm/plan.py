@@ -18,13 +18,13 @@ from neuido.physics.runtime.events import MarkRecorder
 
 STATES = 5
 """Number of inputs that form the initial state: x, v, C, F and the history (no columns if no effect has a history)."""
-KINDS = ("particle",) * 6 + ("time",) + ("scene",) * 3 + ("particle", "time") + ("scene",) * 3 + ("time", "scene")
+KINDS = ("particle",) * 6 + ("time",) + ("scene",) * 3 + ("particle", "time") + ("scene",) * 3 + ("time", "scene", "scene")
 """The leading axis of each input before the tensors of the laws: the initial state (5), mass, acceleration, force, friction,
-viscosity, the tables of material effects (stiffness, growth, material, branches, flow), and those of swelling and of spin decay. `time` is
-(T, S, ...), or (1, S, ...) if constant. An absent input has no elements."""
+viscosity, the tables of material effects (stiffness, growth, material, branches, flow), those of swelling and of spin decay, and the
+friction between bodies. `time` is (T, S, ...), or (1, S, ...) if constant. An absent input has no elements."""
 FIXED = len(KINDS)
-MATERIAL, SHRINKAGE, SPIN_LOSS = STATES + 5, STATES + 10, STATES + 11
-"""Index of the first table of the material effects, of `Effects.shrinkage` and of `Effects.spin_loss`."""
+MATERIAL, SHRINKAGE, SPIN_LOSS, BODY_FRICTION = STATES + 5, STATES + 10, STATES + 11, STATES + 12
+"""Index of the first table of the material effects, of `Effects.shrinkage`, of `Effects.spin_loss` and of the friction between bodies."""
 
 LARGE = 1 << 17
 """Number of particles from which a GPU uses blocks of 256 threads, else of 32: small bodies need more blocks to fill the GPU."""

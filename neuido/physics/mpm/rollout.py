@@ -16,7 +16,7 @@ from neuido.physics.effects import swelling_kernels
 from neuido.physics.effects.spin_decay import SpinDecay
 from neuido.physics.laws.base import Engine
 from neuido.physics.mpm import transfers as kernels
-from neuido.physics.mpm.plan import SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step
+from neuido.physics.mpm.plan import BODY_FRICTION, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step
 from neuido.physics.runtime.device import real_of, torch_stream
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.launches import LaunchRecordings
@@ -31,7 +31,7 @@ class Tape(NamedTuple):
     F: Tensor
     history: Tensor
     status: Tensor
-    """Code, particle and substep of the first failure of each scene, (3 S,) int32."""
+    """Code, particle and substep of the first failure of each velocity field, (3 fields,) int32."""
     lowest: Tensor
     """Smallest det F of each particle, of those below `COLLAPSED`, (P,)."""
     since: Tensor
@@ -68,7 +68,7 @@ def new_tape(plan: Plan, keep_all: bool) -> Tape:
     count = plan.steps if keep_all else plan.steps // plan.every
     history = setup.mass.new_empty(len(setup.mass), plan.layout.width)
     x, v, C, F, history = (t.new_empty(count + 1, *t.shape) for t in (*setup.state, history))
-    status = torch.zeros(3 * setup.scene_count, dtype=torch.int32, device=setup.device)
+    status = torch.zeros(3 * setup.grid_shape[0], dtype=torch.int32, device=setup.device)
     lowest, since = torch.empty_like(setup.mass), torch.empty(len(setup.mass), dtype=torch.int32, device=setup.device)
     more = keep_all and setup.keep_grid
     tau = setup.state.F.new_empty(plan.steps, *setup.state.F.shape) if more else None
@@ -96,7 +96,7 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
     spare = [tuple(torch.empty_like(t) for t in now) for _ in range(2)] if stride > 1 else []
     scratch, other = torch.empty_like(now[3]), torch.empty_like(now[3])
     copies = setup.device.type == "cpu"
-    clears = copies and tape.grid is None  # the grid update zeroes the nodes as it reads them, which saves a pass
+    clears = copies and tape.grid is None and setup.contact is None  # the grid update zeroes the nodes as it reads them, which saves a pass
     for name in ("grid", "velocity") if clears else ():
         setup.scratch(name).zero_()
     recordings = LaunchRecordings()
@@ -127,7 +127,8 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
             if not clears:
                 grid.zero_()
             to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid, spin, damped)
-            on_nodes = partial(update_nodes, plan, grid, pull_now, force, friction, velocity, reach, clears)
+            met = grid if setup.contact is None else setup.scratch("met")
+            on_nodes = partial(update_nodes, plan, met, pull_now, force, friction, velocity, reach, clears)
             shrinkage = at_step(inputs[SHRINKAGE], n)
             to_particles = partial(gather, plan, n, now, then, material, plastic, velocity, trial, tape, shrinkage)
             if same is None:
@@ -155,7 +156,7 @@ def scatter(
     spin: SpinDecay | None = None,
     damped: tuple[Tensor, Tensor] | None = None,
 ) -> None:
-    """Compute the stress, and add momentum and mass of the particles to the nodes (P2G).
+    """Compute the stress, and add momentum and mass of the particles to the nodes (P2G); let bodies that meet exchange momentum.
 
     Args:
         plan: The rollout.
@@ -174,6 +175,26 @@ def scatter(
         spin.damp(inputs[SPIN_LOSS], inputs[STATES], x, v, C, *damped)
         v, C = damped
     add_to_grid(plan, x, v, C, tau, inputs[STATES], grid)
+    meet(plan, x, grid, inputs[BODY_FRICTION])
+
+
+def meet(plan: Plan, x: Tensor, grid: Tensor, friction: Tensor) -> Tensor:
+    """Exchange momentum between bodies in contact.
+
+    Args:
+        plan: The rollout.
+        x: Position of the particles [m], (P, 3).
+        grid: Momentum and mass of the nodes of each velocity field, (nodes, 4).
+        friction: Coulomb's coefficient of each pair of bodies [-], (S, B B).
+
+    Returns:
+        Momentum and mass after the exchange: `grid` itself where no bodies have fields of their own, else scratch memory.
+    """
+    setup = plan.setup
+    if setup.contact is None:
+        return grid
+    particles = [setup.field, setup.particles.scene, setup.field_origin, setup.field_dx, x, setup.sorted_volume]
+    return setup.contact.exchange(plan.launch, particles, grid, friction, setup.scratch("met"))
 
 
 def gather(
@@ -206,8 +227,8 @@ def gather(
     x, _, _, F, history = now
     raw = trial if plan.corrects else then[3]
     plan.launch(setup.kernels.grid_to_particles, len(x),
-                [setup.particles.scene, setup.sorted_held, setup.origin, setup.dx, setup.dt, setup.nodes, velocity, x, F, *then[:3],
-                 raw, n, tape.status, setup.span, tape.lowest, tape.since,
+                [setup.field, setup.sorted_held, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, velocity, x, F,
+                 *then[:3], raw, n, tape.status, setup.span, tape.lowest, tape.since,
                  tape.rest_x, tape.rest_F], plan.block)  # fmt: skip
     if shrinkage.numel():
         swell(plan, shrinkage, raw, tape.rest_F)
@@ -316,7 +337,8 @@ def to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tens
 def add_to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> None:
     """Add momentum and mass of the particles to the nodes of `grid`."""
     setup = plan.setup
-    arguments = [setup.particles.scene, setup.origin, setup.dx, setup.dt, setup.nodes, mass, setup.sorted_volume, x, v, C, tau, grid]
+    table = [setup.field, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes]
+    arguments = [*table, mass, setup.sorted_volume, x, v, C, tau, grid]
     plan.launch(setup.kernels.particles_to_grid, len(x), arguments, plan.block)
 
 
@@ -381,7 +403,7 @@ def check(plan: Plan, tape: Tape) -> None:
     if bool(finite.all() & ~found.any()):  # one transfer
         return
     if plan.nan_on_failure:
-        invalidate(tape.states[:4], ~finite | (found[:, 0] != 0)[setup.particles.scene.long()], setup.particles.scene)
+        invalidate(tape.states[:4], ~finite | (found[:, 0] != 0)[setup.field.long()], setup.particles.scene)
         return
     # report the earliest failure
     code, p, step = min((row for row in found.tolist() if row[0]), key=lambda row: row[2], default=(0, 0, 0))

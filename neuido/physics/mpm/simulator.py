@@ -5,6 +5,7 @@ This module validates the inputs and starts the rollout. `rollout.py` has the fo
 Method"): P2G with tau(F), grid update, G2P, F_tr = (I + dt C) F, F = F_hat(F_tr). `reference.py` is a slow implementation for tests.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from itertools import pairwise
@@ -16,11 +17,13 @@ from torch import Tensor
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw, strain_limit
+from neuido.physics.laws.composite import laws_of_bodies
 from neuido.physics.mpm import inputs
 from neuido.physics.mpm.differentiable import run
 from neuido.physics.mpm.graphs import RolloutCache
 from neuido.physics.mpm.plan import Plan
 from neuido.physics.mpm.state import Setup
+from neuido.physics.multibody.scene_bodies import bodies_of, labels
 from neuido.physics.runtime.deprecated import renamed_option
 from neuido.physics.runtime.device import as_device
 from neuido.physics.runtime.events import Marks, OnInversion, checked_option, raise_inversions
@@ -48,12 +51,12 @@ class StepLimit(NamedTuple):
 
 
 class Simulator:
-    """Simulate one or several scenes by MPM, each with one body; kernel launches are batched over scenes.
+    """Simulate one or several scenes by MPM, each with one or several bodies; kernel launches are batched over scenes.
 
     Args:
         scenes: One scene or a list; grid, time step, gravity and colliders may differ between them.
-        bodies: One body per scene.
-        density: Mass density [kg/m^3], one number or one per scene.
+        bodies: One body per scene; None: the scenes bring theirs (`Scene.bodies`).
+        density: Mass density of the bodies that bring none [kg/m^3], one number or one per scene.
         device: `auto` (CUDA where there is one), `cpu`, `cuda`, or a `torch.device`.
         dtype: `torch.float32` for production, `torch.float64` for gradient checks.
         threads: On the CPU, run scenes in parallel, one thread per core.
@@ -73,12 +76,13 @@ class Simulator:
         mass: Particle masses [kg], (P,), attached masses included.
         volume: Initial volumes [m^3], (P,).
         particles: `Particles`, the scene that each particle belongs to.
+        bodies: The bodies of each scene.
     """
 
     def __init__(
         self,
         scenes: Scene | Sequence[Scene],
-        bodies: Body | Sequence[Body],
+        bodies: Body | Sequence[Body] | None = None,
         *,
         density: float | Sequence[float] = 1000.0,
         device: str | torch.device = "auto",
@@ -94,19 +98,24 @@ class Simulator:
             raise UserError(f"store is {store!r}; choose state, all or auto")
         self.on_inversion = checked_option(on_inversion)
         self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
-        bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
-        if len(bodies) != len(self.scenes) or not bodies:
-            raise UserError(f"{len(bodies)} bodies for {len(self.scenes)} scenes; give one body per scene")
-        densities = [float(density)] * len(bodies) if isinstance(density, (int, float)) else [float(d) for d in density]
-        if len(densities) != len(bodies) or not all(d > 0 for d in densities):
-            raise UserError(f"density is {density}; give one positive number, or one for each of {len(bodies)} scenes")
-        self.setup = setup = Setup(self.scenes, bodies, densities, as_device(device), dtype, store)
+        self.bodies = bodies_of(self.scenes, bodies, density)
+        self.setup = setup = Setup(self.scenes, self.bodies, as_device(device), dtype, store)
         self.device, self.dtype = setup.device, dtype
         self.particles, self.state, self.mass, self.volume = setup.particles, setup.state, setup.mass, setup.volume
         self.order, self.inverse, self.held = setup.order, setup.inverse, setup.held
         self.dt, self.dx, self.gravity, self.colliders = setup.dt, setup.dx, setup.gravity, setup.colliders
         self.cache = RolloutCache(graphs and self.device.type == "cuda")
-        self.pool = scene_pool() if threads and self.device.type == "cpu" and len(self.scenes) > 1 else None
+        self.alone = all(len(own.bodies) == 1 and own.bodies[0].law is None for own in self.bodies)
+        self.pool = scene_pool() if threads and self.device.type == "cpu" and len(self.scenes) > 1 and self.alone else None
+
+    @functools.cached_property
+    def own_laws(self) -> tuple[ElasticLaw, PlasticLaw | None]:
+        """The elastic and the plastic law that the bodies bring.
+
+        Raises:
+            UserError: A body without a law, or a field that does not fit.
+        """
+        return laws_of_bodies([body for own in self.bodies for body in own.bodies], self.order)
 
     @property
     def scene_count(self) -> int:
@@ -142,14 +151,27 @@ class Simulator:
             out.append(StepLimit(COURANT_LIMIT * dx / max((modulus / density) ** 0.5, 1e-30), viscous))
         return out
 
+    def _laws(self, elasticity: ElasticLaw | None, plasticity: PlasticLaw | None) -> tuple[ElasticLaw, PlasticLaw | None]:
+        """Return the laws of a rollout: the given ones, or those of the bodies.
+
+        Raises:
+            UserError: A plastic law without an elastic one, or bodies without a law.
+        """
+        if elasticity is not None:
+            return elasticity, plasticity
+        if plasticity is not None:
+            raise UserError("a rollout got a plastic law without an elastic one; give both, or none to use those of the bodies")
+        return self.own_laws
+
     def step_margin(
-        self, steps: int, elasticity: ElasticLaw, plasticity: PlasticLaw | None = None, *, effects: Effects | None = None
+        self, steps: int, elasticity: ElasticLaw | None = None, plasticity: PlasticLaw | None = None, *, effects: Effects | None = None
     ) -> float:
         """Return the smallest ratio of stable to actual time step over the scenes; below 1, `rollout` raises.
 
         Raises:
             UserError: As `rollout`, except for an unstable step.
         """
+        elasticity, plasticity = self._laws(elasticity, plasticity)
         given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
         limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
         crossing = [scene.dx / max(speed, 1e-30) for speed, scene in zip(self._speeds(), self.scenes)]
@@ -218,7 +240,7 @@ class Simulator:
     def rollout(
         self,
         steps: int,
-        elasticity: ElasticLaw,
+        elasticity: ElasticLaw | None = None,
         plasticity: PlasticLaw | None = None,
         *,
         state: ParticleState | None = None,
@@ -226,6 +248,7 @@ class Simulator:
         gravity: Tensor | None = None,
         friction: Tensor | None = None,
         mass: Tensor | None = None,
+        body_friction: Tensor | float | None = None,
         every: int = 1,
         segment: int | None = None,
         check: bool = True,
@@ -234,17 +257,19 @@ class Simulator:
     ) -> Frames:
         """Simulate `steps` substeps.
 
-        Differentiable with respect to `state`, `gravity`, `friction`, `mass` and the tensors of laws and effects.
+        Differentiable with respect to `state`, `gravity`, `friction`, `mass`, `body_friction` and the tensors of laws and effects.
 
         Args:
             steps: Number of substeps.
-            elasticity: F -> Kirchhoff stress.
+            elasticity: F -> Kirchhoff stress; None: the laws that the bodies bring.
             plasticity: Trial F -> corrected F; None: purely elastic.
             state: Initial state, (P, ...); by default the bodies as loaded.
             effects: Physical effects beyond the laws.
             gravity: [m/s^2], (S, 3); by default that of the scenes.
             friction: Friction coefficients, (S, K): colliders first, then walls.
             mass: [kg], (P,); by default density times volume.
+            body_friction: Coulomb's coefficient between the bodies [-], a number, (S,), or (S, B, B) for each pair of up to B bodies, of
+                which the mean of both orders counts; by default that of the scenes.
             every: Substeps between two frames.
             segment: Substeps between two checkpoints of gradient checkpointing, for long rollouts. The backward pass recomputes each
                 segment, which takes a third more time. On CUDA it applies without gradients too: one captured segment is replayed for
@@ -263,6 +288,7 @@ class Simulator:
         """
         nan_on_failure = renamed_option("nan_on_failure", nan_on_failure, "lenient", lenient)
         check_frames(steps, every)
+        elasticity, plasticity = self._laws(elasticity, plasticity)
         if segment is not None and (segment < 1 or steps % segment or segment % every):
             raise UserError(f"segment is {segment}; it must divide steps ({steps}) and be a multiple of every ({every})")
         given = inputs.prepare(
@@ -285,7 +311,7 @@ class Simulator:
         start = [t[self.order] for t in (*given.state, history, mass)]
         optional = [given.viscosity, None if given.stiffness is None else given.stiffness[self.order], given.growth]
         optional += [None] * 3 if tables is None else [tables.material, tables.branches, tables.flow]
-        optional += [shrinkage, loss]
+        optional += [shrinkage, loss, None if self.setup.contact is None else self.setup.contact.frictions(body_friction)]
         optional = [mass.new_empty(0) if t is None else t.contiguous() for t in optional]
         with self.cache.lock:
             frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, self.pool)
@@ -294,7 +320,18 @@ class Simulator:
         recorder = plan.recorder
         marks = Marks(recorder.lowest[self.inverse], recorder.since[self.inverse], self.particles.scene, dts, (every,) * len(dts))
         limit = strain_limit(elasticity, plasticity)
-        out = Frames(x, v, C, F, [dt * every for dt in dts], self.particles, history, marks=marks, strain_limit=limit)
+        out = Frames(
+            x,
+            v,
+            C,
+            F,
+            [dt * every for dt in dts],
+            self.particles,
+            history,
+            marks=marks,
+            strain_limit=limit,
+            **labels(self.bodies, self.setup.body),
+        )
         if nan_on_failure:
             refusing = torch.tensor([bool(why) for why in refused], device=self.device)
             scene = self.particles.scene.long()

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import Literal
 
 import torch
@@ -11,6 +12,8 @@ from torch import Tensor
 from neuido.errors import UserError
 from neuido.physics.colliders.tables import clamp_table, collider_table, inside_box
 from neuido.physics.mpm import transfers as kernels
+from neuido.physics.multibody.contact_grid import ContactGrid
+from neuido.physics.multibody.scene_bodies import SceneBodies, checked_body, friction_table
 from neuido.physics.runtime.device import real_of
 from neuido.physics.runtime.limits import check_memory
 from neuido.types import Body, Particles, ParticleState, Scene
@@ -74,8 +77,7 @@ class Setup:
 
     Args:
         scenes: S scenes.
-        bodies: One body per scene.
-        densities: [kg/m^3], one per scene.
+        bodies: The bodies of each scene.
         device: Device of the arrays, with its index.
         dtype: Scalar type of the arrays.
         store: As for `Simulator`.
@@ -89,8 +91,12 @@ class Setup:
         mass: [kg], (P,).
         volume: [m^3], (P,).
         held: Particles in a clamp, (P,) uint8.
+        body: Index of each particle's body, (P,) int32; the bodies of all scenes are counted on.
+        field: Index of each particle's velocity field, (P,) int32. A scene has one field, or one for each body where bodies may part.
+        field_scene: Scene of each field, (fields,) int64.
+        contact: Contact between bodies with fields of their own; None where no scene has such.
         first: First particle of each scene, then their number, (S + 1,) int32.
-        order: The order in which the kernels see the particles, (P,): scene by scene, then by cell.
+        order: The order in which the kernels see the particles, (P,): scene by scene, body by body, then by cell.
         inverse: The inverse permutation.
         nodes: Grid nodes along each axis, padding included.
         keep_grid: Whether a tape stores stress and nodal values too.
@@ -101,28 +107,33 @@ class Setup:
     def __init__(
         self,
         scenes: Sequence[Scene],
-        bodies: Sequence[Body],
-        densities: Sequence[float],
+        bodies: Sequence[SceneBodies],
         device: torch.device,
         dtype: torch.dtype,
         store: Literal["state", "all", "auto"],
     ) -> None:
-        self.scenes, self.device, self.dtype = tuple(scenes), device, dtype
+        self.scenes, self.bodies, self.device, self.dtype = tuple(scenes), tuple(bodies), device, dtype
         self.kernels = kernels.build(real_of(dtype))
         self._load_scenes()
         nodes = [max(scene.nodes[a] for scene in self.scenes) + 2 * kernels.PAD for a in range(3)]
-        self.grid_shape = (len(self.scenes), *nodes)
+        field_counts = torch.tensor([len(own.bodies) if own.separate else 1 for own in bodies])
+        self.field_scene = torch.arange(len(bodies)).repeat_interleave(field_counts).to(device)
+        self.grid_shape = (len(self.field_scene), *nodes)
         self.node_count = math.prod(self.grid_shape)
-        self._check_memory(bodies)
+        self._check_memory()
         self.nodes = wp.vec3i(*nodes)
-        self._load_bodies(bodies, densities)
+        self._load_bodies()
         self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes per thread: on the CPU, calling a thread costs as much as a node
-        scene, *axes = (torch.arange(n, dtype=torch.int32) for n in self.grid_shape)
-        s, i, j, k = torch.meshgrid(scene, *axes, indexing="ij")
+        axes = (torch.arange(n, dtype=torch.int32) for n in nodes)
+        s, i, j, k = torch.meshgrid(self.field_scene.int().cpu(), *axes, indexing="ij")
         self.node_index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(self.device)
-        watched = self.device.type == "cpu" and len(self.scenes) == 1
+        self.field_origin, self.field_dx, self.field_dt, self.contact = self.origin, self.dx, self.dt, None
+        if any(own.separate for own in bodies):
+            self.field_origin, self.field_dx, self.field_dt = (t[self.field_scene] for t in (self.origin, self.dx, self.dt))
+            self.contact = ContactGrid(field_counts.tolist(), self.nodes, self.chunk, friction_table(self.scenes, bodies), device, dtype)
+        watched = self.device.type == "cpu" and len(self.field_scene) == 1
         self.span = torch.empty(2 if watched else 0, dtype=self.dtype, device=self.device)
-        """Smallest and largest x [m] of the particles after a substep; only for a single scene on the CPU."""
+        """Smallest and largest x [m] of the particles after a substep; only for a single velocity field on the CPU."""
         self.ends = self.span.numpy() if watched else None
         self._sort()
         self.keep_grid = store == "all" or (store == "auto" and self.node_count <= 4 * len(self.mass))
@@ -144,32 +155,28 @@ class Setup:
         self.colliders = collider_table(self.scenes, self.dtype, self.device)
         self.clamp_lower, self.clamp_upper = clamp_table(self.scenes, self.dtype, self.device)
 
-    def _check_memory(self, bodies: Sequence[Body]) -> None:
+    def _check_memory(self) -> None:
         """Raise UserError where grid and particles need more memory than there is."""
-        count = sum(torch.as_tensor(body.x).shape[:1].numel() for body in bodies)
+        count = sum(torch.as_tensor(body.x).shape[:1].numel() for own in self.bodies for body in own.bodies)
         needed = self.node_count * (NODE_BYTES + 8 * self.dtype.itemsize) + count * (PARTICLE_BYTES + 24 * self.dtype.itemsize)
         nodes = " x ".join(str(n) for n in self.grid_shape[1:])
         what = f"a simulator of {len(self.scenes)} scene{'s' * (len(self.scenes) > 1)}, {count} particles and {nodes} grid nodes a scene"
         check_memory(needed, self.device, what, "lower `cells` or the number of particles or scenes")
 
-    def _load_bodies(self, bodies: Sequence[Body], densities: Sequence[float]) -> None:
-        x, v, C, F, mass, volume, held, scene_index = [], [], [], [], [], [], [], []
-        for s, (scene, body, rho) in enumerate(zip(self.scenes, bodies, densities)):
-            bx = torch.as_tensor(body.x).to(self.device, torch.float64)
-            bv = torch.as_tensor(body.v).to(self.device, torch.float64)
-            V = torch.as_tensor(body.volume).to(self.device, torch.float64)
-            if bx.ndim != 2 or bx.shape[1] != 3 or bv.shape != bx.shape or V.shape != bx.shape[:1] or not len(bx):
-                raise UserError(f"body of scene {s} has shapes x {tuple(bx.shape)}, v {tuple(bv.shape)}, volume {tuple(V.shape)}; "
-                                "they must be (P, 3), (P, 3), (P,)")  # fmt: skip
-            if not bool(torch.isfinite(bx).all() & torch.isfinite(bv).all() & (V > 0).all()):
-                raise UserError(f"body of scene {s} holds a NaN, an infinity or a volume that is not positive")
+    def _load_bodies(self) -> None:
+        x, v, C, F, mass, volume, held, scene_index, body_index, field_index = ([] for _ in range(10))
+        counts, bodies_before, fields_before = [], 0, 0
+        for s, (scene, own) in enumerate(zip(self.scenes, self.bodies)):
+            parts = [checked_body(body, s, b, own.own, self.device) for b, body in enumerate(own.bodies)]
+            bx, bv, V = (torch.cat(t) for t in zip(*parts))
             lower, upper = bx.new_tensor(scene.lower), bx.new_tensor(scene.upper)
             out = ((bx < lower) | (bx > upper)).any(dim=1)
             if bool(out.any()):
                 p = int(out.nonzero()[0])
                 raise UserError(f"particle {p} of scene {s} at {short_vector(bx[p])} m lies outside the domain "
                                 f"{short_vector(lower)} to {short_vector(upper)}; move the body or enlarge `lower`/`upper`")  # fmt: skip
-            m = rho * V
+            densities = [rho if isinstance(rho, float) else rho.to(self.device) for rho in own.density]
+            m = torch.cat([rho * part[2] for rho, part in zip(densities, parts)])
             for attached in scene.attached_masses:
                 picked = inside_box(bx, attached.box, name="attached mass")
                 m = m + torch.where(picked, V, 0.0) * (attached.mass / V[picked].sum())
@@ -181,29 +188,36 @@ class Setup:
             mass.append(m)
             volume.append(V)
             held.append(hold)
-            C.append(affine_velocity(bx, bv))
-            eye = torch.eye(3, dtype=torch.float64, device=self.device).expand(len(bx), 3, 3)
-            F.append(eye if body.F is None else torch.as_tensor(body.F).to(self.device, torch.float64))
+            for body, (own_x, own_v, _) in zip(own.bodies, parts):
+                C.append(affine_velocity(own_x, own_v))
+                eye = torch.eye(3, dtype=torch.float64, device=self.device).expand(len(own_x), 3, 3)
+                F.append(eye if body.F is None else torch.as_tensor(body.F).to(self.device, torch.float64))
+            counts.append(len(bx))
             scene_index.append(torch.full((len(bx),), s, dtype=torch.int32, device=self.device))
+            of_body = torch.arange(len(own.bodies), dtype=torch.int32, device=self.device)
+            of_body = of_body.repeat_interleave(torch.tensor(own.counts, device=self.device))
+            body_index.append(of_body + bodies_before)
+            field_index.append(of_body * int(own.separate) + fields_before)
+            bodies_before += len(own.bodies)
+            fields_before += len(own.bodies) if own.separate else 1
 
         def join(parts: list[Tensor]) -> Tensor:
             return torch.cat(parts).to(self.dtype).contiguous()
 
-        offsets = [0]
-        for part in x:
-            offsets.append(offsets[-1] + len(part))
+        offsets = [0, *accumulate(counts)]
         self.particles = Particles(torch.cat(scene_index), tuple(offsets))
         self.first = torch.tensor(offsets, dtype=torch.int32, device=self.device)
         self.state = ParticleState(join(x), join(v), join(C), join(F))
         self.mass, self.volume = join(mass), join(volume)
         self.held = torch.cat(held).to(torch.uint8)
+        self.body, self.field = torch.cat(body_index), torch.cat(field_index)
 
     def _sort(self) -> None:
-        """Sort the particles as the kernels see them: scene by scene, then by cell, so that neighbours add to the same nodes."""
-        scene = self.particles.scene.long()
+        """Sort the particles as the kernels see them: by scene, body and cell, so that neighbours add to the same nodes."""
+        scene, body = self.particles.scene.long(), self.body.long()
         cell = ((self.state.x - self.origin[scene]) / self.dx[scene, None] - 0.5).floor().long()
-        ny, nz = self.grid_shape[2:]
-        key = ((scene * self.grid_shape[1] + cell[:, 0]) * ny + cell[:, 1]) * nz + cell[:, 2]
+        nx, ny, nz = self.grid_shape[1:]
+        key = ((body * nx + cell[:, 0]) * ny + cell[:, 1]) * nz + cell[:, 2]
         self.order = torch.argsort(key, stable=True)
         self.inverse = torch.argsort(self.order)
         self.sorted_volume, self.sorted_held = self.volume[self.order].contiguous(), self.held[self.order].contiguous()
@@ -213,7 +227,8 @@ class Setup:
         if s not in self._single:
             own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
             body = Body(self.state.x[own], self.state.v[own], self.volume[own], self.state.F[own])
-            one = Setup(self.scenes[s : s + 1], [body], [1000.0], self.device, self.dtype, "all" if self.keep_grid else "state")
+            alone = SceneBodies((body,), (1000.0,), own=False, separate=False)
+            one = Setup(self.scenes[s : s + 1], [alone], self.device, self.dtype, "all" if self.keep_grid else "state")
             one.order = self.order[own] - own.start
             one.sorted_volume, one.sorted_held = self.sorted_volume[own], self.sorted_held[own]
             one.first_scene, one.first_particle = s, own.start
