@@ -11,7 +11,9 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics.colliders.tables import clamp_table, collider_table, inside_box
+from neuido.physics.mpm import stencil
 from neuido.physics.mpm import transfers as kernels
+from neuido.physics.multibody import contact_kernels
 from neuido.physics.multibody.contact_grid import ContactGrid
 from neuido.physics.multibody.scene_bodies import SceneBodies, checked_body, friction_table
 from neuido.physics.runtime.device import real_of
@@ -130,7 +132,9 @@ class Setup:
         self.field_origin, self.field_dx, self.field_dt, self.contact = self.origin, self.dx, self.dt, None
         if any(own.separate for own in bodies):
             self.field_origin, self.field_dx, self.field_dt = (t[self.field_scene] for t in (self.origin, self.dx, self.dt))
-            self.contact = ContactGrid(field_counts.tolist(), self.nodes, self.chunk, friction_table(self.scenes, bodies), device, dtype)
+            pairs = contact_kernels.build(real_of(dtype), stencil.functions)
+            frictions = friction_table(self.scenes, bodies)
+            self.contact = ContactGrid(field_counts.tolist(), pairs, self.nodes, self.chunk, frictions, device, dtype)
         watched = self.device.type == "cpu" and len(self.field_scene) == 1
         self.span = torch.empty(2 if watched else 0, dtype=self.dtype, device=self.device)
         """Smallest and largest x [m] of the particles after a substep; only for a single velocity field on the CPU."""

@@ -9,14 +9,13 @@ would else be held about a cell apart. `contact_kernels` has the kernels and the
 
 from collections.abc import Callable, Sequence
 from itertools import accumulate
+from types import SimpleNamespace
 
 import torch
 import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics.multibody import contact_kernels
-from neuido.physics.runtime.device import real_of
 
 Launch = Callable[[wp.Kernel, int, list], None]
 
@@ -26,6 +25,7 @@ class ContactGrid:
 
     Args:
         counts: Number of velocity fields of each scene.
+        kernels: The kernels (`contact_kernels.build`).
         nodes: Grid nodes along each axis, padding included.
         chunk: Nodes that a thread handles.
         friction: `friction_table` of the scenes.
@@ -38,9 +38,16 @@ class ContactGrid:
     """
 
     def __init__(
-        self, counts: Sequence[int], nodes: wp.vec3i, chunk: int, friction: Tensor, device: torch.device, dtype: torch.dtype
+        self,
+        counts: Sequence[int],
+        kernels: SimpleNamespace,
+        nodes: wp.vec3i,
+        chunk: int,
+        friction: Tensor,
+        device: torch.device,
+        dtype: torch.dtype,
     ) -> None:
-        self.kernels = contact_kernels.build(real_of(dtype))
+        self.kernels = kernels
         self.nodes, self.chunk = nodes, chunk
         self.size = nodes[0] * nodes[1] * nodes[2]
         self.first = torch.tensor([0, *accumulate(counts)], dtype=torch.int32, device=device)

@@ -14,11 +14,11 @@ has no derivative. A node belongs to one thread, which visits its pairs one afte
 """
 
 import functools
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.mpm import stencil as stencil_functions
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
@@ -27,11 +27,12 @@ FAR = -1.0e30
 
 
 @cached
-def build(real: type) -> SimpleNamespace:
+def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespace:
     """Return the kernels for one scalar type, compiled at their first launch.
 
     Args:
         real: `wp.float32` or `wp.float64`.
+        stencil: Returns the functions of the transfers' weights (`mpm.stencil.functions`).
     """
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
@@ -39,7 +40,7 @@ def build(real: type) -> SimpleNamespace:
     name = f"neuido.contact.{real.__name__}"
     func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
-    own = stencil_functions.functions(real, name, native=False)
+    own = stencil(real, name, native=False)
     spline, spline_slope, first_node, stencil_offset = own.spline, own.spline_slope, own.first_node, own.stencil_offset
     flat_index, velocity_of = own.flat_index, own.velocity_of
 
