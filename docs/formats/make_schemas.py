@@ -199,7 +199,7 @@ def schemas() -> dict[str, Schema]:
                 "discretisation": GRID,
                 "steps": {"type": "integer", "minimum": 1},
             },
-            {"source": {"type": "string"}, "on_inversion": one_of(["report", "error"])},
+            {"source": {"type": "string"}, "on_inversion": one_of(["report", "error"]), "on_leave": one_of(["error", "clamp", "delete"])},
         ),
         "neuido-diagnosis-1": _older_diagnosis(names),
         "neuido-diagnosis-2": diagnosis_format.schema(),

@@ -101,3 +101,14 @@ def test_a_body_that_collapses_is_told_of_or_refused(scene, tmp_path, capsys):
     scene.write_text(scene.read_text().replace("on_inversion: error", "on_inversion: maybe"))
     status, _, err = run(capsys, "simulate", scene, "--out", tmp_path / "refused", "--device", "cpu")
     assert status == 2 and "on_inversion must be report or error" in err
+
+
+def test_a_body_that_leaves_is_refused_clamped_or_deleted(scene, tmp_path, capsys):
+    scene.write_text(SCENE.replace("-2.0", "-6.0").replace("steps: 30", "steps: 120").replace("scene:\n", "scene:\n  walls: null\n", 1))
+    status, _, err = run(capsys, "simulate", scene, "--out", tmp_path / "refused", "--device", "cpu")
+    assert status == 2 and "left the domain" in err and "on_leave" in err and not (tmp_path / "refused").exists()
+    status, printed, err = run(capsys, "simulate", scene, "--out", tmp_path / "gone", "--device", "cpu", "--on_leave", "delete")
+    assert status == 0 and "note: scene 0:" in printed and "left the domain and were deleted" in printed, err
+    scene.write_text(scene.read_text() + "on_leave: clamp\n")
+    status, printed, err = run(capsys, "simulate", scene, "--out", tmp_path / "clamped", "--device", "cpu")
+    assert status == 0 and "were clamped" in printed, err

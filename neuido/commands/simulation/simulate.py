@@ -25,6 +25,7 @@ def simulate(
     data_root: str | None = None,
     device: str = "auto",
     on_inversion: Literal["report", "error"] | None = None,
+    on_leave: Literal["error", "clamp", "delete"] | None = None,
     progress: bool = True,
 ) -> None:
     """Simulate the body of a scene file and write its motion: `neuido simulate SCENE --out FOLDER`.
@@ -42,6 +43,8 @@ def simulate(
         device: auto, cpu or cuda.
         on_inversion: Where matter turns inside out or collapses (det F below 0.001): report it, or end with an error and write nothing;
             what the scene file says where absent, else report.
+        on_leave: Where a particle leaves the domain: end with an error, clamp it to the faces, or delete it; what the scene file says where
+            absent, else error.
         progress: Show progress on stderr.
 
     Raises:
@@ -64,7 +67,9 @@ def simulate(
     spacing = next(k for k in range(-(-count // FRAMES), count + 1) if count % k == 0) if every is None else every
     laws = material(setup.info["elasticity"], setup.info["plasticity"]) if law is None else load_law(law)
     asked = on_inversion or setup.info["on_inversion"]
-    simulator = Simulator(setup.scene, setup.body, density=setup.info["density"], device=device, on_inversion=asked)
+    leaves = on_leave or setup.info["on_leave"]
+    density = setup.info["density"]
+    simulator = Simulator(setup.scene, setup.body, density=density, device=device, on_inversion=asked, on_leave=leaves)
     start = time.perf_counter()
     with new_folder(folder) as hidden:
         with Progress(f"simulating {setup.info['name']}, {count} substeps in one run", shown=progress):

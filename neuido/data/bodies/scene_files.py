@@ -26,7 +26,7 @@ from neuido.physics.runtime.limits import check_limit
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
 
 FORMAT = "neuido-scene/1"
-KEYS = ("format", "name", "source", "scene", "model", "body", "discretisation", "steps", "on_inversion")
+KEYS = ("format", "name", "source", "scene", "model", "body", "discretisation", "steps", "on_inversion", "on_leave")
 VARIABLE = "NEUIDO_DATA"
 FEW = 4000
 """Number of particles below which the smallest box around them bounds the estimate of their volume."""
@@ -39,7 +39,7 @@ class SceneSetup(NamedTuple):
     scene: Scene
     body: Body
     info: dict[str, Any]
-    """name, source, steps, on_inversion, density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them)."""
+    """name, source, steps, on_inversion, on_leave, density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them)."""
 
 
 def data_root(option: str | os.PathLike | None = None) -> Path:
@@ -83,7 +83,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         raise UserError(f"the scene file {path} is missing{known}")
     content = read_yaml(path)
     with checking(path):
-        check_keys(content, "the file", KEYS, ("source", "on_inversion"))
+        check_keys(content, "the file", KEYS, ("source", "on_inversion", "on_leave"))
         if content["format"] != FORMAT:
             raise UserError(f"format = {content['format']!r} must be {FORMAT!r}")
         for key in ("name", "source"):
@@ -95,13 +95,23 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         on_inversion = content.get("on_inversion", "report")
         if on_inversion not in ("report", "error"):
             raise UserError(f"on_inversion must be report or error, got {on_inversion!r}")
+        on_leave = content.get("on_leave", "error")
+        if on_leave not in ("error", "clamp", "delete"):
+            raise UserError(f"on_leave must be error, clamp or delete, got {on_leave!r}")
         scene = scene_from_dict(content["scene"], content["discretisation"])
         model = model_from_dict(content["model"])
         body = body_from_dict(content["body"], root, path.parent)
         outside = ((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any(dim=1)
         if outside.any():
             raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain: enlarge the domain or move the body")
-    info = {"name": content["name"], "source": content.get("source", ""), "steps": steps, "on_inversion": on_inversion, **model}
+    info = {
+        "name": content["name"],
+        "source": content.get("source", ""),
+        "steps": steps,
+        "on_inversion": on_inversion,
+        "on_leave": on_leave,
+        **model,
+    }
     return SceneSetup(scene, body, info)
 
 

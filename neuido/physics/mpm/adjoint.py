@@ -32,6 +32,7 @@ def run_backward(
         The gradient of each input; None for tensors of laws that need none.
     """
     setup, k = plan.setup, plan.setup.kernels
+    mass_before = None
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
     a_fixed = [torch.zeros_like(t) for t in inputs[STATES:FIXED]]
     a_mass, a_pull, a_force, a_friction, a_viscosity = a_fixed[:5]
@@ -54,13 +55,20 @@ def run_backward(
             x, v, C, F, history = state = tuple(t[n] for t in tape.states)
             v_next, C_next, F_next = tape.v[n + 1], tape.C[n + 1], tape.F[n + 1]
             material, a_material = plan.material(inputs, n), plan.material((*inputs[:STATES], *a_fixed), n)
+            if setup.leaving is not None:
+                mass_before = a_mass.clone()
             v_in, C_in = v, C  # what P2G reads
             if spin is not None and damped is not None:
                 spin.damp(inputs[SPIN_LOSS], mass, x, v, C, *damped, every=True)
                 v_in, C_in = damped
+            v_first, mass_in = v_in, mass
             tau, grid, met, velocity = recompute(plan, inputs, tape, n, state, (v_in, C_in), elastic, material, scratch)
+            if setup.leaving is not None:
+                v_in, mass_in = setup.leaving.entered(v_first, mass)
             shrinkage = at_step(inputs[SHRINKAGE], n)
             a_x, a_v, a_C, a_F, a_history = then
+            if setup.leaving is not None:
+                setup.leaving.end_adjoint(tape.x[n + 1], now[0])
             a_out = now[3]
             trial = None
             if plan.corrects:
@@ -76,7 +84,7 @@ def run_backward(
                 swelling = swelling_kernels.build(real_of(setup.dtype))
                 plan.launch(swelling.swell_adjoint, len(x), [setup.particles.scene, setup.dt, *arguments])
             plan.launch(k.grid_to_particles_adjoint, len(x),
-                        [setup.field, setup.sorted_held, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, velocity, x, F,
+                        [setup.field, setup.held_now, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, velocity, x, F,
                          v_next, C_next, *now[:3], a_out, a_velocity.zero_(), a_x, a_F], plan.block)  # fmt: skip
             arguments = [met, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters]
             inputs_n = grid_inputs(plan, at_step(pull, n), force, friction)
@@ -87,8 +95,10 @@ def run_backward(
                 adjoints = [a_grid, setup.scratch("a_before"), a_x, a_body_friction]
                 a_before = setup.contact.exchange_adjoint(plan.launch, particles, grid, inputs[BODY_FRICTION], *adjoints)
             plan.launch(k.particles_to_grid_adjoint, len(x),
-                        [setup.field, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, mass, setup.sorted_volume, x,
+                        [setup.field, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, mass_in, setup.sorted_volume, x,
                          v_in, C_in, tau, a_before, a_mass, a_x, a_v, a_C, a_tau], plan.block)  # fmt: skip
+            if setup.leaving is not None and mass_before is not None:
+                setup.leaving.enter_adjoint(x, v_first, a_v, a_tau, a_mass, mass_before)
             if spin is not None:
                 spin.adjoint(inputs[SPIN_LOSS], mass, x, v, C, a_loss, a_mass, a_x, a_v, a_C)
             if viscosity.numel():
@@ -137,7 +147,10 @@ def recompute(
     tau = scratch if tape.tau is None else tape.tau[n]
     if tape.tau is None:
         stress(plan, elastic, F, C, history, viscosity, material, tau)
-    grid = to_grid(plan, x, *moving, tau, mass, setup.scratch("grid")) if tape.grid is None else tape.grid[n]
+    v_in, C_in = moving
+    if setup.leaving is not None:
+        v_in, mass = setup.leaving.enter(x, v_in, mass, tau)
+    grid = to_grid(plan, x, v_in, C_in, tau, mass, setup.scratch("grid")) if tape.grid is None else tape.grid[n]
     met = meet(plan, x, grid, inputs[BODY_FRICTION])
     velocity = setup.scratch("velocity") if tape.velocity is None else tape.velocity[n]
     if tape.velocity is None:

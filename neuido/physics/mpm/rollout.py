@@ -174,7 +174,10 @@ def scatter(
     if spin is not None and damped is not None:
         spin.damp(inputs[SPIN_LOSS], inputs[STATES], x, v, C, *damped)
         v, C = damped
-    add_to_grid(plan, x, v, C, tau, inputs[STATES], grid)
+    mass = inputs[STATES]
+    if plan.setup.leaving is not None:
+        v, mass = plan.setup.leaving.enter(x, v, mass, tau)
+    add_to_grid(plan, x, v, C, tau, mass, grid)
     meet(plan, x, grid, inputs[BODY_FRICTION])
 
 
@@ -227,9 +230,11 @@ def gather(
     x, _, _, F, history = now
     raw = trial if plan.corrects else then[3]
     plan.launch(setup.kernels.grid_to_particles, len(x),
-                [setup.field, setup.sorted_held, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, velocity, x, F,
+                [setup.field, setup.held_now, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, velocity, x, F,
                  *then[:3], raw, n, tape.status, setup.span, tape.lowest, tape.since,
                  tape.rest_x, tape.rest_F], plan.block)  # fmt: skip
+    if setup.leaving is not None:
+        setup.leaving.end(then[0])
     if shrinkage.numel():
         swell(plan, shrinkage, raw, tape.rest_F)
     if plastic is not None:
@@ -414,7 +419,7 @@ def check(plan: Plan, tape: Tape) -> None:
     scene = setup.scenes[s]
     s += setup.first_scene
     what = {
-        kernels.LOST: "left the domain; enlarge `lower`/`upper`, or close it with `walls`",
+        kernels.LOST: "left the domain; enlarge `lower`/`upper`, close it with `walls`, or set `on_leave` to clamp or delete",
         kernels.FAST: f"moved by more than a cell ({scene.dx:.4g} m) or became NaN; lower `dt` (now {scene.dt:g} s) or the stiffness",
         0: f"has a deformation gradient that is not finite; lower `dt` (now {scene.dt:g} s) or check the law",
     }[code]

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.colliders.leaving import OnLeave, checked_on_leave
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw, strain_limit
 from neuido.physics.laws.composite import laws_of_bodies
@@ -66,6 +67,9 @@ class Simulator:
             faster. `auto`: `all` if there are at most four nodes per particle, else `state`.
         on_inversion: What a rollout does where matter turns inside out or collapses (det F below 0.001). `report`: `Frames.events` has
             it. `error`: it raises, or makes the scene NaN with `nan_on_failure`.
+        on_leave: What happens to a particle that leaves the domain. `error`: the rollout raises as soon as the grid, which reaches a cell
+            and a half further, holds it no longer. `clamp`: at the faces it keeps its position and loses its velocity outwards.
+            `delete`: it stays where it left, at rest, and has no effect on the others. `Frames.events` counts them.
         keep: Deprecated name of `store`.
 
     Raises:
@@ -91,6 +95,7 @@ class Simulator:
         graphs: bool = True,
         store: Literal["state", "all", "auto"] = "auto",
         on_inversion: OnInversion = "report",
+        on_leave: OnLeave = "error",
         keep: Literal["state", "all", "auto"] | None = None,
     ) -> None:
         store = renamed_option("store", store, "keep", keep)
@@ -100,6 +105,7 @@ class Simulator:
         self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
         self.bodies = bodies_of(self.scenes, bodies, density)
         self.setup = setup = Setup(self.scenes, self.bodies, as_device(device), dtype, store)
+        setup.watch_faces(checked_on_leave(on_leave))
         self.device, self.dtype = setup.device, dtype
         self.particles, self.state, self.mass, self.volume = setup.particles, setup.state, setup.mass, setup.volume
         self.order, self.inverse, self.held = setup.order, setup.inverse, setup.held
@@ -319,6 +325,8 @@ class Simulator:
         dts = tuple(scene.dt for scene in self.scenes)
         recorder = plan.recorder
         marks = Marks(recorder.lowest[self.inverse], recorder.since[self.inverse], self.particles.scene, dts, (every,) * len(dts))
+        if (leaving := self.setup.leaving) is not None:
+            marks = marks._replace(left=leaving.first_frames(frames[0])[self.inverse], clamped=leaving.mode == "clamp")
         limit = strain_limit(elasticity, plasticity)
         out = Frames(
             x,

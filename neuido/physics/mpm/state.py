@@ -10,6 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.colliders.leaving import Leaving
 from neuido.physics.colliders.tables import clamp_table, collider_table, inside_box
 from neuido.physics.mpm import stencil
 from neuido.physics.mpm import transfers as kernels
@@ -142,6 +143,7 @@ class Setup:
         self._sort()
         self.keep_grid = store == "all" or (store == "auto" and self.node_count <= 4 * len(self.mass))
         self.first_scene = self.first_particle = 0
+        self.leaving: Leaving | None = None
         self._single: dict[int, Setup] = {}
         self._scratch: dict[str, Tensor] = {}
 
@@ -236,8 +238,19 @@ class Setup:
             one.order = self.order[own] - own.start
             one.sorted_volume, one.sorted_held = self.sorted_volume[own], self.sorted_held[own]
             one.first_scene, one.first_particle = s, own.start
+            if self.leaving is not None:
+                one.watch_faces(self.leaving.mode)
             self._single[s] = one
         return self._single[s]
+
+    def watch_faces(self, on_leave: str) -> None:
+        """Clamp or delete particles that leave the domain, in place of an error."""
+        self.leaving = None if on_leave == "error" else Leaving(on_leave, self.scenes, self.particles.scene, self.sorted_held, self.mass)
+
+    @property
+    def held_now(self) -> Tensor:
+        """Particles that are held at rest in the current substep, (P,) uint8: those of clamps, and deleted ones."""
+        return self.sorted_held if self.leaving is None else self.leaving.held
 
     @property
     def scene_count(self) -> int:

@@ -17,7 +17,7 @@ COLLAPSED = 1e-3
 """det F below which matter counts as collapsed [-]."""
 SIGN_TOLERANCE = 1e-6
 """Absolute value of a negative det F above which matter counts as inverted; up to it the sign may be a rounding error."""
-INVERTED, CRUSHED, OUTSIDE = "inverted", "collapsed", "outside training"
+INVERTED, CRUSHED, OUTSIDE, LEFT, CLAMPED = "inverted", "collapsed", "outside training", "left", "clamped"
 OnInversion = Literal["report", "error"]
 CHUNK = 1 << 20
 """Number of deformation gradients that are processed at a time."""
@@ -27,7 +27,8 @@ class Event(NamedTuple):
     """An event in one scene of a rollout."""
 
     kind: str
-    """`inverted`: det F below zero. `collapsed`: det F below 0.001. `outside training`: a strain beyond `Law.strain_limit`."""
+    """`inverted`: det F below zero. `collapsed`: det F below 0.001. `outside training`: a strain beyond `Law.strain_limit`. `left`: out of
+    the domain, and deleted. `clamped`: at a face of the domain in a frame."""
     scene: int
     """Index of the scene."""
     count: int
@@ -43,7 +44,7 @@ class Event(NamedTuple):
     frame: int
     """First frame at or after that time."""
     extreme: float
-    """Smallest det F, or largest absolute logarithmic stretch, of all steps [-]."""
+    """Smallest det F, or largest absolute logarithmic stretch, of all steps [-]; of `left` and `clamped`, the share of the particles."""
     what: str = "particles"
     """What `count`, `total` and `first` refer to: `particles` or `elements`."""
 
@@ -54,10 +55,16 @@ class Event(NamedTuple):
             INVERTED: "turned inside out",
             CRUSHED: f"collapsed (det F below {COLLAPSED:g})",
             OUTSIDE: "strained beyond the law's training",
+            LEFT: "left the domain and were deleted",
+            CLAMPED: "came to the faces of the domain and were clamped",
         }
+        start = (
+            f"{self.count} of {self.total} {self.what} {plain[self.kind]}, the first ({self.what[:-1]} {self.first}) at {self.time:.4g} s"
+        )
+        if self.kind in (LEFT, CLAMPED):
+            return start
         least = f"largest logarithmic stretch {self.extreme:.3g}" if self.kind == OUTSIDE else f"smallest det F {self.extreme:.3g}"
-        return (f"{self.count} of {self.total} {self.what} {plain[self.kind]}, "
-                f"the first ({self.what[:-1]} {self.first}) at {self.time:.4g} s; {least}")  # fmt: skip
+        return f"{start}; {least}"
 
     def __str__(self) -> str:
         return f"scene {self.scene}: {self.words}"
@@ -77,16 +84,27 @@ class Marks(NamedTuple):
     every: tuple[int, ...]
     """Steps between two frames of each scene."""
     what: str = "particles"
+    left: Tensor | None = None
+    """First frame in which each particle had left the domain or was at a face, (P,) int32; -1 if none; None: not asked."""
+    clamped: bool = False
+    """Whether such particles are clamped, in place of deleted."""
 
     def events(self) -> list[Event]:
-        """Return the events of each scene, inversions first."""
+        """Return the events of each scene: particles that left, inversions, collapses."""
         found = self.since >= 0
+        out = [] if self.left is None else self._departures(self.left)
         if not bool(found.any()):
-            return []
-        out = []
+            return out
         for kind, seen in ((INVERTED, found & (self.lowest < -SIGN_TOLERANCE)), (CRUSHED, found & (self.lowest >= -SIGN_TOLERANCE))):
             out += _scene_events(kind, seen, self.since + 1, self.lowest, self.scene, self.dt, self.every, self.what)
         return out
+
+    def _departures(self, left: Tensor) -> list[Event]:
+        """Return the events of particles that left the domain or were clamped at its faces, at the resolution of the frames."""
+        every = torch.tensor(self.every, device=left.device)[self.scene.long()]
+        share = torch.zeros_like(self.lowest)
+        found = _scene_events(CLAMPED if self.clamped else LEFT, left >= 0, left * every, share, self.scene, self.dt, self.every, self.what)
+        return [event._replace(extreme=event.count / event.total) for event in found]
 
 
 def _scene_events(
@@ -140,7 +158,7 @@ def raise_inversions(marks: Marks) -> None:
     Raises:
         UserError: There is such an event.
     """
-    found = sorted(marks.events(), key=lambda event: event.time)
+    found = sorted((event for event in marks.events() if event.kind in (INVERTED, CRUSHED)), key=lambda event: event.time)
     if found:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
         raise UserError(f"{found[0]}{more}; lower dt, the speed of the impact or the load, or take neo_hookean or sigma, which do not "

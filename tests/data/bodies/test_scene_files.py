@@ -161,6 +161,7 @@ def test_scene_from_a_file(ball_folder, monkeypatch):
     [
         ({"colour": "red"}, "colour"),
         ({"steps": 0}, "steps"),
+        ({"on_leave": "ignore"}, "on_leave must be error, clamp or delete"),
         ({"format": "neuido-scene/9"}, "format"),
         ({"body": {"particles": "../ball.npz"}}, "leaves the data folder"),
         ({"body": {"particles": "/etc/hostname"}}, "leaves the data folder"),
