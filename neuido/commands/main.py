@@ -61,24 +61,24 @@ def main(args: Sequence[str] | None = None) -> None:
         args: Arguments without the program's name; those of the process where absent.
     """
     status: Any = FAULT
-    with interruption.watched():
-        try:
+    try:
+        with interruption.watched():  # inside of the `try`, since a signal may come while it opens
             status = _run(list(sys.argv[1:] if args is None else args))
-        except KeyboardInterrupt:
-            status = 128 + (interruption.received() or signal.SIGINT)
-        except BrokenPipeError:  # as of `neuido ... | head`
-            _discard_output()
-            status = 128 + signal.SIGPIPE
-        except SystemExit as stop:
-            status = stop.code
-            if not interruption.received():
-                raise
-        except Exception as error:
-            if os.environ.get("NEUIDO_TRACEBACK"):
-                raise
-            line = one_line(error)
-            _fail(*(_fault(error), FAULT) if line is None else (line, 2))
-        number = interruption.received()
+    except KeyboardInterrupt:
+        status = 128 + (interruption.received() or signal.SIGINT)
+    except BrokenPipeError:  # as of `neuido ... | head`
+        _discard_output()
+        status = 128 + signal.SIGPIPE
+    except SystemExit as stop:
+        status = stop.code
+        if not interruption.received():
+            raise
+    except Exception as error:
+        if os.environ.get("NEUIDO_TRACEBACK"):
+            raise
+        line = one_line(error)
+        _fail(*(_fault(error), FAULT) if line is None else (line, 2))
+    number = interruption.received()
     if number or status == 128 + signal.SIGINT:
         number = number or signal.SIGINT
         _fail("interrupted" + (f" by {signal.Signals(number).name}" if number != signal.SIGINT else ""), 128 + number)

@@ -2,6 +2,7 @@
 
 import functools
 import io
+import json
 import os
 import subprocess
 import sys
@@ -34,20 +35,40 @@ def assert_one_line(capsys, args: list[str], *words: str) -> None:
         assert word in lines[0]
 
 
-@pytest.mark.parametrize(
-    "name", ["--help", "--version", *[f"{name} --help" for name in cli.LIGHT], "fit --help", "test --config adapt --help"]
-)
-def test_help_loads_no_torch(name):
-    code = f"""
-import atexit, sys
-atexit.register(lambda: print("LOADED", sorted({{"torch", "lightning", "warp"}} & set(sys.modules))))
+HELP = ["--help", "--version", *[f"{name} --help" for name in cli.LIGHT], "fit --help", "test --config adapt --help"]
+
+
+@pytest.fixture(scope="module")
+def helped():
+    """What each command of `HELP` prints and loads, in a fork each of a fresh process that has imported the command line alone."""
+    code = """
+import contextlib, io, json, os, sys
 from neuido.commands.main import main
-main({name.split()!r})
+
+for words in json.loads(sys.argv[1]):
+    sys.stdout.flush()
+    if os.fork():
+        os.wait()
+        continue
+    streams = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(streams[0]), contextlib.redirect_stderr(streams[1]):
+        try:
+            main(words.split())
+        except SystemExit as stop:
+            status = stop.code
+    print(json.dumps([words, status, *(each.getvalue() for each in streams), sorted({"torch", "lightning", "warp"} & set(sys.modules))]))
+    sys.stdout.flush()
+    os._exit(0)
 """
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert "LOADED []" in answer.stdout
-    assert "neuido" in answer.stdout
-    assert answer.stderr == ""
+    answer = subprocess.run([sys.executable, "-c", code, json.dumps(HELP)], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert not answer.stderr
+    return {words: rest for words, *rest in map(json.loads, answer.stdout.splitlines())}
+
+
+@pytest.mark.parametrize("name", HELP)
+def test_help_loads_no_torch(helped, name):
+    status, out, err, loaded = helped[name]
+    assert status == 0 and loaded == [] and "neuido" in out and err == ""
 
 
 def test_help_names_every_command(capsys):

@@ -39,7 +39,7 @@ class Reader(NamedTuple):
     """Of the folder."""
     count: int = 10_000
     """Inputs of the slow tier: fewer where one costs milliseconds."""
-    quick: int = 40
+    quick: int = 16
     """Inputs of the fast tier."""
 
 

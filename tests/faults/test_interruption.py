@@ -14,7 +14,7 @@ import yaml
 from lightning.pytorch import Callback, LightningModule, Trainer
 from safetensors.torch import load_file
 
-from neuido.commands.cli.interruption import received, stop_at_step, watched
+from neuido.commands.cli.interruption import SIGNALS, received, stop_at_step, watched
 from neuido.commands.main import main
 from neuido.commands.sweep import sweep
 from neuido.data.sampling import FixedBatches, ResumableLoader
@@ -259,3 +259,39 @@ def test_a_worker_that_was_forked_dies_of_its_signal():
                 os._exit(3)
         _, ended = os.waitpid(child, 0)
     assert os.WIFSIGNALED(ended) and os.WTERMSIG(ended) == signal.SIGTERM
+
+
+@pytest.mark.parametrize("call", [2, 3, 4, 5], ids=["set", "all set", "restored", "half restored"])
+def test_a_signal_while_handlers_are_set_or_restored_ends_in_one_line(monkeypatch, capfd, call):
+    handlers, calls, real = [signal.getsignal(number) for number in SIGNALS], [], signal.signal
+
+    def interrupted_by(number, handler):
+        before = real(number, handler)
+        calls.append(number)
+        if len(calls) == call:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return before
+
+    monkeypatch.setattr("neuido.commands.main._dispatch", lambda args: 0)
+    try:
+        with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
+            real(signal.SIGTERM, lambda *_: None)  # what pytest has would end it
+            patch.setattr(signal, "signal", interrupted_by)
+            main(["doctor"])
+    finally:
+        for number, handler in zip(SIGNALS, handlers):
+            real(number, handler)
+    late = call == 5  # SIGTERM has its earlier handler again
+    assert stop.value.code == (0 if late else 128 + signal.SIGTERM)
+    assert capfd.readouterr().err == ("" if late else "neuido: interrupted by SIGTERM\n")
+
+
+def test_an_early_ctrl_c_shows_no_traceback():
+    code = (
+        "import builtins, os, signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "import neuido.__main__ as program; real = builtins.__import__\n"
+        "def late(name, *rest):\n    if name == 'neuido.commands.main': os.kill(os.getpid(), signal.SIGINT)\n    return real(name, *rest)\n"
+        "builtins.__import__ = late; program.run()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGINT and not done.stderr

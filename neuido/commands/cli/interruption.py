@@ -32,9 +32,10 @@ def received() -> int | None:
 def watched() -> Iterator[None]:
     """Turn SIGINT, SIGTERM and SIGHUP into `Interrupted` while this is open; one that was ignored before (nohup) still is.
 
-    A trainer that is `stop_at_step` ends by itself after its batch; a second signal ends it at once.
+    A trainer that is `stop_at_step` ends by itself after its batch; a second signal ends it at once. A signal that comes while this closes
+    is noted (`received`), so that the earlier handlers are restored whole.
     """
-    owner = os.getpid()
+    owner, closing = os.getpid(), False
 
     def handle(number: int, frame: Any) -> None:
         if os.getpid() != owner:  # a worker, forked from this process
@@ -43,19 +44,21 @@ def watched() -> Iterator[None]:
             return
         again = bool(_received)
         _received.append(number)
-        if not _patient or again:
+        if not closing and (not _patient or again):
             raise Interrupted(signal.Signals(number).name)
 
     before = {}
     _received.clear()
     _patient.clear()
-    with contextlib.suppress(ValueError):  # not the main thread: whoever runs this has signals of its own
-        for number in SIGNALS:
-            if signal.getsignal(number) not in (signal.SIG_IGN, None):
-                before[number] = signal.signal(number, handle)
     try:
+        with contextlib.suppress(ValueError):  # not the main thread: whoever runs this has signals of its own
+            for number in SIGNALS:
+                if (handler := signal.getsignal(number)) not in (signal.SIG_IGN, None):
+                    before[number] = handler
+                    signal.signal(number, handle)
         yield
     finally:
+        closing = True
         for number, handler in before.items():
             signal.signal(number, handler)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neuido.discrepancy.inference.floors import project_out_nuisances, score
+from neuido.discrepancy.inference.floors import project_out_nuisances, scores
 
 NOISE_ALONE = 1.8
 """Errors count as noise while their mean square is at most this many times that of the noise."""
@@ -54,36 +54,31 @@ class LinearModel:
         names = [(None, ())] + [(key, (key,)) for key in self.keys]
         self.solvers = {name: _solver([p for p in self.parts if p.fitted], keys) for name, keys in names}
 
-    def draw(self, *, exact: bool = False) -> list[np.ndarray]:
-        """Draw one residual of each part under the null hypothesis, in the basis of the part.
-
-        With `exact`, only noise and nuisances are drawn, and no discretisation error.
-        """
-        return [p.draw(self.rng, exact) for p in self.parts]
-
-    def errors(self, draw: Sequence[np.ndarray]) -> dict[str | None, np.ndarray]:
-        """Fit a draw, and return the mean squares (parts,) that the base (key None) and each candidate leave."""
-        out = {}
-        fitted = np.concatenate([p.weighted(r) for p, r in zip(self.parts, draw, strict=True) if p.fitted])
-        for name, solve in self.solvers.items():
-            keys = () if name is None else (name,)
-            q = solve @ fitted
-            out[name] = np.array([p.square(r - p.design(keys) @ q) for p, r in zip(self.parts, draw, strict=True)])
-        return out
-
     def null(self, data: np.ndarray, count: int = 199, *, exact: bool = False) -> np.ndarray:
-        """Return the largest `gain` over all candidates in each of `count` draws, (count,).
+        """Return the largest `gain` over all candidates in each of `count` draws from the null hypothesis, (count,).
 
         Args:
             data: Mean squares of the parts that the base leaves of the measured data, as in `gain`.
             count: Number of draws.
-            exact: Whether to draw noise and nuisances alone.
+            exact: Whether to draw noise and nuisances alone, and no discretisation error.
         """
-        return np.array([self._largest(self.errors(self.draw(exact=exact)), data) for _ in range(count)])
-
-    def _largest(self, errors: Mapping[str | None, np.ndarray], data: np.ndarray) -> float:
+        errors = self._errors([[p.draw(self.rng, exact) for p in self.parts] for _ in range(count)])
         fitted, noise = [p.fitted for p in self.parts], np.array([p.noise**2 for p in self.parts])
-        return max((gain(errors[None], errors[key], fitted, noise, data=data) for key in self.keys), default=0.0)
+        gains = [_gains(errors[None], errors[key], fitted, noise, data) for key in self.keys]
+        return np.max(gains, axis=0) if gains else np.zeros(count)
+
+    def _errors(self, draws: Sequence[Sequence[tuple[np.ndarray, float]]]) -> dict[str | None, np.ndarray]:
+        """Fit draws, and return the mean squares (draws, parts) that the base (key None) and each candidate leave."""
+        residuals = [np.stack([r for r, _ in own]) for own in zip(*draws, strict=True)]  # (draws, k) for each part
+        outside = [np.array([rest for _, rest in own]) for own in zip(*draws, strict=True)]
+        weighted = np.concatenate([p.weighted(r) for p, r in zip(self.parts, residuals, strict=True) if p.fitted], axis=1)
+        out = {}
+        for name, solve in self.solvers.items():
+            amounts, keys = weighted @ solve.T, () if name is None else (name,)
+            left = [r - amounts @ p.design(keys).T for p, r in zip(self.parts, residuals, strict=True)]
+            squares = [((r * r).sum(1) + rest) / p.count for p, r, rest in zip(self.parts, left, outside, strict=True)]
+            out[name] = np.stack(squares, axis=1)
+        return out
 
     def cosine(self, a: str, b: str) -> float:
         """Return the cosine between two candidates, after the directions of the base fit are projected out.
@@ -113,18 +108,26 @@ def gain(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: n
         noise: The noise.
         data: What the base leaves of the measured data, if `before` belongs to a draw. A draw is always near the noise, the data may not.
     """
+    return float(_gains(before, after, fitted, noise, data))
+
+
+def _gains(before: np.ndarray, after: np.ndarray, fitted: Sequence[bool], noise: np.ndarray, data: np.ndarray | None) -> np.ndarray:
+    """Return `gain` of several draws at once, (...,), from mean squares (..., parts)."""
     own = np.array(fitted)
     if own.all():
         return ratio(before, after, own)
+    held_out = ratio(before, after, ~own)
+    if not own.any():
+        return held_out
     seen = [before, after] if data is None else [before, after, data]
-    if own.any() and not max(squares[own].mean() for squares in seen) < NOISE_ALONE * noise[own].mean():
-        return min(ratio(before, after, own), ratio(before, after, ~own))
-    return ratio(before, after, ~own)
+    largest = np.max(np.broadcast_arrays(*(squares[..., own].mean(-1) for squares in seen)), axis=0)
+    noisy = largest < NOISE_ALONE * noise[own].mean()
+    return np.where(noisy, held_out, np.minimum(ratio(before, after, own), held_out))
 
 
-def ratio(before: np.ndarray, after: np.ndarray, group: np.ndarray) -> float:
+def ratio(before: np.ndarray, after: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Return the logarithm of the error before over the error after, for a group of parts given by a mask; arguments are mean squares."""
-    return 0.5 * (score(np.minimum(before[group], 1e300)) - score(np.minimum(after[group], 1e300)))
+    return 0.5 * (scores(np.minimum(before[..., group], 1e300)) - scores(np.minimum(after[..., group], 1e300)))
 
 
 class _Part:
@@ -154,21 +157,19 @@ class _Part:
         return np.concatenate([self.declared, *(self.candidates[key] for key in keys), self.settings], axis=1)
 
     def weighted(self, r: np.ndarray) -> np.ndarray:
-        """Return a residual (k,) times the weight of each direction."""
-        return r[: len(self.scale)] * self.scale
+        """Return residuals (..., k) times the weight of each direction."""
+        return r * self.scale
 
-    def draw(self, rng: np.random.Generator, exact: bool = False) -> np.ndarray:
-        """Draw a residual (k,) under the null hypothesis, with the nuisances projected out; `exact`: without discretisation error."""
+    def draw(self, rng: np.random.Generator, exact: bool = False) -> tuple[np.ndarray, float]:
+        """Draw a residual (k,) under the null hypothesis, with the nuisances projected out, and the sum of squares outside of the basis.
+
+        With `exact`, only noise and nuisances are drawn, and no discretisation error.
+        """
         k = len(self.scale)
         r = self.noise * rng.standard_normal(k)
         for columns in (self.nuisances,) if exact else (self.nuisances, self.discretisation, self.smooth):
             r = r + columns @ rng.standard_normal(columns.shape[1])
-        self.rest = self.noise**2 * (rng.chisquare(self.outside) if self.outside else 0.0)
-        return self.project(r)
-
-    def square(self, r: np.ndarray) -> float:
-        """Return the mean square over all data of the recording, given a residual (k,) in the basis."""
-        return (float(r @ r) + self.rest) / self.count
+        return self.project(r), self.noise**2 * (rng.chisquare(self.outside) if self.outside else 0.0)
 
 
 def _solver(parts: Sequence[_Part], keys: Sequence[str]) -> np.ndarray:

@@ -328,7 +328,12 @@ class Round:
 
 def score(errors: np.ndarray) -> float:
     """Return the mean over the parts of the logarithm of their mean squares."""
-    return float(np.mean(np.log(np.maximum(errors, 1e-300))))
+    return float(scores(errors))
+
+
+def scores(errors: np.ndarray) -> np.ndarray:
+    """Return `score` over the last axis of mean squares (..., parts)."""
+    return np.log(np.maximum(errors, 1e-300)).mean(-1)
 
 
 def times_over(errors: np.ndarray, floors: np.ndarray) -> float:

@@ -205,12 +205,17 @@ def test_what_the_model_needs_is_known_before_setup(folder):
 # Resuming
 
 
+@pytest.fixture(scope="module")
+def straight(folder, tmp_path_factory):
+    """A run that is not broken off."""
+    return fit(module(folder), tmp_path_factory.mktemp("straight"), every=1000)
+
+
 @pytest.mark.parametrize("options", [{}, {"preload": False, "num_workers": 1}], ids=["resident", "workers"])
 @pytest.mark.parametrize("stop", [4, 15, 16, 17, 18, 40])
-def test_resumed_run_sees_the_same_batches(folder, tmp_path, stop, options):
+def test_resumed_run_sees_the_same_batches(folder, straight, tmp_path, stop, options):
     """Broken off within an epoch, at its last batch (16) and in the next ones; a checkpoint after each step."""
     assert len(module(folder).order) == 16
-    straight = fit(module(folder), tmp_path / "straight", every=1000)
     first = fit(module(folder, **options), tmp_path / "broken", stop=stop, **options_of(options))
     last = max((tmp_path / "broken" / "saved").glob("*.ckpt"), key=lambda path: int(path.stem.split("=")[1]))
     done = int(last.stem.split("=")[1])

@@ -37,6 +37,7 @@ from neuido.discrepancy.store import Budget
 T = np.linspace(0.0, 1.0, 120)
 NOISE = 0.01
 WAVES = 3
+WAVE = np.array([[np.sin((k + 1 + 0.3 * n) * T) for k in range(8)] for n in range(WAVES)])
 
 
 class Line(Problem):
@@ -76,7 +77,8 @@ class Line(Problem):
             phase = 3.0 * p.get("a", 1.0) if self._turns else 0.0
             y = (p.get("a", 1.0) + 2.0 * setting) * T + self._wiggle * setting * np.sin(40 * T + phase)
             for n in range(WAVES):
-                y = y + sum(p.get(f"wave{n}.c{k}", 0.0) * np.sin((k + 1 + 0.3 * n) * T) for k in range(8))
+                if any(f"wave{n}.c{k}" in p for k in range(8)):
+                    y = y + sum(p.get(f"wave{n}.c{k}", 0.0) * WAVE[n, k] for k in range(8))
             y = y + p.get("square.c", 0.0) * T**2 + p.get("cube.c", 0.0) * T**3
             out.append(np.minimum(y, 1.0 / p["clip.inverse"]) if p.get("clip.inverse") else y)
         return np.stack(out)
