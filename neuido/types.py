@@ -235,6 +235,52 @@ class Plane:
 
 
 @dataclass(frozen=True)
+class Keyframes:
+    """The motion of a collider on a given path: linear in the positions, spherically linear in the rotations, at rest outside the times.
+
+    Args:
+        times: Rising times [s], (N,).
+        positions: [m], (N, 3).
+        rotations: Unit quaternions (w, x, y, z), (N, 4); None: the rotation of the collider throughout.
+    """
+
+    times: tuple[float, ...]
+    positions: tuple[Vector, ...]
+    rotations: tuple[tuple[float, float, float, float], ...] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solid:
+    """What all solid colliders share; the kinds are in `neuido.physics.colliders`: `Sphere`, `Cuboid`, `MeshCollider`, ...
+
+    A solid is at rest, moves at a constant `velocity` and `spin`, follows a `path`, or, with a `mass`, moves freely.
+
+    Args:
+        position: Origin of its frame at t = 0 [m]; the centre of mass of a free body.
+        rotation: Rotation at t = 0, a quaternion (w, x, y, z) of any length.
+        contact: As for `Plane`.
+        friction: As for `Plane` [-].
+        velocity: [m/s]; the initial velocity of a free body.
+        spin: Angular velocity in the axes of the scene [rad/s]; the initial one of a free body.
+        path: The motion in time; it replaces position and velocity.
+        mass: Mass of a free rigid body [kg]; None: not free.
+        inertia: Inertia of a free body about its centre of mass in its own axes [kg m^2], (3, 3); None: that of a uniform density.
+        name: Name in results.
+    """
+
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    contact: str = "separate"
+    friction: float = 0.0
+    velocity: Vector = (0.0, 0.0, 0.0)
+    spin: Vector = (0.0, 0.0, 0.0)
+    path: Keyframes | None = None
+    mass: float | None = None
+    inertia: tuple[Vector, Vector, Vector] | None = None
+    name: str = ""
+
+
+@dataclass(frozen=True)
 class Box:
     """An axis-aligned box, given by its lower and upper corner [m]."""
 
@@ -280,7 +326,7 @@ class Scene:
         cells: Number of grid cells along the longest side of the domain.
         dt: Substep [s].
         gravity: Acceleration of gravity [m/s^2].
-        colliders: Planes that act on the grid, in this order and before the walls.
+        colliders: Planes and solids. Planes act on the grid in this order and before the walls, then solids in this order.
         walls: Walls of the domain; None: the domain is open, and a particle that leaves it is an error.
         clamps: Boxes whose particles and nodes are held at rest.
         attached_masses: Masses that are added to the body.
@@ -296,7 +342,7 @@ class Scene:
     cells: int = 32
     dt: float = 1e-3
     gravity: Vector = (0.0, -9.8, 0.0)
-    colliders: tuple[Plane, ...] = ()
+    colliders: tuple[Plane | Solid, ...] = ()
     walls: Walls | None = Walls()
     clamps: tuple[Box, ...] = ()
     attached_masses: tuple[AttachedMass, ...] = ()

@@ -40,12 +40,12 @@ class ColliderTable(NamedTuple):
 
 
 def planes_of(scene: Scene) -> tuple[Plane, ...]:
-    """Return the colliders of a scene followed by its six walls.
+    """Return the planes among the colliders of a scene, followed by its six walls.
 
     Raises:
         UserError: An unknown kind of contact, a normal without length, or a friction that is negative or NaN.
     """
-    planes = list(scene.colliders)
+    planes = [plane for plane in scene.colliders if isinstance(plane, Plane)]
     if scene.walls is not None:
         wall = scene.walls
         for axis in range(3):

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from neuido.physics.colliders.solid_loop import SolidLoop
 from neuido.physics.effects import swelling_kernels
 from neuido.physics.laws.base import Engine
-from neuido.physics.mpm.plan import BODY_FRICTION, FIXED, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step
+from neuido.physics.mpm.plan import BODY_FRICTION, FIXED, SHRINKAGE, SOLIDS, SPIN_LOSS, STATES, Material, Plan, at_step, solid_loop
 from neuido.physics.mpm.rollout import Tape, flow_inputs, grid_inputs, meet, stress, stress_inputs, swell, to_grid, update_nodes
 from neuido.physics.runtime.device import real_of, torch_stream
 
@@ -36,7 +37,7 @@ def run_backward(
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
     a_fixed = [torch.zeros_like(t) for t in inputs[STATES:FIXED]]
     a_mass, a_pull, a_force, a_friction, a_viscosity = a_fixed[:5]
-    a_shrinkage, a_loss, a_body_friction = a_fixed[SHRINKAGE - STATES :]
+    a_shrinkage, a_loss, a_body_friction = a_fixed[SHRINKAGE - STATES : SOLIDS - STATES]
     parameters = any(wanted[STATES + 1 : STATES + 4])
     now = [torch.zeros_like(t) for t in inputs[:STATES]]
     then = [torch.empty_like(t) for t in now]
@@ -49,6 +50,9 @@ def run_backward(
             plastic.start_adjoint(wanted[plan.split :])
         spin = plan.spin_decay(inputs)
         damped = None if spin is None else (torch.empty_like(now[1]), torch.empty_like(now[2]))
+        solids = solid_loop(plan, inputs, tape.solids)
+        if solids is not None:
+            solids.start_adjoint(plan.every, gradients[STATES:], a_fixed[SOLIDS - STATES :], a_pull, a_friction)
         for n in reversed(range(plan.steps if steps is None else steps)):
             if (n + 1) % plan.every == 0:
                 _add(now, gradients, (n + 1) // plan.every)
@@ -62,7 +66,7 @@ def run_backward(
                 spin.damp(inputs[SPIN_LOSS], mass, x, v, C, *damped, every=True)
                 v_in, C_in = damped
             v_first, mass_in = v_in, mass
-            tau, grid, met, velocity = recompute(plan, inputs, tape, n, state, (v_in, C_in), elastic, material, scratch)
+            tau, grid, met, velocity = recompute(plan, inputs, tape, n, state, (v_in, C_in), elastic, material, scratch, solids)
             if setup.leaving is not None:
                 v_in, mass_in = setup.leaving.entered(v_first, mass)
             shrinkage = at_step(inputs[SHRINKAGE], n)
@@ -86,9 +90,16 @@ def run_backward(
             plan.launch(k.grid_to_particles_adjoint, len(x),
                         [setup.field, setup.held_now, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, velocity, x, F,
                          v_next, C_next, *now[:3], a_out, a_velocity.zero_(), a_x, a_F], plan.block)  # fmt: skip
+            if solids is not None:
+                free = setup.scratch("free")
+                update_nodes(plan, met, at_step(pull, n), force, friction, free)
+                solids.advance_adjoint(n)
+                solids.meet_adjoint(n, setup.node_index, met, free, a_velocity)
             arguments = [met, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters]
             inputs_n = grid_inputs(plan, at_step(pull, n), force, friction)
             plan.launch(k.update_grid_adjoint, setup.node_count // setup.chunk, [*inputs_n, *arguments])
+            if solids is not None:
+                a_grid[:, 3] += a_velocity[:, 3]
             a_before = a_grid
             if setup.contact is not None:
                 particles = [setup.field, setup.particles.scene, setup.field_origin, setup.field_dx, x, setup.sorted_volume]
@@ -113,6 +124,8 @@ def run_backward(
             elastic.adjoint(F, a_tau, a_F)
             now, then = then, now
         _add(now, gradients, 0)
+        if solids is not None:
+            solids.end_adjoint()
         of_laws = [*elastic.gradients(), *(() if plastic is None else plastic.gradients())]
     return [*now, *a_fixed, *of_laws]
 
@@ -127,6 +140,7 @@ def recompute(
     elastic: Engine,
     material: Material | None,
     scratch: Tensor,
+    solids: SolidLoop | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return stress, nodal momentum before and after contact of bodies, and nodal velocity of a substep, from the tape or recomputed.
 
@@ -140,6 +154,7 @@ def recompute(
         elastic: Engine of the elastic law.
         material: Tables of material effects in the substep, or None.
         scratch: Memory for a recomputed stress, (P, 3, 3).
+        solids: The launches of the solids, or None.
     """
     setup = plan.setup
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
@@ -155,6 +170,8 @@ def recompute(
     velocity = setup.scratch("velocity") if tape.velocity is None else tape.velocity[n]
     if tape.velocity is None:
         update_nodes(plan, met, at_step(pull, n), force, friction, velocity)
+        if solids is not None:
+            solids.meet(n, setup.node_index, met, velocity, solids.spare)
     return tau, grid, met, velocity
 
 

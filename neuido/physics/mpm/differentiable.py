@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from neuido.physics.mpm.graphs import RolloutCache
-from neuido.physics.mpm.plan import FIXED, KINDS, STATES, Plan
-from neuido.physics.mpm.rollout import check
+from neuido.physics.mpm.plan import FIXED, KINDS, SOLIDS, STATES, Plan
+from neuido.physics.mpm.rollout import Tape, check
 from neuido.physics.runtime.limits import UNCHECKED, check_memory
 from neuido.physics.runtime.threads import one_thread_each
 
@@ -67,7 +67,12 @@ def _frames(plan: Plan, cache: RolloutCache, inputs: tuple[Tensor, ...]) -> tupl
     cached = cache.find(plan, inputs, keep_all=False)
     cached.forward(plan, inputs)
     check(plan, cached.tape)
-    return cached.tape.states
+    return (*cached.tape.states, *of_solids(cached.tape, plan.every))
+
+
+def of_solids(tape: Tape, every: int) -> tuple[Tensor, ...]:
+    """Return the frames of the states of solids, (K, S, C, 13), and the impulses of all substeps, (T, S, C, 6); nothing without solids."""
+    return () if tape.solids is None else (tape.solids.state[::every], tape.solids.impulse)
 
 
 class _Rollout(torch.autograd.Function):
@@ -82,7 +87,7 @@ class _Rollout(torch.autograd.Function):
         ctx.serial = ctx.cached.forward(plan, inputs)
         check(plan, ctx.cached.tape)
         ctx.save_for_backward(*(t.clone() for t in inputs))
-        return tuple(t[:: plan.every] for t in ctx.cached.tape.states)
+        return (*(t[:: plan.every] for t in ctx.cached.tape.states), *of_solids(ctx.cached.tape, plan.every))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -101,30 +106,34 @@ class _Segments(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         inputs = tuple(t.detach() for t in inputs)
         ctx.part, ctx.count, ctx.cache = plan.shortened(segment), plan.steps // segment, cache
+        ctx.carried = _carried(plan)
         length = segment // plan.every
-        frames = tuple(t.new_empty(ctx.count * length + 1, *t.shape) for t in inputs[:STATES])
-        starts = [inputs[:STATES]]
+        starts = [tuple(inputs[c] for c in ctx.carried)]
+        frames = tuple(t.new_empty(ctx.count * length + 1, *t.shape) for t in starts[0])
+        impulses = []
         for i in range(ctx.count):
             ctx.part.offset = i * segment
-            rest = [_own(t, kind, i, segment) for t, kind in zip(inputs[STATES:], _kinds(inputs))]
-            for frame, part in zip(frames, _frames(ctx.part, cache, (*starts[i], *rest))):
+            parts = _frames(ctx.part, cache, _segment_inputs(ctx.carried, starts[i], inputs, i, segment))
+            for frame, part in zip(frames, parts):
                 frame[i * length : (i + 1) * length + 1] = part
+            impulses += [part.clone() for part in parts[len(frames) :]]
             starts.append(tuple(frame[(i + 1) * length].clone() for frame in frames))
-        ctx.save_for_backward(*inputs[STATES:], *(t for start in starts[:-1] for t in start))
-        return frames
+        ctx.save_for_backward(*inputs, *(t for start in starts[:-1] for t in start))
+        return (*frames, *([torch.cat(impulses)] if impulses else []))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        part, wanted, tensors = ctx.part, ctx.needs_input_grad[3:], ctx.saved_tensors
-        rest, starts = tensors[: len(wanted) - STATES], tensors[len(wanted) - STATES :]
+        part, wanted, tensors, carried = ctx.part, ctx.needs_input_grad[3:], ctx.saved_tensors, ctx.carried
+        given, starts = tensors[: len(wanted)], tensors[len(wanted) :]
         length = part.steps // part.every
         cache = ctx.cache
-        carry = [torch.zeros_like(t) for t in starts[:STATES]]
-        kinds = _kinds((*carry, *rest))
-        total = [torch.zeros_like(t) for t in rest]
+        carry = [torch.zeros_like(given[c]) for c in carried]
+        kinds = _kinds(given)
+        total = [torch.zeros_like(t) for t in given]
+        needed = tuple(want or c in carried for c, want in enumerate(wanted))
         for i in reversed(range(ctx.count)):
-            inputs = (*starts[STATES * i : STATES * (i + 1)], *(_own(t, kind, i, part.steps) for t, kind in zip(rest, kinds)))
+            inputs = _segment_inputs(carried, starts[len(carried) * i : len(carried) * (i + 1)], given, i, part.steps)
             own = []
             for a, gradient in zip(carry, gradients):
                 of_frames = a.new_zeros(length + 1, *a.shape)
@@ -133,20 +142,36 @@ class _Segments(torch.autograd.Function):
                     of_frames[0 if i == 0 else 1 :] = gradient[i * length + (0 if i == 0 else 1) : (i + 1) * length + 1]
                 of_frames[-1] += a
                 own.append(of_frames)
+            own += [None if g is None else g[i * part.steps : (i + 1) * part.steps] for g in gradients[len(carried) :]]
             with cache.lock:
                 cached = cache.find(part, inputs, keep_all=True)
                 serial = cached.forward(part, inputs)
-                out = cached.backward(part, inputs, serial, own, (True,) * STATES + tuple(wanted[STATES:]))
-            carry = out[:STATES]
-            for t, kind, new in zip(total, kinds, out[STATES:], strict=True):
-                if new is not None:
+                out = cached.backward(part, inputs, serial, own, needed)
+            carry = [out[c] for c in carried]
+            for c, (t, kind, new) in enumerate(zip(total, kinds, out, strict=True)):
+                if new is not None and c not in carried:
                     _own(t, kind, i, part.steps).add_(new)
-        return (None, None, None, *(g if want else None for g, want in zip([*carry, *total], wanted, strict=True)))
+        for c, a in zip(carried, carry):
+            total[c] = a
+        return (None, None, None, *(g if want else None for g, want in zip(total, wanted, strict=True)))
 
 
 def _kinds(inputs: Sequence[Tensor]) -> tuple[str, ...]:
-    """Return the kinds of the inputs that follow the initial state."""
-    return (*KINDS[STATES:], *("law",) * (len(inputs) - FIXED))
+    """Return the kinds of the inputs."""
+    return (*KINDS, *("law",) * (len(inputs) - FIXED))
+
+
+def _carried(plan: Plan) -> tuple[int, ...]:
+    """Return the indices of the inputs that a segment takes from the end of the one before: the state, and that of solids."""
+    return (*range(STATES), *([SOLIDS] if plan.setup.solids is not None else []))
+
+
+def _segment_inputs(carried: Sequence[int], start: Sequence[Tensor], inputs: Sequence[Tensor], i: int, steps: int) -> tuple[Tensor, ...]:
+    """Return the inputs of segment i of `steps` substeps, with `start` in place of the carried ones."""
+    out = [_own(t, kind, i, steps) for t, kind in zip(inputs, _kinds(inputs))]
+    for c, t in zip(carried, start):
+        out[c] = t
+    return tuple(out)
 
 
 def _own(t: Tensor, kind: str, i: int, steps: int) -> Tensor:

@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.colliders.solid_loop import SolidLoop, SolidTape, new_solid_tape
 from neuido.physics.effects import swelling_kernels
 from neuido.physics.effects.spin_decay import SpinDecay
 from neuido.physics.laws.base import Engine
 from neuido.physics.mpm import transfers as kernels
-from neuido.physics.mpm.plan import BODY_FRICTION, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step
+from neuido.physics.mpm.plan import BODY_FRICTION, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step, solid_loop
+from neuido.physics.mpm.state import Setup
 from neuido.physics.runtime.device import real_of, torch_stream
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.launches import LaunchRecordings
@@ -50,6 +52,8 @@ class Tape(NamedTuple):
     """Nodal velocity of each substep, (T, nodes, 4), or None."""
     whole: bool
     """Whether a backward pass may follow."""
+    solids: SolidTape | None = None
+    """Record of the solids in every substep; None without solids."""
 
     @property
     def states(self) -> tuple[Tensor, ...]:
@@ -75,7 +79,8 @@ def new_tape(plan: Plan, keep_all: bool) -> Tape:
     trial = torch.empty_like(tau) if tau is not None and plan.corrects else None
     grid, velocity = (setup.mass.new_empty(plan.steps, setup.node_count, 4) if more else None for _ in range(2))
     rest_x, rest_F = (torch.empty_like(t) if plan.compensated else None for t in (setup.state.x, setup.state.F))
-    return Tape(x, v, C, F, history, status, lowest, since, rest_x, rest_F, tau, trial, grid, velocity, keep_all)
+    solids = None if setup.solids is None else new_solid_tape(setup.solids, plan.steps)
+    return Tape(x, v, C, F, history, status, lowest, since, rest_x, rest_F, tau, trial, grid, velocity, keep_all, solids)
 
 
 def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
@@ -96,7 +101,8 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
     spare = [tuple(torch.empty_like(t) for t in now) for _ in range(2)] if stride > 1 else []
     scratch, other = torch.empty_like(now[3]), torch.empty_like(now[3])
     copies = setup.device.type == "cpu"
-    clears = copies and tape.grid is None and setup.contact is None  # the grid update zeroes the nodes as it reads them, which saves a pass
+    # the grid update zeroes the nodes as it reads them, which saves a pass
+    clears = copies and tape.grid is None and setup.contact is None and tape.solids is None
     for name in ("grid", "velocity") if clears else ():
         setup.scratch(name).zero_()
     recordings = LaunchRecordings()
@@ -112,6 +118,9 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
         elastic, plastic = plan.engines(inputs)
         spin = plan.spin_decay(inputs)
         damped = None if spin is None else (torch.empty_like(now[1]), torch.empty_like(now[2]))
+        solids = solid_loop(plan, inputs, tape.solids)
+        if solids is not None:
+            solids.begin()
         for n in range(plan.steps if steps is None else steps):
             frame = tuple(frames[(n + 1) // stride] for frames in tape.states) if (n + 1) % stride == 0 else None
             # on the CPU a frame is copied out: launches that always use the same buffers can be recorded once and repeated
@@ -134,10 +143,14 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
             if same is None:
                 to_nodes()
                 on_nodes()
+                if solids is not None:
+                    meet_solids(solids, n, setup, met, velocity, reach)
                 to_particles()
             else:
                 recordings.run(("scatter", same), to_nodes)
                 recordings.run((reach.start, reach.stop), on_nodes)
+                if solids is not None:
+                    recordings.run(("solids", reach.start, reach.stop), partial(meet_solids, solids, n, setup, met, velocity, reach), n)
                 recordings.run(("gather", same), to_particles, n)
             if frame is not None and then is not frame:
                 for target, t in zip(frame, then):
@@ -372,6 +385,12 @@ def update_nodes(
     setup = plan.setup
     inputs = [*grid_inputs(plan, pull, force, friction, reach), grid[reach], velocity[reach], clear]
     plan.launch(setup.kernels.update_grid, len(grid[reach]) // setup.chunk, inputs)
+
+
+def meet_solids(solids: SolidLoop, n: int, setup: Setup, grid: Tensor, velocity: Tensor, reach: slice) -> None:
+    """Bring a range of nodes in contact with the solids in substep n, and move the solids; arguments as for `update_nodes`."""
+    solids.meet(n, setup.node_index[reach], grid[reach], velocity[reach])
+    solids.advance(n)
 
 
 def grid_inputs(plan: Plan, pull: Tensor, force: Tensor, friction: Tensor, reach: slice = slice(None)) -> list:

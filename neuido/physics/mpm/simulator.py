@@ -15,7 +15,10 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.colliders.collider_frames import collider_frames
 from neuido.physics.colliders.leaving import OnLeave, checked_on_leave
+from neuido.physics.colliders.solid_loop import kernel_inputs
+from neuido.physics.colliders.solid_tables import SolidInputs, solid_inputs
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw, strain_limit
 from neuido.physics.laws.composite import laws_of_bodies
@@ -134,6 +137,36 @@ class Simulator:
         dts = sorted({scene.dt for scene in self.scenes})
         return (f"Simulator({count} scene{'' if count == 1 else 's'}, {len(self.mass)} particles, {_span(cells)} cells, "
                 f"dt {_span(dts)} s, {str(self.dtype).removeprefix('torch.')} on {self.device})")  # fmt: skip
+
+    def solid_inputs(self, steps: int) -> SolidInputs:
+        """Return pose, motion, mass and friction of the solid colliders of the scenes, for a rollout of `steps` substeps.
+
+        Raises:
+            UserError: There is no solid, or a path or an inertia is none.
+        """
+        if self.setup.solids is None:
+            raise UserError("the scenes have no solid colliders; give `colliders` such as Sphere or Cuboid")
+        return solid_inputs(self.scenes, steps, self.device)
+
+    def _solid_tensors(self, steps: int, given: SolidInputs | None, effects: Effects) -> list[Tensor | None]:
+        """Return the tensors of solids that the kernels read; None each without solids."""
+        if self.setup.solids is None:
+            if given is not None:
+                raise UserError("`solids` is given and the scenes have no solid colliders")
+            return [None] * 4
+        own = self.solid_inputs(steps)
+        if given is not None:
+            for name, t, like in zip(own._fields, given, own):
+                rows = (steps, *like.shape[1:]) if name == "twist" else like.shape
+                if t.shape not in (rows, like.shape):
+                    raise UserError(f"solids.{name} has shape {tuple(t.shape)}; it must be {tuple(rows)}")
+            if bool(((given.mass > 0) != (own.mass > 0)).any()):
+                raise UserError("solids.mass frees a collider or holds a free one; give `mass` where the collider is made")
+            own = SolidInputs(*(t.to(self.device, torch.float64) for t in given))
+        if effects.friction is not None:
+            more = effects.rows("friction", self.scene_count, self.mass)
+            own = own._replace(friction=(own.friction + more).clamp(min=0.0))
+        return list(kernel_inputs(own))
 
     def step_limits(
         self,
@@ -255,6 +288,7 @@ class Simulator:
         friction: Tensor | None = None,
         mass: Tensor | None = None,
         body_friction: Tensor | float | None = None,
+        solids: SolidInputs | None = None,
         every: int = 1,
         segment: int | None = None,
         check: bool = True,
@@ -276,6 +310,7 @@ class Simulator:
             mass: [kg], (P,); by default density times volume.
             body_friction: Coulomb's coefficient between the bodies [-], a number, (S,), or (S, B, B) for each pair of up to B bodies, of
                 which the mean of both orders counts; by default that of the scenes.
+            solids: Pose, motion, mass and friction of solid colliders; by default `solid_inputs(steps)`, those of the scenes.
             every: Substeps between two frames.
             segment: Substeps between two checkpoints of gradient checkpointing, for long rollouts. The backward pass recomputes each
                 segment, which takes a third more time. On CUDA it applies without gradients too: one captured segment is replayed for
@@ -317,11 +352,14 @@ class Simulator:
         start = [t[self.order] for t in (*given.state, history, mass)]
         optional = [given.viscosity, None if given.stiffness is None else given.stiffness[self.order], given.growth]
         optional += [None] * 3 if tables is None else [tables.material, tables.branches, tables.flow]
-        optional += [shrinkage, loss, None if self.setup.contact is None else self.setup.contact.frictions(body_friction)]
+        between = None if self.setup.contact is None else self.setup.contact.frictions(body_friction)
+        optional += [shrinkage, loss, between, *self._solid_tensors(steps, solids, given.effects)]
         optional = [mass.new_empty(0) if t is None else t.contiguous() for t in optional]
+        pool = None if self.setup.solids is not None else self.pool
         with self.cache.lock:
-            frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, self.pool)
-            x, v, C, F, history = (t[:, self.inverse] for t in frames)
+            frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, pool)
+            x, v, C, F, history = (t[:, self.inverse] for t in frames[:5])
+            states, impulses = (t.clone() for t in frames[5:]) if len(frames) > 5 else (None, None)
         dts = tuple(scene.dt for scene in self.scenes)
         recorder = plan.recorder
         marks = Marks(recorder.lowest[self.inverse], recorder.since[self.inverse], self.particles.scene, dts, (every,) * len(dts))
@@ -338,6 +376,7 @@ class Simulator:
             history,
             marks=marks,
             strain_limit=limit,
+            colliders=collider_frames(self.scenes, len(x), every, states, impulses),
             **labels(self.bodies, self.setup.body),
         )
         if nan_on_failure:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics.colliders.leaving import Leaving
+from neuido.physics.colliders.solid_tables import solid_table
 from neuido.physics.colliders.tables import clamp_table, collider_table, inside_box
 from neuido.physics.mpm import stencil
 from neuido.physics.mpm import transfers as kernels
@@ -159,6 +160,7 @@ class Setup:
         self.origin = column([[l - kernels.PAD * s.dx for l in s.lower] for s in self.scenes])
         self.gravity = column([list(s.gravity) for s in self.scenes])
         self.colliders = collider_table(self.scenes, self.dtype, self.device)
+        self.solids = solid_table(self.scenes, self.dtype, self.device)
         self.clamp_lower, self.clamp_upper = clamp_table(self.scenes, self.dtype, self.device)
 
     def _check_memory(self) -> None:

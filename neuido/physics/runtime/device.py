@@ -107,6 +107,27 @@ def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.devic
     wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), block_dim=block)
 
 
+def launch_adjoint(kernel: wp.Kernel, dim: int, arguments: Sequence, adjoints: Sequence, device: torch.device) -> None:
+    """Launch the adjoint that Warp generates of a kernel, on torch tensors.
+
+    Warp's adjoints of loops that carry a value from turn to turn are silently wrong: use it for kernels without them.
+
+    Args:
+        kernel: The kernel, built with `enable_backward`.
+        dim: Number of threads.
+        arguments: As for `launch`, as in the forward pass.
+        adjoints: Adjoint of each argument, in part read and in part added to; None for scalars, and for arrays without one.
+        device: Device of the tensors.
+    """
+    if device.type == "cuda":
+        _load(kernel, device, 256)
+    with BUILDING:  # as in `_launch_cached`
+        inputs, own = _inputs(kernel, arguments), _inputs(kernel, adjoints)
+    launches.forbid_repetition()
+    where = "cpu" if device.type == "cpu" else wp.device_from_torch(device)
+    wp.launch(kernel, dim=dim, inputs=inputs, adj_inputs=own, adjoint=True, device=where)
+
+
 def repeated(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, *, block: int = 256) -> Callable[[int], None]:
     """Prepare the repeated launch of a kernel whose first argument is the number of the step.
 

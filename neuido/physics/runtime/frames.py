@@ -104,6 +104,25 @@ class Frames(ParticleState):
         beyond = [] if self.strain_limit is None else events.strain_events(self.F, self.strain_limit, scene, each)
         return (*marks.events(), *beyond)
 
+    @property
+    def forces(self) -> Tensor:
+        """Force of the bodies on each solid collider, the mean since the frame before [N], (K, C, 3) float64.
+
+        The C solids of all scenes are in the order of `colliders`, planes left out. Frame 0 has zeros. Differentiable.
+        """
+        return self._of_solids("force")
+
+    @property
+    def torques(self) -> Tensor:
+        """Torque on each solid collider about its position, as `forces` [N m], (K, C, 3) float64."""
+        return self._of_solids("torque")
+
+    def _of_solids(self, what: str) -> Tensor:
+        found = [t for t in (getattr(collider, what, None) for collider in self.colliders) if t is not None]
+        if not found:
+            return self.x.new_zeros(len(self.x), 0, 3, dtype=torch.float64)
+        return torch.stack(found, dim=1)
+
     def __repr__(self) -> str:
         frames, count = self.x.shape[:2]
         scenes = 1 if self.particles is None else len(self.particles.offsets) - 1
