@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from neuido.types import Scene as Scene
     from neuido.types import Skin as Skin
     from neuido.types import Walls as Walls
+    from neuido.viewer.opening import view as view
 
 __version__ = "0.1.0"
 
@@ -70,6 +71,7 @@ _PLACES = {  # name: its module, and after a colon its name there; a module alon
     "read_tracks": "data.measured.track:read_tracks",
     "render": "models.render.splatting:render",
     "shapes": "data.bodies.shapes",
+    "view": "viewer.opening:view",
 }
 
 __all__ = [
@@ -107,6 +109,7 @@ __all__ = [
     "read_tracks",
     "render",
     "shapes",
+    "view",
 ]
 
 

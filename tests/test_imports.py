@@ -23,6 +23,7 @@ ROOMS = {  # room: the parts of neuido that it may import, itself included
     "neuido.data": (*GROUND, "neuido.physics", "neuido.data"),
     "neuido.models": (*GROUND, "neuido.physics", "neuido.data", "neuido.models"),
     "neuido.discrepancy": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.discrepancy"),
+    "neuido.viewer": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.viewer"),
 }
 PHYSICS_MAY = {"torch", "numpy", "warp", "neuido"} | set(sys.stdlib_module_names)
 
@@ -182,7 +183,7 @@ def test_few_floors():
         rooms.setdefault(own, set()).update(room for other in others if (room := ".".join(other.split(".")[:2])) != own)
     assert circles(rooms) == []
     assert floors(rooms) <= FLOORS
-    assert floors(by_folder(drawn(), ("neuido.commands", "neuido.discrepancy"))) <= FOLDER_FLOORS
+    assert floors(by_folder(drawn(), ("neuido.commands", "neuido.discrepancy", "neuido.viewer"))) <= FOLDER_FLOORS
 
 
 def test_folders_and_files_are_small():

@@ -299,4 +299,13 @@ frames = simulator.rollout(50, laws.FixedCorotated(5e4, 0.3), every=10)
 print(frames, frames.times)
 frames.save("motion.npz")  # or .csv, or .ply: a point cloud a frame
 """,
+    "view": f"""
+import neuido
+from neuido import Scene, Simulator, laws, shapes
+{_BALL}
+frames = simulator.rollout(50, laws.FixedCorotated(5e4, 0.3), every=10)
+page = neuido.view(frames, laws.FixedCorotated(5e4, 0.3))  # with the law also the stress can be shown
+print(page.url)  # open it in a browser; page.wait() serves until Ctrl+C
+page.stop()
+""",
 }

@@ -43,6 +43,8 @@ LIGHT = {  # name: (module, function, one line for the list); the module must im
     "report": ("neuido.commands.report", "report", "One page of several runs: tables, curves, videos side by side."),
     "latents": ("neuido.commands.latents", "latents", "How the latents of Stage I lie, and what lies between two of them."),
     "demo": ("neuido.commands.demo.demo", "demo", "Learn laws from bodies and from video, and find an effect that a model lacks."),
+    "view": ("neuido.commands.viewing.view", "view", "Open a motion, a recording or a diagnosis in the browser, or run a scene live."),
+    "render": ("neuido.commands.viewing.render", "render", "Draw a motion to a video or pictures, without a display."),
     "film": ("neuido.commands.film", "film", "Film simulated bodies of many materials, for the video encoder."),
     "doctor": ("neuido.commands.doctor", "doctor", "Print versions and devices, and run a small rollout on each device."),
 }

@@ -6,7 +6,7 @@ from typing import Literal
 
 from neuido import configs_root
 from neuido.data.files.output_folder import check_unused
-from neuido.data.files.writing import new_folder
+from neuido.data.files.writing import copy_file, new_folder
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.physics.runtime.limits import check_limit
@@ -35,7 +35,7 @@ def simulate(
 
     Args:
         scene: Scene file, or the name of one that comes with neuido (bouncy-ball, nclaw-cube, ...).
-        out: Folder to write, new or empty: frames.npz, and a point cloud a frame in ply/.
+        out: Folder to write, new or empty: frames.npz, a point cloud a frame in ply/, and the scene (and the learned law) beside them.
         law: Neural law of `neuido predict` (law.safetensors) in place of the scene's elasticity and plasticity.
         steps: Substeps; those of the scene file where absent.
         every: Write a frame every so many substeps, a divisor of `steps`; such that at most 100 frames follow the first where absent.
@@ -78,6 +78,9 @@ def simulate(
         try:
             frames.save(hidden / "frames.npz")
             frames.save(hidden / "ply" / "frame.ply")
+            copy_file(_file_of(scene), hidden / "scene.yaml")  # what `neuido view` needs for floor, gravity and stress
+            if law is not None:
+                copy_file(law, hidden / "law.safetensors")
         except OSError as error:
             raise UserError(f"out = {out}: {error.strerror or error}") from error
     told = f"the law of {law}" if law else ", ".join(_told(setup.info[part]) for part in ("elasticity", "plasticity"))
@@ -96,7 +99,7 @@ def simulate(
         print(f"note: {event}")
     print(
         f"results in {folder}: frames.npz opens with numpy.load (x, v, C, F, times), "
-        "ply/frame_0000.ply and on in ParaView, MeshLab or Blender"
+        f"ply/frame_0000.ply and on in ParaView, MeshLab or Blender; `neuido view {folder}` plays them"
     )
 
 
@@ -104,10 +107,15 @@ def _one_scene(scene: str) -> str:
     """Return a scene's file or name; a file that lists several scenes is an error that names the command for it."""
     from neuido.data.files.parsing import read_yaml
 
-    own = Path(scene) if scene.endswith((".yaml", ".yml")) else configs_root() / "scenes" / f"{scene}.yaml"
+    own = _file_of(scene)
     if own.is_file() and "scenes" in read_yaml(own):
         raise UserError(f"{scene} lists several scenes to film: `neuido scenes --config {scene} --out FOLDER` makes them")
     return scene
+
+
+def _file_of(scene: str) -> Path:
+    """Return the file of a scene that is given by its path or its name."""
+    return Path(scene) if scene.endswith((".yaml", ".yml")) else configs_root() / "scenes" / f"{scene}.yaml"
 
 
 def _told(law: dict) -> str:

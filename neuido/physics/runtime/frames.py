@@ -4,6 +4,7 @@ import functools
 import os
 import re
 from collections.abc import Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +155,24 @@ class Frames(ParticleState):
         if path.suffix.lower() not in writers:
             return [neuido.export(self, path)]
         return writers[path.suffix.lower()](path)
+
+    def show(self, *, law: Any = None, scene: Any = None, colour: str | None = None, height: int = 480) -> Any:
+        """Return a player of the motion for a notebook, which shows it where it is the last line of a cell; it needs no server.
+
+        Args:
+            law: Elastic law, for the colours of stress.
+            scene: The scene of the frames, for floor and gravity.
+            colour: Quantity by which particles are coloured, such as "speed" or "strain"; the first that there is where absent.
+            height: Height of the player [px].
+
+        Returns:
+            The player; its `save` writes it as one HTML file.
+
+        Raises:
+            UserError: The extra `viewer` is missing, or the frames have no such quantity.
+        """
+        player = import_module("neuido.viewer.notebook")  # the viewer shows physics, which must not need it
+        return player.player_of(self, law=law, scene=scene, colour=colour, height=height)
 
     def _scene(self) -> np.ndarray:
         """Return the scene of each particle, (P,)."""

@@ -1,0 +1,1 @@
+"""Looking at motions: an interactive page (viser), pictures and videos without a display, and a player for notebooks."""
