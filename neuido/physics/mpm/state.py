@@ -136,7 +136,7 @@ class Setup:
             self.field_origin, self.field_dx, self.field_dt = (t[self.field_scene] for t in (self.origin, self.dx, self.dt))
             pairs = contact_kernels.build(real_of(dtype), stencil.functions)
             frictions = friction_table(self.scenes, bodies)
-            self.contact = ContactGrid(field_counts.tolist(), pairs, self.nodes, self.chunk, frictions, device, dtype)
+            self.contact = ContactGrid(field_counts.tolist(), pairs, self.nodes, self.chunk, self.dx, frictions, device, dtype)
         watched = self.device.type == "cpu" and len(self.field_scene) == 1
         self.span = torch.empty(2 if watched else 0, dtype=self.dtype, device=self.device)
         """Smallest and largest x [m] of the particles after a substep; only for a single velocity field on the CPU."""

@@ -28,6 +28,7 @@ class ContactGrid:
         kernels: The kernels (`contact_kernels.build`).
         nodes: Grid nodes along each axis, padding included.
         chunk: Nodes that a thread handles.
+        dx: Cell size of each scene [m], (S,).
         friction: `friction_table` of the scenes.
         device: Device of the arrays.
         dtype: Scalar type of the arrays.
@@ -43,11 +44,12 @@ class ContactGrid:
         kernels: SimpleNamespace,
         nodes: wp.vec3i,
         chunk: int,
+        dx: Tensor,
         friction: Tensor,
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
-        self.kernels = kernels
+        self.kernels, self.dx = kernels, dx
         self.nodes, self.chunk = nodes, chunk
         self.size = nodes[0] * nodes[1] * nodes[2]
         self.first = torch.tensor([0, *accumulate(counts)], dtype=torch.int32, device=device)
@@ -55,7 +57,7 @@ class ContactGrid:
         self.scenes, fields, self.bodies = len(counts), sum(counts), round(friction.shape[1] ** 0.5)
         self.shared = torch.zeros(self.scenes * self.size, dtype=torch.int32, device=device)
         self.gradient, self.a_gradient = (torch.zeros(fields * self.size, 3, dtype=dtype, device=device) for _ in range(2))
-        self.reach = torch.zeros(fields * self.size, dtype=dtype, device=device)
+        self.reach = torch.zeros(fields * self.size, 2 * self.bodies, dtype=dtype, device=device)
 
     def frictions(self, given: Tensor | float | None) -> Tensor:
         """Return the friction of each pair for a rollout, (S, B B).
@@ -127,4 +129,4 @@ class ContactGrid:
 
     def _table(self, friction: Tensor) -> list:
         """Return the first arguments of the kernel of the exchange and of its adjoint."""
-        return [self.first, self.size, self.chunk, self.bodies, friction, self.shared, self.gradient, self.reach]
+        return [self.first, self.size, self.chunk, self.bodies, self.dx, friction, self.shared, self.gradient, self.reach]
