@@ -74,7 +74,7 @@ def plan(cases: int, curves: int, seed: int, *, particles: int = 0, seconds: flo
         if kind == "cohesion" or any((KINDS | OUTSIDE)[k].grid for k in kind.split("+") if k != "none"):
             solver = SOLVERS[i % 2]
         made.append(Case(kind=kind, nuisances=off, solver=solver, particles=particles, seconds=seconds))
-    made += [Case(measured=("material_test", "track")[i % 2]) for i in range(curves)]
+    made += [Case(measured=("material_test", "track", "material_test", "guided")[i % 4]) for i in range(curves)]
     return [(f"case-{n:03d}", 1000 * seed + int(i), made[i]) for n, i in enumerate(rng.permutation(len(made)))]
 
 
@@ -268,7 +268,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/blind"))
     parser.add_argument("--cases", type=int, default=60)
-    parser.add_argument("--curves", type=int, default=0, help="additional cases that are alternately material tests and tracks")
+    parser.add_argument("--curves", type=int, default=0, help="additional cases: material tests, tracks of flights and of guided bodies")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, help="number of parallel processes; default: 2 on the CPU, 1 on a GPU")
     parser.add_argument("--gpus", type=int, default=1, help="number of GPUs over which the processes are spread")

@@ -124,7 +124,7 @@ def effect_page() -> str:
             ]
             for p in e.parameters
         ]
-        parts.append(table(["parameter", "unit", "range", "field of `Effects`", "kernels"], rows))
+        parts.append(table(["parameter", "unit", "range", "field of `Effects` or `Forces`", "kernels"], rows))
     return "\n".join(parts)
 
 

@@ -154,11 +154,21 @@ def schemas() -> dict[str, Schema]:
             {
                 "format": one_of(["neuido-track/1"]),
                 "name": TEXT,
-                "model": record({"gravity": VECTOR}, {"effects": effects_of(track.EFFECTS), "free": FREE}),
+                "model": record(
+                    {"gravity": VECTOR},
+                    {
+                        "effects": effects_of(track.EFFECTS),
+                        "free": FREE,
+                        "fluid_density": NOT_NEGATIVE,
+                        "constraint": {"oneOf": [{"type": "null"}, *_constraints(track.CONSTRAINTS)]},
+                    },
+                ),
                 "bodies": {
                     "type": "object",
                     "minProperties": 1,
-                    "additionalProperties": {"oneOf": [{"type": "null"}, record({}, dict.fromkeys(track.FIGURES, POSITIVE))]},
+                    "additionalProperties": {
+                        "oneOf": [{"type": "null"}, record({}, dict.fromkeys(track.FIGURES, POSITIVE) | {"shape": one_of(track.SHAPES)})]
+                    },
                 },
                 "recordings": some(
                     record(
@@ -166,13 +176,19 @@ def schemas() -> dict[str, Schema]:
                             "name": TEXT,
                             "body": TEXT,
                             "file": TEXT,
-                            "columns": record({"t": TEXT}, dict.fromkeys(track.AXES, TEXT), minProperties=2),
+                            "columns": {
+                                "oneOf": [
+                                    record({"t": TEXT}, dict.fromkeys(track.AXES, TEXT), minProperties=2),
+                                    record({"t": TEXT, track.ANGLE: TEXT}),
+                                ]
+                            },
                             "role": role,
                         },
                         {
                             "rows": ROWS,
-                            "scale": record({}, dict.fromkeys(track.AXES, NOT_ZERO) | {"t": POSITIVE}),
+                            "scale": record({}, dict.fromkeys((*track.AXES, track.ANGLE), NOT_ZERO) | {"t": POSITIVE}),
                             "spin": VECTOR,
+                            "attitude": VECTOR,
                             "noise": POSITIVE,
                         },
                     )
@@ -206,6 +222,19 @@ def schemas() -> dict[str, Schema]:
     }
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {f"{name}.schema.json": {"$schema": dialect, "title": name, **schema} for name, schema in formats.items()}
+
+
+def _constraints(types: Any) -> list[Schema]:
+    """Return the schema of each type of constraint, from the figures that it needs and those that it may have."""
+    out = []
+    for name, (needed, others) in types.items():
+        figures = {key: NUMBER if key == "floor" else NOT_NEGATIVE for key in (*needed, *others)}
+        figures |= {key: POSITIVE for key in ("length", "restitution") if key in figures}
+        figures |= {"stiffness": POSITIVE} if name == "spring" else {}
+        figures |= {"restitution": POSITIVE | {"maximum": 1}} if "restitution" in figures else {}
+        more = {key: figures[key] for key in others} | ({"normal": VECTOR} if name == "plane" else {})
+        out.append(record({"type": one_of([name])} | {key: figures[key] for key in needed}, more))
+    return out
 
 
 def _choices(keys: tuple[str, ...], others: dict[str, str]) -> list[list[str]]:

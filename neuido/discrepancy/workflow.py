@@ -240,7 +240,7 @@ def problems_of(
 
         return [MaterialProblem(read_material_tests(folder, model=given))]
     from neuido.data.measured.track import read_tracks
-    from neuido.discrepancy.problems.tracks import TrackProblem, track_problems
+    from neuido.discrepancy.problems.tracks.track_problem import TrackProblem, track_problems
 
     if given is None or set(given) != {"bodies"}:
         return track_problems(read_tracks(folder, model=given))
@@ -278,7 +278,7 @@ def problems_of_data(
         from neuido.discrepancy.problems.material import MaterialProblem
 
         return "material test", [MaterialProblem(source)]
-    from neuido.discrepancy.problems.tracks import track_problems
+    from neuido.discrepancy.problems.tracks.track_problem import track_problems
 
     return "track", track_problems(source)
 

@@ -146,7 +146,8 @@ def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str,
             flat[f"{name}.{key}"] = number(figure, f"{where}.{name}.{key}")
     try:
         later = [f"time_force.{key}" for key in WAVES]  # `discrepancy.problems.candidates` converts them to knots; a gradient needs a body
-        Effects.of({key: figure for key, figure in flat.items() if not key.startswith("stiffness_gradient.") and key not in later})
+        other = {entry.name for entry in LIBRARY if entry.only == "track"} | {"stiffness_gradient"}
+        Effects.of({key: figure for key, figure in flat.items() if key.partition(".")[0] not in other and key not in later})
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
     return flat

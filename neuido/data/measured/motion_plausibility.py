@@ -92,7 +92,7 @@ def lost_positions(x: np.ndarray) -> np.ndarray:
     return out
 
 
-def check_track(t: np.ndarray, x: np.ndarray, axes: Sequence[str], where: str) -> None:
+def check_track(t: np.ndarray, x: np.ndarray, axes: Sequence[str], where: str, *, free: bool = True) -> None:
     """Check one track for unseen points, a point that stands still, gaps, jumps and a pivot.
 
     Args:
@@ -100,6 +100,7 @@ def check_track(t: np.ndarray, x: np.ndarray, axes: Sequence[str], where: str) -
         x: Coordinates [m], (n, A).
         axes: Names of the axes.
         where: Name of the recording in messages.
+        free: Whether the point is declared to fly.
 
     Raises:
         UserError: The point stands still, or rows hold the number of a point that was not seen.
@@ -124,11 +125,11 @@ def check_track(t: np.ndarray, x: np.ndarray, axes: Sequence[str], where: str) -
     if float(np.ptp(x, axis=0).max()) > FARTHEST:
         _warn(f"{where}: the point travels {np.ptp(x, axis=0).max():.4g} m; are the positions in mm or pixels? (scale)")
     check_gaps(t, where)
-    pivot = _pivot(x)
+    pivot = _pivot(x) if free else None
     if pivot is not None:
         _warn(
-            f"{where}: the point moves to and fro on a circle of {pivot:.3g} m, as on a pivot; a track is a free body, and what holds it "
-            "shows as an effect"
+            f"{where}: the point moves to and fro on a circle of {pivot:.3g} m, as on a pivot, and no constraint is declared: give "
+            f"model.constraint: {{type: pendulum, length: {pivot:.3g}}}"
         )
 
 

@@ -17,6 +17,7 @@ from neuido.data.progress import Progress
 from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.curves import curve_case
+from neuido.data.undeclared.guided_tracks import guided_case
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, Redraw
 from neuido.errors import UserError
@@ -56,7 +57,7 @@ def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, pro
 
 def _make(seed: int, hidden: Path, name: str, case: Case, plan: dict[str, Any], device: str, progress: bool) -> str:
     """Fill a folder with a case, and return the text of its key."""
-    maker = body_case if case.measured == "body" else curve_case
+    maker = {"body": body_case, "guided": guided_case}.get(case.measured, curve_case)
     with Progress(f"case {name}", unit="simulations", shown=progress) as work:
         for attempt in range(TRIES):
             rng = np.random.default_rng([seed, attempt])
@@ -76,11 +77,11 @@ def _make(seed: int, hidden: Path, name: str, case: Case, plan: dict[str, Any], 
 
 
 def _check(case: Case) -> None:
-    if case.measured not in ("body", "material_test", "track"):
-        raise UserError(f"measured = {case.measured!r} is unknown: choose from body, material_test, track")
+    if case.measured not in ("body", "material_test", "track", "guided"):
+        raise UserError(f"measured = {case.measured!r} is unknown: choose from body, material_test, track, guided")
     if case.solver is not None and case.solver not in SOLVERS:
         raise UserError(f"solver = {case.solver!r} is unknown: choose from {', '.join(SOLVERS)}")
-    if case.kind is not None and case.kind != "none":
+    if case.kind is not None and case.kind != "none" and case.measured != "guided":
         for kind in case.kind.split("+"):
             if kind not in KINDS and kind not in OUTSIDE:
                 raise UserError(f"kind = {kind!r} is unknown: choose from none, {', '.join((*KINDS, *OUTSIDE))}, or join two by +")

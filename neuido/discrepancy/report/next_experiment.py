@@ -223,18 +223,22 @@ def _turned(r: Measured, axis: int) -> Measured | None:
 
 
 class _Launches(Problem):
-    """A point mass that is thrown in another way, with data from which the part that a change of the start would explain is removed."""
+    """A point mass that starts in another way, with data from which the part that a change of the start would explain is removed."""
 
-    def __init__(self, problem: Problem, velocity: np.ndarray, t: np.ndarray) -> None:
+    def __init__(self, problem: Problem, velocity: np.ndarray, t: np.ndarray, place: float = 0.0) -> None:
         super().__init__("", "rmse", "m", (), (), (), ())
-        self.inner, self.velocity, self.t = problem, velocity, t
+        self.inner, self.velocity, self.t, self.place = problem, velocity, t, place
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         from neuido.physics.points.point_mass import fly
 
         track = self.inner._flights[self.inner.roles["fit"][0]]
         count = len(points)
-        x = fly(self.t, np.zeros((count, 3)), np.tile(self.velocity, (count, 1)), np.zeros(count), self.inner.forces(points, track))
+        forces, begun = self.inner.forces(points, track), np.zeros((count, 3))
+        begun[:, 0] = self.place
+        if forces.floor_normal is not None:  # from the floor
+            begun += np.asarray(forces.floor_height)[:, None] * forces.floor_normal
+        x = fly(self.t, begun, np.tile(self.velocity, (count, 1)), np.zeros(count), forces)
         basis = np.linalg.qr(np.stack([np.ones_like(self.t), self.t], axis=1))[0]
         return (x - np.einsum("tk,sk,psa->pta", basis, basis, x)).reshape(count, -1)
 
@@ -244,6 +248,10 @@ def _tracks(problem: Problem) -> Iterator[tuple[str, Problem, Any]]:
     t = np.linspace(0.0, max(float(r.times.max()) for r in problem.recordings), 60)
     speed = max(float(np.ptp(r.y)) / max(float(np.ptp(r.times)), 1e-9) for r in problem.recordings)
     noise = problem.error_model
+    constraint = problem.tracks.constraint
+    if constraint is not None and constraint.type != "bounce":
+        yield from _guided(problem, constraint.type, t)
+        return
     for name, v, scale in (
         ("drop it from rest, twice as long", (0.0, 0.0, 0.0), 2.0),
         (f"throw it up at {speed:.2g} m/s", (0.0, speed, 0.0), 1.0),
@@ -253,6 +261,21 @@ def _tracks(problem: Problem) -> Iterator[tuple[str, Problem, Any]]:
     ):
         size = math.hypot(noise.sigma, noise.amplitude)
         yield name, _Launches(problem, np.array(v), scale * t), lambda rows, size=size: np.full(rows.shape[1], size)
+
+
+def _guided(problem: Problem, kind: str, t: np.ndarray) -> Iterator[tuple[str, Problem, Any]]:
+    """Yield other starts of a guided body: name, problem, and function from predictions to their standard deviations (n,)."""
+    track = problem._flights[problem.roles["fit"][0]]
+    reach = 0.5 * float(np.ptp(track.x)) * (problem.tracks.constraint.figures["length"] if track.angle and kind == "pendulum" else 1.0)
+    swings = kind in ("pendulum", "spring")
+    speed = 0.0 if swings else float(np.ptp(track.x)) / max(float(np.ptp(track.t)), 1e-9)
+    size = math.hypot(problem.error_model.sigma, problem.error_model.amplitude)
+    dense = np.linspace(0.0, t[-1], 400)
+    for factor, longer in ((0.5, 1.0), (2.0, 1.0), (1.0, 2.0)):
+        far = "half as" if factor < 1 else "twice as" if factor > 1 else "as"
+        name = f"start it {far} {'far' if swings else 'fast'}" + (" and record twice as long" if longer > 1 else "")
+        start = np.array([factor * speed, 0.0, 0.0])
+        yield name, _Launches(problem, start, longer * dense, factor * reach * swings), lambda rows: np.full(rows.shape[1], size)
 
 
 class _Loads(Problem):

@@ -362,7 +362,7 @@ _FIELDS = {
     f"{entry.name}.{parameter.name}": parameter.field
     for entry in LIBRARY
     for parameter in entry.parameters
-    if parameter.field in Effects._fields
+    if parameter.field in Effects._fields and entry.only != "track"
 }
 """The field of `Effects` that each parameter name of `LIBRARY` sets, whole or as its component x, y or z."""
 

@@ -1,7 +1,7 @@
-"""Entries of the library for the effects that laboratories see in material tests.
+"""Entries of the library for the effects that laboratories see in material tests, and in tracks of points.
 
-Two of them, sums of Maxwell branches, act in bodies too. Rollouts of bodies refuse the others. The ranges are those of soft and hard
-materials alike.
+Two of those of tests, sums of Maxwell branches, act in bodies too. Rollouts of bodies refuse the others. The ranges are those of soft
+and hard materials alike.
 """
 
 from neuido.physics.effects.entry import Entry, Parameter
@@ -184,3 +184,75 @@ POINT_ENTRIES = (
 """One entry for each effect."""
 FLUID = ("power_law", "carreau", "bingham", "herschel_bulkley", "thixotropy")
 """Effects of a declared fluid in steady or changing shear; a solid has none of them, and a fluid no others."""
+
+TRACK_ENTRIES = (
+    Entry(
+        "dry_friction",
+        "dry friction",
+        "a -= c v/|v|",
+        (Parameter("c", "dry_friction", "m/s^2", 0.0, 10.0),),
+        "flight",
+        ("drag_linear", "drag_quadratic"),
+        "Coulomb 1785; of a rolling ball c = g times its coefficient of rolling resistance",
+        needs="a body that is guided: a pendulum, a spring, an axis or a plane",
+        only="track",
+    ),
+    Entry(
+        "local_force",
+        "a force near a place",
+        "a -= a0 r exp((1 - r^2)/2), r = (x - c)/w",
+        (
+            Parameter("a0", "local_force", "m/s^2", -50.0, 50.0, True),
+            *(Parameter(axis, "local_centre", "m", -10.0, 10.0, True) for axis in "xyz"),
+            Parameter("w", "local_width", "m", 1e-3, 2.0),
+        ),
+        "flight",
+        ("position_force", "time_force"),
+        "a bell-shaped potential, as of a magnet beside the path",
+        only="track",
+    ),
+    Entry(
+        "lift",
+        "lift of a disc",
+        "a += |v|^2 (k s e - d s^2 v/|v|), s = sine of the angle of attack",
+        (Parameter("k", "lift", "1/m", -2.0, 2.0, True), Parameter("d", "lift_drag", "1/m", 0.0, 4.0)),
+        "flight",
+        ("magnus", "drag_quadratic", "uniform_acceleration"),
+        "Potts and Crowther 2002; Hummel 2003: lift linear and drag quadratic in the angle of attack",
+        needs="two measured axes, one of them along gravity",
+        only="track",
+    ),
+    Entry(
+        "buoyancy",
+        "buoyancy and the mass of the moved fluid",
+        "a = g (1 - q)/(1 + q/2) without other forces",
+        (Parameter("q", "added_mass", "1", 0.0, 20.0),),
+        "flight",
+        ("gravity", "added_mass", "drag_linear"),
+        "Lamb, Hydrodynamics, 92: a sphere in a fluid, q its density over that of the sphere",
+        only="track",
+    ),
+    Entry(
+        "bounce_friction",
+        "friction and spin in a bounce",
+        "tangential impulse mu times the normal one, until the body rolls",
+        (Parameter("mu", "bounce_friction", "1", 0.0, 2.0),),
+        "contact",
+        ("bounce_speed",),
+        "Garwin 1969; Cross 2002",
+        needs="a declared bounce, and a horizontal axis",
+        only="track",
+    ),
+    Entry(
+        "bounce_speed",
+        "a restitution that depends on the speed",
+        "restitution times (speed in m/s)^-p",
+        (Parameter("p", "restitution_speed", "1", -0.5, 0.5, True),),
+        "contact",
+        ("bounce_friction", "drag_quadratic"),
+        "Johnson, Contact Mechanics, 11.5: p = 1/4 of plastic impacts",
+        needs="a declared bounce, at several speeds",
+        only="track",
+    ),
+)
+"""Effects that the track of a body as a point shows, beside those that bodies have too; their fields are those of `points.Forces`."""

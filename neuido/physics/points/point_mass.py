@@ -1,9 +1,9 @@
 """The point mass: a body whose deformation does not matter, held until its release, then moved by gravity and other forces.
 
 x'' = g / (1 + added_mass) + uniform_acceleration + time_force(t) - drag_linear v - drag_quadratic |v| v + magnus x v
-      - position_force (x - position_centre),
-with the effects of `physics.effects` at the centre of mass. Many parameter sets run as one batch. The motion is integrated by the
-classical Runge-Kutta scheme of fourth order, with cubic Hermite interpolation between its steps.
+      - position_force (x - position_centre) - dry_friction v/|v| - local_force r exp((1 - r^2)/2) + |v|^2 (lift s e - lift_drag s^2 v/|v|),
+with r = (x - local_centre) / local_width, s = -disc_normal . v/|v|, and e the unit vector normal to v in the plane of v and disc_normal. A
+pendulum moves along its arc, the first coordinate. A floor returns the point. Many parameter sets run as one batch (`point_kernels`).
 """
 
 import math
@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.errors import UserError
+from neuido.physics.points.point_kernels import COLUMNS, WIDTHS, build
+from neuido.physics.runtime.limits import check_limit
 from neuido.types import brief_fields
 
 
@@ -38,6 +40,36 @@ class Forces(NamedTuple):
     """Time between two values of `time_force` [s]."""
     added_mass: np.ndarray | float | None = None
     """c of the factor 1 + c on the inertia at unchanged weight [-]."""
+    dry_friction: np.ndarray | float | None = None
+    """c of the acceleration -c v/|v| [m/s^2]; within the speed c times the step it falls to zero."""
+    local_force: np.ndarray | float | None = None
+    """Largest acceleration [m/s^2] towards a place, at the distance `local_width` from it; negative: away from it."""
+    local_centre: np.ndarray | None = None
+    """Place of `local_force` [m], vector; None: the origin."""
+    local_width: np.ndarray | float | None = None
+    """Distance from `local_centre` at which `local_force` is largest [m]; needed with it."""
+    lift: np.ndarray | float | None = None
+    """Lift of a disc, per squared speed and unit of s, the sine of its angle of attack [1/m]."""
+    lift_drag: np.ndarray | float | None = None
+    """Drag of a disc beyond `drag_quadratic`, per squared speed and s^2 [1/m]."""
+    disc_normal: np.ndarray | None = None
+    """Unit normal of the disc, vector; constant in a flight, as the spin holds it."""
+    pendulum: np.ndarray | tuple[float, float] | None = None
+    """Gravity [m/s^2] and length [m] of a pendulum, (2,) or (P, 2): -g sin(x / length) along the first coordinate, which is the arc."""
+    floor_normal: np.ndarray | None = None
+    """Unit normal of a floor, vector; None: no floor."""
+    floor_height: np.ndarray | float | None = None
+    """Coordinate of the point along `floor_normal` at contact [m]."""
+    restitution: np.ndarray | float | None = None
+    """Normal velocity after an impact at 1 m/s over that before it [-]."""
+    restitution_speed: np.ndarray | float | None = None
+    """p of the factor (speed in m/s)^-p on the restitution [-]."""
+    bounce_friction: np.ndarray | float | None = None
+    """Coulomb's friction coefficient of an impact [-]."""
+    roundness: np.ndarray | float | None = None
+    """Moment of inertia over m r^2 [-]: 0.4 of a solid ball, 2/3 of a hollow one. At 0 an impact causes no friction."""
+    surface_velocity: np.ndarray | None = None
+    """Spin times radius at the release [m/s], vector. Impacts change it, and nothing else does."""
 
     def __repr__(self) -> str:
         return brief_fields(self)
@@ -55,7 +87,7 @@ def fly(
     """Simulate the flight of P point masses from their release.
 
     Args:
-        times: Times of the result [s], (n,) or (P, n).
+        times: Times of the result [s], increasing, (n,) or (P, n).
         position: Position until the release [m], (P, 3).
         velocity: Velocity at the release [m/s], (P, 3).
         release: Time of the release [s], (P,); it may lie before the first of `times`.
@@ -66,85 +98,61 @@ def fly(
         Positions [m], (P, n, 3); NaN for a point mass whose motion is not finite.
 
     Raises:
-        UserError: A step that is not positive, or forces whose number of rows is neither one nor P.
+        UserError: A step that is not positive, more steps than `NEUIDO_MAX_STEPS`, times that do not increase, or forces whose number of
+            rows is neither one nor P.
     """
     if not (step > 0 and math.isfinite(step)):
         raise UserError(f"step = {step} s must be positive")
-    position, velocity = np.array(position, dtype=np.float64), np.array(velocity, dtype=np.float64)
+    position, velocity = (np.ascontiguousarray(given, dtype=np.float64) for given in (position, velocity))
     count = len(position)
-    times = np.broadcast_to(times, (count, np.shape(times)[-1]))
-    since = np.maximum(times - np.asarray(release, dtype=np.float64)[:, None], 0.0)
-    duration = float(since.max())
-    steps, h = max(math.ceil(duration / step), 1), step
-    accelerate = _acceleration(forces, count, np.asarray(release, dtype=np.float64))
-    X, V = np.empty((steps + 1, count, 3)), np.empty((steps + 1, count, 3))
-    X[0], V[0] = position, velocity
-    with np.errstate(over="ignore", invalid="ignore"):
-        for i in range(steps):
-            x, v, t = X[i], V[i], i * h
-            a1 = accelerate(x, v, t)
-            v2 = v + h / 2 * a1
-            a2 = accelerate(x + h / 2 * v, v2, t + h / 2)
-            v3 = v + h / 2 * a2
-            a3 = accelerate(x + h / 2 * v2, v3, t + h / 2)
-            v4 = v + h * a3
-            a4 = accelerate(x + h * v3, v4, t + h)
-            X[i + 1] = x + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
-            V[i + 1] = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-        out = _hermite(X, V, since, h)
-    out[~np.isfinite(out).all(axis=(1, 2))] = np.nan
+    times = np.array(np.broadcast_to(times, (count, np.shape(times)[-1])), dtype=np.float64)
+    release = np.array(release, dtype=np.float64)
+    duration = float(np.nanmax(times - release[:, None], initial=0.0))
+    check_limit(math.ceil(duration / step), "NEUIDO_MAX_STEPS", f"a flight of {duration:.4g} s in steps of {step:.4g} s")
+    if (np.diff(times, axis=1) < 0).any():
+        raise UserError("the times of a flight must increase")
+    table, knots, interval = _table(forces, count)
+    finite = np.isfinite(table).all(axis=1) & np.isfinite(np.concatenate([position, velocity, release[:, None]], axis=1)).all(axis=1)
+    finite &= np.isfinite(times).all(axis=1)
+    table[~finite], position, velocity = 0.0, np.where(finite[:, None], position, 0.0), np.where(finite[:, None], velocity, 0.0)
+    times, release = np.where(finite[:, None], times, 0.0), np.where(finite, release, 0.0)
+    out = _move(times, position, velocity, release, table, knots, interval, step)
+    out[~finite | ~np.isfinite(out).all(axis=(1, 2))] = np.nan
     return out
 
 
-def _hermite(X: np.ndarray, V: np.ndarray, since: np.ndarray, h: float) -> np.ndarray:
-    """Interpolate positions, (P, n, 3), at times `since` the release (P, n), from x and v (K, P, 3) at multiples of `h`."""
-    at = np.minimum((since / h).astype(np.int64), len(X) - 2)
-    u = (since / h - at)[..., None]
-    row = np.arange(X.shape[1])[:, None]
-    x0, x1, v0, v1 = X[at, row], X[at + 1, row], V[at, row] * h, V[at + 1, row] * h
-    return x0 + u * v0 + u**2 * (3 * (x1 - x0) - 2 * v0 - v1) + u**3 * (2 * (x0 - x1) + v0 + v1)
+def _move(times, position, velocity, release, table, knots, interval: float, step: float) -> np.ndarray:
+    """Run the kernel on the CPU; return positions (P, n, 3)."""
+    import warp as wp
+
+    kernel = build()
+
+    def array(values: np.ndarray, dtype: type) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device="cpu")
+
+    out = wp.empty(times.shape, dtype=wp.vec3d, device="cpu")
+    given = [array(times, wp.float64), array(position, wp.vec3d), array(velocity, wp.vec3d), array(release, wp.float64)]
+    given += [array(table, wp.float64), array(knots, wp.vec3d), interval, step]
+    wp.launch(kernel, dim=len(times), inputs=given, outputs=[out], device="cpu")
+    return out.numpy().copy()
 
 
-def _acceleration(forces: Forces, count: int, release: np.ndarray):
-    """Return a function of x (P, 3), v (P, 3) and the time since the release that gives the acceleration [m/s^2], (P, 3)."""
-
-    def scalar(name: str) -> np.ndarray | None:
+def _table(forces: Forces, count: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return forces as the table of the kernel (P, M), the knots of `time_force` (P, J, 3) and their interval [s], 0 without a force."""
+    table = np.zeros((count, sum(WIDTHS.values())))
+    for name, width in WIDTHS.items():
         value = getattr(forces, name)
-        return None if value is None else _rows(value, count, (), name)[:, None]
-
-    constant = _rows(forces.gravity, count, (3,), "gravity")
-    if (added := scalar("added_mass")) is not None:
-        constant = constant / (1 + added)
-    if forces.uniform_acceleration is not None:
-        constant = constant + _rows(forces.uniform_acceleration, count, (3,), "uniform_acceleration")
-    linear, quadratic, pull = scalar("drag_linear"), scalar("drag_quadratic"), scalar("position_force")
-    centre = _rows(np.zeros(3) if forces.position_centre is None else forces.position_centre, count, (3,), "position_centre")
-    spin = None if forces.magnus is None else _rows(forces.magnus, count, (3,), "magnus")
-    knots = None
-    if forces.time_force is not None:
-        shape = np.shape(forces.time_force)[-2:]
-        knots = _rows(forces.time_force, count, shape, "time_force")
-        if not forces.time_force_interval > 0:
-            raise UserError(f"time_force_interval = {forces.time_force_interval} s must be positive")
-
-    def accelerate(x: np.ndarray, v: np.ndarray, t: float) -> np.ndarray:
-        a = constant
-        if linear is not None:
-            a = a - linear * v
-        if quadratic is not None:
-            a = a - quadratic * np.sqrt((v * v).sum(1, keepdims=True)) * v
-        if spin is not None:
-            a = a + np.cross(spin, v)
-        if pull is not None:
-            a = a - pull * (x - centre)
-        if knots is not None:
-            u = np.clip((t + release) / forces.time_force_interval, 0, knots.shape[1] - 1)
-            low = np.minimum(u.astype(np.int64), max(knots.shape[1] - 2, 0))
-            share, row = (u - low)[:, None], np.arange(count)
-            a = a + (1 - share) * knots[row, low] + share * knots[row, np.minimum(low + 1, knots.shape[1] - 1)]
-        return a
-
-    return accelerate
+        if value is not None:
+            rows = _rows(value, count, () if width == 1 else (width,), name)
+            table[:, COLUMNS[name] : COLUMNS[name] + width] = rows.reshape(count, width)
+    if forces.local_force is not None and (table[:, COLUMNS["local_width"]] <= 0).any():
+        raise UserError("local_force needs a local_width above zero")
+    if forces.time_force is None:
+        return table, np.zeros((count, 1, 3)), 0.0
+    if not forces.time_force_interval > 0:
+        raise UserError(f"time_force_interval = {forces.time_force_interval} s must be positive")
+    knots = _rows(forces.time_force, count, np.shape(forces.time_force)[-2:], "time_force")
+    return table, np.array(knots), float(forces.time_force_interval)
 
 
 def _rows(value, count: int, shape: tuple[int, ...], name: str) -> np.ndarray:

@@ -27,7 +27,7 @@ from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.body import BodyProblem, body_problem
 from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.problem import Problem
-from neuido.discrepancy.problems.tracks import track_problems
+from neuido.discrepancy.problems.tracks.track_problem import track_problems
 from neuido.discrepancy.report import answer, residual
 from neuido.discrepancy.report.answer_content import motions
 from neuido.discrepancy.store import CachedProblem

@@ -21,7 +21,7 @@ from neuido.discrepancy.inference.search.intervals import findings
 from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.noise import correlation, surface
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
-from neuido.discrepancy.problems.tracks import TrackProblem, track_problems
+from neuido.discrepancy.problems.tracks.track_problem import TrackProblem, track_problems
 from neuido.discrepancy.report import answer, answer_content
 from neuido.errors import UserError
 from tests.discrepancy import made

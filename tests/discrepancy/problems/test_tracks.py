@@ -7,7 +7,7 @@ import yaml
 from neuido.data.measured.track import read_tracks
 from neuido.discrepancy.inference.least_squares import levenberg_marquardt, run
 from neuido.discrepancy.problems.noise import correlation
-from neuido.discrepancy.problems.tracks import TrackProblem, flight_of, track_problems
+from neuido.discrepancy.problems.tracks.track_problem import TrackProblem, flight_of, track_problems
 from neuido.physics.points.point_mass import Forces, fly
 
 T = np.arange(0, 3.0, 1 / 15)
@@ -130,7 +130,7 @@ def test_spin_gives_a_coefficient(tmp_path):
 def test_frames_after_the_landing_are_left_out(tmp_path):
     folder = write(tmp_path, {"stone": Forces()}, impact=True)
     tracks = read_tracks(folder)
-    assert [len(flight_of(track, tracks.gravity).t) for track in tracks.recordings] == [len(T) - 2] * 2
+    assert [len(flight_of(track, tracks).t) for track in tracks.recordings] == [len(T) - 2] * 2
     assert [len(r.y) for r in track_problems(folder)[0].recordings] == [43, 43 - math.ceil(0.4 * 43)]
 
 

@@ -13,7 +13,7 @@ from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial
 from neuido.discrepancy.inference.least_squares import Fit
 from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.discrepancy.problems.body import body_problem
-from neuido.discrepancy.problems.tracks import TrackProblem
+from neuido.discrepancy.problems.tracks.track_problem import TrackProblem
 from neuido.discrepancy.report import next_experiment
 from tests.discrepancy import made
 

@@ -1,77 +1,108 @@
-"""The nuisances of a track (start of the flight, clock, length scale), and their estimate from its first frames."""
+"""The nuisances of a track (start of the motion, clock, length scale, spin, attitude), and their estimate from its first frames."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from neuido.data.measured.track import AXES, Track
+from neuido.data.measured.track import AXES
 from neuido.discrepancy.problems.noise import SeriesError
 from neuido.discrepancy.problems.problem import Parameter
+from neuido.discrepancy.problems.tracks.guides import Guide
+from neuido.physics.points.point_kernels import WIDTHS
 from neuido.physics.points.point_mass import Forces, fly
 
 LARGEST_ERROR = 2.0
 """Largest error of a clock or length scale, in standard deviations of its prior."""
-VELOCITY_FRAMES = 4
-"""Number of frames for the first estimate of the velocity."""
+FARTHEST = 5.0
+"""Largest error of a spin or an attitude, in standard deviations of its prior."""
+UNKNOWN_SPIN = 0.5
+"""Relative standard deviation of the spins of recordings about their common spin, where none is stated."""
 ITERATIONS = 25
 """Largest number of steps of the least-squares fit."""
 PROBE = 1e-3
 """Step of the finite differences, in units of `Parameter.scale`."""
-CONVERGED = 1e-5
+CONVERGED = 1e-4
 """Step at which the fit has converged, in units of `Parameter.scale`."""
 LONGEST, LEAST_STEPS = 0.05, 60
 """Largest time step of the integration [s], and least number of steps per recording."""
+BLOCK = 1000
+"""Samples whose slow tracking errors are correlated at the most; longer series are divided, which bounds the memory."""
 
 
 class Released:
-    """One recording of a body that is held until its release and then flies, with the errors of its instruments.
+    """One recording of a body that is held until its release and then moves, with the errors of its instruments.
 
-    Its parameters are position [m] and velocity [m/s] along each measured axis, then `release_time` [s], `length_scale` [-] and
-    `time_base` [-] where the folder gives them a standard deviation. Each name is followed by a colon and the name of the recording.
-    A time t in the file is the true time (1 + time_base) t. A displacement from the place of release is measured (1 + length_scale)
-    times too large.
+    Its parameters are those of its guide (in free flight position [m] and velocity [m/s] along each measured axis), then `release_time`
+    [s], `length_scale` [-] and `time_base` [-] where the folder gives them a standard deviation, and the deviations of spin and attitude
+    where an effect depends on them. Each name is followed by a colon and the name of the recording. A time t in the file is the true time
+    (1 + time_base) t. A displacement from the place of release is measured (1 + length_scale) times too large.
 
     Args:
-        track: The recording.
-        nuisances: Prior standard deviation of `release_time` [s], `length_scale` [-] and `time_base` [-]; 0: without error.
-        gravity: Acceleration of gravity [m/s^2], (3,).
-        error: Error of the tracked positions [m].
+        guide: The guide of the recording.
+        nuisances: Standard deviation of the nuisances; 0: without error.
+        error: Error of the tracked positions, in the unit of the data.
+        period: Shortest period of the declared model [s]; infinite where nothing swings.
+        spin: Axes along which a spin shows.
+        attitude: Axes along which the attitude of a disc may be tilted.
     """
 
-    def __init__(self, track: Track, nuisances: Mapping[str, float], gravity: Sequence[float], error: SeriesError) -> None:
-        self.track, self.error = track, error
-        sigma = error.sigma if track.noise is None else track.noise
-        n = min(VELOCITY_FRAMES, len(track.t))
-        span = float(track.t[n - 1] - track.t[0])
-        slope = np.polyfit(track.t[:n], track.x[:n], 1)[0]
-        extent = max(float(np.ptp(track.x)), 10 * sigma)
-        size = max(float(np.linalg.norm(gravity)), 1e-3)
-        # noise and gravity alone change the slope of the first frames by this much
-        spread = float(np.hypot(2 * sigma / span, size * span))
-        out = []
-        for a, at in zip(track.axes, np.median(track.x[:3], axis=0), strict=True):
-            step = max(3 * sigma, 1e-3 * extent)
-            out.append(Parameter(f"position_{AXES[a]}:{track.name}", "m", float(at), step, at - extent, at + extent))
-        for a, speed in zip(track.axes, slope):
-            lower, upper = speed - 5 * spread, speed + 5 * spread
-            out.append(Parameter(f"velocity_{AXES[a]}:{track.name}", "m/s", float(speed), spread / 4, lower, upper, prior=4.0))
+    def __init__(
+        self,
+        guide: Guide,
+        nuisances: Mapping[str, float],
+        error: SeriesError,
+        *,
+        period: float = np.inf,
+        spin: tuple[int, ...] = (),
+        attitude: tuple[int, ...] = (),
+    ) -> None:
+        self.guide, self.track, self.error = guide, guide.track, error
+        out, track = guide.parameters(), guide.track
         for name, unit in (("release_time", "s"), ("length_scale", "1"), ("time_base", "1")):
             sd = nuisances[name]
-            if sd > 0:
+            if sd > 0 and not (name == "length_scale" and track.angle):
                 out.append(Parameter(f"{name}:{track.name}", unit, 0.0, sd / 4, -LARGEST_ERROR * sd, LARGEST_ERROR * sd, prior=4.0))
+        of_spin = max(nuisances["spin"], UNKNOWN_SPIN) if track.spin is None and nuisances["spin"] > 0 else nuisances["spin"]
+        for name, axes, sd in (("spin", spin, of_spin), ("attitude", attitude, nuisances["attitude"])):
+            for a in axes if sd > 0 else ():
+                limit = FARTHEST * sd
+                out.append(Parameter(f"{name}_{AXES[a]}:{track.name}", "1", 0.0, sd / 4, -limit, limit, prior=4.0))
         self.parameters: tuple[Parameter, ...] = tuple(out)
+        self.names = [p.name.partition(":")[0] for p in out]
+        self.step = min(LONGEST, float(np.ptp(track.t)) / LEAST_STEPS, period / LEAST_STEPS)
+        self._factors: dict[int, list[np.ndarray]] = {}
 
     def seen(self, values: np.ndarray, forces: Forces, t: np.ndarray) -> np.ndarray:
-        """Predict the measured coordinates [m], (P, n, A) for A axes, at times t (n,) [s] for P rows of parameters (P, k)."""
-        axes, count = list(self.track.axes), len(values)
-        x, v = np.zeros((count, 3)), np.zeros((count, 3))
-        x[:, axes], v[:, axes] = values[:, : len(axes)], values[:, len(axes) : 2 * len(axes)]
-        off = dict.fromkeys(("release_time", "length_scale", "time_base"), np.zeros(count))
-        for i, p in enumerate(self.parameters[2 * len(axes) :], 2 * len(axes)):
-            off[p.name.partition(":")[0]] = values[:, i]
-        step = min(LONGEST, float(np.ptp(self.track.t)) / LEAST_STEPS)
-        moved = fly((1 + off["time_base"])[:, None] * t, x, v, off["release_time"], forces, step=step)
-        return (x[:, None] + (1 + off["length_scale"])[:, None, None] * (moved - x[:, None]))[..., axes]
+        """Predict the measured coordinates, (P, n, A) for A axes, at times t (n,) [s] for P rows of parameters (P, k)."""
+        count = len(values)
+        own = dict(zip(self.names, values.T, strict=True))
+        if forces.pendulum is not None:
+            own["length"] = np.broadcast_to(np.asarray(forces.pendulum, dtype=np.float64), (count, 2))[:, 1]
+        x, v = self.guide.begin(own)
+        zero = np.zeros(count)
+        times = (1 + own.get("time_base", zero))[:, None] * t
+        moved = fly(times, x, v, own.get("release_time", zero), self.turned(forces, own, count), step=self.step)
+        if "length_scale" not in own:
+            return self.guide.seen(moved, own)
+        first = self.guide.seen(x[:, None], own)
+        return first + (1 + own["length_scale"])[:, None, None] * (self.guide.seen(moved, own) - first)
+
+    def turned(self, forces: Forces, own: Mapping[str, np.ndarray], count: int) -> Forces:
+        """Return the forces with the spin and the attitude of this recording."""
+        off = {name: np.zeros((count, 3)) for name in ("spin", "attitude")}
+        for name, rows in off.items():
+            for i, a in enumerate(AXES):
+                rows[:, i] = own.get(f"{name}_{a}", 0.0)
+        changed = {}
+        for name in ("magnus", "surface_velocity"):
+            value = getattr(forces, name)
+            if value is not None and off["spin"].any():
+                value = np.broadcast_to(np.asarray(value, dtype=np.float64), (count, 3))
+                changed[name] = value + np.linalg.norm(value, axis=1, keepdims=True) * off["spin"]
+        if forces.disc_normal is not None:
+            normal = np.broadcast_to(np.asarray(forces.disc_normal, dtype=np.float64), (count, 3)) + off["attitude"]
+            changed["disc_normal"] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        return forces._replace(**changed)
 
     def off_prior(self, values: np.ndarray) -> np.ndarray:
         """Return the deviation of parameters (P, k) from their priors in standard deviations, a column per parameter with a prior."""
@@ -80,14 +111,20 @@ class Released:
 
     @property
     def variance(self) -> float:
-        """Variance of the tracking error of a coordinate [m^2]: of the stated noise, or of the estimated error with its slow part."""
+        """Variance of the tracking error of a coordinate: of the stated noise, or of the estimated error with its slow part."""
         return self.error.sigma**2 + self.error.amplitude**2 if self.track.noise is None else self.track.noise**2
 
-    def whitener(self, t: np.ndarray) -> np.ndarray:
-        """Return the matrix (n, n) [1/m] that turns tracking errors at times t (n,) into independent ones of variance one."""
-        if self.track.noise is not None:
-            return np.eye(len(t)) / self.track.noise
-        return np.linalg.inv(np.linalg.cholesky(self.error.covariance(t)))
+    def whiten(self, errors: np.ndarray) -> np.ndarray:
+        """Turn tracking errors of the first n frames (P, n, A) into independent ones of variance one."""
+        if self.track.noise is not None or self.error.amplitude == 0.0:
+            return errors / self.variance**0.5
+        n = errors.shape[1]
+        if n not in self._factors:
+            parts = [self.track.t[i : min(i + BLOCK, n)] for i in range(0, n, BLOCK)]
+            self._factors[n] = [np.linalg.inv(np.linalg.cholesky(self.error.covariance(t))) for t in parts]
+        cuts = range(0, n, BLOCK)
+        done = [np.einsum("ij,pja->pia", w, errors[:, i : i + BLOCK]) for i, w in zip(cuts, self._factors[n], strict=True)]
+        return np.concatenate(done, axis=1)
 
 
 def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarray:
@@ -107,7 +144,6 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
     """
     parameters, track = start.parameters, start.track
     t, y = track.t[:frames], track.x[:frames]
-    whiten = start.whitener(t)
     scale, centre, low, high = (np.array([getattr(p, key) for p in parameters]) for key in ("scale", "value", "lower", "upper"))
     release = [i for i, p in enumerate(parameters) if p.name.startswith("release_time")]
     begun = [centre, centre + np.array([(p.prior or 0.0) * p.scale if i in release else 0.0 for i, p in enumerate(parameters)])]
@@ -121,7 +157,7 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
         step = np.where(v + PROBE * scale > high, -PROBE, PROBE)
         probes = np.concatenate([v[None], v[None] + np.eye(k)[:, None] * (step * scale)[None]]).reshape(-1, k)
         seen = start.seen(probes, forces, t) - y
-        r = np.einsum("ij,pja->pia", whiten, seen).reshape(len(probes), -1)
+        r = start.whiten(seen).reshape(len(probes), -1)
         r = np.concatenate([r, start.off_prior(probes)], axis=1)
         r = r.reshape(k + 1, rows, -1)
         return r[0], np.moveaxis(r[1:] - r[0], 0, -1) / step[:, None, :]
@@ -167,7 +203,7 @@ def settled_error(start: Released, forces: Forces, frames: int) -> float:
     probes = np.concatenate([values, values + PROBE * np.diag(scale)])
     seen = start.seen(probes, _repeated(forces, 1, len(probes)), t)
     J = np.moveaxis(seen[1:] - seen[0], 0, -1) / PROBE  # (n, A, k)
-    early = np.einsum("ij,jak->iak", start.whitener(t[:frames]), J[:frames]).reshape(-1, len(parameters))
+    early = np.moveaxis(start.whiten(np.moveaxis(J[:frames], -1, 0)), 0, -1).reshape(-1, len(parameters))
     information = early.T @ early + np.diag([p.prior**-2 if p.prior is not None else 0.0 for p in parameters])
     spread = np.einsum("nak,kl,nal->na", J[frames:], np.linalg.pinv(information), J[frames:])
     return float(np.sqrt(spread.mean() + start.variance))
@@ -179,7 +215,7 @@ def _repeated(forces: Forces, count: int, times: int) -> Forces:
     for name, value in forces._asdict().items():
         if value is not None and name != "time_force_interval":
             value = np.asarray(value, dtype=np.float64)
-            shape = {"time_force": 2, "gravity": 1, "uniform_acceleration": 1, "magnus": 1, "position_centre": 1}.get(name, 0)
+            shape = 2 if name == "time_force" else int(WIDTHS[name] > 1)
             if value.ndim > shape and len(value) == count and count > 1:
                 value = np.tile(value, (times, *([1] * shape)))
         fields[name] = value

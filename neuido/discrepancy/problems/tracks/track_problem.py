@@ -1,32 +1,29 @@
-"""Tracks as `Problem`s, one per body: a point mass under gravity, measured with errors of clock and length scale."""
+"""Tracks as `Problem`s, one per body: a point mass that flies or is guided, measured with errors of clock and length scale."""
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
-from neuido.data.measured.track import AXES, Track, Tracks, read_tracks
+from neuido.data.measured.track import AIR, AXES, Track, Tracks, read_tracks
 from neuido.discrepancy.problems.noise import SeriesError, correlation, high_pass
-from neuido.discrepancy.problems.problem import Candidate, Parameter, Point, Problem, Recording
-from neuido.discrepancy.problems.released import Released, settle, settled_error
+from neuido.discrepancy.problems.problem import Point, Problem, Recording
+from neuido.discrepancy.problems.tracks.guides import guide_of, normal_of
+from neuido.discrepancy.problems.tracks.released import Released, settle, settled_error
+from neuido.discrepancy.problems.tracks.track_candidates import declared_parameter, track_candidates
 from neuido.physics.effects.library import KNOTS
-from neuido.physics.effects.parameters import LIBRARY
 from neuido.physics.points.point_mass import Forces
 
 SURROUNDINGS = ("gravity", "uniform_acceleration", "position_force", "time_force")
 """Effects of the surroundings, which are the same for all bodies of a folder. All others belong to a body."""
+MOST_FRAMES = 3000
+"""Frames of a recording that are fitted at the most, evenly spread: more add time and hardly any information."""
 EARLY = 0.4
 """Share of the frames of a held-out recording that determine its start and are not scored."""
-AIR = 1.2
-"""Density of air [kg/m^3]."""
-LIGHTEST, SMALLEST = 30.0, 0.02
-"""Least density [kg/m^3] and diameter [m] of a body, assumed where the folder does not give them."""
-LARGEST_DRAG = 2.0
-"""Upper limit of the drag coefficient of a compact body."""
 IMPACT = 4.0
 """Loss of speed between two frames that counts as an impact, in standard deviations of the noise."""
 DISAGREE = 1e-3
@@ -43,7 +40,7 @@ class TrackProblem(Problem):
     The body is held until its release and then flies. Position, velocity, release time, length scale and time base of each recording are
     nuisances. `predict` fits them anew for every parameter set (`released.settle`), with the priors of the folder: to all frames of a
     `fit` recording, and to the first 40 % of a held-out one, of which only the later frames are scored. The inference has no nuisances.
-    Frames after an impact at the end of a track are left out (`flight_of`). Times count from the first sample of each recording.
+    Frames after an impact at the end of a flight are left out (`flight_of`). Times count from the first sample of each recording.
 
     Args:
         tracks: The folder's content.
@@ -53,23 +50,52 @@ class TrackProblem(Problem):
     def __init__(self, tracks: Tracks, body: str) -> None:
         tracks = from_first_samples(tracks)
         self.tracks, self.body = tracks, body
-        self._flights = [flight_of(track, tracks.gravity) for track in tracks.recordings if track.body == body]
+        self._flights = [flight_of(track, tracks) for track in tracks.recordings if track.body == body]
         self.error_model = tracking_error(tracks)
-        self._starts = [Released(track, tracks.nuisances, tracks.gravity, self.error_model) for track in self._flights]
         candidates = track_candidates(tracks, body, self._flights)
         self.axes = tuple(sorted({a for track in self._flights for a in track.axes}))
         interval = max(float(np.ptp(track.t)) for track in tracks.recordings) / (KNOTS - 1)  # the same for all bodies
         self._partners = {p.name: p.value for c in candidates for p in c.parameters} | {"time_force.interval": interval} | tracks.effects
+        self._starts = [self._released(track, {c.name for c in candidates}) for track in self._flights]
         super().__init__(
             name=f"{tracks.name}: {body}",
             measure="rmse",
-            unit="m",
-            declared=tuple(_declared(tracks, name) for name in tracks.free),
+            unit="rad" if self._flights[0].angle else "m",
+            declared=tuple(declared_parameter(tracks, name, self._flights) for name in tracks.free),
             nuisances=(),
             candidates=candidates,
             recordings=tuple(map(self._recording, self._flights, self._starts)),
             labels={"kind": "track", "body": body},
         )
+
+    def _released(self, track: Track, effects: set[str]) -> Released:
+        """Return the nuisances of a recording."""
+        tracks = self.tracks
+        sigma = self.error_model.sigma if track.noise is None else track.noise
+        kind = None if tracks.constraint is None else tracks.constraint.type
+        pull = self._stiffness({})
+        rate = math.sqrt(pull) if kind != "pendulum" else math.sqrt(np.linalg.norm(tracks.gravity) / tracks.constraint.figures["length"])
+        guide = guide_of(track, tracks.constraint, sigma, tracks.gravity, pull)
+        known = effects | {name.partition(".")[0] for name in tracks.effects}
+        spins = "magnus" in known or (kind == "bounce" and track.spin is not None)
+        spin = (0, 1, 2) if len(track.axes) == 3 else tuple(a for a in range(3) if a not in track.axes)
+        level = [a for a in track.axes if not abs(normal_of(None, tracks.gravity)[a]) > 0.9]
+        return Released(
+            guide,
+            tracks.nuisances,
+            self.error_model,
+            period=2 * math.pi / rate if rate > 0 else math.inf,
+            spin=spin if spins else (),
+            attitude=tuple(level) if "lift" in known else (),
+        )
+
+    def _stiffness(self, point: Point) -> float:
+        """Return the squared angular frequency of a spring or an axis in a parameter set [1/s^2]; 0 without one."""
+        constraint = self.tracks.constraint
+        if constraint is None or "stiffness" not in constraint.figures:
+            return 0.0
+        mass = self.tracks.bodies[self.body]["mass"] if constraint.type == "spring" else 1.0
+        return float(point.get("stiffness", constraint.figures["stiffness"])) / mass
 
     def _recording(self, track: Track, start: Released) -> Recording:
         """Return the scored frames of a track as a recording.
@@ -118,15 +144,22 @@ class TrackProblem(Problem):
         more = rows("gravity.g")
         down = gravity / size if size > 0 else np.zeros(3)
         magnus = vectors("magnus")
-        lift = rows("magnus.coefficient")
-        if lift is not None:
-            magnus = (0.0 if magnus is None else magnus) + lift[:, None] * np.array(track.spin)
+        coefficient = rows("magnus.coefficient")
+        if coefficient is not None:
+            magnus = (0.0 if magnus is None else magnus) + coefficient[:, None] * np.array(track.spin)
         knots = [vectors("time_force", f"{{}}{j}") for j in range(KNOTS)]
         force = None
         if any(k is not None for k in knots):
             force = np.stack([np.zeros((len(points), 3)) if k is None else k for k in knots], 1)
-        return Forces(
-            gravity=(sizes if more is None else sizes + more)[:, None] * down,
+        sizes = sizes if more is None else sizes + more
+        added, fluid = rows("added_mass.c"), rows("buoyancy.q")
+        if fluid is not None:
+            sizes, added = sizes * (1 - fluid), (1 + (0.0 if added is None else added)) * (1 + 0.5 * fluid) - 1
+        attitude = normal_of(None, self.tracks.gravity) if track.attitude is None else np.array(track.attitude)
+        lift, lift_drag = rows("lift.k"), rows("lift.d")
+        local = rows("local_force.a0")
+        free = Forces(
+            gravity=sizes[:, None] * down,
             uniform_acceleration=vectors("uniform_acceleration"),
             drag_linear=rows("drag_linear.k"),
             drag_quadratic=rows("drag_quadratic.k"),
@@ -135,7 +168,44 @@ class TrackProblem(Problem):
             position_centre=vectors("position_force"),
             time_force=force,
             time_force_interval=float(self._partners.get("time_force.interval", 1.0)),
-            added_mass=rows("added_mass.c"),
+            added_mass=added,
+            dry_friction=rows("dry_friction.c"),
+            local_force=local,
+            local_centre=None if local is None else vectors("local_force"),
+            local_width=None if local is None else rows("local_force.w"),
+            lift=lift,
+            lift_drag=lift_drag,
+            disc_normal=None if lift is None and lift_drag is None else attitude / np.linalg.norm(attitude),
+        )
+        return free if self.tracks.constraint is None else self._guided(free, points, track, sizes)
+
+    def _guided(self, free: Forces, points: Sequence[Point], track: Track, gravity: np.ndarray) -> Forces:
+        """Return the forces on a body that its constraint guides, from those in flight and the size of gravity (P,)."""
+        constraint = self.tracks.constraint
+        given = {name: np.array([float(p.get(name, value)) for p in points]) for name, value in constraint.figures.items()}
+        normal = normal_of(constraint, self.tracks.gravity)
+        if constraint.type == "pendulum":
+            return free._replace(gravity=(0.0, 0.0, 0.0), pendulum=np.stack([gravity, given["length"]], axis=1))
+        if constraint.type in ("spring", "axis"):
+            pull = np.array([self._stiffness(p) for p in points])
+            more = 0.0 if free.position_force is None else free.position_force
+            return free._replace(gravity=(0.0, 0.0, 0.0), position_force=pull + more, position_centre=None)
+        if constraint.type == "plane":
+            whole = np.broadcast_to(free.gravity, (len(points), 3))
+            return free._replace(gravity=(whole - (whole @ normal)[:, None] * normal) / (1 + given["inertia"])[:, None])
+        more = [
+            np.array([float(p.get(name, self._partners.get(name, 0.0))) for p in points])
+            for name in ("bounce_friction.mu", "bounce_speed.p")
+        ]
+        radius = 0.5 * self.tracks.bodies[self.body].get("diameter", 0.0)
+        return free._replace(
+            floor_normal=normal,
+            floor_height=given["floor"],
+            restitution=given["restitution"],
+            restitution_speed=more[1],
+            bounce_friction=given["friction"] + more[0],
+            roundness=given["inertia"],
+            surface_velocity=None if track.spin is None else radius * np.array(track.spin),
         )
 
     def surroundings_estimates(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -162,7 +232,7 @@ class TrackProblem(Problem):
         for n in self.roles["fit"] if spans else ():
             seen, values = self._profile(asked, n)
             start = self._starts[n]
-            r = np.einsum("ij,pja->pia", start.whitener(self._flights[n].t), seen - self._flights[n].x).reshape(len(asked), -1)
+            r = start.whiten(seen - self._flights[n].x).reshape(len(asked), -1)
             r = np.concatenate([r, start.off_prior(values)], axis=1)
             columns.append((r[1:] - r[0]).T)
             left.append(r[0])
@@ -184,10 +254,17 @@ class TrackProblem(Problem):
         if "gravity" in values and np.linalg.norm(gravity) > 0:
             gravity = gravity / np.linalg.norm(gravity) * values["gravity"]
         own = {p.name: p.value for c in self.candidates if c.name in effects for p in c.parameters}
+        more: dict[str, Any] = {}
+        if (constraint := self.tracks.constraint) is not None:
+            figures = {name: float(values.get(name, figure)) for name, figure in constraint.figures.items()}
+            normal = {} if constraint.normal is None else {"normal": list(constraint.normal)}
+            more["constraint"] = {"type": constraint.type} | figures | normal
+        if self.tracks.fluid_density != AIR:
+            more["fluid_density"] = self.tracks.fluid_density
         own |= {name: float(value) for name, value in values.items() if name.partition(".")[0] in effects and "." in name}
         if any(name.startswith("time_force.") for name in own):
             own["time_force.interval"] = float(self._partners["time_force.interval"])
-        return {"gravity": gravity.tolist(), "effects": self.tracks.effects | own, "free": list(self.tracks.free)}
+        return {"gravity": gravity.tolist(), "effects": self.tracks.effects | own, "free": list(self.tracks.free)} | more
 
 
 def track_problems(folder: str | os.PathLike | Tracks) -> tuple[TrackProblem, ...]:
@@ -261,16 +338,20 @@ def from_first_samples(tracks: Tracks) -> Tracks:
     return replace(tracks, recordings=tuple(replace(track, t=track.t - track.t[0]) for track in tracks.recordings))
 
 
-def flight_of(track: Track, gravity: Sequence[float]) -> Track:
-    """Remove the frames after an impact at the end of a track.
+def flight_of(track: Track, tracks: Tracks) -> Track:
+    """Return the frames of a recording that are fitted.
 
-    An impact is a sudden loss of speed along the mean motion of the five frames before. It must exceed four standard deviations of the
-    noise (`IMPACT`) and three times the loss that gravity could cause. Only the last six frames are searched.
+    At most `MOST_FRAMES` are taken, and in free flight the frames after an impact at the end of a track are removed. An impact is a sudden
+    loss of speed along the mean motion of the five frames before. It must exceed four standard deviations of the noise (`IMPACT`) and three
+    times the loss that gravity could cause. Only the last six frames are searched.
     """
+    every = math.ceil(len(track.t) / MOST_FRAMES)
+    if tracks.constraint is not None:
+        return replace(track, t=track.t[::every], x=track.x[::every])
     step, dt = np.diff(track.x, axis=0), np.diff(track.t)
     sigma = track.noise or high_pass([(track.t, channel) for channel in track.x.T]) or 0.0
     velocity = step / dt[:, None]
-    g = max(float(np.linalg.norm(gravity)), 1e-9)
+    g = max(float(np.linalg.norm(tracks.gravity)), 1e-9)
     for i in range(max(len(velocity) - 5, 6), len(velocity)):
         mean = np.median(velocity[i - 5 : i], axis=0)
         speed = float(np.linalg.norm(mean))
@@ -278,12 +359,9 @@ def flight_of(track: Track, gravity: Sequence[float]) -> Track:
             continue
         lost = speed - float(velocity[i] @ mean) / speed
         if lost > max(IMPACT * math.sqrt(2) * sigma / dt[i], 3 * g * dt[i]):
-            return _cut(track, i + 1)
-    return track
-
-
-def _cut(track: Track, n: int) -> Track:
-    return Track(track.name, track.body, track.role, track.t[:n], track.x[:n], track.axes, track.spin, track.noise)
+            track = replace(track, t=track.t[: i + 1], x=track.x[: i + 1])
+            break
+    return replace(track, t=track.t[::every], x=track.x[::every])
 
 
 def _early(track: Track) -> int:
@@ -293,74 +371,5 @@ def _early(track: Track) -> int:
 
 def tracking_error(tracks: Tracks) -> SeriesError:
     """Estimate noise and slow error of the tracking from the `fit` recordings of all bodies (`noise.correlation`)."""
-    flights = [flight_of(track, tracks.gravity) for track in tracks.of("fit")]
+    flights = [flight_of(track, tracks) for track in tracks.of("fit")]
     return correlation([(track.t, channel) for track in flights for channel in track.x.T])
-
-
-def track_candidates(tracks: Tracks, body: str, flights: Sequence[Track]) -> tuple[Candidate, ...]:
-    """Return the effects that a body may lack, with ranges and starts scaled by its motion; vectors have the measured axes alone.
-
-    Args:
-        tracks: The folder's content.
-        body: Name of the body.
-        flights: Recordings of the body without impacts.
-    """
-    fits = [track for track in flights if track.role == "fit"]
-    duration = max(float(np.ptp(track.t)) for track in flights)
-    speed = max(float(np.linalg.norm(np.ptp(track.x, axis=0))) / float(np.ptp(track.t)) for track in fits)
-    axes = sorted({a for track in fits for a in track.axes})
-    names = [AXES[a] for a in axes]
-    g = float(np.linalg.norm(tracks.gravity)) or 9.81
-    figures = tracks.bodies[body]
-    diameter = figures.get("diameter", SMALLEST)
-    density = LIGHTEST
-    if len(figures) == 2:
-        density = figures["mass"] / (math.pi / 6 * diameter**3)
-    most = 0.75 * AIR * LARGEST_DRAG / (density * diameter)  # drag per mass of a sphere [1/m]
-    out: list[Candidate] = []
-
-    def add(name: str, start: Mapping[str, float], *parameters: tuple, sizes: str = "", others: Sequence[Mapping[str, float]] = ()) -> None:
-        """Add a candidate with parameters (name, typical step, lower, upper); `sizes` are zero when it is absent (all where empty)."""
-        entry = next(entry for entry in LIBRARY if entry.name == name)
-        units = {p.name: p.unit for p in entry.parameters} | {"coefficient": "1"}
-        made = []
-        for key, scale, lower, upper in parameters:
-            value = tracks.effects.get(f"{name}.{key}", start[key] if sizes and key not in sizes.split() else 0.0)
-            made.append(Parameter(f"{name}.{key}", units[key], value, scale, min(lower, value), max(upper, value)))
-        starts = tuple({f"{name}.{k}": float(v) for k, v in one.items()} for one in (start, *others))
-        out.append(Candidate(name, tuple(made), starts, entry.stage, sizes=tuple(f"{name}.{k}" for k in sizes.split())))
-
-    if any(abs(tracks.gravity[a]) > 0 for a in axes) and "gravity" not in tracks.free:
-        add("gravity", {"g": 0.05 * g}, ("g", 0.03 * g, -0.5 * g, 0.5 * g))
-    add("uniform_acceleration", dict.fromkeys(names, 0.05 * g), *((a, 0.03 * g, -0.5 * g, 0.5 * g) for a in names))
-    k = min(0.1 / (duration * speed), most / 2)
-    add("drag_linear", {"k": k * speed}, ("k", k * speed, 0.0, 2 * most * speed), others=[{"k": min(4 * k, most) * speed}])
-    add("drag_quadratic", {"k": k}, ("k", k, 0.0, most), others=[{"k": min(4 * k, most)}])
-    if len(axes) > 1:
-        w = 0.1 / duration
-        rates = [float(np.linalg.norm(track.spin)) for track in flights if track.spin is not None]
-        if len(rates) == len(flights) and min(rates) > 0:
-            add("magnus", {"coefficient": w / max(rates)}, ("coefficient", w / max(rates), -1.0, 1.0))
-        else:
-            add("magnus", dict.fromkeys(AXES, w), *((a, w, -50 * w, 50 * w) for a in AXES))
-    k = 0.1 / duration**2
-    centre = np.mean([track.x.mean(axis=0) for track in fits], axis=0)
-    extent = float(np.max([np.ptp(track.x, axis=0).max() for track in fits]))
-    places = dict(zip(names, map(float, centre)))
-    shape = [(a, 0.2 * extent, c - 3 * extent, c + 3 * extent) for a, c in places.items()]
-    add("position_force", {"k": k} | places, ("k", k, -100 * k, 100 * k), *shape, sizes="k")
-    knots = [f"{a}{j}" for j in range(KNOTS) for a in names]
-    add("time_force", dict.fromkeys(knots, 0.05 * g), *((key, 0.03 * g, -g, g) for key in knots))
-    c = 0.5 * AIR / density  # the added mass of a sphere in air
-    add("added_mass", {"c": 0.5 * c}, ("c", min(0.03, c), 0.0, c))
-    return tuple(out)
-
-
-def _declared(tracks: Tracks, name: str) -> Parameter:
-    if name == "gravity":
-        g = float(np.linalg.norm(tracks.gravity))
-        return Parameter("gravity", "m/s^2", g, 0.03 * max(g, 1.0), 0.0, 3 * max(g, 1.0))
-    effect, _, part = name.partition(".")
-    parameter = next(p for entry in LIBRARY if entry.name == effect for p in entry.parameters if p.name == part)
-    value = tracks.effects[name]
-    return Parameter(name, parameter.unit, value, max(0.1 * abs(value), 1e-4), min(parameter.low, value), max(parameter.high, value))
