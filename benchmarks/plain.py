@@ -168,7 +168,7 @@ class Transfers:
             )
         self.sim, self.kernels, self.device = sim, build(len(used)), wp.device_from_torch(sim.device)
         self.plane, self.friction = table.plane[0, used].contiguous(), friction.contiguous()
-        self.scene = (wp.vec3(*sim.setup.origin[0].tolist()), float(sim.dx[0]), float(sim.dt[0]), sim.setup.nodes)
+        self.scene = (wp.vec3(*sim.setup.origin[0].tolist()), float(sim.dx[0]), float(sim.dt[0]), sim.setup.room.size)
         self.gravity = wp.vec3(*sim.gravity[0].tolist())
 
     def launch(self, inputs: tuple[Tensor, ...], adjoints: tuple[Tensor, ...] | None = None) -> tuple[Tensor, ...]:
@@ -179,7 +179,7 @@ class Transfers:
             return torch.zeros_like(like) if record else None
 
         outputs = [torch.empty_like(t) for t in inputs[:3]]
-        nodes = [torch.zeros(sim.setup.node_count, *shape, device=sim.device) for shape in ((3,), (), (3,))]
+        nodes = [torch.zeros(sim.setup.room.count, *shape, device=sim.device) for shape in ((3,), (), (3,))]
         gradients = [zeros(t) for t in inputs]
         node_types, types = (wp.vec3, wp.float32, wp.vec3), (wp.vec3, wp.vec3, wp.mat33, wp.mat33)
         x, v, C, tau = (array(t, kind, g) for t, kind, g in zip(inputs, types, gradients))
@@ -187,7 +187,7 @@ class Transfers:
         after = [array(t, kind, g) for t, kind, g in zip(outputs, types, adjoints or (None,) * 3)]
         planes = array(self.plane, wp.vec4), array(self.friction, wp.float32)
         particles = array(sim.mass, wp.float32), array(sim.volume, wp.float32)
-        count, nodes_count = len(inputs[0]), sim.setup.node_count
+        count, nodes_count = len(inputs[0]), sim.setup.room.count
 
         def substep() -> None:
             k, device = self.kernels, self.device

@@ -252,7 +252,7 @@ def measure(case: Case, device: torch.device, data: Path | None, repeat: int, ra
            "microseconds_per_substep": 1e6 * seconds / steps, "rate": len(sim.mass) * steps / seconds,
            "peak_bytes": peak, "trajectory_bytes": saved, "held_bytes": held}  # fmt: skip
     flops = sum(network_flops(law.tensors(), case.gradient) for law in (elastic, plastic) if hasattr(law, "weights"))
-    kept = (len(sim.mass) * (KEPT if plastic else KEPT // 2) + 16 * sim.setup.node_count) if sim.setup.keep_grid else 0
+    kept = (len(sim.mass) * (KEPT if plastic else KEPT // 2) + 16 * sim.setup.room.count) if sim.setup.keep_grid else 0
     least, binding = floor(len(sim.mass), flops, case.gradient, kept, rates)
     row |= {"floor_microseconds": 1e6 * least, "floor_of": binding, "over_floor": seconds / steps / least}
     row |= {"plain_substeps": case.plain, "plain_microseconds": "", "plain_over_ours": "", "plain_peak_bytes": ""}

@@ -42,7 +42,7 @@ def run_backward(
     now = [torch.zeros_like(t) for t in inputs[:STATES]]
     then = [torch.empty_like(t) for t in now]
     scratch, a_tau, other, a_trial = (torch.empty_like(now[3]) for _ in range(4))
-    a_velocity, a_grid = setup.scratch("a_velocity"), setup.scratch("a_grid")
+    a_velocity, a_grid = setup.room.scratch("a_velocity"), setup.room.scratch("a_grid")
     with torch_stream(setup.device):
         elastic, plastic = plan.engines(inputs)
         elastic.start_adjoint(wanted[FIXED : plan.split])
@@ -88,25 +88,25 @@ def run_backward(
                 swelling = swelling_kernels.build(real_of(setup.dtype))
                 plan.launch(swelling.swell_adjoint, len(x), [setup.particles.scene, setup.dt, *arguments])
             plan.launch(k.grid_to_particles_adjoint, len(x),
-                        [setup.field, setup.held_now, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, velocity, x, F,
+                        [setup.field, setup.held_now, setup.field_origin, setup.field_dx, setup.field_dt, setup.room.size, velocity, x, F,
                          v_next, C_next, *now[:3], a_out, a_velocity.zero_(), a_x, a_F], plan.block)  # fmt: skip
             if solids is not None:
-                free = setup.scratch("free")
+                free = setup.room.scratch("free")
                 update_nodes(plan, met, at_step(pull, n), force, friction, free)
                 solids.advance_adjoint(n)
-                solids.meet_adjoint(n, setup.node_index, met, free, a_velocity)
+                solids.meet_adjoint(n, setup.room.index, met, free, a_velocity)
             arguments = [met, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters]
             inputs_n = grid_inputs(plan, at_step(pull, n), force, friction)
-            plan.launch(k.update_grid_adjoint, setup.node_count // setup.chunk, [*inputs_n, *arguments])
+            plan.launch(k.update_grid_adjoint, setup.room.count // setup.room.chunk, [*inputs_n, *arguments])
             if solids is not None:
                 a_grid[:, 3] += a_velocity[:, 3]
             a_before = a_grid
             if setup.contact is not None:
                 particles = [setup.field, setup.particles.scene, setup.field_origin, setup.field_dx, x, setup.sorted_volume]
-                adjoints = [a_grid, setup.scratch("a_before"), a_x, a_body_friction]
+                adjoints = [a_grid, setup.room.scratch("a_before"), a_x, a_body_friction]
                 a_before = setup.contact.exchange_adjoint(plan.launch, particles, grid, inputs[BODY_FRICTION], *adjoints)
             plan.launch(k.particles_to_grid_adjoint, len(x),
-                        [setup.field, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, mass_in, setup.sorted_volume, x,
+                        [setup.field, setup.field_origin, setup.field_dx, setup.field_dt, setup.room.size, mass_in, setup.sorted_volume, x,
                          v_in, C_in, tau, a_before, a_mass, a_x, a_v, a_C, a_tau], plan.block)  # fmt: skip
             if setup.leaving is not None and mass_before is not None:
                 setup.leaving.enter_adjoint(x, v_first, a_v, a_tau, a_mass, mass_before)
@@ -165,13 +165,13 @@ def recompute(
     v_in, C_in = moving
     if setup.leaving is not None:
         v_in, mass = setup.leaving.enter(x, v_in, mass, tau)
-    grid = to_grid(plan, x, v_in, C_in, tau, mass, setup.scratch("grid")) if tape.grid is None else tape.grid[n]
+    grid = to_grid(plan, x, v_in, C_in, tau, mass, setup.room.scratch("grid")) if tape.grid is None else tape.grid[n]
     met = meet(plan, x, grid, inputs[BODY_FRICTION])
-    velocity = setup.scratch("velocity") if tape.velocity is None else tape.velocity[n]
+    velocity = setup.room.scratch("velocity") if tape.velocity is None else tape.velocity[n]
     if tape.velocity is None:
         update_nodes(plan, met, at_step(pull, n), force, friction, velocity)
         if solids is not None:
-            solids.meet(n, setup.node_index, met, velocity, solids.spare)
+            solids.meet(n, setup.room.index, met, velocity, solids.spare)
     return tau, grid, met, velocity
 
 

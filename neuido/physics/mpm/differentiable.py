@@ -1,4 +1,4 @@
-"""A rollout as one autograd function: with a full tape, with gradient checkpointing, or with one thread per scene."""
+"""A rollout as one autograd function: with a full tape, in pieces, or with one thread per scene."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,6 +10,7 @@ from torch import Tensor
 from neuido.physics.mpm.graphs import RolloutCache
 from neuido.physics.mpm.plan import FIXED, KINDS, SOLIDS, STATES, Plan
 from neuido.physics.mpm.rollout import Tape, check
+from neuido.physics.mpm.window.placement import PIECE, Piece, corners, pieces
 from neuido.physics.runtime.limits import UNCHECKED, check_memory
 from neuido.physics.runtime.threads import one_thread_each
 
@@ -39,8 +40,11 @@ def run(
     differentiable = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
     _check_memory(plan, inputs, segment, differentiable, cache)
     captured = plan.setup.device.type == "cuda"  # a graph of many thousand substeps is large and slow to capture
+    if plan.setup.window is not None:
+        return _Pieces.apply(plan, pieces(plan.steps, plan.every, segment), cache, differentiable, *inputs)
     if (differentiable or captured) and segment is not None and segment < plan.steps:
-        return _Segments.apply(plan, segment, cache, *inputs)
+        parts = [Piece(n, segment, plan.every) for n in range(0, plan.steps, segment)]
+        return _Pieces.apply(plan, parts, cache, differentiable, *inputs)
     if pool is not None:
         return _ThreadedRollout.apply(SingleScenes(plan, cache, pool), differentiable, *inputs)
     if differentiable:
@@ -53,9 +57,11 @@ def _check_memory(plan: Plan, inputs: Sequence[Tensor], segment: int | None, dif
     setup, state = plan.setup, sum(t.numel() for t in inputs[:STATES])
     frames = plan.steps // plan.every + 1
     taped = min(segment or plan.steps, plan.steps) if differentiable else 0
+    if setup.window is not None and differentiable:
+        frames, taped = frames + plan.steps // PIECE, min(taped, PIECE)  # the states between pieces, and the tape of one
     numbers = state * (2 * frames + taped)  # as computed and in the order of the bodies
     if setup.keep_grid:
-        numbers += taped * (9 * len(setup.mass) * (2 if plan.corrects else 1) + 8 * setup.node_count)
+        numbers += taped * (9 * len(setup.mass) * (2 if plan.corrects else 1) + 8 * setup.room.count)
     what = f"a rollout of {len(setup.mass)} particles, {plan.steps} steps and {frames} frames{' with gradients' if differentiable else ''}"
     change = f"raise `every`, lower `steps`{', give `segment`' if taped == plan.steps else ''}"
     needed = numbers * setup.dtype.itemsize
@@ -98,62 +104,98 @@ class _Rollout(torch.autograd.Function):
         return (None, None, *(g if want else None for g, want in zip(out, wanted, strict=True)))
 
 
-class _Segments(torch.autograd.Function):
-    """`_Rollout` with gradient checkpointing: stores the states between segments and recomputes the tape of one segment at a time."""
+class _Pieces(torch.autograd.Function):
+    """`_Rollout` piece by piece: stores the states between pieces and recomputes the tape of one piece at a time.
+
+    This is gradient checkpointing; and where the grid follows the matter, each piece has its own place of the grid.
+    """
 
     @staticmethod
-    def forward(ctx: Any, plan: Plan, segment: int, cache: RolloutCache, *inputs: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, plan: Plan, parts: Sequence[Piece], cache: RolloutCache, differentiable: bool, *inputs: Tensor
+    ) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         inputs = tuple(t.detach() for t in inputs)
-        ctx.part, ctx.count, ctx.cache = plan.shortened(segment), plan.steps // segment, cache
-        ctx.carried = _carried(plan)
-        length = segment // plan.every
-        starts = [tuple(inputs[c] for c in ctx.carried)]
-        frames = tuple(t.new_empty(ctx.count * length + 1, *t.shape) for t in starts[0])
-        impulses = []
-        for i in range(ctx.count):
-            ctx.part.offset = i * segment
-            parts = _frames(ctx.part, cache, _segment_inputs(ctx.carried, starts[i], inputs, i, segment))
-            for frame, part in zip(frames, parts):
-                frame[i * length : (i + 1) * length + 1] = part
-            impulses += [part.clone() for part in parts[len(frames) :]]
-            starts.append(tuple(frame[(i + 1) * length].clone() for frame in frames))
-        ctx.save_for_backward(*inputs, *(t for start in starts[:-1] for t in start))
+        ctx.plan, ctx.parts, ctx.cache, ctx.carried, ctx.places = plan, parts, cache, _carried(plan), []
+        now = tuple(inputs[c] for c in ctx.carried)
+        frames = tuple(t.new_empty(plan.steps // plan.every + 1, *t.shape) for t in now)
+        for frame, t in zip(frames, now):
+            frame[0] = t
+        starts, impulses = [], []
+        for piece in parts:
+            starts += now if differentiable else ()
+            ctx.places.append(_place(plan, now[0], piece))
+            found = _frames(_part(plan, piece), cache, _piece_inputs(ctx.carried, now, inputs, piece))
+            own, whole = _frames_of(piece, plan.every)
+            for frame, part in zip(frames, found):
+                frame[whole] = part[own]
+            impulses += [part.clone() for part in found[len(frames) :]]
+            now = tuple(part[-1].clone() for part in found[: len(frames)])
+        ctx.save_for_backward(*inputs, *starts)
         return (*frames, *([torch.cat(impulses)] if impulses else []))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        part, wanted, tensors, carried = ctx.part, ctx.needs_input_grad[3:], ctx.saved_tensors, ctx.carried
+        plan, wanted, tensors, carried = ctx.plan, ctx.needs_input_grad[4:], ctx.saved_tensors, ctx.carried
         given, starts = tensors[: len(wanted)], tensors[len(wanted) :]
-        length = part.steps // part.every
-        cache = ctx.cache
         carry = [torch.zeros_like(given[c]) for c in carried]
         kinds = _kinds(given)
         total = [torch.zeros_like(t) for t in given]
         needed = tuple(want or c in carried for c, want in enumerate(wanted))
-        for i in reversed(range(ctx.count)):
-            inputs = _segment_inputs(carried, starts[len(carried) * i : len(carried) * (i + 1)], given, i, part.steps)
+        for i, piece in reversed(list(enumerate(ctx.parts))):
+            inputs = _piece_inputs(carried, starts[len(carried) * i : len(carried) * (i + 1)], given, piece)
+            own_frames, whole = _frames_of(piece, plan.every)
             own = []
             for a, gradient in zip(carry, gradients):
-                of_frames = a.new_zeros(length + 1, *a.shape)
+                of_frames = a.new_zeros(piece.steps // piece.every + 1, *a.shape)
                 if gradient is not None:
-                    # the first frame of a segment is the last frame of the previous one
-                    of_frames[0 if i == 0 else 1 :] = gradient[i * length + (0 if i == 0 else 1) : (i + 1) * length + 1]
+                    of_frames[own_frames] = gradient[whole]
+                    if i == 0:  # the first frame of another piece is the last frame of the one before
+                        of_frames[0] = gradient[0]
                 of_frames[-1] += a
                 own.append(of_frames)
-            own += [None if g is None else g[i * part.steps : (i + 1) * part.steps] for g in gradients[len(carried) :]]
-            with cache.lock:
-                cached = cache.find(part, inputs, keep_all=True)
+            steps = slice(piece.first, piece.first + piece.steps)
+            own += [None if g is None else g[steps] for g in gradients[len(carried) :]]
+            part = _part(plan, piece)
+            with ctx.cache.lock:
+                if ctx.places[i] is not None:
+                    plan.setup.place(*ctx.places[i])
+                cached = ctx.cache.find(part, inputs, keep_all=True)
                 serial = cached.forward(part, inputs)
                 out = cached.backward(part, inputs, serial, own, needed)
             carry = [out[c] for c in carried]
             for c, (t, kind, new) in enumerate(zip(total, kinds, out, strict=True)):
                 if new is not None and c not in carried:
-                    _own(t, kind, i, part.steps).add_(new)
+                    _own(t, kind, piece).add_(new)
         for c, a in zip(carried, carry):
             total[c] = a
-        return (None, None, None, *(g if want else None for g, want in zip(total, wanted, strict=True)))
+        return (None, None, None, None, *(g if want else None for g, want in zip(total, wanted, strict=True)))
+
+
+def _place(plan: Plan, x: Tensor, piece: Piece) -> tuple[tuple[int, int, int], Tensor] | None:
+    """Move a window around the particles at x, and return where it is; None where the grid is the whole domain."""
+    setup = plan.setup
+    if setup.window is None:
+        return None
+    shape, origin = setup.window.fit(*corners(x, setup.particles.offsets), piece.steps)
+    setup.place(shape, origin)
+    return shape, origin
+
+
+def _part(plan: Plan, piece: Piece) -> Plan:
+    """Return the plan of a piece."""
+    part = plan.shortened(piece.steps)
+    part.every, part.offset = piece.every, piece.first
+    return part
+
+
+def _frames_of(piece: Piece, every: int) -> tuple[slice, slice]:
+    """Return which frames of a piece, after its first, are frames of the rollout, and which of the rollout's they are."""
+    end = piece.first + piece.steps
+    if piece.every == every:
+        return slice(1, None), slice(piece.first // every + 1, end // every + 1)
+    return (slice(0, 0), slice(0, 0)) if end % every else (slice(-1, None), slice(end // every, end // every + 1))
 
 
 def _kinds(inputs: Sequence[Tensor]) -> tuple[str, ...]:
@@ -162,21 +204,21 @@ def _kinds(inputs: Sequence[Tensor]) -> tuple[str, ...]:
 
 
 def _carried(plan: Plan) -> tuple[int, ...]:
-    """Return the indices of the inputs that a segment takes from the end of the one before: the state, and that of solids."""
+    """Return the indices of the inputs that a piece takes from the end of the one before: the state, and that of solids."""
     return (*range(STATES), *([SOLIDS] if plan.setup.solids is not None else []))
 
 
-def _segment_inputs(carried: Sequence[int], start: Sequence[Tensor], inputs: Sequence[Tensor], i: int, steps: int) -> tuple[Tensor, ...]:
-    """Return the inputs of segment i of `steps` substeps, with `start` in place of the carried ones."""
-    out = [_own(t, kind, i, steps) for t, kind in zip(inputs, _kinds(inputs))]
+def _piece_inputs(carried: Sequence[int], start: Sequence[Tensor], inputs: Sequence[Tensor], piece: Piece) -> tuple[Tensor, ...]:
+    """Return the inputs of a piece, with `start` in place of the carried ones."""
+    out = [_own(t, kind, piece) for t, kind in zip(inputs, _kinds(inputs))]
     for c, t in zip(carried, start):
         out[c] = t
     return tuple(out)
 
 
-def _own(t: Tensor, kind: str, i: int, steps: int) -> Tensor:
-    """Return the part of an input that belongs to segment i of `steps` substeps."""
-    return t[i * steps : (i + 1) * steps] if kind == "time" and t.numel() and len(t) > 1 else t
+def _own(t: Tensor, kind: str, piece: Piece) -> Tensor:
+    """Return the part of an input that belongs to a piece."""
+    return t[piece.first : piece.first + piece.steps] if kind == "time" and t.numel() and len(t) > 1 else t
 
 
 class SingleScenes:

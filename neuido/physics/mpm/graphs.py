@@ -34,6 +34,7 @@ class CachedRollout:
 
     def __init__(self, plan: Plan, keep_all: bool) -> None:
         self.tape = new_tape(plan, keep_all)
+        self.room = plan.setup.room  # a captured graph uses its memory
         self.serial = 0
 
     def forward(self, plan: Plan, inputs: Sequence[Tensor]) -> int:
@@ -156,7 +157,8 @@ class RolloutCache:
     def find(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> CachedRollout:
         """Return the cached rollout for a plan and inputs of these shapes, or make one; captured if graphs are on and the laws allow it."""
         own = plan.key(inputs) if self.graphs else None
-        key = (own, plan.steps, plan.every, plan.plasticity is None, plan.compensated, keep_all, *(tuple(t.shape) for t in inputs))
+        shapes = plan.setup.room.shape, *(tuple(t.shape) for t in inputs)
+        key = (own, plan.steps, plan.every, plan.plasticity is None, plan.compensated, keep_all, *shapes)
         if key not in self._rollouts:
             while len(self._rollouts) >= CAPACITY:
                 self._rollouts.popitem(last=False)

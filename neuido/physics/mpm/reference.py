@@ -109,7 +109,7 @@ def substep(
         nodes = base[:, None, :] + offsets
         weight = w[:, offsets[:, 0], 0] * w[:, offsets[:, 1], 1] * w[:, offsets[:, 2], 2]
         arm = setup.origin[s] + nodes * dx - x[:, None, :]
-        shape = setup.grid_shape[1:]
+        shape = setup.room.shape[1:]
         flat = ((nodes[..., 0] * shape[1] + nodes[..., 1]) * shape[2] + nodes[..., 2]).reshape(-1)
         affine = m[:, None, None] * C - dt * volume[:, None, None] * 4.0 / dx**2 * tau
         momentum = weight[..., None] * (m[:, None, None] * v[:, None, :] + torch.einsum("pab,pnb->pna", affine, arm))

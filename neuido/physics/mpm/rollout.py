@@ -72,12 +72,12 @@ def new_tape(plan: Plan, keep_all: bool) -> Tape:
     count = plan.steps if keep_all else plan.steps // plan.every
     history = setup.mass.new_empty(len(setup.mass), plan.layout.width)
     x, v, C, F, history = (t.new_empty(count + 1, *t.shape) for t in (*setup.state, history))
-    status = torch.zeros(3 * setup.grid_shape[0], dtype=torch.int32, device=setup.device)
+    status = torch.zeros(3 * len(setup.field_scene), dtype=torch.int32, device=setup.device)
     lowest, since = torch.empty_like(setup.mass), torch.empty(len(setup.mass), dtype=torch.int32, device=setup.device)
     more = keep_all and setup.keep_grid
     tau = setup.state.F.new_empty(plan.steps, *setup.state.F.shape) if more else None
     trial = torch.empty_like(tau) if tau is not None and plan.corrects else None
-    grid, velocity = (setup.mass.new_empty(plan.steps, setup.node_count, 4) if more else None for _ in range(2))
+    grid, velocity = (setup.mass.new_empty(plan.steps, setup.room.count, 4) if more else None for _ in range(2))
     rest_x, rest_F = (torch.empty_like(t) if plan.compensated else None for t in (setup.state.x, setup.state.F))
     solids = None if setup.solids is None else new_solid_tape(setup.solids, plan.steps)
     return Tape(x, v, C, F, history, status, lowest, since, rest_x, rest_F, tau, trial, grid, velocity, keep_all, solids)
@@ -104,7 +104,7 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
     # the grid update zeroes the nodes as it reads them, which saves a pass
     clears = copies and tape.grid is None and setup.contact is None and tape.solids is None
     for name in ("grid", "velocity") if clears else ():
-        setup.scratch(name).zero_()
+        setup.room.scratch(name).zero_()
     recordings = LaunchRecordings()
     changing = pull, inputs[STATES + 6], inputs[SHRINKAGE]
     steady = all(len(t) <= 1 for t in changing)  # none has a row for each substep
@@ -129,14 +129,14 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
             reach = node_range(plan, now[0] if n == 0 else None) if tape.grid is None else slice(None)
             tau = scratch if tape.tau is None else tape.tau[n]
             trial = other if tape.trial is None else tape.trial[n]
-            grid = setup.scratch("grid") if tape.grid is None else tape.grid[n]
-            velocity = setup.scratch("velocity") if tape.velocity is None else tape.velocity[n]
+            grid = setup.room.scratch("grid") if tape.grid is None else tape.grid[n]
+            velocity = setup.room.scratch("velocity") if tape.velocity is None else tape.velocity[n]
             if n == 0 or not steady:
                 material, pull_now = plan.material(inputs, n, all_branches=tape.whole), at_step(pull, n)
             if not clears:
                 grid.zero_()
             to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid, spin, damped)
-            met = grid if setup.contact is None else setup.scratch("met")
+            met = grid if setup.contact is None else setup.room.scratch("met")
             on_nodes = partial(update_nodes, plan, met, pull_now, force, friction, velocity, reach, clears)
             shrinkage = at_step(inputs[SHRINKAGE], n)
             to_particles = partial(gather, plan, n, now, then, material, plastic, velocity, trial, tape, shrinkage)
@@ -210,7 +210,7 @@ def meet(plan: Plan, x: Tensor, grid: Tensor, friction: Tensor) -> Tensor:
     if setup.contact is None:
         return grid
     particles = [setup.field, setup.particles.scene, setup.field_origin, setup.field_dx, x, setup.sorted_volume]
-    return setup.contact.exchange(plan.launch, particles, grid, friction, setup.scratch("met"))
+    return setup.contact.exchange(plan.launch, particles, grid, friction, setup.room.scratch("met"))
 
 
 def gather(
@@ -243,7 +243,7 @@ def gather(
     x, _, _, F, history = now
     raw = trial if plan.corrects else then[3]
     plan.launch(setup.kernels.grid_to_particles, len(x),
-                [setup.field, setup.held_now, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes, velocity, x, F,
+                [setup.field, setup.held_now, setup.field_origin, setup.field_dx, setup.field_dt, setup.room.size, velocity, x, F,
                  *then[:3], raw, n, tape.status, setup.span, tape.lowest, tape.since,
                  tape.rest_x, tape.rest_F], plan.block)  # fmt: skip
     if setup.leaving is not None:
@@ -340,8 +340,8 @@ def node_range(plan: Plan, x: Tensor | None) -> slice:
     setup.ends[:] = math.inf, -math.inf
     if not math.isfinite(high - low):
         return slice(None)
-    planes, dx = setup.grid_shape[1], setup.scenes[0].dx
-    edge, plane = setup.scenes[0].lower[0] - kernels.PAD * dx, setup.node_count // planes
+    planes, dx = setup.room.shape[1], setup.scenes[0].dx
+    edge, plane = setup.edge, setup.room.count // planes
     first, last = (min(max(int((at - edge) / dx - 0.5), 0), planes - 3) for at in (low, high))
     return slice(max(first - 1, 0) * plane, min(last + 4, planes) * plane)
 
@@ -355,7 +355,7 @@ def to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tens
 def add_to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> None:
     """Add momentum and mass of the particles to the nodes of `grid`."""
     setup = plan.setup
-    table = [setup.field, setup.field_origin, setup.field_dx, setup.field_dt, setup.nodes]
+    table = [setup.field, setup.field_origin, setup.field_dx, setup.field_dt, setup.room.size]
     arguments = [*table, mass, setup.sorted_volume, x, v, C, tau, grid]
     plan.launch(setup.kernels.particles_to_grid, len(x), arguments, plan.block)
 
@@ -384,12 +384,12 @@ def update_nodes(
     """
     setup = plan.setup
     inputs = [*grid_inputs(plan, pull, force, friction, reach), grid[reach], velocity[reach], clear]
-    plan.launch(setup.kernels.update_grid, len(grid[reach]) // setup.chunk, inputs)
+    plan.launch(setup.kernels.update_grid, len(grid[reach]) // setup.room.chunk, inputs)
 
 
 def meet_solids(solids: SolidLoop, n: int, setup: Setup, grid: Tensor, velocity: Tensor, reach: slice) -> None:
     """Bring a range of nodes in contact with the solids in substep n, and move the solids; arguments as for `update_nodes`."""
-    solids.meet(n, setup.node_index[reach], grid[reach], velocity[reach])
+    solids.meet(n, setup.room.index[reach], grid[reach], velocity[reach])
     solids.advance(n)
 
 
@@ -408,8 +408,8 @@ def grid_inputs(plan: Plan, pull: Tensor, force: Tensor, friction: Tensor, reach
         friction,
         setup.clamp_lower,
         setup.clamp_upper,
-        setup.node_index[reach],
-        setup.chunk,
+        setup.room.index[reach],
+        setup.room.chunk,
     ]
 
 

@@ -68,6 +68,8 @@ class Simulator:
         store: What a forward pass stores of each substep for the backward pass. `state`: x, v, C, F (96 bytes a particle in
             float32); stress, trial gradient and grid are recomputed. `all`: these too (72 bytes more a particle, 32 a node), which is
             faster. `auto`: `all` if there are at most four nodes per particle, else `state`.
+        grid: Extent of the grid. `domain`: all of it. `window`: a block that follows the matter, so that memory goes with the bodies and
+            not with the domain. `auto`: `window` if the nodes of the domain take more than 256 MB and more than the particles.
         on_inversion: What a rollout does where matter turns inside out or collapses (det F below 0.001). `report`: `Frames.events` has
             it. `error`: it raises, or makes the scene NaN with `nan_on_failure`.
         on_leave: What happens to a particle that leaves the domain. `error`: the rollout raises as soon as the grid, which reaches a cell
@@ -97,6 +99,7 @@ class Simulator:
         threads: bool = True,
         graphs: bool = True,
         store: Literal["state", "all", "auto"] = "auto",
+        grid: Literal["domain", "window", "auto"] = "auto",
         on_inversion: OnInversion = "report",
         on_leave: OnLeave = "error",
         keep: Literal["state", "all", "auto"] | None = None,
@@ -104,10 +107,12 @@ class Simulator:
         store = renamed_option("store", store, "keep", keep)
         if store not in ("state", "all", "auto"):
             raise UserError(f"store is {store!r}; choose state, all or auto")
+        if grid not in ("domain", "window", "auto"):
+            raise UserError(f"grid is {grid!r}; choose domain, window or auto")
         self.on_inversion = checked_option(on_inversion)
         self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
         self.bodies = bodies_of(self.scenes, bodies, density)
-        self.setup = setup = Setup(self.scenes, self.bodies, as_device(device), dtype, store)
+        self.setup = setup = Setup(self.scenes, self.bodies, as_device(device), dtype, store, grid)
         setup.watch_faces(checked_on_leave(on_leave))
         self.device, self.dtype = setup.device, dtype
         self.particles, self.state, self.mass, self.volume = setup.particles, setup.state, setup.mass, setup.volume

@@ -6,7 +6,6 @@ from itertools import accumulate
 from typing import Literal
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from neuido.errors import UserError
@@ -15,6 +14,8 @@ from neuido.physics.colliders.solid_tables import solid_table
 from neuido.physics.colliders.tables import clamp_table, collider_table, inside_box
 from neuido.physics.mpm import stencil
 from neuido.physics.mpm import transfers as kernels
+from neuido.physics.mpm.window.nodes import Nodes
+from neuido.physics.mpm.window.placement import FOLLOWED, PIECE, Window, corners
 from neuido.physics.multibody import contact_kernels
 from neuido.physics.multibody.contact_grid import ContactGrid
 from neuido.physics.multibody.scene_bodies import SceneBodies, checked_body, friction_table
@@ -85,6 +86,7 @@ class Setup:
         device: Device of the arrays, with its index.
         dtype: Scalar type of the arrays.
         store: As for `Simulator`.
+        grid: As for `Simulator`.
 
     Raises:
         UserError: As `Simulator`.
@@ -98,11 +100,13 @@ class Setup:
         body: Index of each particle's body, (P,) int32; the bodies of all scenes are counted on.
         field: Index of each particle's velocity field, (P,) int32. A scene has one field, or one for each body where bodies may part.
         field_scene: Scene of each field, (fields,) int64.
-        contact: Contact between bodies with fields of their own; None where no scene has such.
         first: First particle of each scene, then their number, (S + 1,) int32.
         order: The order in which the kernels see the particles, (P,): scene by scene, body by body, then by cell.
         inverse: The inverse permutation.
-        nodes: Grid nodes along each axis, padding included.
+        room: The nodes of the grid at present.
+        window: Places the grid around the particles; None: it is the whole domain.
+        origin: Place of the first node of each scene [m], (S, 3).
+        edge: The x of that of the first scene [m].
         keep_grid: Whether a tape stores stress and nodal values too.
         first_scene: Index of the first scene within the whole simulator, if this is a part of one.
         first_particle: Index of the first particle within the whole simulator.
@@ -115,38 +119,30 @@ class Setup:
         device: torch.device,
         dtype: torch.dtype,
         store: Literal["state", "all", "auto"],
+        grid: Literal["domain", "window", "auto"] = "domain",
     ) -> None:
         self.scenes, self.bodies, self.device, self.dtype = tuple(scenes), tuple(bodies), device, dtype
         self.kernels = kernels.build(real_of(dtype))
         self._load_scenes()
-        nodes = [max(scene.nodes[a] for scene in self.scenes) + 2 * kernels.PAD for a in range(3)]
-        field_counts = torch.tensor([len(own.bodies) if own.separate else 1 for own in bodies])
-        self.field_scene = torch.arange(len(bodies)).repeat_interleave(field_counts).to(device)
-        self.grid_shape = (len(self.field_scene), *nodes)
-        self.node_count = math.prod(self.grid_shape)
-        self._check_memory()
-        self.nodes = wp.vec3i(*nodes)
-        self._load_bodies()
-        self.chunk = nodes[2] if self.device.type == "cpu" else 1  # nodes per thread: on the CPU, calling a thread costs as much as a node
-        axes = (torch.arange(n, dtype=torch.int32) for n in nodes)
-        s, i, j, k = torch.meshgrid(self.field_scene.int().cpu(), *axes, indexing="ij")
-        self.node_index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(self.device)
-        self.field_origin, self.field_dx, self.field_dt, self.contact = self.origin, self.dx, self.dt, None
+        self.whole = tuple(max(scene.nodes[a] for scene in self.scenes) + 2 * kernels.PAD for a in range(3))
+        self.field_counts = torch.tensor([len(own.bodies) if own.separate else 1 for own in bodies])
+        self.field_scene = torch.arange(len(bodies)).repeat_interleave(self.field_counts).to(device)
+        self.field_origin, self.field_dx, self.field_dt = self.origin, self.dx, self.dt
         if any(own.separate for own in bodies):
             self.field_origin, self.field_dx, self.field_dt = (t[self.field_scene] for t in (self.origin, self.dx, self.dt))
-            pairs = contact_kernels.build(real_of(dtype), stencil.functions)
-            frictions = friction_table(self.scenes, bodies)
-            self.contact = ContactGrid(field_counts.tolist(), pairs, self.nodes, self.chunk, self.dx, frictions, device, dtype)
+        self.window: Window | None = None
+        self._rooms: dict[tuple[int, ...], Nodes] = {}
+        self._open_room(grid)
+        self._load_bodies()
         watched = self.device.type == "cpu" and len(self.field_scene) == 1
         self.span = torch.empty(2 if watched else 0, dtype=self.dtype, device=self.device)
         """Smallest and largest x [m] of the particles after a substep; only for a single velocity field on the CPU."""
         self.ends = self.span.numpy() if watched else None
         self._sort()
-        self.keep_grid = store == "all" or (store == "auto" and self.node_count <= 4 * len(self.mass))
+        self.keep_grid = store == "all" or (store == "auto" and self.room.count <= 4 * len(self.mass))
         self.first_scene = self.first_particle = 0
         self.leaving: Leaving | None = None
         self._single: dict[int, Setup] = {}
-        self._scratch: dict[str, Tensor] = {}
 
     def _load_scenes(self) -> None:
         def column(values: list) -> Tensor:
@@ -157,19 +153,67 @@ class Setup:
                 raise UserError(f"cells is {scene.cells}, dt {scene.dt:g}; a scene needs cells >= 4, dt > 0 and upper above lower")
         self.dx = column([s.dx for s in self.scenes])
         self.dt = column([s.dt for s in self.scenes])
-        self.origin = column([[l - kernels.PAD * s.dx for l in s.lower] for s in self.scenes])
+        self._corner = [[l - kernels.PAD * s.dx for l in s.lower] for s in self.scenes]
+        self.origin = column(self._corner)
         self.gravity = column([list(s.gravity) for s in self.scenes])
         self.colliders = collider_table(self.scenes, self.dtype, self.device)
         self.solids = solid_table(self.scenes, self.dtype, self.device)
         self.clamp_lower, self.clamp_upper = clamp_table(self.scenes, self.dtype, self.device)
 
-    def _check_memory(self) -> None:
-        """Raise UserError where grid and particles need more memory than there is."""
-        count = sum(torch.as_tensor(body.x).shape[:1].numel() for own in self.bodies for body in own.bodies)
-        needed = self.node_count * (NODE_BYTES + 8 * self.dtype.itemsize) + count * (PARTICLE_BYTES + 24 * self.dtype.itemsize)
-        nodes = " x ".join(str(n) for n in self.grid_shape[1:])
+    def _open_room(self, grid: str) -> None:
+        """Choose between the whole domain and a window, and allocate the nodes.
+
+        Raises:
+            UserError: Grid and particles need more memory than there is.
+        """
+        positions = [torch.cat([torch.as_tensor(body.x).reshape(-1, 3) for body in own.bodies]) for own in self.bodies]
+        of_particles = sum(len(x) for x in positions) * (PARTICLE_BYTES + 24 * self.dtype.itemsize)
+        of_nodes = self._node_bytes(self.whole)
+        if grid == "window" or (grid == "auto" and of_nodes > max(FOLLOWED, of_particles)):
+            self.window = Window(self.scenes, kernels.PAD)
+            ends = [corners(x, (0, len(x))) for x in positions]
+            shape, origin = self.window.fit(torch.cat([low for low, _ in ends]), torch.cat([high for _, high in ends]), PIECE)
+            of_nodes = self._node_bytes(shape)
+            self.window.shape.zero_()  # a rollout of shorter pieces needs less
+        else:
+            shape, origin = self.whole, torch.tensor(self._corner, dtype=torch.float64)
+        nodes = " x ".join(str(n) for n in shape)
+        count = sum(len(x) for x in positions)
         what = f"a simulator of {len(self.scenes)} scene{'s' * (len(self.scenes) > 1)}, {count} particles and {nodes} grid nodes a scene"
-        check_memory(needed, self.device, what, "lower `cells` or the number of particles or scenes")
+        change = "lower `cells` or the number of particles or scenes"
+        check_memory(of_nodes + of_particles, self.device, what, change + (", or give `grid='window'`" if grid == "domain" else ""))
+        self.place(shape, origin)
+
+    def _node_bytes(self, shape: Sequence[int]) -> int:
+        """Return the memory of the nodes of a grid [bytes]."""
+        return len(self.field_scene) * math.prod(shape) * (NODE_BYTES + 8 * self.dtype.itemsize)
+
+    def _nodes(self, shape: tuple[int, ...]) -> Nodes:
+        """Return the nodes of a grid; of several shapes the last two are kept."""
+        if shape not in self._rooms:
+            while len(self._rooms) >= 2:
+                self._rooms.pop(next(iter(self._rooms)))
+            nodes = Nodes(self.field_scene, shape, self.dtype, self.device)
+            if any(own.separate for own in self.bodies):
+                pairs = contact_kernels.build(real_of(self.dtype), stencil.functions)
+                frictions = friction_table(self.scenes, self.bodies)
+                counts = self.field_counts.tolist()
+                nodes.contact = ContactGrid(counts, pairs, nodes.size, nodes.chunk, self.dx, frictions, self.device, self.dtype)
+            self._rooms[shape] = nodes
+        return self._rooms[shape]
+
+    @property
+    def contact(self) -> ContactGrid | None:
+        """Contact between bodies with fields of their own; None where no scene has such."""
+        return self.room.contact
+
+    def place(self, shape: tuple[int, ...], origin: Tensor) -> None:
+        """Move the grid: nodes along each axis, and the place of the first node of each scene [m], (S, 3)."""
+        self.room = self._nodes(shape)
+        self.edge = float(origin[0, 0])
+        self.origin.copy_(origin)  # in place: a captured graph reads this memory
+        if self.field_origin is not self.origin:
+            self.field_origin.copy_(self.origin[self.field_scene])
 
     def _load_bodies(self) -> None:
         x, v, C, F, mass, volume, held, scene_index, body_index, field_index = ([] for _ in range(10))
@@ -224,7 +268,7 @@ class Setup:
         """Sort the particles as the kernels see them: by scene, body and cell, so that neighbours add to the same nodes."""
         scene, body = self.particles.scene.long(), self.body.long()
         cell = ((self.state.x - self.origin[scene]) / self.dx[scene, None] - 0.5).floor().long()
-        nx, ny, nz = self.grid_shape[1:]
+        nx, ny, nz = self.whole
         key = ((body * nx + cell[:, 0]) * ny + cell[:, 1]) * nz + cell[:, 2]
         self.order = torch.argsort(key, stable=True)
         self.inverse = torch.argsort(self.order)
@@ -258,12 +302,6 @@ class Setup:
     def scene_count(self) -> int:
         """The number of scenes S."""
         return len(self.scenes)
-
-    def scratch(self, name: str) -> Tensor:
-        """Return a buffer of four numbers a node, (S nx ny nz, 4), reused by later rollouts."""
-        if name not in self._scratch:
-            self._scratch[name] = torch.empty(self.node_count, 4, dtype=self.dtype, device=self.device)
-        return self._scratch[name]
 
 
 def short_vector(t: Tensor) -> list[float]:

@@ -43,7 +43,7 @@ def test_a_substep_conserves_mass_momentum_and_spin(device):
     start = sim.state._replace(F=F)
     plan = Plan(sim.setup, SOFT, None, 1, 1)
     tau = SOFT(F)
-    grid = to_grid(plan, start.x, start.v, start.C, tau, sim.mass, sim.setup.scratch("grid"))
+    grid = to_grid(plan, start.x, start.v, start.C, tau, sim.mass, sim.setup.room.scratch("grid"))
     assert torch.isclose(grid[..., 3].sum(), sim.mass.sum(), rtol=1e-13)
     m = sim.mass[:, None]
     frames = sim.rollout(5, SOFT, state=start)

@@ -141,14 +141,14 @@ class Stage:
 
     def grid(self):
         x, v, C, _ = self.state
-        return to_grid(self.plan, x, v, C, self.tau, self.sim.mass, self.sim.scratch("grid")).clone()
+        return to_grid(self.plan, x, v, C, self.tau, self.sim.mass, self.sim.room.scratch("grid")).clone()
 
 
 def kernel_cases(stage: Stage):
     """Per kernel: inputs by argument name, the differentiable ones, and what it writes."""
     sim = stage.sim
     x, v, C, F = stage.state
-    place = {"scene": sim.particles.scene, "origin": sim.origin, "dx": sim.dx, "dt": sim.dt, "nodes": sim.nodes}
+    place = {"scene": sim.particles.scene, "origin": sim.origin, "dx": sim.dx, "dt": sim.dt, "nodes": sim.room.size}
     table = sim.colliders
     walls = {"plane": table.plane, "kind": table.kind, "lower": sim.clamp_lower, "upper": sim.clamp_upper}
     grid = stage.grid()
@@ -170,8 +170,8 @@ def kernel_cases(stage: Stage):
             {"grid": torch.zeros_like(grid)},
         ),
         "update_grid": (
-            {**{k: place[k] for k in ("origin", "dx", "dt")}, "index": sim.node_index,
-             "chunk": sim.chunk, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
+            {**{k: place[k] for k in ("origin", "dx", "dt")}, "index": sim.room.index,
+             "chunk": sim.room.chunk, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
              "friction": table.friction.clone(), "grid": grid, "clear": False},
             ["gravity", "force", "friction", "grid"],
             {"velocity": velocity},
@@ -185,7 +185,7 @@ def kernel_cases(stage: Stage):
 
 
 def launch(stage, kernel, values):
-    dim = stage.sim.node_count // stage.sim.chunk if "update_grid" in kernel.key else len(stage.sim.mass)
+    dim = stage.sim.room.count // stage.sim.room.chunk if "update_grid" in kernel.key else len(stage.sim.mass)
     stage.plan.launch(kernel, dim, [values[arg.label] for arg in kernel.adj.args])
 
 
@@ -251,7 +251,7 @@ def test_kernel_adjoint_equals_warp_autodiff(name):
             value = wp.from_torch(value.clone(), dtype=arg.type.dtype, requires_grad=arg.label in (*wanted, *outputs))
         arrays[arg.label] = value
     with wp.Tape() as tape:
-        dim = stage.sim.node_count // stage.sim.chunk if name == "update_grid" else len(stage.sim.mass)
+        dim = stage.sim.room.count // stage.sim.room.chunk if name == "update_grid" else len(stage.sim.mass)
         wp.launch(oracle, dim=dim, inputs=[arrays[arg.label] for arg in oracle.adj.args], device=DEVICE)
     tape.backward(grads={arrays[key]: wp.from_torch(weights[key].clone(), dtype=arrays[key].dtype) for key in outputs})
     for key in set(wanted) - ({"friction"} if name == "update_grid" else set()):
