@@ -191,7 +191,7 @@ def test_mesh_in_a_scene_file(ball_folder, monkeypatch):
     root, write = ball_folder
     (root / "body.obj").write_text(TETRAHEDRON)
     body = {"shape": "mesh", "file": "body.obj", "particles": 500, "size": 0.4, "centre": [0.5, 0.5, 0.5]}
-    monkeypatch.delenv("NEUIDO_DATA")  # the file lies beside the scene
+    monkeypatch.delenv("NEUIDO_DATA", raising=False)  # the file lies beside the scene
     setup = scenes.load_scene(write(body=body))
     assert float(setup.body.volume.sum()) == pytest.approx(0.4**3 / 6, rel=1e-4)
     assert len(setup.body.skin.vertices) == 4
