@@ -94,7 +94,7 @@ def test_third_parties(module):
 LIGHT = ("", ".__main__", ".errors", ".data.trajectories.options", ".data.scenes.film_options", ".data.undeclared", ".data.files.html_page",
          ".data.files.results", ".data.files.sweep_run", ".data.files.score_tables", ".commands.diagnose",
          *(f".commands.{name}" for name in ("main", "doctor", "reconstruct", "film", "sweep", "report",
-                                            "latents", "demo.demo",
+                                            "latents", "demo.demo", "output.export",
                                             *(f"simulation.{n}" for n in ("simulate", "trajectories", "scenes", "undeclared", "replay",
                                                                           "former_options")), "cli.config_files", "cli.abbreviations",
                                             "cli.trainer", "cli.trainer_help", "cli.signatures", "cli.functions")))  # fmt: skip

@@ -1,0 +1,1 @@
+"""Commands that turn results into what other programs and people look at."""

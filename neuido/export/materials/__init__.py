@@ -1,0 +1,1 @@
+"""Material laws for other programs: cards of constants, TorchScript and C."""
