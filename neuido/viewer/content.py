@@ -15,12 +15,15 @@ PLAIN = "body"
 """Name of the colouring by body, without a quantity."""
 BODY_COLOURS = ((86, 156, 214), (230, 145, 56), (106, 168, 79), (194, 86, 110), (142, 124, 195), (118, 118, 118))
 """Colours of bodies, in turn [RGB]."""
-RELIEF_NEIGHBOURS, RELIEF = 16, 0.3
-"""Neighbours from which the side that a particle shows to the outside is taken, and by how much its brightness changes."""
+RELIEF_NEIGHBOURS, RELIEF, GLOSS = 16, 0.3, 110.0
+"""Neighbours from which the side that a particle shows to the outside is taken, by which share its brightness changes, and by how much
+at the same time where it is dark [of 255]."""
 SKY = np.array([-0.35, 0.85, 0.4])
 """Direction towards the light of that relief, for +y up."""
 GAP = 0.35
 """Gap between panels side by side, relative to the width of one."""
+LARGE = 2.5
+"""Size of a collider relative to the motion above which it is background, and need not be in the picture as a whole."""
 FEW_SAMPLED = 4000
 """Particles from which the distance to the nearest neighbour is taken."""
 
@@ -33,7 +36,6 @@ class Surface(NamedTuple):
     """Indices of vertices, (T, 3)."""
     vertices: Callable[[int], np.ndarray]
     """Function of a frame's index that returns the vertices [m], (V, 3)."""
-    body: int = 0
 
 
 @dataclass(eq=False)
@@ -51,6 +53,7 @@ class Motion:
         body: Index of each particle's body, (P,); None: one body.
         skins: Meshes that are bound to the particles.
         shift: Where the panel of this motion stands relative to the world [m], (3,).
+        thinning: Draw every so many particles as a point.
     """
 
     name: str
@@ -63,6 +66,7 @@ class Motion:
     body: np.ndarray | None = None
     skins: tuple[Surface, ...] = ()
     shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    thinning: int = 1
 
     @cached_property
     def quantities(self) -> dict[str, Quantity]:
@@ -92,7 +96,8 @@ class Motion:
         if self.x.shape[1] <= RELIEF_NEIGHBOURS or not self.spacing:
             return colours
         outwards = (x - x[self._neighbours].mean(axis=1)) @ SKY.astype(x.dtype) / self.spacing
-        return np.clip(colours * (1.0 + RELIEF * np.clip(np.nan_to_num(outwards), -1.0, 0.8))[:, None], 0, 255).astype(np.uint8)
+        light = RELIEF * np.clip(np.nan_to_num(outwards), -1.0, 1.0)[:, None]
+        return np.clip(colours * (1.0 + light) + GLOSS * light, 0, 255).astype(np.uint8)
 
     @cached_property
     def spacing(self) -> float:
@@ -161,6 +166,10 @@ class Content:
             parts = [eyes]
         every = np.concatenate([part.reshape(-1, 3) for part in parts]).astype(np.float64)
         low, high = every.min(axis=0), every.max(axis=0)
+        for surface in self.surfaces:
+            points = np.concatenate([surface.vertices(0), surface.vertices(self.frames - 1)])
+            if np.ptp(points, axis=0).max() < LARGE * (high - low).max():
+                low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
         pad = 0.02 * max(float((high - low).max()), 1e-6)
         return low - pad, high + pad
 
@@ -240,9 +249,9 @@ def content_of_frames(frames: Any, *, title: str = "rollout", scene: Scene | Non
         frames: `Frames` of a simulator; skins, bodies and colliders are shown where it has them.
         title: Name of the whole.
         scene: The scene that was simulated, for floor, domain and gravity.
-        law: Elastic law, for the stress.
+        law: Elastic law, for the stress; those of the scene's bodies where absent.
     """
-    from neuido.viewer.quantities import stress_of
+    from neuido.viewer.quantities import stress_by_body, stress_of
 
     def array(name: str) -> np.ndarray | None:
         value = getattr(frames, name, None)
@@ -254,11 +263,22 @@ def content_of_frames(frames: Any, *, title: str = "rollout", scene: Scene | Non
     particles = getattr(frames, "particles", None)
     if particles is not None and len(particles.offsets) > 2:
         x, body = _apart(x, particles.scene.cpu().numpy()), particles.scene.cpu().numpy()
-    skins = tuple(_skin(skin, frames, i) for i, skin in enumerate(getattr(frames, "skins", None) or ()))
+    skins = tuple(
+        skin_surface(f"skin {i}", skin.faces.cpu().numpy(), skin.indices.cpu().numpy(), skin.weights.cpu().numpy(), x)
+        for i, skin in enumerate(getattr(frames, "skins", None) or ())
+    )
     stress = None if law is None else stress_of(law)
+    if law is None and scene is not None and body is not None and len(scene.bodies) == int(body.max()) + 1:
+        stress = stress_by_body([each.law for each in scene.bodies], body)
     motion = Motion(title, times, x, array("v"), array("F"), stress=stress, body=body, skins=skins)
-    surfaces = tuple(made for i, each in enumerate(getattr(frames, "colliders", None) or ()) if (made := _collider(each, i)) is not None)
-    content = Content(title, [motion], surfaces=surfaces, times=times)
+    content = Content(title, [motion], times=times)
+    shapes = getattr(frames, "colliders", None) or ()
+    content.surfaces = tuple(
+        moved_surface(each.name, each.mesh.vertices, each.mesh.faces, each.poses.detach().cpu().numpy())
+        for each in shapes
+        if each.mesh is not None
+    )
+    content.planes = tuple(each.shape for each in shapes if isinstance(each.shape, Plane))
     return content if scene is None else with_scene(content, scene)
 
 
@@ -276,20 +296,16 @@ def _apart(x: np.ndarray, scene: np.ndarray) -> np.ndarray:
     return x + (step * scene)[None, :, None] * np.array([1.0, 0.0, 0.0], x.dtype)
 
 
-def _skin(skin: Any, frames: Any, index: int) -> Surface:
-    vertices = np.asarray(skin.vertices_at(frames).detach().cpu(), np.float32)
-    return Surface(getattr(skin, "name", "") or f"skin {index}", np.asarray(skin.faces.cpu()), lambda k: vertices[k], index)
+def skin_surface(name: str, faces: np.ndarray, indices: np.ndarray, weights: np.ndarray, x: np.ndarray) -> Surface:
+    """Return a skin (`neuido.types.Skin`) as a surface that follows the particles x, (K, P, 3)."""
+    return Surface(name, faces, lambda k: np.einsum("vk,vkc->vc", weights, x[k][indices]).astype(np.float32))
 
 
-def _collider(collider: Any, index: int) -> Surface | None:
-    """Return a collider with a mesh as a surface that follows its poses; None for one without a mesh."""
-    mesh = getattr(collider, "mesh", None)
-    if mesh is None:
-        return None
-    points, poses = np.asarray(mesh.vertices, float), np.asarray(collider.poses, float)
+def moved_surface(name: str, vertices: np.ndarray, faces: np.ndarray, poses: np.ndarray) -> Surface:
+    """Return a mesh as a surface that follows its poses, (K, 4, 4)."""
 
-    def vertices(frame: int) -> np.ndarray:
+    def moved(frame: int) -> np.ndarray:
         pose = poses[min(frame, len(poses) - 1)]
-        return points @ pose[:3, :3].T + pose[:3, 3]
+        return vertices @ pose[:3, :3].T + pose[:3, 3]
 
-    return Surface(getattr(collider, "name", "") or f"collider {index}", np.asarray(mesh.faces), vertices)
+    return Surface(name, faces, moved)

@@ -113,20 +113,11 @@ def player(content: Content, *, colour: str | None = None, height: int = 480) ->
 
 
 def _thin(content: Content) -> np.ndarray:
-    """Return the frames that are kept, and reduce the particles of motions that are too many."""
+    """Return the frames that are kept, and set how many particles of each motion are drawn."""
     points = sum(motion.x.shape[1] for motion in content.motions)
     fitting = int(ROOM / max(points * POINT_BYTES, 1))
     many = min(content.frames, max(LEAST_FRAMES, min(MOST_FRAMES, fitting)))
     frames = np.unique(np.linspace(0, content.frames - 1, many).round().astype(int))
-    step = int(np.ceil(len(frames) * points * POINT_BYTES / ROOM))
-    if step > 1:
-        for motion in content.motions:
-            if motion.skins:
-                continue
-            for name in ("x", "v", "F", "reference"):
-                part = getattr(motion, name)
-                if part is not None:
-                    setattr(motion, name, part[:, ::step])
-            motion.body = None if motion.body is None else motion.body[::step]
-            motion.__dict__.pop("quantities", None)
+    for motion in content.motions:
+        motion.thinning = max(1, int(np.ceil(len(frames) * points * POINT_BYTES / ROOM)))
     return frames

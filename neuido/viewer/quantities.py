@@ -216,8 +216,15 @@ def stress_of(law: Any) -> Callable[[np.ndarray], np.ndarray]:
     return stress
 
 
-def stress_by_body(laws: Sequence[Any], body: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the Kirchhoff stress [Pa] where each body has its own elastic law; `body` has the index of each particle, (P,)."""
+def stress_by_body(laws: Sequence[Any], body: np.ndarray) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return the Kirchhoff stress [Pa] where each body has its own elastic law; None where a body's law varies within it or is not given.
+
+    Args:
+        laws: The law of each body.
+        body: Index of each particle's body, (P,).
+    """
+    if not all(hasattr(law, "tensors") and all(len(t) == 1 for t in law.tensors()) for law in laws):
+        return None
     own = [stress_of(law) for law in laws]
 
     def stress(F: np.ndarray) -> np.ndarray:

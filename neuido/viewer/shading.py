@@ -18,6 +18,8 @@ TAPS = ((-0.9, -0.4), (0.4, -0.9), (0.9, 0.4), (-0.4, 0.9))
 """Shifts [px] of the looks into the shadow map, whose mean softens the edges."""
 PAPER_TOP, PAPER_BOTTOM = (244, 246, 249), (222, 227, 234)
 """Background, top and bottom [RGB]."""
+CREASE = 0.87
+"""Cosine of the angle between the normals of a face and of its corner, 30 degrees, above which an edge is drawn sharp."""
 FLOOR, LINE = (206, 211, 218), (172, 179, 189)
 FADE = 2.6
 """Distance from the middle at which a floor has faded into the background, relative to the size of what is shown."""
@@ -144,12 +146,21 @@ def _surface(shapes: list[Shape], item: np.ndarray, place: np.ndarray) -> tuple[
         elif len(index):
             corners = shape.points[shape.faces[index]]
             weights = _barycentric(place[own], corners)
-            normal[own] = np.einsum("nk,nkc->nc", weights, vertex_normals(shape.points, shape.faces)[shape.faces[index]])
+            normal[own] = np.einsum("nk,nkc->nc", weights, _corner_normals(shape.points, shape.faces, index))
             colour[own] = np.einsum("nk,nkc->nc", weights, shape.colours[shape.faces[index]].astype(float))
             bias[own] = 0.5 * float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
         first += count
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     return normal / np.maximum(length, 1e-12), colour, bias
+
+
+def _corner_normals(points: np.ndarray, faces: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Return the normals at the corners of some faces, (N, 3, 3): smooth, but those of the face itself at a sharp edge."""
+    corners = points[faces[index]].astype(np.float64)
+    own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    own = (own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-30))[:, None]
+    smooth = vertex_normals(points, faces)[faces[index]]
+    return np.where(np.sum(own * smooth, axis=2, keepdims=True) > CREASE, smooth, own)
 
 
 def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:

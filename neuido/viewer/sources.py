@@ -12,12 +12,17 @@ from neuido.data.files.values import vector
 from neuido.data.formats.ply import read_ply_header, read_ply_vertices
 from neuido.errors import UserError, suggest
 from neuido.types import Gaussians, Plane
-from neuido.viewer.content import Content, Motion, place_side_by_side, with_scene
+from neuido.viewer.content import Content, Motion, moved_surface, place_side_by_side, skin_surface, with_scene
+from neuido.viewer.quantities import stress_of
 
 RATE = 20.0
 """Frames a second at which motions without times are played: that of the videos of `neuido predict`."""
 SCENE, LAW = "scene.yaml", "law.safetensors"
 """Names under which `neuido simulate` keeps the scene and a learned law beside the motion."""
+PARTS = {"skin": ("faces", "indices", "weights"), "collider": ("vertices", "faces", "poses")}
+"""Arrays of each skin and collider in a file of frames, as in `Frames.save`."""
+MOST_SURFACES = 64
+"""Skins, and colliders, of a file that are shown at most."""
 KINDS = (
     "a rollout (.npz), a folder of `neuido simulate`, `neuido predict` or `neuido diagnose`, an experiment, a recording, PLY files of "
     "particles or Gaussians, or a scene file (.yaml)"
@@ -94,7 +99,8 @@ def _pick(names: Sequence[str], wanted: str | None, place: Path) -> str:
 
 def _archive(path: Path, recording: str | None) -> Content:
     """Read an .npz file of frames, with the scene and the law that lie beside it."""
-    arrays = read_arrays(path, ("x",), ("v", "F", "times", "t", "scene", "body"), what="file of frames with positions x")
+    kept = [f"{kind}_{i}_{part}" for kind, parts in PARTS.items() for i in range(MOST_SURFACES) for part in parts]
+    arrays = read_arrays(path, ("x",), ("v", "F", "times", "t", "scene", "body", *kept), what="file of frames with positions x")
     x = arrays["x"]
     if x.ndim == 2:
         x = x[None]
@@ -106,17 +112,48 @@ def _archive(path: Path, recording: str | None) -> Content:
             raise UserError(f"{path}: {name} has the shape {arrays[name].shape}; with x {x.shape} it must be {shape}")
     given = arrays.get("times", arrays.get("t"))
     times, timed = _times(given if given is None or given.ndim == 1 else given[0], frames, path)
-    scene, law, laws = _beside(path.parent)
-    body = arrays.get("body")
-    stress = _stress(law, laws, body)
+    scene, law = _beside(path.parent)
+    body, stress = arrays.get("body"), None if law is None else stress_of(law)
     motion = Motion("simulated", times, x.astype(np.float32), arrays.get("v"), arrays.get("F"), stress=stress, body=body)
     content = Content(path.parent.name if path.name == "frames.npz" else path.stem, [motion], times=times, timed=timed)
+    _add_surfaces(content, arrays, path)
     if "scene" in arrays and arrays["scene"].max() > 0:
         number = arrays["scene"].astype(int)
         wide = 1.35 * float(np.ptp(x[np.isfinite(x).all(axis=-1)][:, 0]))
         motion.x = motion.x + (wide * number)[None, :, None].astype(np.float32) * np.array([1, 0, 0], np.float32)
         motion.body = number
     return content if scene is None else with_scene(content, scene)
+
+
+def _add_surfaces(content: Content, arrays: dict[str, np.ndarray], path: Path) -> None:
+    """Add the skins and colliders that a file of frames has."""
+    motion, colliders, skins = content.motions[0], [], []
+    for i in range(MOST_SURFACES):
+        found = {kind: [arrays.get(f"{kind}_{i}_{part}") for part in parts] for kind, parts in PARTS.items()}
+        for kind, parts in found.items():
+            given = [part for part in parts if part is not None]
+            if given and len(given) < len(parts):
+                raise UserError(f"{path}: {kind} {i} is not whole; it takes {', '.join(f'{kind}_{i}_{part}' for part in PARTS[kind])}")
+        if found["skin"][0] is not None:
+            faces, indices, weights = found["skin"]
+            bound = indices.ndim == weights.ndim == 2 and indices.shape == weights.shape and _within(indices, motion.x.shape[1])
+            if not bound or not _triangles(faces, len(indices)):
+                raise UserError(f"{path}: skin {i} does not fit the particles: an index is outside, or shapes differ")
+            skins.append(skin_surface(f"skin {i}", faces, indices, weights, motion.x))
+        if found["collider"][0] is not None:
+            vertices, faces, poses = found["collider"]
+            if vertices.ndim != 2 or not _triangles(faces, len(vertices)) or poses.shape[1:] != (4, 4) or not len(poses):
+                raise UserError(f"{path}: collider {i} has vertices {vertices.shape}, faces {faces.shape} and poses {poses.shape}")
+            colliders.append(moved_surface(f"collider {i}", vertices, faces, poses))
+    motion.skins, content.surfaces = tuple(skins), tuple(colliders)
+
+
+def _within(indices: np.ndarray, count: int) -> bool:
+    return indices.dtype.kind in "iu" and bool(((indices >= 0) & (indices < count)).all())
+
+
+def _triangles(faces: np.ndarray, vertices: int) -> bool:
+    return faces.ndim == 2 and faces.shape[1] == 3 and _within(faces, vertices)
 
 
 def _times(given: np.ndarray | None, frames: int, path: Path) -> tuple[np.ndarray, bool]:
@@ -128,32 +165,24 @@ def _times(given: np.ndarray | None, frames: int, path: Path) -> tuple[np.ndarra
     return given.astype(np.float64), True
 
 
-def _beside(folder: Path) -> tuple[Any, Any, Sequence[Any]]:
-    """Return the scene, the elastic law and the laws of several bodies that `neuido simulate` kept in a folder; None where absent."""
+def _beside(folder: Path) -> tuple[Any, Any]:
+    """Return the scene and the elastic law that `neuido simulate` kept in a folder; None where absent."""
     from neuido.data.bodies.scene_files import model_from_dict, scene_from_dict
     from neuido.physics.laws.classical import material
 
     if not (folder / SCENE).is_file():
-        return None, None, ()
+        return None, None
     content = read_yaml(folder / SCENE)
     with naming(folder / SCENE):
         scene = scene_from_dict(content["scene"], content["discretisation"])
         if (folder / LAW).is_file():
             from neuido.models.inference.law_file import load_law
 
-            return scene, load_law(folder / LAW)[0], ()
+            return scene, load_law(folder / LAW)[0]
         if "model" not in content:
-            return scene, None, ()
+            return scene, None
         model = model_from_dict(content["model"])
-    return scene, material(model["elasticity"], model["plasticity"])[0], ()
-
-
-def _stress(law: Any, laws: Sequence[Any], body: np.ndarray | None) -> Callable[[np.ndarray], np.ndarray] | None:
-    from neuido.viewer.quantities import stress_by_body, stress_of
-
-    if laws and body is not None:
-        return stress_by_body(laws, body)
-    return None if law is None else stress_of(law)
+        return scene, material(model["elasticity"], model["plasticity"])[0]
 
 
 def _numbered(folder: Path) -> list[Path]:

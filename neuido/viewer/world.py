@@ -10,14 +10,14 @@ from neuido.errors import UserError
 from neuido.physics.runtime.lazy import import_extra
 from neuido.types import Plane
 from neuido.viewer.content import Content, Motion, Surface
-from neuido.viewer.picture import ARROW, COLLIDER, FIELD_OF_VIEW, MEASURED, RADIUS, View, camera_of, frusta
+from neuido.viewer.picture import ARROW, COLLIDER, FIELD_OF_VIEW, MEASURED, View, camera_of, frusta
 from neuido.viewer.quantities import Quantity, table
 from neuido.viewer.shading import grid_step
 
 HOST, PORT = "localhost", 8080
 PORTS = (1, 65535)
-DOT = 2.0 * RADIUS
-"""Size of a point relative to the distance of its neighbours."""
+DOT = 1.1
+"""Size of a point relative to the distance of its neighbours, which it touches."""
 FLOOR_REACH = 3.0
 """Side of a drawn floor relative to the size of what is shown."""
 
@@ -185,7 +185,7 @@ class Drawn:
 
     def __init__(self, server: Any, content: Content, index: int) -> None:
         self.server, self.content, self.motion, self.index = server, content, content.motions[index], index
-        spacing = self.motion.spacing or 0.02 * content.size
+        spacing = self.motion.spacing * self.motion.thinning ** (1 / 3) or 0.02 * content.size
         self.cloud = Cloud(server, f"motion/{index}/particles", spacing)
         self.measured = Cloud(server, f"motion/{index}/measured", 0.6 * spacing)
         self.arrows: Any = None
@@ -197,6 +197,7 @@ class Drawn:
         """Draw a frame with the colours of a quantity."""
         motion = self.motion
         colours, seen = motion.colours(frame, quantity), np.isfinite(motion.x[frame]).all(axis=1)
+        seen[np.arange(len(seen)) % motion.thinning > 0] = False
         self.cloud.visible = self.shown["particles"] and not (self.shown["skin"] and motion.skins)
         lit = motion.lit(motion.x[frame], colours)
         self.cloud.show(motion.x[frame][seen] + motion.shift, lit[seen], 0.55 if motion.reference is not None else 1.0)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from neuido.physics.colliders.solid_meshes import SolidMesh, mesh_of
 from neuido.physics.colliders.solid_tables import rotate, solids_of
 from neuido.types import Plane, Scene, Solid, brief_fields
 
@@ -30,6 +31,11 @@ class ColliderFrames(NamedTuple):
 
     def __repr__(self) -> str:
         return brief_fields(self)
+
+    @property
+    def mesh(self) -> SolidMesh | None:
+        """Its surface in its own axes, for pictures and files; None of a half-space or a plane."""
+        return mesh_of(self.shape)
 
 
 def collider_frames(

@@ -140,9 +140,11 @@ class Frames(ParticleState):
 
         Args:
             path: The file; missing folders are created. `.npz`: arrays x, v, C, F, times and scene (C and F if the motion has them),
-                with body and body_names where there are several bodies. `.ply`: one point cloud per frame, `NAME_0000.ply`,
-                `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; other files of a series of that name are deleted. `.csv`:
-                one row per frame and particle. Other endings, such as `.usd`, are those of `neuido.export`.
+                with body and body_names where there are several bodies; of skin i `skin_i_vertices`, `_faces`, `_indices` and `_weights`
+                (`Skin`), and of collider i with a surface `collider_i_vertices` [m], `_faces` and `_poses`, (K, 4, 4). `.ply`: one
+                point cloud per frame, `NAME_0000.ply`, `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; other files of a
+                series of that name are deleted. `.csv`: one row per frame and particle. Other endings, such as `.usd`, are those of
+                `neuido.export`.
 
         Returns:
             The files that were written.
@@ -182,6 +184,12 @@ class Frames(ParticleState):
         arrays: dict[str, Any] = {name: t.detach().cpu().numpy() for name, t in zip(self._fields, self) if t is not None}
         if self.body is not None:
             arrays |= {"body": self.body.cpu().numpy(), "body_names": np.array(self.body_names)}
+        for i, skin in enumerate(self.skins):
+            arrays |= {f"skin_{i}_{name}": part.cpu().numpy() for name, part in zip(skin._fields, skin)}
+        for i, collider in enumerate(self.colliders):
+            if collider.mesh is not None:
+                parts = collider.mesh._asdict() | {"poses": collider.poses.detach().cpu().numpy()}
+                arrays |= {f"collider_{i}_{name}": part for name, part in parts.items()}
         with whole_file(path) as hidden, open(hidden, "wb") as file:
             np.savez_compressed(file, times=self.times.numpy(), scene=self._scene(), **arrays)
         return [path]
