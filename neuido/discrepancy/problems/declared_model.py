@@ -42,7 +42,7 @@ class Figure(NamedTuple):
 
 
 FIGURES = {
-    "young": Figure("Pa", 0.1, 1e2, 1e13, True),
+    "young": Figure("Pa", 0.1, 1e-3, 1e13, True),
     "poisson": Figure("1", 0.03, -0.9, 0.4999, False),
     "density": Figure("kg/m^3", 0.05, 1.0, 3e4, True),
     "yield_stress": Figure("Pa", 0.1, 1e-2, 1e12, True),

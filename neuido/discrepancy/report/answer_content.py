@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import neuido
-from neuido.discrepancy.inference.floors import Part, Round, Trial
+from neuido.discrepancy.inference.floors import Part, Round, Trial, unphysical
 from neuido.discrepancy.inference.power import Compatible
 from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.discrepancy.inference.search.intervals import would_help
@@ -289,6 +289,9 @@ def _effect(d: Diagnosis, r: Round, series: Mapping[str, list[residual.Series]],
     }
     if c.form:
         out["form"] = c.form
+    limit = unphysical(c, {p.name: d.after.get(p.name, p.value) for p in c.parameters})  # refits after it was named may have moved it
+    if limit:
+        out["at_limit"] = limit
     return out
 
 

@@ -15,14 +15,13 @@ from neuido.data.files.parsing import read_arrays
 from neuido.data.files.writing import copy_file
 from neuido.discrepancy.report import diagnosis_format
 from neuido.discrepancy.report.reader_units import Units, axis_of
-from neuido.discrepancy.report.wording import LEADING, MORE, Words, more, named, scored_by, words_of
+from neuido.discrepancy.report.wording import LEADING, MORE, MORE_LEFT, Words, more, named, scored_by, words_of
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
     from matplotlib.figure import Figure
 
-MORE_LEFT = ", and something more that no effect here explains"
 BEFORE, AFTER, INK = "#c0392b", "#1f77b4", "#333333"
 MOST_PANELS = 4
 

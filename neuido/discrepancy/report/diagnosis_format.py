@@ -63,7 +63,7 @@ def schema() -> Schema:
             "where": ANY_TEXT,
             "step": STEP,
         },
-        {"title": TEXT, "form": ANY_TEXT, "p_value_of": ANY_TEXT},
+        {"title": TEXT, "form": ANY_TEXT, "p_value_of": ANY_TEXT, "at_limit": TEXT},
     )
     error = record(
         {"measure": TEXT, "unit": TEXT, "noise_floor": MAYBE, "discretisation_floor": MAYBE, "before": SCORES, "after": SCORES},

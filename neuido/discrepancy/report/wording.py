@@ -10,6 +10,8 @@ LEADING = ("yield_stress", "damping_ratio", "coefficient", "ratio")
 """Derived quantities that replace the fitted parameters of an effect in words."""
 MORE = 3.0
 """Ratio of the residual with the named effects to its floor, above which something more is missing."""
+MORE_LEFT = ", and something more that no effect here explains"
+"""End of the first sentence where something more is missing."""
 STANDS_ABOVE = 1.5
 """Ratio of residual to noise above which the answer `none` states the ratio."""
 MOST_SAID = 4
@@ -143,13 +145,12 @@ def _finding(c: Content, units: Units) -> str:
     why = "; ".join(c["why"])
     out = [f"{why[0].upper()}{why[1:]}."] if why else []
     if answer in ("effect", "class"):
-        out.append(_missing(effects, units, name=c.get("name", "model")))
         over = c["error"].get("left_over_floor")
-        if over is not None and over > MORE:
-            out.append(
-                "Something more is missing that no effect of the library explains: what is left is "
-                f"{over:.0f} times what noise and discretisation leave."
-            )
+        more = over is not None and over > MORE
+        out.append(_missing(effects, units, more=MORE_LEFT if more else ""))
+        if more:
+            out.append(f"What is left is {over:.0f} times what noise and discretisation leave.")
+        out += [f"A limit and no size, since a later fit moved it: {e['at_limit']}." for e in effects if e.get("at_limit")]
     elif answer == "none":
         out.append("Nothing is missing that these data could show.")
         over = c["error"].get("left_over_noise")
@@ -170,20 +171,19 @@ def _finding(c: Content, units: Units) -> str:
     return " ".join(out)
 
 
-def _missing(effects: Sequence[Content], units: Units, *, name: str) -> str:
-    """Return a sentence on the missing effects, and a second one where the data cannot tell effects apart."""
+def _missing(effects: Sequence[Content], units: Units, *, more: str = "") -> str:
+    """Return a sentence on the missing effects, which ends with `more`, and a second one where the data cannot tell effects apart."""
     if len(effects) == 1:
         (e,) = effects
         size = size_of(e["parameters"], units)
         if len(e["class"]) == 1:
-            return f"The model lacks {title(e['name'])}: {size}." if size else f"The model lacks {title(e['name'])}."
+            return f"The model lacks {title(e['name'])}{f': {size}' if size else ''}{more}."
         as_first = f" As {title(e['name'])}: {size}." if size else ""
-        return f"The model lacks {_class_of(e)}; these data cannot tell them apart.{as_first}"
+        return f"The model lacks {_class_of(e)}{more}; these data cannot tell them apart.{as_first}"
     said = [f"{_class_of(e)}{f', {size}' if (size := size_of(e['parameters'], units)) else ''}" for e in effects]
     apart = " The data cannot tell apart what is joined by “or”." if any(len(e["class"]) > 1 for e in effects) else ""
-    return (
-        f"The model lacks {NUMBERS[len(effects)] if len(effects) < len(NUMBERS) else len(effects)} effects: {'; and '.join(said)}.{apart}"
-    )
+    count = NUMBERS[len(effects)] if len(effects) < len(NUMBERS) else len(effects)
+    return f"The model lacks {count} effects: {'; and '.join(said)}{more}.{apart}"
 
 
 def scored_by(scores: Content) -> str:

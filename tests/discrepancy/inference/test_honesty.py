@@ -72,7 +72,7 @@ def content(found, tmp_path):
 def test_what_is_left_beside_a_named_effect_is_told(tmp_path):
     told = content(diagnose(Line({"young": 1.5, "drag_linear.k": 3.0}, beside=0.15), draws=39), tmp_path)
     assert told["answer"] == "effect" and told["error"]["left_over_floor"] > 3.0
-    assert "Something more is missing that no effect of the library explains" in (tmp_path / "report.html").read_text()
+    assert "and something more that no effect here explains" in (tmp_path / "report.html").read_text()
     clean = content(diagnose(Line({"young": 1.5, "drag_linear.k": 3.0}), draws=39), tmp_path)
     assert clean["answer"] == "effect" and clean["error"]["left_over_floor"] < 1.3
     assert "Something more" not in (tmp_path / "report.html").read_text()

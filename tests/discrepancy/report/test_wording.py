@@ -83,7 +83,10 @@ def test_next_experiment_is_told_with_its_odds():
 def test_an_effect_that_leaves_more_says_so():
     c = content()
     c["error"]["left_over_floor"] = 12.0
-    assert "Something more is missing" in words_of(c).finding and "12 times" in words_of(c).finding
+    first, *_ = words_of(c).finding.split(". ")
+    assert first.endswith(", and something more that no effect here explains") and "12 times" in words_of(c).finding
+    c["effects"][0]["at_limit"] = "drag_linear.k ends at 5 1/s, the edge of its physical range"
+    assert "a limit and no size" in words_of(c).finding.lower()
 
 
 def test_stresses_stand_in_one_unit():
