@@ -104,6 +104,7 @@ def schemas() -> dict[str, Schema]:
     material = {"elasticity": ELASTICITY}
     extra = {"plasticity": PLASTICITY, "free": FREE}
     law = record({"file": TEXT}, {"stiffness": POSITIVE})
+    fluid = record({"law": one_of(["newtonian"]), "viscosity": POSITIVE})
     own = record({"density": POSITIVE, **material}, {**extra, "effects": effects_of(names)})
     neural = record({"density": POSITIVE, "law": law}, {**material, **extra, "effects": effects_of(names)})
     columns = [
@@ -132,10 +133,15 @@ def schemas() -> dict[str, Schema]:
             {
                 "format": one_of(["neuido-material-test/1"]),
                 "name": TEXT,
-                "model": record(
-                    {"density": POSITIVE, **material},
-                    {**extra, "incompressible": {"type": "boolean"}, "effects": effects_of(material_test.EFFECTS)},
-                ),
+                "model": {
+                    "oneOf": [
+                        record(
+                            {"density": POSITIVE, **material},
+                            {**extra, "incompressible": {"type": "boolean"}, "effects": effects_of(material_test.EFFECTS)},
+                        ),
+                        record({"density": POSITIVE, "flow": fluid}, {"free": FREE, "effects": effects_of(material_test.FLUID)}),
+                    ]
+                },
                 "tests": some(
                     record(
                         {
@@ -145,7 +151,14 @@ def schemas() -> dict[str, Schema]:
                             "columns": {"anyOf": [record(c, {"time": TEXT}) for c in columns]},
                             "role": role,
                         },
-                        {"scale": SCALE, "rows": ROWS, "direction": VECTOR},
+                        {
+                            "scale": SCALE,
+                            "rows": ROWS,
+                            "direction": VECTOR,
+                            "control": one_of(material_test.CONTROLS),
+                            "periodic": {"type": "boolean"},
+                            "noise": POSITIVE,
+                        },
                     )
                 ),
             }

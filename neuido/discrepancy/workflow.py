@@ -236,7 +236,7 @@ def problems_of(
         raise UserError(f"{'law' if law is not None else 'data'} is for experiments, and {folder} is a {kind}: leave it out")
     if kind == "material test":
         from neuido.data.measured.material_test import read_material_tests
-        from neuido.discrepancy.problems.material import MaterialProblem
+        from neuido.discrepancy.problems.specimens.material import MaterialProblem
 
         return [MaterialProblem(read_material_tests(folder, model=given))]
     from neuido.data.measured.track import read_tracks
@@ -275,7 +275,7 @@ def problems_of_data(
     if law is not None or data != "auto":
         raise UserError(f"{'law' if law is not None else 'data'} is for experiments, not {type(source).__name__}: leave it out")
     if isinstance(source, MaterialTests):
-        from neuido.discrepancy.problems.material import MaterialProblem
+        from neuido.discrepancy.problems.specimens.material import MaterialProblem
 
         return "material test", [MaterialProblem(source)]
     from neuido.discrepancy.problems.tracks.track_problem import track_problems

@@ -75,5 +75,5 @@ def test_diagnose(crushed, tmp_path):
     found = diagnose(crushed, out=tmp_path / "out", **options)
     content = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert any(line.startswith("before: ") and "det F" in line for line in content["doubts"]["throw"])
-    assert "The predicted motion of throw is doubtful" in found.summary()
-    assert "The predicted motion of throw is doubtful" in (tmp_path / "out" / "report.html").read_text()
+    assert "The prediction of throw is doubtful" in found.summary()
+    assert "The prediction of throw is doubtful" in (tmp_path / "out" / "report.html").read_text()

@@ -51,7 +51,7 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
     """
     problem, recordings = lab.problem, lab.fitted_recordings
     taken = {t.candidate.name for t in found}
-    candidates = problem.candidates
+    candidates = [c for c in problem.candidates if not c.needs or c.needs in taken]
     if not candidates or not lab.runs(at.fit.point):
         return []
     own = {name.partition(".")[0] for name in r.base if "." in name}

@@ -46,6 +46,7 @@ FIGURES = {
     "poisson": Figure("1", 0.03, -0.9, 0.4999, False),
     "density": Figure("kg/m^3", 0.05, 1.0, 3e4, True),
     "yield_stress": Figure("Pa", 0.1, 1e-2, 1e12, True),
+    "viscosity": Figure("Pa s", 0.1, 1e-9, 1e15, True),
     "stiffness": Figure("1", 0.1, 1e-3, 1e3, True),
     "friction_angle": Figure("degrees", 2.0, 1.0, 80.0, False),
 }

@@ -87,6 +87,8 @@ class Candidate:
     """Change of the logarithm of a declared parameter per unit of the size, which keeps the whole body about as stiff as before."""
     takes: tuple[str, ...] = ()
     """Declared parameters that a fit overestimates while the effect is missing, such as the modulus of a body that stiffens."""
+    needs: str = ""
+    """Effect that must be in the model before this one is offered, such as `yield` for its hardening. Empty: none."""
 
     @property
     def key(self) -> str:

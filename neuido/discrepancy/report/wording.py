@@ -55,7 +55,7 @@ def _notes(c: Content) -> str:
     out = []
     if c["left_out"]:
         out.append(f"The search ended before {listed([worded(step) for step in c['left_out']])}: the same command with {more(c)} goes on.")
-    out += [f"The predicted motion of {name} is doubtful, {'; '.join(events)}." for name, events in c.get("doubts", {}).items()]
+    out += [f"The prediction of {name} is doubtful, {'; '.join(events)}." for name, events in c.get("doubts", {}).items()]
     return " ".join(out)
 
 

@@ -25,8 +25,8 @@ from neuido.discrepancy.inference.search import attribution, next_effect
 from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.body import BodyProblem, body_problem
-from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.problem import Problem
+from neuido.discrepancy.problems.specimens.material import MaterialProblem
 from neuido.discrepancy.problems.tracks.track_problem import track_problems
 from neuido.discrepancy.report import answer, residual
 from neuido.discrepancy.report.answer_content import motions

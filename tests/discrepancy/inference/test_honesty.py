@@ -18,9 +18,9 @@ from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import levenberg_marquardt, run
 from neuido.discrepancy.inference.search.attribution import diagnose
 from neuido.discrepancy.inference.search.intervals import findings
-from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.noise import correlation, surface
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
+from neuido.discrepancy.problems.specimens.material import MaterialProblem
 from neuido.discrepancy.problems.tracks.track_problem import TrackProblem, track_problems
 from neuido.discrepancy.report import answer, answer_content
 from neuido.errors import UserError

@@ -6,8 +6,8 @@ import yaml
 
 from neuido.data.measured.material_test import read_material_tests
 from neuido.discrepancy.inference.least_squares import levenberg_marquardt, run
-from neuido.discrepancy.problems.material import MaterialProblem
 from neuido.discrepancy.problems.noise import high_pass, monotone_pieces
+from neuido.discrepancy.problems.specimens.material import MaterialProblem
 
 YOUNG = 1.0e6
 MU = YOUNG / (2 * 1.499)
@@ -65,27 +65,42 @@ def test_impossible_points_are_nan_alone(tmp_path):
 
 
 def test_which_effects_are_asked_for(tmp_path):
-    """Only what the tests can show: one axis tells no fibre, a monotone path no damage, a path without times no rate."""
+    """Only what the tests can show: one axis tells no fibre, a monotone path no damage, one loading at one rate no effect of time."""
     l, t = np.linspace(1.0, 2.0, 12), np.linspace(0, 1, 12)
+    timed = {"stretch": "L", "nominal_stress": "S", "time": "T"}
+
+    def problem(tests, **more):
+        return MaterialProblem(write(tmp_path, tests, **({"L": l, "S": YOUNG * (l - 1), "T": t} | more)))
 
     def names(tests, **more):
-        return {c.name for c in MaterialProblem(write(tmp_path, tests, **({"L": l, "S": YOUNG * (l - 1), "T": t} | more))).candidates}
+        return {c.name for c in problem(tests, **more).candidates if not c.needs}
 
     plain = names([{"name": "a"}])
     assert plain == {"strain_stiffening", "second_invariant", "yield"}
     assert names([{"name": "a"}, {"name": "b", "direction": [0, 1, 0]}]) == plain | {"fibre"}
-    rates = {"viscosity_shear", "maxwell", "hysteresis", "stiffness_change"}
-    assert names([{"name": "a", "columns": {"stretch": "L", "nominal_stress": "S", "time": "T"}}]) == plain | rates
+    assert names([{"name": "a", "columns": timed}]) == plain
+    why = problem([{"name": "a", "columns": timed}]).labels["excluded"]
+    assert "one rate" in why["maxwell"] and "one rate" in why["creep"] and "once" in why["stiffness_change"]
+    rates = {"viscosity_shear", "maxwell", "hysteresis", "creep"}
+    held = np.minimum(2 * np.linspace(0, 1, 12), 1.0) + 1.0
+    assert names([{"name": "a", "columns": timed}], L=held) == plain | rates
+    faster = {"columns": timed | {"time": "T2"}, "name": "b"}
+    spectra = {"relaxation_spectrum", "fractional"}  # for these the rates must span a decade and a half
+    assert names([{"name": "a", "columns": timed}, faster], T2=t / 4) == plain | rates | spectra
     there = np.concatenate([l[::2], l[::-2]])
-    assert names([{"name": "a"}], L=there, S=YOUNG * (there - 1)) == plain | {"softening"}
+    unloaded = plain | {"softening", "mullins", "permanent_set"}
+    assert names([{"name": "a"}], L=there, S=YOUNG * (there - 1)) == unloaded
     around = np.concatenate([l[::2], 1 / l[::2]])
-    assert names([{"name": "a"}], L=around, S=YOUNG * (around - 1)) == plain | {"softening", "tension_compression"}
+    assert names([{"name": "a"}], L=around, S=YOUNG * (around - 1)) == unloaded | {"tension_compression", "compaction"}
     steel = {"elasticity": {"law": "sigma", "young": 2e11, "poisson": 0.3}, "plasticity": {"law": "von_mises", "yield_stress": 3e8},
              "incompressible": False}  # fmt: skip
     small = 1 + 0.01 * np.sin(np.linspace(0, 12, 40))
     table = write(tmp_path, [{"name": "a"}], model=steel, L=small, S=3e8 * np.sign(small - 1), T=small)
-    found = {c.name for c in MaterialProblem(table).candidates}
-    assert found == {"tension_compression", "softening", "hardening", "kinematic_hardening"}
+    flows = {"hardening", "cyclic_hardening", "kinematic_hardening", "nonlinear_backstress"}
+    assert {c.name for c in MaterialProblem(table).candidates} == flows | {"tension_compression", "softening"}
+    elastic = {"elasticity": {"law": "sigma", "young": 2e11, "poisson": 0.3}, "incompressible": False}
+    table = write(tmp_path, [{"name": "a"}], model=elastic, L=small, S=3e8 * np.sign(small - 1), T=small)
+    assert {c.name for c in MaterialProblem(table).candidates if c.needs == "yield"} == flows  # offered once yield is found
 
 
 def test_stiffening_is_found_and_the_model_after_answers_it(tmp_path):

@@ -130,7 +130,7 @@ def test_tracks(tmp_path):
 
 
 def test_material_tests(tmp_path):
-    from neuido.discrepancy.problems.material import MaterialProblem
+    from neuido.discrepancy.problems.specimens.material import MaterialProblem
 
     made.material_test(tmp_path / "rubber")
     problem = MaterialProblem(tmp_path / "rubber")

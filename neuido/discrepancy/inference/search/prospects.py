@@ -179,7 +179,8 @@ def screened(lab: Laboratory, point: Point, floor: Floor, found: Sequence[Trial]
         The candidates, the free parameters, their slopes, and the two results of `directions.screen`.
     """
     taken = {t.candidate.name for t in found}
-    candidates = [c for c in lab.problem.candidates if c.name not in taken and len(c.parameters) <= most]
+    able = [c for c in lab.problem.candidates if c.name not in taken and (not c.needs or c.needs in taken)]
+    candidates = [c for c in able if len(c.parameters) <= most]
     if led is not None and led.chosen is not None:
         at = led.chosen
         candidates = [c if c.key in led.keys else replace(c, starts=(c.starts[at.get(c.key, 0)],)) for c in candidates]

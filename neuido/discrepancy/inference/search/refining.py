@@ -124,7 +124,7 @@ def growing_pairs(search: Search, base: Point, floor: Floor) -> list[Pair]:
     """
     lab = search.lab
     free, breadth = lab.problem.declared, PAIRS if lab.problem.together else PAIRS_ONE_BY_ONE
-    small = [c for c in lab.problem.candidates if len(c.parameters) <= breadth.parameters]
+    small = [c for c in lab.problem.candidates if len(c.parameters) <= breadth.parameters and not c.needs]
     wide = base_fits.early(lab, floor, HORIZONS[1])
     firsts = ranked_starts(lab, at_first(search, free, contests.at_declared(lab, base), floor), small, wide, free)[: breadth.firsts]
     lab.tell(f"growing pairs beside {', '.join(c.key for c, _ in firsts)}")
