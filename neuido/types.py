@@ -302,6 +302,25 @@ class AttachedMass:
 
 
 @dataclass(frozen=True)
+class Attachment:
+    """Particles that are held to places in space or on a solid collider, by a spring and a damper or rigidly.
+
+    Args:
+        particles: Those in a `Box` at t = 0, those that a `Skin` is bound to, or indices of particles of the scene.
+        to: Name of the solid collider; empty: places in space.
+        point: The place [m] to which all are drawn; None: each to where it is at t = 0.
+        stiffness: Of all these particles together [N/m]; infinite: rigidly.
+        damping: Of all together [N s/m].
+    """
+
+    particles: Any
+    to: str = ""
+    point: Vector | None = None
+    stiffness: float = math.inf
+    damping: float = 0.0
+
+
+@dataclass(frozen=True)
 class Walls:
     """The six walls of the domain.
 
@@ -330,6 +349,7 @@ class Scene:
         walls: Walls of the domain; None: the domain is open, and a particle that leaves it is an error.
         clamps: Boxes whose particles and nodes are held at rest.
         attached_masses: Masses that are added to the body.
+        attachments: Particles that are held to places in space or on solid colliders.
         bodies: The bodies, if the scene brings them; `Simulator(scene)` then needs no other.
         contact: Contact between the bodies: `sticky` (they share one velocity field and never part) or `separate` (they push, slide with
             friction, and part).
@@ -346,6 +366,7 @@ class Scene:
     walls: Walls | None = Walls()
     clamps: tuple[Box, ...] = ()
     attached_masses: tuple[AttachedMass, ...] = ()
+    attachments: tuple[Attachment, ...] = field(default=(), compare=False)
     bodies: Sequence[Body] = field(default=(), compare=False)
     contact: str = "separate"
     body_friction: float | Sequence[tuple[str, str, float]] = 0.0

@@ -78,6 +78,33 @@ PLASTICITY = {
 CONTACT = one_of(["sticky", "slip", "separate"])
 PLANE = record({"type": one_of(["plane"]), "point": VECTOR, "normal": VECTOR, "contact": CONTACT}, {"friction": NOT_NEGATIVE})
 COLLIDERS = {"type": ["array", "null"], "items": PLANE}
+QUATERNION: Schema = {"type": "array", "items": NUMBER, "minItems": 4, "maxItems": 4, "description": "w, x, y, z"}
+PATH = record({"times": some(NUMBER), "positions": some(VECTOR)}, {"rotations": some(QUATERNION)})
+SHARED: dict[str, Schema] = {
+    "name": {"type": "string"},
+    "position": VECTOR,
+    "rotation": QUATERNION,
+    "contact": CONTACT,
+    "friction": NOT_NEGATIVE,
+    "velocity": VECTOR,
+    "spin": VECTOR,
+    "path": PATH,
+    "mass": POSITIVE,
+    "inertia": {"type": "array", "items": VECTOR, "minItems": 3, "maxItems": 3},
+}
+LATTICE: Schema = {"type": "array", "items": {"type": "array", "items": NUMBER, "minItems": 2}, "minItems": 2}
+OWN: dict[str, dict[str, Schema]] = {
+    "half_space": {},
+    "sphere": {"radius": POSITIVE},
+    "cuboid": {"size": {"type": "array", "items": POSITIVE, "minItems": 3, "maxItems": 3}},
+    "capsule": {"radius": POSITIVE, "length": POSITIVE},
+    "cylinder": {"radius": POSITIVE, "length": POSITIVE},
+    "height_field": {"heights": LATTICE, "size": {"type": "array", "items": POSITIVE, "minItems": 2, "maxItems": 2}},
+    "mesh": {"file": TEXT},
+}
+MESH_OPTIONS: dict[str, Schema] = {"scale": POSITIVE, "up": one_of(["x", "y", "z"])}
+SOLIDS = [record({"kind": one_of([kind]), **own}, SHARED | (MESH_OPTIONS if kind == "mesh" else {})) for kind, own in OWN.items()]
+KIND_PLANE = record({"kind": one_of(["plane"]), "point": VECTOR, "normal": VECTOR, "contact": CONTACT}, {"friction": NOT_NEGATIVE})
 MASSES = {"type": ["array", "null"], "items": record({"box": BOX, "mass": POSITIVE})}
 SCENE = record(
     {"domain": BOX, "gravity": VECTOR},
@@ -88,6 +115,10 @@ SCENE = record(
         "walls": {"oneOf": [{"type": "null"}, record({"contact": CONTACT}, {"friction": NOT_NEGATIVE, "inset": NOT_NEGATIVE})]},
     },
 )
+SCENE_WITH_SOLIDS = {
+    **SCENE,
+    "properties": SCENE["properties"] | {"colliders": {"type": ["array", "null"], "items": {"oneOf": [PLANE, KIND_PLANE, *SOLIDS]}}},
+}
 GRID = record({"grid": {"type": "integer", "minimum": 4}, "dt": POSITIVE})
 FREE = {"type": "array", "items": TEXT, "uniqueItems": True}
 
@@ -213,7 +244,7 @@ def schemas() -> dict[str, Schema]:
             {
                 "format": one_of(["neuido-scene/1"]),
                 "name": TEXT,
-                "scene": SCENE,
+                "scene": SCENE_WITH_SOLIDS,
                 "model": record({"density": POSITIVE, **material}, {"plasticity": PLASTICITY}),
                 "body": {
                     "anyOf": [

@@ -2,11 +2,11 @@
 
 import time
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from neuido import configs_root
 from neuido.data.files.output_folder import check_unused
-from neuido.data.files.writing import copy_file, new_folder
+from neuido.data.files.writing import copy_file, new_folder, write_text
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.physics.runtime.limits import check_limit
@@ -35,7 +35,8 @@ def simulate(
 
     Args:
         scene: Scene file, or the name of one that comes with neuido (bouncy-ball, nclaw-cube, ...).
-        out: Folder to write, new or empty: frames.npz, a point cloud a frame in ply/, and the scene (and the learned law) beside them.
+        out: Folder to write, new or empty: frames.npz, a point cloud a frame in ply/, and the scene (and the learned law) beside them;
+            forces.csv with the forces on solid colliders.
         law: Neural law of `neuido predict` (law.safetensors) in place of the scene's elasticity and plasticity.
         steps: Substeps; those of the scene file where absent.
         every: Write a frame every so many substeps, a divisor of `steps`; such that at most 100 frames follow the first where absent.
@@ -81,6 +82,8 @@ def simulate(
             copy_file(_file_of(scene), hidden / "scene.yaml")  # what `neuido view` needs for floor, gravity and stress
             if law is not None:
                 copy_file(law, hidden / "law.safetensors")
+            if frames.forces.shape[1]:
+                write_text(hidden / "forces.csv", _force_table(frames))
         except OSError as error:
             raise UserError(f"out = {out}: {error.strerror or error}") from error
     told = f"the law of {law}" if law else ", ".join(_told(setup.info[part]) for part in ("elasticity", "plasticity"))
@@ -95,12 +98,27 @@ def simulate(
         f"after {float(frames.times[-1]):.4g} s: the centre is {abs(fall):.3g} m {'lower' if fall < 0 else 'higher'}, "
         f"the fastest particle has {speed:.3g} m/s, det F is {float(share.min()):.3g} to {float(share.max()):.3g}"
     )
+    for solid in (collider for collider in frames.colliders if collider.force is not None):
+        told_force = ", ".join(f"{value:.4g}" for value in solid.force[-1].tolist())
+        print(f"mean force on {solid.name} in the last frame: ({told_force}) N")
     for event in frames.events:
         print(f"note: {event}")
     print(
         f"results in {folder}: frames.npz opens with numpy.load (x, v, C, F, times), "
         f"ply/frame_0000.ply and on in ParaView, MeshLab or Blender; `neuido view {folder}` plays them"
     )
+
+
+def _force_table(frames: Any) -> str:
+    """Return the forces on the solid colliders as a table, a row for each frame and collider."""
+    rows = ["frame,time [s],collider,Fx [N],Fy [N],Fz [N],Tx [N m],Ty [N m],Tz [N m]"]
+    solids = [collider for collider in frames.colliders if collider.force is not None]
+    for k, time_of in enumerate(frames.times.tolist()):
+        for solid in solids:
+            figures = [*solid.force[k].tolist(), *solid.torque[k].tolist()]
+            name = solid.name.replace('"', '""')
+            rows.append(f'{k},{time_of:.9g},"{name}",' + ",".join(f"{value:.9g}" for value in figures))
+    return "\n".join(rows) + "\n"
 
 
 def _one_scene(scene: str) -> str:

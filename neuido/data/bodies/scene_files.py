@@ -7,7 +7,7 @@
 import inspect
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import NoneType
 from typing import Any, NamedTuple, get_args
@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from neuido.data.bodies import shapes
+from neuido.data.bodies.collider_entries import solid_from_dict
 from neuido.data.files.parsing import read_arrays, read_yaml
 from neuido.data.files.values import check_keys, mapping, number, path_inside, vector
 from neuido.data.files.yaml_files import checking
@@ -23,7 +24,7 @@ from neuido.errors import UserError, suggest
 from neuido.physics.laws.classical import material
 from neuido.physics.linalg.extent import box_axes, without_volume
 from neuido.physics.runtime.limits import check_limit
-from neuido.types import AttachedMass, Body, Box, Plane, Scene, Walls
+from neuido.types import AttachedMass, Body, Box, Plane, Scene, Solid, Walls
 
 FORMAT = "neuido-scene/1"
 KEYS = ("format", "name", "source", "scene", "model", "body", "discretisation", "steps", "on_inversion", "on_leave")
@@ -98,7 +99,7 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         on_leave = content.get("on_leave", "error")
         if on_leave not in ("error", "clamp", "delete"):
             raise UserError(f"on_leave must be error, clamp or delete, got {on_leave!r}")
-        scene = scene_from_dict(content["scene"], content["discretisation"])
+        scene = scene_from_dict(content["scene"], content["discretisation"], lambda file, where: named_file(file, where, root, path.parent))
         model = model_from_dict(content["model"])
         body = body_from_dict(content["body"], root, path.parent)
         outside = ((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any(dim=1)
@@ -115,13 +116,14 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
     return SceneSetup(scene, body, info)
 
 
-def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any]) -> Scene:
+def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any], find: Callable[[str, str], Path] | None = None) -> Scene:
     """Build a scene from the keys `scene` and `discretisation` of an experiment file.
 
     Args:
         scene: domain [m] and gravity [m/s^2]; optionally colliders, clamps, attached_masses and walls. walls has contact, friction and
             inset [cells]; null means no walls. Without the key, the faces of the domain are frictionless walls.
         discretisation: grid (cells along the longest side) and dt [s].
+        find: Returns the path of a file that a collider names, from its text and the name of its key; None: colliders are planes alone.
 
     Raises:
         UserError: A key is unknown or missing, or a value has the wrong type or is outside its range. The message names the key.
@@ -134,14 +136,14 @@ def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any])
     if not isinstance(cells, int) or isinstance(cells, bool) or cells < 4:
         raise UserError(f"discretisation.grid must be a whole number of at least 4 cells, got {cells!r}")
     colliders = _list(scene, "colliders")
-    check_limit(len(colliders), "NEUIDO_MAX_COLLIDERS", f"scene.colliders has {len(colliders)} planes")
+    check_limit(len(colliders), "NEUIDO_MAX_COLLIDERS", f"scene.colliders has {len(colliders)} entries")
     return Scene(
         lower=domain.lower,
         upper=domain.upper,
         cells=cells,
         dt=number(discretisation["dt"], "discretisation.dt", above=0.0),
         gravity=vector(scene["gravity"], "scene.gravity"),
-        colliders=tuple(_plane(c, f"scene.colliders[{i}]") for i, c in enumerate(colliders)),
+        colliders=tuple(_collider(c, f"scene.colliders[{i}]", find) for i, c in enumerate(colliders)),
         walls=_walls(scene["walls"]) if "walls" in scene else Walls(),
         clamps=tuple(_boxed(c, f"scene.clamps[{i}]") for i, c in enumerate(_list(scene, "clamps"))),
         attached_masses=tuple(_attached(m, f"scene.attached_masses[{i}]") for i, m in enumerate(_list(scene, "attached_masses"))),
@@ -342,6 +344,13 @@ def _particles(path: Path) -> Body:
     except UserError as error:
         raise UserError(f"body.particles: {path}: {error}") from error
     return Body(torch.from_numpy(x).float(), torch.from_numpy(v).float(), torch.full((len(x),), each))
+
+
+def _collider(given: Any, where: str, find: Callable[[str, str], Path] | None) -> Plane | Solid:
+    given = mapping(given, where)
+    if given.get("kind") == "plane":
+        given = {"type": "plane"} | {key: value for key, value in given.items() if key != "kind"}
+    return solid_from_dict(given, where, find) if "kind" in given else _plane(given, where)
 
 
 def _plane(given: Any, where: str) -> Plane:

@@ -22,7 +22,7 @@ from neuido.data.measured.motion_plausibility import check_motion, check_positio
 from neuido.data.measured.plausibility import check_density
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY
-from neuido.types import Body, Box, Plane, Scene, Walls
+from neuido.types import Body, Box, Plane, Scene, Solid, Walls
 
 FORMAT = "neuido-experiment/1"
 OVERRIDES = ("gravity", "attached_masses", "colliders")
@@ -151,7 +151,9 @@ def scene_to_dict(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
     def corners(box: Box) -> list[list[float]]:
         return [list(box.lower), list(box.upper)]
 
-    def plane(p: Plane) -> dict[str, Any]:
+    def plane(p: Plane | Solid) -> dict[str, Any]:
+        if not isinstance(p, Plane):
+            raise UserError(f"a {type(p).__name__} among the colliders: an experiment has planes alone")
         return {"type": "plane", "point": list(p.point), "normal": list(p.normal), "contact": p.contact, "friction": p.friction}
 
     out: dict[str, Any] = {

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.colliders.solid_tables import refuse_solids
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.fem import element_kernels
 from neuido.physics.fem.assembly import Assembly, BodyMesh, SolverArrays, body_mesh
@@ -86,6 +87,7 @@ class FiniteElements:
         if smoothing not in ("none", "nodal"):
             raise UserError(f"smoothing is {smoothing!r}; choose none or nodal")
         self.on_inversion = checked_option(on_inversion)
+        refuse_solids((scenes,) if isinstance(scenes, Scene) else scenes, "FiniteElements")
         loaded = Simulator(scenes, bodies, density=density, device=device, dtype=dtype, threads=False, graphs=False)
         self.scenes, self.device, self.dtype, self.smoothing = loaded.scenes, loaded.device, loaded.dtype, smoothing
         self.particles, self.state, self.mass, self.volume = loaded.particles, loaded.state, loaded.mass, loaded.volume

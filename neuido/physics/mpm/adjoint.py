@@ -11,7 +11,20 @@ from torch import Tensor
 from neuido.physics.colliders.solid_loop import SolidLoop
 from neuido.physics.effects import swelling_kernels
 from neuido.physics.laws.base import Engine
-from neuido.physics.mpm.plan import BODY_FRICTION, FIXED, SHRINKAGE, SOLIDS, SPIN_LOSS, STATES, Material, Plan, at_step, solid_loop
+from neuido.physics.mpm.plan import (
+    ATTACHED,
+    BODY_FRICTION,
+    FIXED,
+    SHRINKAGE,
+    SOLIDS,
+    SPIN_LOSS,
+    STATES,
+    Material,
+    Plan,
+    at_step,
+    attachment_loop,
+    solid_loop,
+)
 from neuido.physics.mpm.rollout import Tape, flow_inputs, grid_inputs, meet, stress, stress_inputs, swell, to_grid, update_nodes
 from neuido.physics.runtime.device import real_of, torch_stream
 
@@ -52,7 +65,8 @@ def run_backward(
         damped = None if spin is None else (torch.empty_like(now[1]), torch.empty_like(now[2]))
         solids = solid_loop(plan, inputs, tape.solids)
         if solids is not None:
-            solids.start_adjoint(plan.every, gradients[STATES:], a_fixed[SOLIDS - STATES :], a_pull, a_friction)
+            solids.start_adjoint(plan.every, gradients[STATES:], a_fixed[SOLIDS - STATES : ATTACHED - STATES], a_pull, a_friction)
+        attached = attachment_loop(plan, inputs, solids)
         for n in reversed(range(plan.steps if steps is None else steps)):
             if (n + 1) % plan.every == 0:
                 _add(now, gradients, (n + 1) // plan.every)
@@ -65,6 +79,8 @@ def run_backward(
             if spin is not None and damped is not None:
                 spin.damp(inputs[SPIN_LOSS], mass, x, v, C, *damped, every=True)
                 v_in, C_in = damped
+            v_free = v_in
+            v_in = v_in if attached is None else attached.hold(n, x, v_in, spare=True)
             v_first, mass_in = v_in, mass
             tau, grid, met, velocity = recompute(plan, inputs, tape, n, state, (v_in, C_in), elastic, material, scratch, solids)
             if setup.leaving is not None:
@@ -110,6 +126,8 @@ def run_backward(
                          v_in, C_in, tau, a_before, a_mass, a_x, a_v, a_C, a_tau], plan.block)  # fmt: skip
             if setup.leaving is not None and mass_before is not None:
                 setup.leaving.enter_adjoint(x, v_first, a_v, a_tau, a_mass, mass_before)
+            if attached is not None:
+                attached.adjoint(n, x, v_free, a_fixed[ATTACHED - STATES], a_mass, a_x, a_v)
             if spin is not None:
                 spin.adjoint(inputs[SPIN_LOSS], mass, x, v, C, a_loss, a_mass, a_x, a_v, a_C)
             if viscosity.numel():

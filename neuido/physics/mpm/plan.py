@@ -8,6 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from neuido.physics.colliders.attachments import AttachmentLoop
 from neuido.physics.colliders.solid_loop import SolidLoop, SolidTape
 from neuido.physics.effects import stress_kernels
 from neuido.physics.effects.coefficients import Layout, Tables
@@ -20,15 +21,15 @@ from neuido.physics.runtime.events import MarkRecorder
 STATES = 5
 """Number of inputs that form the initial state: x, v, C, F and the history (no columns if no effect has a history)."""
 KINDS = ("particle",) * 6 + ("time",) + ("scene",) * 3 + ("particle", "time") + ("scene",) * 3 + ("time", "scene", "scene")
-KINDS += ("scene", "time", "scene", "scene")
+KINDS += ("scene", "time", "scene", "scene", "scene")
 """The leading axis of each input before the tensors of the laws: the initial state (5), mass, acceleration, force, friction,
 viscosity, the tables of material effects (stiffness, growth, material, branches, flow), those of swelling and of spin decay, the friction
-between bodies, and those of solids (`solid_loop.kernel_inputs`). `time` is (T, S, ...), or (1, S, ...) if constant. An absent input has
-no elements."""
+between bodies, those of solids (`solid_loop.kernel_inputs`), and the rates of attachments. `time` is (T, S, ...), or (1, S, ...) if
+constant. An absent input has no elements."""
 FIXED = len(KINDS)
-MATERIAL, SHRINKAGE, SPIN_LOSS, BODY_FRICTION, SOLIDS = STATES + 5, STATES + 10, STATES + 11, STATES + 12, STATES + 13
-"""Index of the first table of the material effects, of `Effects.shrinkage`, of `Effects.spin_loss`, of the friction between bodies and of
-the first input of solids."""
+MATERIAL, SHRINKAGE, SPIN_LOSS, BODY_FRICTION, SOLIDS, ATTACHED = (STATES + i for i in (5, 10, 11, 12, 13, 17))
+"""Index of the first table of the material effects, of `Effects.shrinkage`, of `Effects.spin_loss`, of the friction between bodies, of the
+first input of solids and of the rates of attachments."""
 
 LARGE = 1 << 17
 """Number of particles from which a GPU uses blocks of 256 threads, else of 32: small bodies need more blocks to fill the GPU."""
@@ -158,8 +159,16 @@ def solid_loop(plan: Plan, inputs: Sequence[Tensor], tape: SolidTape | None) -> 
     setup = plan.setup
     if tape is None or setup.solids is None:
         return None
-    own = inputs[SOLIDS:FIXED], inputs[STATES + 1], inputs[STATES + 3]
+    own = inputs[SOLIDS:ATTACHED], inputs[STATES + 1], inputs[STATES + 3]
     return SolidLoop(setup.solids, setup.colliders, setup.origin, setup.dx, setup.dt, *own, tape)
+
+
+def attachment_loop(plan: Plan, inputs: Sequence[Tensor], solids: SolidLoop | None) -> AttachmentLoop | None:
+    """Return the launches of the attachments of a rollout; None without any."""
+    setup = plan.setup
+    if setup.attached is None:
+        return None
+    return AttachmentLoop(setup.attached, setup.particles.scene, setup.dt, inputs[ATTACHED], inputs[STATES], solids)
 
 
 def at_step(t: Tensor, n: int) -> Tensor:

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.colliders.attachments import AttachmentLoop
 from neuido.physics.colliders.solid_loop import SolidLoop, SolidTape, new_solid_tape
 from neuido.physics.effects import swelling_kernels
 from neuido.physics.effects.spin_decay import SpinDecay
 from neuido.physics.laws.base import Engine
 from neuido.physics.mpm import transfers as kernels
-from neuido.physics.mpm.plan import BODY_FRICTION, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step, solid_loop
-from neuido.physics.mpm.state import Setup
+from neuido.physics.mpm.plan import BODY_FRICTION, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step, attachment_loop, solid_loop
 from neuido.physics.runtime.device import real_of, torch_stream
 from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.launches import LaunchRecordings
@@ -121,6 +121,7 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
         solids = solid_loop(plan, inputs, tape.solids)
         if solids is not None:
             solids.begin()
+        attached = attachment_loop(plan, inputs, solids)
         for n in range(plan.steps if steps is None else steps):
             frame = tuple(frames[(n + 1) // stride] for frames in tape.states) if (n + 1) % stride == 0 else None
             # on the CPU a frame is copied out: launches that always use the same buffers can be recorded once and repeated
@@ -135,22 +136,18 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
                 material, pull_now = plan.material(inputs, n, all_branches=tape.whole), at_step(pull, n)
             if not clears:
                 grid.zero_()
-            to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid, spin, damped)
+            to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid, spin, damped, attached, n)
             met = grid if setup.contact is None else setup.room.scratch("met")
-            on_nodes = partial(update_nodes, plan, met, pull_now, force, friction, velocity, reach, clears)
+            on_nodes = partial(update_nodes, plan, met, pull_now, force, friction, velocity, reach, clears, solids, n)
             shrinkage = at_step(inputs[SHRINKAGE], n)
             to_particles = partial(gather, plan, n, now, then, material, plastic, velocity, trial, tape, shrinkage)
             if same is None:
                 to_nodes()
                 on_nodes()
-                if solids is not None:
-                    meet_solids(solids, n, setup, met, velocity, reach)
                 to_particles()
             else:
-                recordings.run(("scatter", same), to_nodes)
-                recordings.run((reach.start, reach.stop), on_nodes)
-                if solids is not None:
-                    recordings.run(("solids", reach.start, reach.stop), partial(meet_solids, solids, n, setup, met, velocity, reach), n)
+                recordings.run(("scatter", same), to_nodes, n)
+                recordings.run((reach.start, reach.stop), on_nodes, n)
                 recordings.run(("gather", same), to_particles, n)
             if frame is not None and then is not frame:
                 for target, t in zip(frame, then):
@@ -168,6 +165,8 @@ def scatter(
     grid: Tensor,
     spin: SpinDecay | None = None,
     damped: tuple[Tensor, Tensor] | None = None,
+    attached: AttachmentLoop | None = None,
+    n: int = 0,
 ) -> None:
     """Compute the stress, and add momentum and mass of the particles to the nodes (P2G); let bodies that meet exchange momentum.
 
@@ -181,12 +180,15 @@ def scatter(
         grid: Momentum and mass of the nodes, (nodes, 4); added to, and zero before.
         spin: The torque that damps the rotation, or None.
         damped: Memory for v and C after that torque.
+        attached: The launches of attachments, or None.
+        n: Number of the substep.
     """
     x, v, C, F, history = now
     stress(plan, elastic, F, C, history, inputs[STATES + 4], material, tau)
     if spin is not None and damped is not None:
         spin.damp(inputs[SPIN_LOSS], inputs[STATES], x, v, C, *damped)
         v, C = damped
+    v = v if attached is None else attached.hold(n, x, v)
     mass = inputs[STATES]
     if plan.setup.leaving is not None:
         v, mass = plan.setup.leaving.enter(x, v, mass, tau)
@@ -369,8 +371,10 @@ def update_nodes(
     velocity: Tensor,
     reach: slice = slice(None),
     clear: bool = False,
+    solids: SolidLoop | None = None,
+    n: int = 0,
 ) -> None:
-    """Compute the velocities of the nodes from their momentum: gravity, body forces, colliders and clamps.
+    """Compute the velocities of the nodes from their momentum: gravity, body forces, colliders and clamps; move the solids.
 
     Args:
         plan: The rollout.
@@ -381,16 +385,15 @@ def update_nodes(
         velocity: Velocity, (nodes, 4); overwritten.
         reach: Range of nodes to update.
         clear: Whether to zero `grid` for the next substep.
+        solids: The launches of solids, which come last, or None.
+        n: Number of the substep.
     """
     setup = plan.setup
     inputs = [*grid_inputs(plan, pull, force, friction, reach), grid[reach], velocity[reach], clear]
     plan.launch(setup.kernels.update_grid, len(grid[reach]) // setup.room.chunk, inputs)
-
-
-def meet_solids(solids: SolidLoop, n: int, setup: Setup, grid: Tensor, velocity: Tensor, reach: slice) -> None:
-    """Bring a range of nodes in contact with the solids in substep n, and move the solids; arguments as for `update_nodes`."""
-    solids.meet(n, setup.room.index[reach], grid[reach], velocity[reach])
-    solids.advance(n)
+    if solids is not None:
+        solids.meet(n, setup.room.index[reach], grid[reach], velocity[reach])
+        solids.advance(n)
 
 
 def grid_inputs(plan: Plan, pull: Tensor, force: Tensor, friction: Tensor, reach: slice = slice(None)) -> list:

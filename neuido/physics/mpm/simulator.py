@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.colliders.attachments import rates
 from neuido.physics.colliders.collider_frames import collider_frames
 from neuido.physics.colliders.leaving import OnLeave, checked_on_leave
 from neuido.physics.colliders.solid_loop import kernel_inputs
@@ -173,6 +174,14 @@ class Simulator:
             own = own._replace(friction=(own.friction + more).clamp(min=0.0))
         return list(kernel_inputs(own))
 
+    def _attachment_rates(self, given: Tensor | None, mass: Tensor) -> Tensor | None:
+        """Return the rates of the attachments for the kernels, for masses in their order; None without attachments."""
+        table = self.setup.attached
+        if given is not None and (table is None or given.shape != table.given.shape):
+            wanted = 0 if table is None else len(table.given)
+            raise UserError(f"attachments has shape {tuple(given.shape)}; the scenes have {wanted} attachments, so give ({wanted}, 2)")
+        return None if table is None else rates(table, given, mass)
+
     def step_limits(
         self,
         elasticity: ElasticLaw,
@@ -294,6 +303,7 @@ class Simulator:
         mass: Tensor | None = None,
         body_friction: Tensor | float | None = None,
         solids: SolidInputs | None = None,
+        attachments: Tensor | None = None,
         every: int = 1,
         segment: int | None = None,
         check: bool = True,
@@ -316,6 +326,7 @@ class Simulator:
             body_friction: Coulomb's coefficient between the bodies [-], a number, (S,), or (S, B, B) for each pair of up to B bodies, of
                 which the mean of both orders counts; by default that of the scenes.
             solids: Pose, motion, mass and friction of solid colliders; by default `solid_inputs(steps)`, those of the scenes.
+            attachments: Stiffness [N/m] and damping [N s/m] of the attachments of all scenes, (A, 2); by default those of the scenes.
             every: Substeps between two frames.
             segment: Substeps between two checkpoints of gradient checkpointing, for long rollouts. The backward pass recomputes each
                 segment, which takes a third more time. On CUDA it applies without gradients too: one captured segment is replayed for
@@ -359,8 +370,9 @@ class Simulator:
         optional += [None] * 3 if tables is None else [tables.material, tables.branches, tables.flow]
         between = None if self.setup.contact is None else self.setup.contact.frictions(body_friction)
         optional += [shrinkage, loss, between, *self._solid_tensors(steps, solids, given.effects)]
+        optional += [self._attachment_rates(attachments, start[-1])]
         optional = [mass.new_empty(0) if t is None else t.contiguous() for t in optional]
-        pool = None if self.setup.solids is not None else self.pool
+        pool = None if self.setup.solids is not None or self.setup.attached is not None else self.pool
         with self.cache.lock:
             frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, pool)
             x, v, C, F, history = (t[:, self.inverse] for t in frames[:5])

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
+from neuido.physics.colliders.attachments import attachment_table
 from neuido.physics.colliders.leaving import Leaving
 from neuido.physics.colliders.solid_tables import solid_table
 from neuido.physics.colliders.tables import clamp_table, collider_table, inside_box
@@ -139,6 +140,7 @@ class Setup:
         """Smallest and largest x [m] of the particles after a substep; only for a single velocity field on the CPU."""
         self.ends = self.span.numpy() if watched else None
         self._sort()
+        self.attached = attachment_table(self.scenes, self.state.x, self.particles.offsets, self.order)
         self.keep_grid = store == "all" or (store == "auto" and self.room.count <= 4 * len(self.mass))
         self.first_scene = self.first_particle = 0
         self.leaving: Leaving | None = None

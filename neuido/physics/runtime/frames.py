@@ -141,10 +141,10 @@ class Frames(ParticleState):
         Args:
             path: The file; missing folders are created. `.npz`: arrays x, v, C, F, times and scene (C and F if the motion has them),
                 with body and body_names where there are several bodies; of skin i `skin_i_vertices`, `_faces`, `_indices` and `_weights`
-                (`Skin`), and of collider i with a surface `collider_i_vertices` [m], `_faces` and `_poses`, (K, 4, 4). `.ply`: one
-                point cloud per frame, `NAME_0000.ply`, `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; other files of a
-                series of that name are deleted. `.csv`: one row per frame and particle. Other endings, such as `.usd`, are those of
-                `neuido.export`.
+                (`Skin`), and of collider i with a surface `collider_i_vertices` [m], `_faces` and `_poses`, (K, 4, 4); where there are
+                solid colliders their `forces` [N], `torques` [N m] and `force_names`. `.ply`: one point cloud per frame,
+                `NAME_0000.ply`, `NAME_0001.ply`, ..., with x, y, z [m] and vx, vy, vz [m/s]; other files of a series of that name are
+                deleted. `.csv`: one row per frame and particle. Other endings, such as `.usd`, are those of `neuido.export`.
 
         Returns:
             The files that were written.
@@ -190,6 +190,9 @@ class Frames(ParticleState):
             if collider.mesh is not None:
                 parts = collider.mesh._asdict() | {"poses": collider.poses.detach().cpu().numpy()}
                 arrays |= {f"collider_{i}_{name}": part for name, part in parts.items()}
+        if self.forces.shape[1]:
+            arrays |= {"forces": self.forces.detach().cpu().numpy(), "torques": self.torques.detach().cpu().numpy()}
+            arrays |= {"force_names": np.array([collider.name for collider in self.colliders if collider.force is not None])}
         with whole_file(path) as hidden, open(hidden, "wb") as file:
             np.savez_compressed(file, times=self.times.numpy(), scene=self._scene(), **arrays)
         return [path]

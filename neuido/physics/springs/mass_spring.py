@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.physics.colliders.contact import SLIP, STICKY
+from neuido.physics.colliders.solid_tables import refuse_solids
 from neuido.physics.colliders.tables import collider_table
 from neuido.physics.runtime.device import real_of, repeated, torch_stream
 from neuido.physics.runtime.limits import check_frames, check_memory
@@ -87,6 +88,7 @@ class MassSpring:
             )
         self.device, self.power = mass.device, float(power)
         self.pairs, self.rest, self.mass = springs.pairs, springs.rest.to(dtype), mass.to(dtype).contiguous()
+        refuse_solids([scene], "MassSpring")
         table = collider_table([scene], dtype, self.device)
         self.planes, self.kinds = table.plane[0].contiguous(), table.kind[0].contiguous()
         self.gravity = tuple(float(g) for g in scene.gravity)
