@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from neuido.export.exporting import export as export
     from neuido.models.inference.video_law import read_law as read_law
     from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator as Operator
+    from neuido.models.reconstruct.scene_import import import_scene as import_scene
     from neuido.models.render.splatting import rasterize as rasterize
     from neuido.models.render.splatting import render as render
     from neuido.models.video.encoder import DynamicsEncoder as Encoder
@@ -61,6 +62,7 @@ _PLACES = {  # name: its module, and after a colon its name there; a module alon
     "effects": "physics.effects",
     "export": "export",
     "import_file": "data.importers.importing:import_file",
+    "import_scene": "models.reconstruct.scene_import:import_scene",
     "laws": "physics.laws",
     "load_scene": "data.bodies.scene_files:load_scene",
     "rasterize": "models.render.splatting:rasterize",
@@ -99,6 +101,7 @@ __all__ = [
     "effects",
     "export",
     "import_file",
+    "import_scene",
     "laws",
     "load_scene",
     "rasterize",

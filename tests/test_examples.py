@@ -28,6 +28,7 @@ ANSWERS = {  # what each must print
     "10": r"Young's modulus read from the video: \d+ kPa, Poisson's ratio 0\.\d+",
     "11": r"lacks linear air drag",
     "12": "",
+    "16": r"3\d{3} particles of \d+ cm\^3; the skin comes down to -?\d+ mm",
 }
 
 

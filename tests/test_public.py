@@ -19,8 +19,8 @@ ROOT = Path(__file__).parents[1]
 PUBLIC = {
     "neuido": """
         AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Operator OwnEffect ParticleState Plane
-        Scene Simulator Skin UserError Walls __version__ configs_root diagnose effects export import_file laws load_scene
-        rasterize read_experiment read_law read_material_tests read_recording read_tracks render shapes view
+        Scene Simulator Skin UserError Walls __version__ configs_root diagnose effects export import_file import_scene laws
+        load_scene rasterize read_experiment read_law read_material_tests read_recording read_tracks render shapes view
     """,
     "neuido.data": """
         Experiment FilmDataModule MaterialTest MaterialTests MultiView MultiViewDataModule Recording SceneSetup Track Tracks

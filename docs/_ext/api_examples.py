@@ -103,6 +103,21 @@ harmonics = (colours - 0.5)[:, None] / 0.28209479  # spherical harmonics of degr
 gaussians = Gaussians(means, 1e-4 * torch.eye(3).expand(200, 3, 3), torch.full((200,), 0.9), harmonics)
 images, alphas = render(gaussians, cameras.orbit(2, width=64, height=64))
 """,
+    "import_scene": """
+from pathlib import Path
+
+from neuido import import_scene
+
+Path("jelly.xml").write_text('''
+<mujoco><worldbody>
+  <geom type="plane" size="1 1 .1"/>
+  <flexcomp name="jelly" type="grid" count="5 5 5" spacing=".05 .05 .05" pos="0 0 .3" dim="3" mass="2">
+    <elasticity young="5e4" poisson="0.3"/>
+  </flexcomp>
+</worldbody></mujoco>
+''')
+print(*import_scene("jelly.xml", "jelly", particles=500), sep="\\n")  # `neuido simulate jelly/scene.yaml --out run` runs it
+""",
     "laws": """
 import torch
 

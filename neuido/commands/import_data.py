@@ -1,4 +1,4 @@
-"""The `import` command: tables of a testing machine or a tracker, or videos, become a folder to diagnose."""
+"""The `import` command: tables of a testing machine or a tracker, or videos, become a folder to diagnose; scenes one to simulate."""
 
 
 def import_data(
@@ -44,18 +44,23 @@ def import_data(
     offsets: list[float] | None = None,
     picture: str | None = None,
     held_out: str = "",
+    particles: int | None = None,
+    opacity_threshold: float | None = None,
     dry_run: bool = False,
 ) -> None:
     """Turn tables of a testing machine, exports of a tracker or of motion capture, or videos into a folder that `neuido diagnose` reads.
+
+    Scenes of MuJoCo (.xml), robots (.urdf), USD, PhysGaussian (.json) and Spring-Gaus (.yaml), meshes and Gaussians (3DGS .ply) become a
+    folder with scene.yaml, which `neuido simulate` runs.
 
     Prints what was understood. What a file does not say is asked for, by the name of its option.
 
     Args:
         files: Files, one a recording; text of any dialect, xlsx, xls, trc, c3d, h5 or video (mp4, mov, avi, mkv). A table of several
-            specimens is several tests.
+            specimens is several tests. Of a scene one, and after it the body where the scene has none: a mesh or Gaussians.
         out: Folder to write, which must not be there.
-        kind: auto, material (a testing machine), track (a body as one point), body (points on a deforming body) or
-            field (displacements by digital image correlation).
+        kind: auto, material (a testing machine), track (a body as one point), body (points on a deforming body),
+            field (displacements by digital image correlation) or scene (of another program).
         mode: Of a material test: uniaxial, compression, equibiaxial, pure_shear, biaxial or simple_shear.
         columns: Quantity and title, where titles do not say it: --columns.force "Channel 2".
         units: Quantity and unit, where the table gives none: --units.force kN.
@@ -95,11 +100,15 @@ def import_data(
         offsets: Instead, what to add to the times of each clip, s.
         picture: Of videos, a PNG file for frames with the outline that was found; written with --dry_run too.
         held_out: Names of recordings that are only scored, with commas; the last of several where absent.
+        particles: Of a scene, the approximate number of particles of a body; 4000 where absent.
+        opacity_threshold: Of Gaussians, the opacity at or below which they are left out; that of the scene or 0.02 where absent.
         dry_run: Only say what was understood.
 
     Raises:
         UserError: What cannot be read or is missing.
     """
+    given = dict(locals())
+
     from pathlib import Path
 
     from neuido.data.files.writing import check_writable
@@ -113,6 +122,18 @@ def import_data(
         raise UserError("give --out FOLDER, or --dry_run true")
     if out is not None and not dry_run:
         check_writable(Path(out).expanduser())
+    if _is_scene(files, kind):
+        _check_scene_options(given)
+        from neuido.models.reconstruct.scene_import import PARTICLES, import_scene
+
+        options = {key: given[key] for key in ("opacity_threshold", "density", "young", "poisson", "scale")}
+        axis = None if up == "y" else up
+        lines = import_scene(files, None if dry_run else out, particles=PARTICLES if particles is None else particles, up=axis, **options)
+        print("\n".join(lines))
+        print(f"results in {out}" if out is not None and not dry_run else "nothing is written (--dry_run)")
+        return
+    if particles is not None or opacity_threshold is not None:
+        raise UserError("--particles and --opacity_threshold are for scenes alone: leave them out, or give --kind scene")
     if picture is not None:
         check_writable(Path(picture).expanduser().parent, "picture")
     lines = import_file(
@@ -146,3 +167,24 @@ def import_data(
     )
     print("\n".join(lines))
     print(f"results in {out}" if out is not None and not dry_run else "nothing is written (--dry_run)")
+
+
+SCENES = (".xml", ".urdf", ".json", ".yaml", ".yml", ".usd", ".usda", ".usdc", ".usdz", ".obj", ".stl", ".ply", ".glb")
+"""Endings of scenes, meshes and Gaussians."""
+FOR_SCENES = ("files", "out", "kind", "density", "young", "poisson", "scale", "up", "particles", "opacity_threshold", "dry_run")
+"""Options that a scene takes."""
+
+
+def _is_scene(files: list[str], kind: str) -> bool:
+    return kind == "scene" or (kind == "auto" and bool(files) and str(files[0]).lower().endswith(SCENES))
+
+
+def _check_scene_options(given: dict) -> None:
+    """Raise UserError for an option that a scene does not take."""
+    import inspect
+
+    from neuido.errors import UserError
+
+    for name, parameter in inspect.signature(import_data).parameters.items():
+        if name not in FOR_SCENES and given[name] != parameter.default:
+            raise UserError(f"--{name} is not for scenes: leave it out; they take {', '.join(f'--{own}' for own in FOR_SCENES[1:])}")
