@@ -11,7 +11,7 @@ from neuido.data.files.values import file_name
 from neuido.data.files.writing import write_text
 from neuido.errors import UserError
 
-TRACK, TEST, BODY = ("x", "y", "z"), ("stretch", "log_strain", "shear"), ("x0", "v0", "volume")
+TRACK, TEST, BODY = ("x", "y", "z", "angle"), ("stretch", "log_strain", "shear"), ("x0", "v0", "volume")
 PARTICLES = ("x", "t", *BODY, "F0", "track", "anchor")
 BODY_NAME = "body"
 
@@ -23,7 +23,7 @@ def write_arrays(
 
     Args:
         data: Recordings by name. Each is a mapping with its columns, named as in the formats, and the other keys of its entry, such as
-            `role` (`fit` where absent), `noise` or `mode`. A track has `t` [s] and some of `x`, `y`, `z` [m], each (n,). A material test
+            `role` (`fit` where absent), `noise` or `mode`. A track has `t` [s] and `x`, `y`, `z` [m] or `angle` [rad]. A material test
             has for example `stretch` and `nominal_stress` [Pa], and possibly `time` [s]. A body has `x` (T, N, 3) [m], `t` (T,) [s], `x0`,
             `v0`, `volume`, and `track` or `anchor`.
         model: Declared model, as the key `model` of the format. For a track it may also have `mass` and `diameter` of the body.
@@ -66,7 +66,7 @@ def _is_column(value: Any) -> bool:
 
 
 def _write_tracks(data: Mapping[str, Mapping[str, Any]], model: dict[str, Any], folder: Path, scene: Any) -> None:
-    figures = {key: model.pop(key) for key in ("mass", "diameter") if key in model}
+    figures = {key: model.pop(key) for key in ("mass", "diameter", "shape") if key in model}
     recordings = []
     for name, given in data.items():
         columns = {key: given[key] for key in ("t", *TRACK) if key in given}

@@ -15,6 +15,8 @@ NEAREST_SAMPLED = 4000
 PALETTE = ((0.34, 0.61, 0.84), (0.90, 0.57, 0.22), (0.42, 0.66, 0.31), (0.76, 0.34, 0.43), (0.56, 0.49, 0.76), (0.46, 0.46, 0.46))
 """Colours of bodies, in turn, RGB in 0..1 (sRGB)."""
 COLLIDER_COLOUR = (0.55, 0.55, 0.55)
+SQUARE = ((0, 1, 2), (0, 2, 3))
+"""Triangles of a square whose corners go anticlockwise."""
 
 
 class Field(NamedTuple):
@@ -154,14 +156,15 @@ def exchange_of(motion: Any, *, every: int = 1, scene: Scene | None = None) -> E
     made = Exchange(times[::every], x[::every], *(None if part is None else part[::every] for part in (v, F)), spacing_of(x[0]), ())
     made.parts = _parts(motion, x.shape[1], made)
     made.surfaces = tuple(_skin(skin, motion, i, every) for i, skin in enumerate(getattr(motion, "skins", None) or ()))
-    colliders = [_collider(each, i, every, made) for i, each in enumerate(getattr(motion, "colliders", None) or ())]
+    own = tuple(getattr(motion, "colliders", None) or ())
+    colliders = [_collider(each, i, every, made, scene) for i, each in enumerate(own)]
     if scene is not None:
         down = np.asarray(scene.gravity, float)
         made.up = "Z" if np.any(down) and int(np.argmax(np.abs(down))) == 2 else "Y"
-        known = {each.name for each in colliders if each is not None}
-        planes = [plane for plane in scene.colliders if isinstance(plane, Plane)]
-        colliders += [_plane(plane, f"plane_{i}", scene) for i, plane in enumerate(planes) if f"plane_{i}" not in known]
-    made.colliders = tuple(each for each in colliders if each is not None)
+        if not any(isinstance(getattr(each, "shape", None), Plane) for each in own):
+            planes = [plane for plane in scene.colliders if isinstance(plane, Plane)]
+            colliders += [_plane(plane, f"plane_{i}", made, scene) for i, plane in enumerate(planes)]
+    made.colliders = tuple(colliders)
     return made
 
 
@@ -205,13 +208,18 @@ def _skin(skin: Any, motion: Any, number: int, every: int) -> Surface:
     return Surface(name, vertices, [faces], [normals_of(at, faces) for at in vertices], colour=PALETTE[number % len(PALETTE)])
 
 
-def _collider(collider: Any, number: int, every: int, made: Exchange) -> Surface | None:
-    """Return a collider that has a mesh, and note one that has none."""
-    mesh, name = getattr(collider, "mesh", None), getattr(collider, "name", "") or f"collider_{number}"
+def _collider(collider: Any, number: int, every: int, made: Exchange, scene: Scene | None) -> Surface:
+    """Return a collider with its mesh, or with a square of its face where it is a half-space."""
+    mesh, name = collider.mesh, getattr(collider, "name", "") or f"collider_{number}"
+    if mesh is None and isinstance(collider.shape, Plane):
+        return _plane(collider.shape, name, made, scene)
     if mesh is None:
-        made.notes.append(f"the collider {name} has no mesh and is left out")
-        return None
-    vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+        low, high = _room(made, scene)
+        half = 0.5 * float((high - low).max())
+        vertices = half * np.array([[-1, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]], np.float32)
+        faces = np.array(SQUARE, np.int32)
+    else:
+        vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
     poses = getattr(collider, "poses", None)
     poses = None if poses is None else np.asarray(poses.cpu() if hasattr(poses, "cpu") else poses, np.float64)
     if poses is not None and len(poses) > 1:
@@ -219,10 +227,18 @@ def _collider(collider: Any, number: int, every: int, made: Exchange) -> Surface
     return Surface(name, [vertices], [faces], [normals_of(vertices, faces)], poses, COLLIDER_COLOUR)
 
 
-def _plane(plane: Plane, name: str, scene: Scene) -> Surface:
+def _room(made: Exchange, scene: Scene | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the domain [m], or of a box three times as large as what moves."""
+    if scene is not None:
+        return np.asarray(scene.lower, float), np.asarray(scene.upper, float)
+    low, high = made.x.min(axis=(0, 1)).astype(float), made.x.max(axis=(0, 1)).astype(float)
+    return low - (high - low), high + (high - low)
+
+
+def _plane(plane: Plane, name: str, made: Exchange, scene: Scene | None) -> Surface:
     """Return a square of a half-space's boundary, below the middle of the domain."""
     normal = np.asarray(plane.normal, float) / np.linalg.norm(plane.normal)
-    low, high = np.asarray(scene.lower, float), np.asarray(scene.upper, float)
+    low, high = _room(made, scene)
     middle = (low + high) / 2
     centre = middle - ((middle - np.asarray(plane.point, float)) @ normal) * normal
     along = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
@@ -231,7 +247,7 @@ def _plane(plane: Plane, name: str, scene: Scene) -> Surface:
     sides = half * np.stack([along, np.cross(normal, along)])
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     vertices = (centre + corners @ sides).astype(np.float32)
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    faces = np.array(SQUARE, np.int32)
     return Surface(name, [vertices], [faces], [np.tile(normal.astype(np.float32), (4, 1))], colour=COLLIDER_COLOUR)
 
 

@@ -6,15 +6,22 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from neuido.data.files.parsing import naming, read_arrays, read_json, read_yaml
 from neuido.data.formats.ply import read_ply_vertices
 from neuido.errors import UserError, suggest
-from neuido.types import Scene
+from neuido.types import Scene, Skin
 
 KINDS = "a folder of `neuido simulate`, `neuido predict` or `neuido diagnose`, or a file of frames (.npz)"
 SCENE, LAW = "scene.yaml", "law.safetensors"
 """Files beside the frames of a simulation: its scene with the model, and a learned law."""
+
+
+SURFACES = {"skin": ("vertices", "faces", "indices", "weights"), "collider": ("vertices", "faces", "poses")}
+"""Arrays of each skin and collider in a file of frames, as `Frames.save` names them."""
+MOST_SURFACES = 64
+"""Skins, and colliders, of a file that are read."""
 
 
 class Run(NamedTuple):
@@ -76,7 +83,8 @@ def elastic_law(path: Path) -> Any:
 
 
 def _frames(path: Path, frame_interval: float | None) -> Run:
-    optional = ("v", "C", "F", "times", "scene", "body", "body_names")
+    kept = [f"{kind}_{i}_{part}" for kind, parts in SURFACES.items() for i in range(MOST_SURFACES) for part in parts]
+    optional = ("v", "C", "F", "times", "scene", "body", "body_names", *kept)
     arrays = read_arrays(path, ("x",), optional, what="file of frames with positions x")
     x = arrays["x"]
     if x.ndim != 3 or x.shape[-1] != 3 or not x.size or x.dtype.kind != "f":
@@ -93,9 +101,41 @@ def _frames(path: Path, frame_interval: float | None) -> Run:
         own["body"] = arrays["scene"]
     if "body_names" in arrays:
         own["body_names"] = tuple(str(name) for name in arrays["body_names"])
-    motion = SimpleNamespace(x=x, v=arrays.get("v", _velocities(x, times)), times=times, **own)
+    skins, colliders = _surfaces(arrays, x.shape[1], path)
+    v = arrays["v"] if "v" in arrays else _velocities(x, times)
+    motion = SimpleNamespace(x=x, v=v, times=times, skins=skins, colliders=colliders, **own)
     scene, law = _beside(path.parent)
     return Run(motion, path.parent.name if path.name == "frames.npz" else path.stem, scene, law)
+
+
+def _surfaces(arrays: dict[str, np.ndarray], particles: int, path: Path) -> tuple[tuple[Skin, ...], tuple[SimpleNamespace, ...]]:
+    """Return the skins and colliders of a file of frames (`Frames.save`)."""
+    skins, colliders = [], []
+    for kind, parts in SURFACES.items():
+        for i in range(MOST_SURFACES):
+            found = {part: arrays[f"{kind}_{i}_{part}"] for part in parts if f"{kind}_{i}_{part}" in arrays}
+            if not found:
+                continue
+            corners = found.get("vertices", np.empty(0))
+            whole = len(found) == len(parts) and corners.ndim == 2 and corners.shape[1] == 3
+            if not whole or not _within(found["faces"], len(corners)) or found["faces"].shape[1:] != (3,):
+                raise UserError(f"{path}: {kind} {i} is not whole, or its triangles name vertices that are not there")
+            if kind == "skin":
+                if found["weights"].shape != found["indices"].shape or len(found["indices"]) != len(corners):
+                    raise UserError(f"{path}: skin {i} has {found['indices'].shape} indices and {found['weights'].shape} weights")
+                if not _within(found["indices"], particles):
+                    raise UserError(f"{path}: skin {i} is bound to particles that are not there")
+                skins.append(Skin(**{part: torch.from_numpy(np.ascontiguousarray(values)) for part, values in found.items()}))
+            else:
+                if found["poses"].shape[1:] != (4, 4) or not np.isfinite(found["poses"]).all():
+                    raise UserError(f"{path}: collider {i} has poses of shape {found['poses'].shape}; needed (K, 4, 4)")
+                mesh = SimpleNamespace(vertices=corners, faces=found["faces"])
+                colliders.append(SimpleNamespace(name=f"collider_{i}", mesh=mesh, poses=found["poses"]))
+    return tuple(skins), tuple(colliders)
+
+
+def _within(indices: np.ndarray, count: int) -> bool:
+    return indices.ndim == 2 and indices.dtype.kind in "iu" and bool(((indices >= 0) & (indices < count)).all())
 
 
 def _times(given: np.ndarray | None, frames: int, interval: float | None, place: Path) -> np.ndarray:

@@ -13,7 +13,9 @@ from neuido.data.formats.ply import read_ply_vertices
 from neuido.errors import UserError
 from neuido.export.exchange import exchange_of
 from neuido.export.reconstruction import reconstruct_surface
+from neuido.export.runs import read_run
 from neuido.models import attach_gaussians, bind, deform, load_gaussians
+from neuido.physics.colliders.solids import Sphere
 from neuido.types import Skin
 
 K, DT = 4, 0.02
@@ -309,10 +311,26 @@ def test_a_library_that_is_missing_is_named_with_its_extra(tmp_path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
-def test_frames_save_themselves_in_every_format(tmp_path):
-    frames = neuido.Simulator(neuido.Scene(cells=16, dt=1e-3), BALL, density=1000.0, device="cpu").rollout(10, LAW, every=5)
+@pytest.mark.slow  # a simulation with a solid collider
+def test_frames_save_themselves_in_every_format_with_their_colliders(tmp_path):
+    """Of a simulation, of its file of frames, and of the file that this one is exported to."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    sphere = Sphere(radius=0.1, position=(0.2, 0.2, 0.2), velocity=(1.0, 0.0, 0.0))
+    scene = neuido.Scene(cells=16, dt=1e-3, colliders=(*SCENE.colliders, sphere))
+    frames = neuido.Simulator(scene, BALL, density=1000.0, device="cpu").rollout(10, LAW, every=5)
     (path,) = frames.save(tmp_path / "a.usd")
-    assert path.is_file()
+    (archive,) = frames.save(tmp_path / "a.npz")
+    again = neuido.export(read_run(archive).motion, tmp_path / "again.usd")
+    for each, name in ((path, "sphere_1"), (again, "collider_1")):
+        stage = Usd.Stage.Open(str(each))
+        prim = stage.GetPrimAtPath(f"/World/colliders/{name}")
+        assert np.array(UsdGeom.Xformable(prim).GetLocalTransformation(2))[3, :3] == pytest.approx([0.21, 0.2, 0.2])
+        assert np.linalg.norm(np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get()), axis=1) == pytest.approx(0.1)
+    stage = Usd.Stage.Open(str(path))
+    floor = UsdGeom.Mesh(stage.GetPrimAtPath("/World/colliders/plane_0"))
+    assert np.array(floor.GetPointsAttr().Get())[:, 1] == pytest.approx(0.05)
     assert neuido.export(frames, tmp_path / "b.npz", every=2).is_file()
     with np.load(tmp_path / "b.npz") as archive:
         assert archive["x"].shape[0] == 2 and archive["times"] == pytest.approx([0.0, 0.01])

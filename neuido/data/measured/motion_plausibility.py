@@ -27,6 +27,8 @@ GAP = 10.0
 """Length of a gap in usual intervals from which on it is said."""
 DENSEST, LIGHTEST = 3e4, 0.1
 """Densities [kg/m^3] of no solid: osmium has 22,600, helium 0.17."""
+TURNED = 0.4
+"""Speed before and after a bounce, as a share of the largest speeds of a flight."""
 ON_CIRCLE = 0.01
 """Distance from a circle, as a share of the extent, at which a path is taken to be on it."""
 OUTSIDE = 0.01
@@ -141,6 +143,31 @@ def check_gaps(t: np.ndarray, where: str) -> None:
         _warn(
             f"{where}: {steps.max():.3g} s lie between data rows {row} and {row + 1}, and {np.median(steps):.3g} s between others: was "
             "the recording cut? Give its parts as recordings of their own (rows)"
+        )
+
+
+def check_bounces(t: np.ndarray, x: np.ndarray, axis: str, where: str) -> None:
+    """Warn of a free flight that turns round at its lowest points, as a body that bounces does.
+
+    Args:
+        t: Times [s], (n,).
+        x: Coordinate against gravity [m], (n,).
+        axis: Its name.
+        where: Name of the recording in messages.
+    """
+    if len(t) < 12:
+        return
+    speed = np.diff(x) / np.diff(t)
+    reach = max(float(np.quantile(np.abs(speed), 0.9)), 1e-12)
+    turns = [
+        i for i in range(2, len(speed) - 2) if np.min(speed[i - 2 : i]) < -TURNED * reach and np.max(speed[i : i + 2]) > TURNED * reach
+    ]
+    turns = [i for i in turns if x[i] <= np.min(x) + 0.2 * np.ptp(x)]
+    if turns:
+        row = turns[0]
+        _warn(
+            f"{where}: {axis} turns round within a few rows at {t[row]:.4g} s (data row {row}), as in a bounce, and no constraint is "
+            f"declared: give model.constraint: {{type: bounce, floor: {np.min(x):.4g}, restitution: 0.8}}, or rows: [0, {row}]"
         )
 
 

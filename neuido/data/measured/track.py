@@ -21,7 +21,7 @@ from neuido.data.measured.columns import (
     read_role,
     read_text,
 )
-from neuido.data.measured.motion_plausibility import check_figures, check_flight, check_track
+from neuido.data.measured.motion_plausibility import check_bounces, check_figures, check_flight, check_track
 from neuido.errors import UserError
 from neuido.physics.effects.point_library import TRACK_ENTRIES
 from neuido.types import Vector
@@ -155,6 +155,8 @@ def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = No
             check_track(track.t, track.x, axes, where, free=constraint is None)
             check_constraint(constraint, track, bodies[track.body], gravity, where)
             for column, a in enumerate(track.axes if constraint is None else ()):
+                if abs(gravity[a]) > 1.0:
+                    check_bounces(track.t, -math.copysign(1.0, gravity[a]) * track.x[:, column], AXES[a], where)
                 check_flight(track.t, track.x[:, column], gravity[a], AXES[a], f"recordings[{i}] ({track.name})")
         for body in bodies:
             if not any(track.body == body and track.role == "fit" for track in recordings):

@@ -341,6 +341,11 @@ def times_over(errors: np.ndarray, floors: np.ndarray) -> float:
     return math.exp(0.5 * (score(errors) - score(floors)))
 
 
+def worst_over(errors: np.ndarray, floors: np.ndarray) -> float:
+    """Return the largest ratio of the root mean square of a part to its floor, both as mean squares of the parts."""
+    return math.sqrt(float(np.max(errors / np.maximum(floors, 1e-300))))
+
+
 def unphysical(c: Candidate, point: Point) -> str:
     """Return why a fitted candidate is unphysical (at the edge of its range, or zero); empty if it is physical."""
     for p in c.size_parameters:

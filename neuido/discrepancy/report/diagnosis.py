@@ -15,7 +15,7 @@ from neuido.data.files.parsing import read_arrays
 from neuido.data.files.writing import copy_file
 from neuido.discrepancy.report import diagnosis_format
 from neuido.discrepancy.report.reader_units import Units, axis_of
-from neuido.discrepancy.report.wording import LEADING, MORE, MORE_LEFT, Words, more, named, scored_by, words_of
+from neuido.discrepancy.report.wording import LEADING, MORE, MORE_LEFT, Words, more, most_over, named, scored_by, words_of
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
@@ -184,9 +184,8 @@ class Diagnosis:
 
     @property
     def leaves_more(self) -> bool:
-        """Whether the error with the named effects is more than `MORE` times that of noise and discretisation."""
-        over = self._content["error"].get("left_over_floor")
-        return bool(self.effects) and over is not None and over > MORE
+        """Whether the error with the named effects, of the whole or of one recording, is more than `MORE` times its floor."""
+        return bool(self.effects) and most_over(self._content["error"]) > MORE
 
     @property
     def left_out(self) -> tuple[str, ...]:

@@ -70,6 +70,7 @@ def schema() -> Schema:
         {
             "left_over_floor": MAYBE,
             "left_over_noise": MAYBE,
+            "worst_over_floor": MAYBE,
             "noise_from": mapping({"enum": ["stated", "estimated", "assumed"]}),
             "amounts": record({"before": mapping(NUMBER), "after": mapping(NUMBER)}),
             "one_setting": record({"before": SCORES, "after": SCORES}),

@@ -145,8 +145,8 @@ def _finding(c: Content, units: Units) -> str:
     why = "; ".join(c["why"])
     out = [f"{why[0].upper()}{why[1:]}."] if why else []
     if answer in ("effect", "class"):
-        over = c["error"].get("left_over_floor")
-        more = over is not None and over > MORE
+        over = most_over(c["error"])
+        more = over > MORE
         out.append(_missing(effects, units, more=MORE_LEFT if more else ""))
         if more:
             out.append(f"What is left is {over:.0f} times what noise and discretisation leave.")
@@ -169,6 +169,11 @@ def _finding(c: Content, units: Units) -> str:
         if c["untried"]:
             out.append(f"Not tried: {listed([title(name) for name in c['untried']])}.")
     return " ".join(out)
+
+
+def most_over(error: Content) -> float:
+    """Return how many times its floor the error is that is left: of the whole, or of the worst recording where that is known."""
+    return max(error.get(key) or 0.0 for key in ("left_over_floor", "worst_over_floor"))
 
 
 def _missing(effects: Sequence[Content], units: Units, *, more: str = "") -> str:

@@ -1,15 +1,19 @@
 """Points under a constraint: what their folders must say, and fits of made recordings."""
 
+import warnings
+
 import numpy as np
 import pytest
 import yaml
 
+from neuido.data.measured.motion_plausibility import check_bounces
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared import Case, make_undeclared
 from neuido.discrepancy.inference.least_squares import levenberg_marquardt, run
 from neuido.discrepancy.problems.tracks.track_candidates import typical_speed
 from neuido.discrepancy.problems.tracks.track_problem import MOST_FRAMES, TrackProblem, track_problems
-from neuido.errors import UserError
+from neuido.errors import PlausibilityWarning, UserError
+from neuido.physics.points.point_mass import Forces, fly
 
 
 def made(tmp_path, kind, seed=1):
@@ -114,6 +118,18 @@ def test_a_speed_counts_the_way_back_and_a_long_recording_is_thinned(tmp_path):
     np.savetxt(folder / "run-1.csv", table, delimiter=",", header="t,y", comments="")
     (long,) = track_problems(folder)
     assert MOST_FRAMES / 2 < len(long.recordings[0].y) <= MOST_FRAMES
+
+
+def test_a_bounce_in_a_free_flight_is_said_and_a_throw_or_a_swing_is_none():
+    t = np.arange(0.0, 1.4, 1 / 60)
+    floor = Forces(floor_normal=np.array([0.0, 1.0, 0.0]), floor_height=0.0, restitution=0.8)
+    drop = fly(t, np.array([[0.0, 1.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), floor)[0, :, 1]
+    with pytest.warns(PlausibilityWarning, match="type: bounce"):
+        check_bounces(t, drop + 0.002 * np.random.default_rng(0).standard_normal(len(t)), "y", "drop")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for other in (6 * t - 4.9 * t**2, -4.9 * t**2, 0.3 * np.sin(3 * t)):
+            check_bounces(t, other, "y", "other")
 
 
 def test_a_spin_is_a_nuisance_and_shows_only_where_something_was_measured(tmp_path):

@@ -85,6 +85,8 @@ def test_an_effect_that_leaves_more_says_so():
     c["error"]["left_over_floor"] = 12.0
     first, *_ = words_of(c).finding.split(". ")
     assert first.endswith(", and something more that no effect here explains") and "12 times" in words_of(c).finding
+    c["error"] |= {"left_over_floor": 2.0, "worst_over_floor": 6.0}
+    assert "no effect here explains" in words_of(c).finding and "6 times" in words_of(c).finding
     c["effects"][0]["at_limit"] = "drag_linear.k ends at 5 1/s, the edge of its physical range"
     assert "a limit and no size" in words_of(c).finding.lower()
 

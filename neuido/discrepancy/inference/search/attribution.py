@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from neuido.discrepancy.inference import comparing, discretisation
-from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, score, times_over
+from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, score, times_over, worst_over
 from neuido.discrepancy.inference.journal import CaseRecord, Journal
 from neuido.discrepancy.inference.laboratory import Tell
 from neuido.discrepancy.inference.least_squares import Fit, NotFinite
@@ -337,7 +337,8 @@ def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], ro
         sealed=list(lab.sealed),
         leads=leads,
         why=why,
-        over={"floor": over, "noise": times_over(after.errors, lab.noise_squares)},
+        over={"floor": over, "noise": times_over(after.errors, lab.noise_squares)}
+        | ({"worst": worst_over(after.errors, lab.noise_squares)} if problem.settings == 1 else {}),
         power=power,
         unable=unable(lab),
         noise_from={r.name: lab.noise_from(n) for n, r in enumerate(problem.recordings)},
