@@ -260,7 +260,8 @@ def untried(d: Diagnosis) -> list[str]:
     if d.answer != "unfinished":
         return []
     fitted = {t.candidate.name for r in d.rounds for t in r.trials}
-    return list(dict.fromkeys(c.name for c in d.problem.candidates if c.name not in fitted))
+    able = [c for c in d.problem.candidates if not c.needs or c.needs in fitted]
+    return list(dict.fromkeys(c.name for c in able if c.name not in fitted))
 
 
 def _lead(t: Trial) -> dict[str, Any]:

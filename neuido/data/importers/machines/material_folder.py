@@ -9,7 +9,7 @@ import numpy as np
 
 from neuido.data.files.parsing import naming
 from neuido.data.importers.machines.loading_path import LEAST_ROWS, Part, Preparation, loading_parts, prepare
-from neuido.data.importers.machines.rheometer import read_relaxation, refuse_curve
+from neuido.data.importers.machines.rheometer import read_curve, read_relaxation
 from neuido.data.importers.machines.testing_machine import MODES, MeasuredTest, Specimen, read_machine
 from neuido.data.importers.tables.checked_folder import recording_name, roles_of, write_tables
 from neuido.data.importers.tables.titled_tables import Table, read_tables
@@ -75,7 +75,8 @@ def write_material_tests(
     tables: dict[str, dict[str, np.ndarray]] = {}
     tests: list[dict[str, Any]] = []
     of_file: dict[str, list[str]] = {}
-    secants = []
+    secants: list[float] = []
+    fluids: list[bool] = []
     for file, path in files.items():
         with naming(path):
             found = read_tables(path, sheet, numbered=mode != "biaxial")
@@ -83,15 +84,24 @@ def write_material_tests(
             for table in kept:
                 own = recording_name(f"{file}-{table.label}" if len(kept) > 1 else file, tables)
                 try:
-                    measured, used = _measured(table, path.name, mode, columns, units, specimen, compression, step)
-                    prepared, parts = prepare(measured.columns, preparation, measured.summary, area=measured.area, at_rest=measured.at_rest)
-                    secants.append(modulus(prepared))
+                    curve = None if step is not None else read_curve(table, path.name, columns, units)
+                    if curve is not None:
+                        measured, used, prepared, parts = curve, curve.entry["mode"], curve.columns, [Part("", 0, 0)]
+                        fluids.append(used == "flow_curve")
+                        secants.append(curve.modulus)
+                    else:
+                        measured, used = _measured(table, path.name, mode, columns, units, specimen, compression, step)
+                        made = measured.columns, preparation, measured.summary
+                        prepared, parts = prepare(*made, area=measured.area, at_rest=measured.at_rest)
+                        fluids.append(False)
+                        secants.append(modulus(prepared))
                 except UserError as error:
                     raise UserError(f"{error} ({table.label})" if len(kept) > 1 else str(error)) from error
                 label = f" ({table.label})" if len(kept) > 1 else ""
                 notes[f"{path.name}{label}"] = list(dict.fromkeys(measured.summary))
                 tables[own] = prepared
-                entries = [_entry(own, part, used, prepared) for part in parts]
+                more = curve.entry if curve is not None else {}
+                entries = [_entry(own, part, used, prepared) | more for part in parts]
                 tests += entries
                 of_file.setdefault(file, []).extend(entry["name"] for entry in entries)
             left = len(found) - len(kept)
@@ -102,10 +112,18 @@ def write_material_tests(
     tests = [test | {"role": roles[test["name"]]} for test in tests]
     if len(tests) > 1:
         summary.append(f"held out: {', '.join(name for name, role in roles.items() if role == 'held_out') or 'none'} (--held_out NAMES)")
-    model, words = declared_model(material, secants)
+    model, words = declared_fluid(material, secants) if all(fluids) else declared_model(material, secants)
     summary += words
     content = {"format": "neuido-material-test/1", "name": next(iter(files)), "model": model, "tests": tests}
     return summary + write_tables(out, "test.yaml", content, tables, read_material_tests)
+
+
+def declared_fluid(material: Material, viscosities: Sequence[float]) -> tuple[dict[str, Any], list[str]]:
+    """Return the declared model of flow curves, and the lines of the summary that say what was assumed."""
+    guess, density = float(f"{np.median(viscosities):.2g}"), material.density or 1000.0
+    said = f"model: a Newtonian fluid, viscosity {guess:g} Pa s from the rows, fitted; density {density:g} kg/m^3"
+    model = {"density": density, "flow": {"law": "newtonian", "viscosity": guess}, "free": ["viscosity"]}
+    return model, [said + ("" if material.density else " (assumed: --density)")]
 
 
 def declared_model(material: Material, secants: Sequence[float]) -> tuple[dict[str, Any], list[str]]:
@@ -168,8 +186,8 @@ def _has_test(table: Table, columns: dict[str, str]) -> bool:
     found = set(find_columns(table.titles, given))
     path = found & {"strain", "log_strain", "stretch", "stretch_1", "strain_1", "displacement", "displacement_1", "shear", "time"}
     load = found & {"force", "force_1", "nominal_stress", "nominal_stress_1", "true_stress", "shear_stress", "relaxation_modulus",
-                    "storage_modulus", "compliance"}  # fmt: skip
-    return bool(path and load)
+                    "storage_modulus", "compliance", "viscosity"}  # fmt: skip
+    return bool((path or found & {"rate", "frequency"}) and load)
 
 
 def _measured(
@@ -180,7 +198,6 @@ def _measured(
     relaxation = read_relaxation(table, name, step, columns, units)
     if relaxation is not None:
         return relaxation, "simple_shear"
-    refuse_curve(find_columns(table.titles, columns), name)
     if step is not None:
         raise UserError(f"--step is for a relaxation modulus, and {name} has none")
     return read_machine(table, name, specimen, mode, columns, units, compression), "uniaxial" if mode == "compression" else mode

@@ -1,39 +1,109 @@
-"""Tables of rheometers: a relaxation modulus becomes a step of shear; curves that no kind of test holds are refused by name."""
+"""Tables of rheometers: relaxation moduli and creep compliances, frequency sweeps and flow curves become material tests."""
 
 import re
 from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from neuido.data.importers.machines.loading_path import LEAST_ROWS
 from neuido.data.importers.machines.testing_machine import MachineTable, MeasuredTest, Specimen
 from neuido.data.importers.tables.titled_tables import Table
 from neuido.errors import UserError
 
-REFUSED = {  # quantities of the curve: what it is, and what to export in its place
-    ("storage_modulus",): (
-        "a frequency sweep (storage and loss modulus)",
-        "the waveforms of strain and stress over time at each frequency, with --mode simple_shear",
-    ),
-    ("compliance",): ("a creep compliance", "strain and stress over time, of which a diagnosis takes the strain as prescribed"),
-    ("rate", "viscosity"): ("a flow curve", "strain and stress over time at each rate, with --mode simple_shear"),
-    ("rate", "nominal_stress"): ("a flow curve", "strain and stress over time at each rate, with --mode simple_shear"),
-    ("rate", "shear_stress"): ("a flow curve", "strain and stress over time at each rate, with --mode simple_shear"),
-}
-"""Curves without a history of strain, which a material test needs."""
 PATHS = {"strain", "strain_1", "log_strain", "stretch", "stretch_1", "shear", "displacement", "displacement_1"}
+SMALL = 0.01
+"""Largest shear of a creep test that is made from a compliance: in the linear range any size serves."""
 
 
-def refuse_curve(found: Mapping[str, int], name: str) -> None:
-    """Raise where a table holds a curve that is no history of strain: a frequency sweep, a compliance, a flow curve.
+class Curve(NamedTuple):
+    """A table that is no history of strain, as the columns and the keys of a material test."""
+
+    columns: dict[str, np.ndarray]
+    """Quantities by the keys of the format, (n,) in SI units."""
+    entry: dict[str, Any]
+    """Further keys of the test."""
+    modulus: float
+    """Young's modulus [Pa] from which a fit may start; of a fluid its viscosity [Pa s]."""
+    summary: list[str]
+
+
+def read_curve(table: Table, name: str, columns: dict[str, str], units: Mapping[str, str]) -> Curve | None:
+    """Convert a frequency sweep, a creep compliance or a flow curve; return None for any other table.
+
+    Args:
+        table: The table.
+        name: Name of the file in messages.
+        columns: Title of the column of a quantity, if its title does not reveal it.
+        units: Unit of a quantity; SI units are taken where none is given.
 
     Raises:
-        UserError: It does; the message says what to export.
+        UserError: A column is missing, a frequency has no unit, or too few rows have positive values.
     """
-    if "time" in found and PATHS & set(found):
-        return
-    for quantities, (what, instead) in REFUSED.items():
-        if set(quantities) <= set(found):
-            raise UserError(f"{name} is {what}; a material test has strain, stress and time: export {instead}")
+    given = MachineTable(table, name, Specimen(), columns, units)
+    found = set(given.found)
+    if "time" in found and PATHS & found:
+        return None
+    if "storage_modulus" in found:
+        return _sweep(given)
+    if "compliance" in found:
+        return _creep(given)
+    stress = next((quantity for quantity in ("shear_stress", "nominal_stress") if quantity in found), "")
+    return _flow(given, stress) if "rate" in found and (stress or "viscosity" in found) else None
+
+
+def _sweep(given: MachineTable) -> Curve:
+    for quantity, what in (("loss_modulus", "loss modulus"), ("frequency", "frequency")):
+        if quantity not in given.found:
+            raise given.missing(what, quantity)
+    unit = given.units.get("frequency") or given.table.units[given.found["frequency"]]
+    angular = re.search(r"rad|angular|ang\.|omega|\u03c9|kreis", f"{unit} {given.title('frequency')}", re.IGNORECASE)
+    if not unit and not angular:
+        raise UserError(f"{given.name}: column {given.title('frequency')!r} has no unit: give --units.frequency Hz or rad/s")
+    omega = given.column("frequency", "1/s", required=False) * (1.0 if angular else 2 * np.pi)
+    moduli = [given.column(f"{kind}_modulus", "Pa", required=False) for kind in ("storage", "loss")]
+    given.summary.append(f"a frequency sweep, in {'angular frequency' if angular else 'cycles per second'}: small oscillations in shear")
+    kept = _positive(given, {"angular_frequency": omega, "storage_modulus": moduli[0], "loss_modulus": moduli[1]})
+    size = np.hypot(kept["storage_modulus"], kept["loss_modulus"])
+    return Curve(kept, {"mode": "oscillation"}, 3 * float(np.median(size)), given.summary)
+
+
+def _creep(given: MachineTable) -> Curve:
+    if "time" not in given.found:
+        raise given.missing("time", "time")
+    kept = _positive(
+        given, {"time": given.column("time", "s", required=False), "shear": given.column("compliance", "1/Pa", required=False)}
+    )
+    modulus, stress = 3 / float(np.median(kept["shear"])), float(f"{SMALL / kept['shear'].max():.3g}")
+    shear = kept["shear"] * stress
+    given.summary.append(
+        f"creep compliance -> shear under a shear stress of {stress:g} Pa, in the linear range, where its size does not matter"
+    )
+    columns = {"shear": shear, "shear_stress": np.full(len(shear), stress), "time": kept["time"]}
+    return Curve(columns, {"mode": "simple_shear", "control": "stress"}, modulus, given.summary)
+
+
+def _flow(given: MachineTable, stress: str) -> Curve:
+    rate = given.column("rate", "1/s", required=False)
+    seen = given.column(stress, "Pa", required=False) if stress else rate * given.column("viscosity", "Pa*s", required=False)
+    given.summary.append("a flow curve of a fluid; every row counts as steady")
+    kept = _positive(given, {"shear_rate": rate, "shear_stress": seen})
+    viscosity = float(np.exp(np.mean(np.log(kept["shear_stress"] / kept["shear_rate"]))))
+    return Curve(kept, {"mode": "flow_curve"}, viscosity, given.summary)
+
+
+def _positive(given: MachineTable, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the rows in which all values are positive.
+
+    Raises:
+        UserError: They are too few.
+    """
+    good = np.all([np.isfinite(values) & (values > 0) for values in columns.values()], axis=0)
+    if good.sum() < LEAST_ROWS:
+        raise UserError(f"{given.name} has {int(good.sum())} rows with positive values, and a curve takes {LEAST_ROWS} at least")
+    if not good.all():
+        given.summary.append(f"{int((~good).sum())} rows without positive values are left out")
+    return {key: values[good] for key, values in columns.items()}
 
 
 def read_relaxation(table: Table, name: str, step: str | None, columns: dict[str, str], units: Mapping[str, str]) -> MeasuredTest | None:

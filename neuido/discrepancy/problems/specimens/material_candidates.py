@@ -125,7 +125,7 @@ def _elastic(c: _Collection, fits: Sequence[MaterialTest], young: float, mu: flo
     if min(ends) < -0.1 * stress and max(ends) > 0.1 * stress:
         c.add("tension_compression", [{"r": 0.3}], ("r", 0.2, -0.7, 3.0))
     squeezed = -min(float(strain_of(test).min()) for test in fits if test.mode != "simple_shear") if _stretched(fits) else 0.0
-    if squeezed > COMPRESSED:
+    if squeezed > COMPRESSED and not tests.incompressible:  # what keeps its volume does not compact
         starts = [{"k": 0.3, "lock": f * squeezed} for f in (1.1, 1.6)]
         c.add("compaction", starts, ("k", 0.3, 0.0, 50.0), ("lock", 0.1, 1.02 * squeezed, 5.0), sizes="k", log="lock")
     angles = _angles(tests)

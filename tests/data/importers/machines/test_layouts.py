@@ -139,21 +139,41 @@ def test_relaxation_modulus(tmp_path):
     np.testing.assert_allclose(test.time[1:], time, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("titles", "words"),
-    [
-        ("Angular Frequency (rad/s),Storage Modulus (Pa),Loss Modulus (Pa)", "a frequency sweep .*waveforms of strain and stress"),
-        ("Time (s),Creep Compliance (1/Pa)", "a creep compliance; .*strain and stress over time"),
-        ("Shear Rate (1/s),Shear stress (Pa)", "a flow curve; .*simple_shear"),
-        ("Shear Rate (1/s),Viscosity (Pa s)", "a flow curve"),
-    ],
-)
-def test_curves_without_a_history_are_refused(tmp_path, titles, words):
-    rows = [",".join(f"{(i + 1) * (j + 1):g}" for j in range(titles.count(",") + 1)) for i in range(8)]
-    path = write(tmp_path / "curve.csv", [titles, *rows])
-    with pytest.raises(UserError, match=words):
-        neuido.import_file(path, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+def curve(tmp_path, titles, rows):
+    return write(tmp_path / "curve.csv", [titles, *(",".join(f"{value:g}" for value in row) for row in rows)])
+
+
+@pytest.mark.parametrize(("title", "factor"), [("Angular Frequency (rad/s)", 1.0), ("Frequency (Hz)", 2 * np.pi)])
+def test_a_frequency_sweep_is_a_small_oscillation(tmp_path, title, factor):
+    w = np.geomspace(0.01, 100, 9)
+    rows = np.stack([w, 1e3 * w, 2e3 * np.sqrt(w)], 1)
+    lines = neuido.import_file(curve(tmp_path, f"{title},Storage Modulus (Pa),Loss Modulus (kPa)", rows), tmp_path / "out")
+    (test,) = neuido.read_material_tests(tmp_path / "out").tests
+    assert test.mode == "oscillation" and any("frequency sweep" in line for line in lines)
+    np.testing.assert_allclose(test.path[:, 0], factor * w, rtol=1e-5)
+    np.testing.assert_allclose(test.stress, np.stack([1e3 * w, 2e6 * np.sqrt(w)], 1), rtol=1e-5)
+    with pytest.raises(UserError, match=r"--units\.frequency Hz or rad/s"):
+        neuido.import_file(curve(tmp_path, "Frequency,Storage Modulus (Pa),Loss Modulus (Pa)", rows), None)
+
+
+def test_a_compliance_is_creep_under_a_small_stress(tmp_path):
+    t = np.geomspace(0.1, 1e3, 12)
+    neuido.import_file(curve(tmp_path, "Time (s),Creep Compliance (1/Pa)", np.stack([t, 1e-5 * t**0.3], 1)), tmp_path / "out")
+    (test,) = neuido.read_material_tests(tmp_path / "out").tests
+    assert test.control == "stress" and test.mode == "simple_shear" and test.path.max() == pytest.approx(0.01, rel=0.01)
+    np.testing.assert_allclose(test.path[:, 0] / test.stress[:, 0], 1e-5 * t**0.3, rtol=1e-5)
+
+
+@pytest.mark.parametrize("title", ["Shear stress (Pa)", "Viscosity (Pa s)"])
+def test_a_flow_curve_declares_a_fluid(tmp_path, title):
+    rate = np.geomspace(0.01, 100, 10)
+    seen = 5 * rate**0.5 if "stress" in title else 5 * rate**-0.5
+    rows = np.concatenate([[[0.0, 1.0]], np.stack([rate, seen], 1)])
+    lines = neuido.import_file(curve(tmp_path, f"Shear Rate (1/s),{title}", rows), tmp_path / "out")
+    read = neuido.read_material_tests(tmp_path / "out")
+    assert read.fluid and read.model["flow"]["viscosity"] == pytest.approx(5.0, rel=0.02)
+    assert any("1 rows without positive values" in line for line in lines)
+    np.testing.assert_allclose(read.tests[0].stress[:, 0], 5 * rate**0.5, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
