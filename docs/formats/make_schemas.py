@@ -240,32 +240,26 @@ def schemas() -> dict[str, Schema]:
             },
             {"nuisances": {"oneOf": [{"type": "null"}, record({}, dict.fromkeys(track.NUISANCES, NOT_NEGATIVE))]}},
         ),
-        "neuido-scene-1": record(
-            {
-                "format": one_of(["neuido-scene/1"]),
-                "name": TEXT,
-                "scene": SCENE_WITH_SOLIDS,
-                "model": record({"density": POSITIVE, **material}, {"plasticity": PLASTICITY}),
-                "body": {
-                    "anyOf": [
-                        record({"particles": TEXT}),
-                        {
-                            "type": "object",
-                            "properties": {"shape": one_of(["cube", "box", "ball", "cylinder", "mesh"])},
-                            "required": ["shape"],
-                        },
-                    ]
-                },
-                "discretisation": GRID,
-                "steps": {"type": "integer", "minimum": 1},
-            },
-            {"source": {"type": "string"}, "on_inversion": one_of(["report", "error"]), "on_leave": one_of(["error", "clamp", "delete"])},
-        ),
+        "neuido-scene-1": _scene(record({"density": POSITIVE, **material}, {"plasticity": PLASTICITY})),
         "neuido-diagnosis-1": _older_diagnosis(names),
         "neuido-diagnosis-2": diagnosis_format.schema(),
     }
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {f"{name}.schema.json": {"$schema": dialect, "title": name, **schema} for name, schema in formats.items()}
+
+
+def _scene(model: Schema) -> Schema:
+    """Return the schema of a scene file: of one body with its model, or of several bodies and the contact between them."""
+    shape = {"type": "object", "properties": {"shape": one_of(["cube", "box", "ball", "cylinder", "mesh"])}, "required": ["shape"]}
+    body = {"anyOf": [record({"particles": TEXT}), shape]}
+    pair = {"type": "array", "prefixItems": [TEXT, TEXT, NOT_NEGATIVE], "minItems": 3, "maxItems": 3}
+    friction = {"anyOf": [NOT_NEGATIVE, {"type": "array", "items": pair}]}
+    common = {"format": one_of(["neuido-scene/1"]), "name": TEXT, "scene": SCENE_WITH_SOLIDS, "discretisation": GRID}
+    common["steps"] = {"type": "integer", "minimum": 1}
+    more = {"source": {"type": "string"}, "on_inversion": one_of(["report", "error"]), "on_leave": one_of(["error", "clamp", "delete"])}
+    contact = record({"kind": one_of(["sticky", "separate"])}, {"friction": friction})
+    several = record(common | {"bodies": some(record({"name": TEXT, "model": model, "body": body}))}, more | {"contact": contact})
+    return {"anyOf": [record(common | {"model": model, "body": body}, more), several]}
 
 
 def _constraints(types: Any) -> list[Schema]:

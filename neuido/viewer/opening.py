@@ -139,9 +139,11 @@ def _live_of_file(
     elif law is not None:
         laws = tuple(law) if isinstance(law, Sequence) else (law, None)
         family = LawFamily(lambda values: laws, ())  # type: ignore[arg-type, return-value]
-    else:
+    elif setup.body is not None:
         family = classical_family(setup.info["elasticity"], setup.info["plasticity"])
-    simulator = Simulator(setup.scene, setup.body, density=setup.info["density"])
+    else:
+        family = LawFamily(lambda values: simulator.own_laws, ())
+    simulator = Simulator(setup.scene, setup.body, density=setup.info.get("density", 1000.0))
     return _live(simulator, family, setup.info["name"], colour, host, port)
 
 

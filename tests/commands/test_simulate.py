@@ -112,3 +112,65 @@ def test_a_body_that_leaves_is_refused_clamped_or_deleted(scene, tmp_path, capsy
     scene.write_text(scene.read_text() + "on_leave: clamp\n")
     status, printed, err = run(capsys, "simulate", scene, "--out", tmp_path / "clamped", "--device", "cpu")
     assert status == 0 and "were clamped" in printed, err
+
+
+BODIES = """
+format: neuido-scene/1
+name: two-blocks
+scene:
+  domain: [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
+  gravity: [0.0, -9.8, 0.0]
+bodies:
+  - name: clay
+    model:
+      density: 1500.0
+      elasticity: {law: sigma, young: 3.0e+4, poisson: 0.2}
+      plasticity: {law: von_mises, yield_stress: 500.0}
+    body: {shape: box, lower: [0.3, 0.1, 0.3], upper: [0.6, 0.3, 0.6], spacing: 0.05}
+  - name: rubber
+    model:
+      density: 1000.0
+      elasticity: {law: neo_hookean, young: 2.0e+4, poisson: 0.3}
+    body: {shape: box, lower: [0.4, 0.3, 0.4], upper: [0.5, 0.4, 0.5], spacing: 0.05, velocity: [0.0, -1.0, 0.0]}
+contact: {kind: separate, friction: [[clay, rubber, 0.4]]}
+discretisation: {grid: 16, dt: 1.0e-3}
+steps: 20
+"""
+
+
+def test_a_scene_of_several_bodies_is_run(tmp_path, capsys):
+    path, out = tmp_path / "blocks.yaml", tmp_path / "out"
+    path.write_text(BODIES)
+    status, printed, err = run(capsys, "simulate", path, "--out", out, "--every", 10, "--device", "cpu")
+    assert status == 0, err
+    assert "law of clay: sigma (young 30000.0, poisson 0.2), von_mises (yield_stress 500.0); density 1500 kg/m^3" in printed
+    assert "law of rubber: neo_hookean" in printed
+    setup = load_scene(path)
+    assert setup.body is None
+    frames = Simulator(setup.scene, device="cpu").rollout(20, every=10)
+    with np.load(out / "frames.npz") as saved:
+        assert torch.equal(torch.from_numpy(saved["x"]), frames.x)
+        assert saved["body_names"].tolist() == ["clay", "rubber"]
+        assert np.array_equal(saved["body"], frames.body.numpy())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("name: rubber", "name: clay", "bodies[1]: name = 'clay' is that of another body"),
+        ("shape: box, lower: [0.4", "shape: bix, lower: [0.4", "bodies[1]: body.shape = 'bix' is unknown"),
+        ("density: 1000.0", "density: -1.0", "bodies[1]: model.density"),
+        ("kind: separate", "kind: glue", "contact.kind = 'glue' is unknown: choose from sticky, separate"),
+        ("[clay, rubber, 0.4]", "[clay, wood, 0.4]", "contact.friction[0] must be [name, name, coefficient] of the bodies clay, rubber"),
+        ("[clay, rubber, 0.4]", "[clay, rubber, -0.4]", "contact.friction[0]"),
+        ("upper: [0.5, 0.4, 0.5]", "upper: [0.5, 1.4, 0.5]", "bodies[1]:"),
+        ("name: two-blocks", "name: two-blocks\nbody: {shape: cube}", "unknown key 'body'"),
+    ],
+)
+def test_a_body_that_does_not_fit_is_one_line(old, new, message, tmp_path, capsys):
+    path = tmp_path / "blocks.yaml"
+    path.write_text(BODIES.replace(old, new))
+    status, _, err = run(capsys, "simulate", path, "--out", tmp_path / "out", "--device", "cpu")
+    assert status == 2
+    assert message in err and str(path) in err
+    assert not (tmp_path / "out").exists()

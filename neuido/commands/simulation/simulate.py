@@ -28,7 +28,7 @@ def simulate(
     on_leave: Literal["error", "clamp", "delete"] | None = None,
     progress: bool = True,
 ) -> None:
-    """Simulate the body of a scene file and write its motion: `neuido simulate SCENE --out FOLDER`.
+    """Simulate the bodies of a scene file and write their motion: `neuido simulate SCENE --out FOLDER`.
 
     Further simulations have commands of their own: `neuido trajectories` (training data of Stage I), `neuido scenes` (filmed bodies),
     `neuido undeclared` (a folder to diagnose, with a sealed answer) and `neuido replay` (the recordings of an experiment).
@@ -37,7 +37,7 @@ def simulate(
         scene: Scene file, or the name of one that comes with neuido (bouncy-ball, nclaw-cube, ...).
         out: Folder to write, new or empty: frames.npz, a point cloud a frame in ply/, and the scene (and the learned law) beside them;
             forces.csv with the forces on solid colliders.
-        law: Neural law of `neuido predict` (law.safetensors) in place of the scene's elasticity and plasticity.
+        law: Neural law of `neuido predict` (law.safetensors) in place of the scene's elasticity and plasticity, for all bodies.
         steps: Substeps; those of the scene file where absent.
         every: Write a frame every so many substeps, a divisor of `steps`; such that at most 100 frames follow the first where absent.
         data_root: Folder of the particles that a scene names; that of NEUIDO_DATA where absent.
@@ -66,10 +66,15 @@ def simulate(
         raise UserError(f"steps is {count}; it must be a positive whole number")
     check_limit(count, "NEUIDO_MAX_STEPS", f"steps is {count}")
     spacing = next(k for k in range(-(-count // FRAMES), count + 1) if count % k == 0) if every is None else every
-    laws = material(setup.info["elasticity"], setup.info["plasticity"]) if law is None else load_law(law)
+    models = setup.info.get("models") or [setup.info]
+    laws: tuple = ()
+    if law is not None:
+        laws = load_law(law)
+    elif setup.body is not None:
+        laws = material(setup.info["elasticity"], setup.info["plasticity"])
     asked = on_inversion or setup.info["on_inversion"]
     leaves = on_leave or setup.info["on_leave"]
-    density = setup.info["density"]
+    density = models[0]["density"]
     simulator = Simulator(setup.scene, setup.body, density=density, device=device, on_inversion=asked, on_leave=leaves)
     start = time.perf_counter()
     with new_folder(folder) as hidden:
@@ -86,12 +91,14 @@ def simulate(
                 write_text(hidden / "forces.csv", _force_table(frames))
         except OSError as error:
             raise UserError(f"out = {out}: {error.strerror or error}") from error
-    told = f"the law of {law}" if law else ", ".join(_told(setup.info[part]) for part in ("elasticity", "plasticity"))
     print(
         f"simulated {setup.info['name']}: {frames.x.shape[1]} particles, {count} substeps of {setup.scene.dt:g} s, "
         f"{len(frames.x)} frames, on {simulator.device}, {seconds:.1f} s"
     )
-    print(f"law: {told}; density {setup.info['density']:g} kg/m^3")
+    for model in models:
+        told = f"the law of {law}" if law else ", ".join(_told(model[part]) for part in ("elasticity", "plasticity"))
+        name = "" if setup.body is not None else f" of {model['name']}"
+        print(f"law{name}: {told}; density {model['density']:g} kg/m^3")
     fall, share = float(frames.x[-1, :, 1].mean() - frames.x[0, :, 1].mean()), torch.linalg.det(frames.F[-1].double())
     speed = float(frames.v[-1].norm(dim=1).max())
     print(

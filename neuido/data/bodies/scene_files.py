@@ -1,13 +1,15 @@
 """Read simulation scenes from YAML files of the format `neuido-scene/1`.
 
 `configs/scenes` has the scenes of the literature. The keys `scene`, `model` and `discretisation` are those of an experiment file
-(`neuido-experiment/1`), with `scene.walls` added. A scene file also has `name`, `source`, `body` and `steps`.
+(`neuido-experiment/1`), with `scene.walls` added. A scene file also has `name`, `source`, `body` and `steps`, or in place of `body` and
+`model` a list `bodies`, each with its own, and `contact` between them.
 """
 
 import inspect
 import math
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import NoneType
 from typing import Any, NamedTuple, get_args
@@ -17,20 +19,19 @@ import torch
 
 from neuido.data.bodies import shapes
 from neuido.data.bodies.collider_entries import solid_from_dict
+from neuido.data.bodies.particle_volume import body_volume
 from neuido.data.files.parsing import read_arrays, read_yaml
 from neuido.data.files.values import check_keys, mapping, number, path_inside, vector
 from neuido.data.files.yaml_files import checking
 from neuido.errors import UserError, suggest
 from neuido.physics.laws.classical import material
-from neuido.physics.linalg.extent import box_axes, without_volume
+from neuido.physics.multibody.scene_bodies import CONTACTS as BODY_CONTACTS
 from neuido.physics.runtime.limits import check_limit
 from neuido.types import AttachedMass, Body, Box, Plane, Scene, Solid, Walls
 
 FORMAT = "neuido-scene/1"
-KEYS = ("format", "name", "source", "scene", "model", "body", "discretisation", "steps", "on_inversion", "on_leave")
+KEYS = ("format", "name", "source", "scene", "model", "body", "bodies", "contact", "discretisation", "steps", "on_inversion", "on_leave")
 VARIABLE = "NEUIDO_DATA"
-FEW = 4000
-"""Number of particles below which the smallest box around them bounds the estimate of their volume."""
 CONTACTS = ("sticky", "slip", "separate")
 
 
@@ -38,9 +39,12 @@ class SceneSetup(NamedTuple):
     """The content of a scene file."""
 
     scene: Scene
-    body: Body
+    """The scene, with its bodies where the file lists several."""
+    body: Body | None
+    """The body; None where the file lists several."""
     info: dict[str, Any]
-    """name, source, steps, on_inversion, on_leave, density [kg/m^3], elasticity and plasticity (as `physics.laws.material` takes them)."""
+    """name, source, steps, on_inversion and on_leave. Of one body also density [kg/m^3], elasticity and plasticity (as
+    `physics.laws.material` takes them), of several `models`, these three of each."""
 
 
 def data_root(option: str | os.PathLike | None = None) -> Path:
@@ -84,7 +88,9 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         raise UserError(f"the scene file {path} is missing{known}")
     content = read_yaml(path)
     with checking(path):
-        check_keys(content, "the file", KEYS, ("source", "on_inversion", "on_leave"))
+        one = "bodies" not in content
+        given = [key for key in KEYS if key not in (("bodies", "contact") if one else ("model", "body"))]
+        check_keys(content, "the file", given, ("source", "on_inversion", "on_leave", "contact"))
         if content["format"] != FORMAT:
             raise UserError(f"format = {content['format']!r} must be {FORMAT!r}")
         for key in ("name", "source"):
@@ -100,11 +106,14 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         if on_leave not in ("error", "clamp", "delete"):
             raise UserError(f"on_leave must be error, clamp or delete, got {on_leave!r}")
         scene = scene_from_dict(content["scene"], content["discretisation"], lambda file, where: named_file(file, where, root, path.parent))
-        model = model_from_dict(content["model"])
-        body = body_from_dict(content["body"], root, path.parent)
-        outside = ((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any(dim=1)
-        if outside.any():
-            raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain: enlarge the domain or move the body")
+        if one:
+            model = model_from_dict(content["model"])
+            body = body_from_dict(content["body"], root, path.parent)
+            _check_domain(body, scene)
+        else:
+            body, bodies, models = None, *_bodies(content["bodies"], scene, root, path.parent)
+            scene = replace(scene, bodies=bodies, **_body_contact(content.get("contact"), [own.name for own in bodies]))
+            model = {"models": models}
     info = {
         "name": content["name"],
         "source": content.get("source", ""),
@@ -114,6 +123,67 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
         **model,
     }
     return SceneSetup(scene, body, info)
+
+
+def _check_domain(body: Body, scene: Scene) -> None:
+    """Raise UserError where particles of a body lie outside the domain."""
+    outside = ((body.x < torch.tensor(scene.lower)) | (body.x > torch.tensor(scene.upper))).any(dim=1)
+    if outside.any():
+        raise UserError(f"{int(outside.sum())} particles of the body lie outside scene.domain: enlarge the domain or move the body")
+
+
+def _bodies(given: Any, scene: Scene, root: str | os.PathLike | None, beside: Path) -> tuple[tuple[Body, ...], list[dict[str, Any]]]:
+    """Build the bodies of a scene file, each with its laws, and return their models too.
+
+    Raises:
+        UserError: As `load_scene`.
+    """
+    if not isinstance(given, list) or not given:
+        raise UserError(f"bodies must be a list of at least one body, got {given!r}")
+    check_limit(len(given), "NEUIDO_MAX_BODIES", f"bodies has {len(given)} entries")
+    bodies, models = [], []
+    for i, entry in enumerate(given):
+        try:
+            check_keys(mapping(entry, "an entry"), "an entry", ("name", "model", "body"))
+            if not isinstance(entry["name"], str) or not entry["name"]:
+                raise UserError(f"name must be text, got {entry['name']!r}")
+            if entry["name"] in [body.name for body in bodies]:
+                raise UserError(f"name = {entry['name']!r} is that of another body")
+            model = model_from_dict(entry["model"])
+            body = body_from_dict(entry["body"], root, beside)
+            _check_domain(body, scene)
+        except UserError as error:
+            raise UserError(f"bodies[{i}]: {error}") from error
+        law, plasticity = material(model["elasticity"], model["plasticity"])
+        bodies.append(Body(shape=body, name=entry["name"], law=law, plasticity=plasticity, density=model["density"]))
+        models.append({"name": entry["name"], **model})
+    return tuple(bodies), models
+
+
+def _body_contact(given: Any, names: list[str]) -> dict[str, Any]:
+    """Return the contact between bodies as arguments of `Scene`.
+
+    Args:
+        given: `kind` (sticky or separate) and optionally `friction`: a coefficient, or a list of [name, name, coefficient].
+        names: Names of the bodies.
+
+    Raises:
+        UserError: An unknown kind or name, or a coefficient that is negative.
+    """
+    if given is None:
+        return {}
+    given = mapping(given, "contact")
+    check_keys(given, "contact", ("kind", "friction"), ("friction",))
+    if given["kind"] not in BODY_CONTACTS:
+        raise UserError(f"contact.kind = {given['kind']!r} is unknown: choose from {', '.join(BODY_CONTACTS)}")
+    friction = given.get("friction", 0.0)
+    if not isinstance(friction, list):
+        return {"contact": given["kind"], "body_friction": number(friction, "contact.friction", least=0.0)}
+    for i, pair in enumerate(friction):
+        if not isinstance(pair, list) or len(pair) != 3 or any(name not in names for name in pair[:2]):
+            raise UserError(f"contact.friction[{i}] must be [name, name, coefficient] of the bodies {', '.join(names)}, got {pair!r}")
+        number(pair[2], f"contact.friction[{i}]", least=0.0)
+    return {"contact": given["kind"], "body_friction": tuple(tuple(pair) for pair in friction)}
 
 
 def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any], find: Callable[[str, str], Path] | None = None) -> Scene:
@@ -165,55 +235,6 @@ def model_from_dict(model: Mapping[str, Any]) -> dict[str, Any]:
     except UserError as error:
         raise UserError(f"model: {error}") from error
     return {"density": density, "elasticity": elasticity, "plasticity": plasticity}
-
-
-def body_volume(x: np.ndarray) -> float:
-    """Estimate the volume [m^3] of a body from its particles x (P, 3) [m], by voxel occupancy.
-
-    A voxel is twice as wide as the mean spacing (V / P)^(1/3). It then holds about eight particles, and no voxel inside the body is
-    empty. The volume V and the voxel width are found together by iteration. A voxel beside an empty one counts 2/3, because the surface
-    cuts it. The result is the mean over eight positions of the voxel grid; its error is below 10 % for 5,000 particles. The motion of
-    a body hardly depends on the volume, because a uniform volume scales masses and forces alike.
-
-    With fewer particles lattice blocks are up to 40 % off and balls of about 35 particles up to 92 %. Below `FEW` particles the volume
-    of the smallest box around them is the upper bound; without it the error would have no limit.
-
-    Raises:
-        UserError: The particles span no volume: they are in one place, on a line or in a plane.
-    """
-    x = np.asarray(x, dtype=np.float64)
-    if flat := without_volume(x):
-        raise UserError(f"the {len(x)} particles {flat} and span no volume: give particles in several layers")
-    lower, extent = x.min(axis=0), np.ptp(x, axis=0)
-    volume = float(np.prod(np.maximum(extent, 1e-3 * extent.max())))
-    for _ in range(30):
-        voxel = 2 * (volume / len(x)) ** (1 / 3)
-        counts = [_occupied((x - lower) / voxel + np.array(shift) / 2) for shift in np.ndindex(2, 2, 2)]
-        before, volume = volume, voxel**3 * float(np.mean(counts))
-        if abs(volume - before) < 1e-3 * before:
-            break
-    return min(volume, _box_volume(x)) if len(x) < FEW else volume
-
-
-def _box_volume(x: np.ndarray) -> float:
-    """Return the volume [m^3] of the smallest box around particles, with its faces half a spacing s outside the outermost.
-
-    Were the box full, its volume would be P s^3, which gives s.
-    """
-    a, b, c = np.ptp(x @ box_axes(x).T, axis=0)
-    s = np.roots([len(x) - 1.0, -(a + b + c), -(a * b + b * c + c * a), -a * b * c]).real.max()
-    return len(x) * float(s) ** 3
-
-
-def _occupied(x: np.ndarray) -> float:
-    """Count the unit cells that contain a point x >= 0; a cell beside an empty one counts 2/3."""
-    cells = np.floor(x).astype(np.int64) + 1
-    occupied = np.zeros(cells.max(axis=0) + 2, dtype=bool)
-    occupied[tuple(cells.T)] = True
-    interior = occupied.copy()
-    for axis in range(3):
-        interior &= np.roll(occupied, 1, axis) & np.roll(occupied, -1, axis)
-    return (2 * occupied.sum() + interior.sum()) / 3
 
 
 def scenes_folder() -> Path:

@@ -14,6 +14,7 @@ A file of conditions, `neuido-conditions/1`:
 """
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +31,6 @@ from neuido.models.inference.outputs import contact_sheet, write_plys, write_vid
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
 from neuido.models.render.gaussians import attach_gaussians, bind, colours_of, deform
 from neuido.models.render.splatting import render
-from neuido.physics.laws.composite import by_body
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Gaussians, ParticleState, Vector
 
@@ -114,20 +114,15 @@ def simulate_condition(condition: Condition, known: list[tuple[PreparedScene, La
         first = chosen[0][0]
         placed = [_place(body, prepared) for body, (prepared, _) in zip(condition.bodies, chosen)]
         _apart([body for body, _ in placed], first.source.scene.dx)
-        joined = Body(*(torch.cat([getattr(body, name) for body, _ in placed]) for name in ("x", "v", "volume")))
         device = first.images.device
-        density = first.source.density
-        if any(prepared.source.density != density for prepared, _ in chosen):
-            raise UserError("the bodies have different densities; a scene has one density")
-        simulator = Simulator(first.source.scene, joined, density=density, device=device, graphs=len(chosen) == 1)
+        bodies = [
+            Body(shape=body, law=laws[0], plasticity=laws[1], density=prepared.source.density)
+            for (body, _), (prepared, laws) in zip(placed, chosen)
+        ]
+        simulator = Simulator(replace(first.source.scene, bodies=bodies, contact="sticky"), device=device)
         steps = ((condition.frames or first.frames) - 1) * first.stride
-        pairs = [laws for _, laws in chosen]
-        if len(pairs) == 1:
-            laws = pairs[0]
-        else:
-            laws = by_body([e for e, _ in pairs], [p for _, p in pairs], [len(body.x) for body, _ in placed], simulator.order)
         with torch.no_grad():
-            motion = simulator.rollout(steps, *laws, every=first.stride)
+            motion = simulator.rollout(steps, every=first.stride)
     except UserError as error:
         raise UserError(f"condition {condition.name}: {error}") from error
     parts, at = [], 0

@@ -1,7 +1,7 @@
 """The same substep as in `simulator`, in plain torch and differentiable by autograd: a slow reference for tests and benchmarks.
 
-It is written from the equations and shares with the kernels only the tables of colliders, clamps and effects. Laws and effects are those of
-`constitutive.Constitutive`.
+It is written from the equations and shares with the kernels only the tables of colliders, clamps and effects and the order of the bodies.
+Laws and effects are those of `constitutive.Constitutive`, contact between bodies is `multibody.contact_twin`.
 """
 
 import torch
@@ -12,6 +12,7 @@ from neuido.physics.effects.constitutive import Constitutive, History
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.multibody.contact_twin import exchange
 from neuido.types import ParticleState
 
 
@@ -21,6 +22,19 @@ def _splines(cells: Tensor) -> tuple[Tensor, Tensor]:
     f = cells - base
     weights = torch.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2], dim=1)
     return base.long(), weights
+
+
+def _slopes(f: Tensor, w: Tensor, offsets: Tensor) -> Tensor:
+    """Return the gradient of the weights at the 27 nodes of each particle in the position of the node [1/cell], (P, 27, 3).
+
+    Args:
+        f: Distance of each particle to its first node [cells], (P, 3).
+        w: Weights, (P, 3 nodes, 3 axes).
+        offsets: Number of each node along each axis, (27, 3).
+    """
+    g = -torch.stack([f - 1.5, -2.0 * (f - 1.0), f - 0.5], dim=1)
+    picked = [[(g if axis == along else w)[:, offsets[:, axis], axis] for axis in range(3)] for along in range(3)]
+    return torch.stack([a * b * c for a, b, c in picked], dim=-1)
 
 
 def _contact(v: Tensor, normal: Tensor, kind: int, friction: Tensor) -> Tensor:
@@ -113,14 +127,26 @@ def substep(
         flat = ((nodes[..., 0] * shape[1] + nodes[..., 1]) * shape[2] + nodes[..., 2]).reshape(-1)
         affine = m[:, None, None] * C - dt * volume[:, None, None] * 4.0 / dx**2 * tau
         momentum = weight[..., None] * (m[:, None, None] * v[:, None, :] + torch.einsum("pab,pnb->pna", affine, arm))
-        grid_p = x.new_zeros(shape[0] * shape[1] * shape[2], 3)
-        grid_m = x.new_zeros(grid_p.shape[0])
+        fields, size = int((setup.field_scene == s).sum()), shape[0] * shape[1] * shape[2]
+        field = (setup.field[own] - setup.field[own].min()).long().repeat_interleave(27)
+        flat = field * size + flat
+        grid_p = x.new_zeros(fields * size, 3)
+        grid_m = x.new_zeros(fields * size)
         grid_p = grid_p.index_add(0, flat, momentum.reshape(-1, 3))
         grid_m = grid_m.index_add(0, flat, (weight * m[:, None]).reshape(-1))
+        if fields > 1:
+            slope = _slopes((x - setup.origin[s]) / dx - base, w, offsets) * (volume / dx)[:, None, None]
+            gradient = x.new_zeros(fields * size, 3).index_add(0, flat, slope.reshape(-1, 3)).reshape(fields, size, 3)
+            half = 0.5 * volume.pow(1 / 3).repeat_interleave(27)
+            table = sim.setup.contact.friction[s].reshape(sim.setup.contact.bodies, -1)  # type: ignore[union-attr]
+            arms = (flat, -arm.detach().reshape(-1, 3), half)
+            grid_p = exchange(grid_p.reshape(fields, size, 3), grid_m.reshape(fields, size), gradient, table, arms, float(dx)).reshape(
+                -1, 3
+            )
         full = grid_m > 0
         u = grid_p / torch.where(full, grid_m, 1.0)[:, None]
         index = torch.cartesian_prod(*[torch.arange(n, device=sim.device) for n in shape])
-        place = setup.origin[s] + index * dx
+        place = (setup.origin[s] + index * dx).repeat(fields, 1)
         u = u + dt * (pull[s] - force[s, 2] * (place - force[s, 3:6]))
         w = 0.5 * dt * torch.linalg.cross(force[s, 6:9].expand(3, 3), eye).mT  # half of w x, for Cayley's rotation
         u = u @ torch.linalg.solve(eye - w, eye + w).mT

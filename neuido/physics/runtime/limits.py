@@ -24,14 +24,15 @@ LIMITS = {
     "NEUIDO_MAX_FRAMES": 100_000,
     "NEUIDO_MAX_PARTICLES": 20_000_000,
     "NEUIDO_MAX_COLLIDERS": 256,
+    "NEUIDO_MAX_BODIES": 64,
     "NEUIDO_MAX_STEPS": 10_000_000,
     "NEUIDO_MAX_TRAJECTORIES": 1_000_000,
     "NEUIDO_MAX_MESH_BYTES": 1 << 30,
     "NEUIDO_MAX_TRIANGLES": 10_000_000,
 }
 """Largest number of bytes of a text file and of a YAML file, nodes of a YAML file, cells of a table, elements of an array, pixels of an
-image, frames of a video, particles of a body or a PLY file, colliders of a scene, steps of a simulation, trajectories of a folder, bytes of
-a mesh file, and triangles or vertices of a mesh."""
+image, frames of a video, particles of a body or a PLY file, colliders and bodies of a scene, steps of a simulation, trajectories of a
+folder, bytes of a mesh file, and triangles or vertices of a mesh."""
 
 MEMORY = "NEUIDO_MAX_MEMORY_BYTES"
 """The environment variable with the largest memory that one simulation may need."""

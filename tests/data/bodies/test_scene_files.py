@@ -7,6 +7,7 @@ import yaml
 
 from neuido.data.bodies import scene_files as scenes
 from neuido.data.bodies import shapes
+from neuido.data.bodies.particle_volume import body_volume
 from neuido.data.files.parsing import read_yaml
 from neuido.errors import UserError
 from neuido.physics.laws.classical import material
@@ -41,7 +42,7 @@ def text(name: str) -> dict:
 
 
 def test_there_is_a_file_for_each_body():
-    assert set(scenes.scene_names()) == {*BODIES, "nclaw-cube"}
+    assert set(scenes.scene_names()) == {*BODIES, "nclaw-cube", "rubber-and-sand"}
 
 
 @pytest.mark.parametrize("name", BODIES)
@@ -243,7 +244,7 @@ def test_body_volume(jitter):
         shapes.cylinder(centre=(0.5, 0.5, 0.5), radius=0.1, height=0.4, spacing=spacing, jitter=jitter),
         shapes.box(lower=(0.1, 0.1, 0.1), upper=(0.4, 0.3, 0.35), spacing=spacing, jitter=jitter),
     ):
-        assert scenes.body_volume(body.x.numpy()) == pytest.approx(float(body.volume.double().sum()), rel=0.1)
+        assert body_volume(body.x.numpy()) == pytest.approx(float(body.volume.double().sum()), rel=0.1)
 
 
 @pytest.mark.parametrize("side", [2, 3, 4, 5])
@@ -252,11 +253,11 @@ def test_body_volume_of_few_particles(side, turned):
     x = 0.1 * np.stack(np.meshgrid(np.arange(side), np.arange(side), np.arange(4.0)), axis=-1).reshape(-1, 3)
     if turned:
         x = x @ np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
-    found = scenes.body_volume(x)
+    found = body_volume(x)
     assert 0.65e-3 * len(x) < found < 1.01e-3 * len(x)
-    assert scenes.body_volume(8.0 * x) == pytest.approx(512.0 * found, rel=0.15)  # in other units; on a lattice the iteration goes on
+    assert body_volume(8.0 * x) == pytest.approx(512.0 * found, rel=0.15)  # in other units; on a lattice the iteration goes on
     four = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    assert 1 / 6 < scenes.body_volume(four) < 25.0  # without the bound: 35,000
+    assert 1 / 6 < body_volume(four) < 25.0  # without the bound: 35,000
 
 
 @pytest.mark.parametrize(
@@ -272,7 +273,7 @@ def test_body_volume_of_few_particles(side, turned):
 def test_particles_without_volume(x, words, tmp_path):
     x = np.asarray(x, dtype=np.float32)
     with pytest.raises(UserError, match=f"{words} and span no volume"):
-        scenes.body_volume(x)
+        body_volume(x)
     np.savez(tmp_path / "flat.npz", x=x, v=np.zeros_like(x))
     with pytest.raises(UserError, match=rf"^body.particles: .*flat.npz: the {words} and span no volume") as error:
         scenes.body_from_dict({"particles": "flat.npz"}, tmp_path)
