@@ -185,6 +185,9 @@ class CachedProblem(Problem):
     def effort(self, recording: int, setting: int = 0) -> float:
         return self.problem.effort(recording, setting)
 
+    def noise_with(self, point: Point, recording: int) -> float | None:
+        return self.problem.noise_with(point, recording)
+
     def others(self, setting: int) -> list[int]:
         return self.problem.others(setting)
 

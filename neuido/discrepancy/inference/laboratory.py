@@ -191,6 +191,11 @@ class Laboratory:
         """Return the standard deviation of the noise of a recording; `noise_from` says where it comes from."""
         return self.noises[n][0]
 
+    def noise_squares_with(self, point: Point) -> np.ndarray:
+        """Return the mean square of what noise and nuisances leave of each part where the model at a point is right, (parts,)."""
+        own = {p.recording: self.problem.noise_with(point, p.recording) or 0.0 for p in self.parts}
+        return np.maximum(self.noise_squares, [own[p.recording] ** 2 for p in self.parts])
+
     def noise_uncertainty(self, n: int) -> float:
         """Return the relative standard deviation of `noise_of`; zero for a stated noise."""
         count = max(len(self.problem.recordings[n].y), 1)

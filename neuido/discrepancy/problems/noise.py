@@ -8,8 +8,12 @@ import numpy as np
 
 LEAST_ROWS = 8
 """Least number of rows for the fit of a surface."""
-WINDOW = 6
-"""Samples per window. A cubic leaves two degrees of freedom."""
+DEGREES = (3, 5, 7, 9)
+"""Degrees of the local polynomials of `high_pass`. A higher one follows a motion of few samples a swing."""
+FREEDOM = 3
+"""Samples per window beyond the degree of its polynomial, which leaves two degrees of freedom."""
+FALLS = 1.5
+"""Factor by which a higher degree must lower the estimate to count: a smaller fall is within the scatter of some forty samples."""
 
 
 def high_pass(pieces: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
@@ -17,7 +21,8 @@ def high_pass(pieces: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
 
     A cubic is fitted to every window of six neighbouring samples. The variance of the noise is the median over the windows of the sum of
     squared residuals, divided by its median for noise of variance one: 2 ln 2, that of chi^2 with two degrees of freedom. Because it is a
-    median, a few corners and outliers hardly change it.
+    median, a few corners and outliers hardly change it. Where polynomials of higher degree in longer windows leave far less, the cubic has
+    left a part of the motion, and they count.
 
     Args:
         pieces: Abscissae (n,) and values (n,) of each smooth piece, in the order of the abscissae.
@@ -25,17 +30,33 @@ def high_pass(pieces: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
     Returns:
         The standard deviation in the unit of the values. None where no piece has six samples.
     """
-    squares = []
-    for at, values in pieces:
-        for i in range(len(values) - WINDOW + 1):
-            x = at[i : i + WINDOW]
-            width = np.ptp(x)
-            if len(np.unique(x)) < 5 or width <= 0:
-                continue
-            basis = np.vander((x - x.mean()) / width, 4)
-            y = values[i : i + WINDOW]
-            squares.append(float(np.sum((y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]) ** 2)))
-    return float(np.sqrt(np.median(squares) / (2 * np.log(2)))) if squares else None
+    best = None
+    for degree in DEGREES:
+        found = [_window_squares(at, values, degree) for at, values in pieces]
+        squares = np.concatenate(found) if found else np.empty(0)
+        if not len(squares):
+            break
+        one = float(np.sqrt(np.median(squares) / (2 * np.log(2))))
+        best = one if best is None or one * FALLS < best else best
+    return best
+
+
+def _window_squares(at: np.ndarray, values: np.ndarray, degree: int) -> np.ndarray:
+    """Return the sum of squared residuals of a polynomial in each window of neighbouring samples (n,); empty for a short series."""
+    width = degree + FREEDOM
+    if len(values) < width:
+        return np.empty(0)
+    x, y = (np.lib.stride_tricks.sliding_window_view(np.asarray(a, dtype=np.float64), width) for a in (at, values))
+    span = np.ptp(x, axis=1)
+    usable = (span > 0) & (np.sum(np.diff(np.sort(x, axis=1), axis=1) > 0, axis=1) > degree)
+    x, y, span = x[usable], y[usable], span[usable]
+    if not len(x):
+        return np.empty(0)
+    basis = np.polynomial.legendre.legvander(2 * (x - x.min(axis=1, keepdims=True)) / span[:, None] - 1, degree)
+    q = np.linalg.qr(basis)[0]
+    y = y - y.mean(axis=1, keepdims=True)
+    left = y - np.einsum("wij,wj->wi", q, np.einsum("wij,wi->wj", q, y))
+    return np.sum(left**2, axis=1)
 
 
 def surface(at: np.ndarray, values: np.ndarray) -> float | None:

@@ -201,6 +201,13 @@ class Problem:
         """Return the root mean square of a residual (n,), in `unit`."""
         return float(np.sqrt(np.mean(residual**2)))
 
+    def noise_with(self, point: Point, recording: int) -> float | None:
+        """Return the standard deviation of what noise and nuisances leave of a recording where the model at a point is right.
+
+        None: it is the noise of the recording.
+        """
+        return self.recordings[recording].noise
+
     def others(self, setting: int) -> list[int]:
         """Return the settings whose differences from a setting estimate its discretisation error."""
         return [s for s in range(self.settings) if s != setting]

@@ -18,7 +18,7 @@ from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import levenberg_marquardt, run
 from neuido.discrepancy.inference.search.attribution import diagnose
 from neuido.discrepancy.inference.search.intervals import findings
-from neuido.discrepancy.problems.noise import correlation, surface
+from neuido.discrepancy.problems.noise import FALLS, correlation, surface
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem, Recording
 from neuido.discrepancy.problems.specimens.material import MaterialProblem
 from neuido.discrepancy.problems.tracks.track_problem import TrackProblem, track_problems
@@ -222,14 +222,14 @@ def test_a_grid_of_biaxial_states_has_its_noise_from_the_surface_through_it(tmp_
     assert surface(states[:5], stress[:5, 0]) is None
 
 
-@pytest.mark.parametrize(("frequency", "decay"), [(0.5, 0.1), (1.0, 0.2), (2.0, 0.05)])
-def test_swings_are_no_tracking_error(frequency, decay):
+@pytest.mark.parametrize(("frequency", "decay", "rate"), [(0.5, 0.1, 60), (1.0, 0.2, 60), (2.0, 0.05, 60), (3.0, 0.1, 30), (2.0, 0.1, 15)])
+def test_swings_are_no_tracking_error(frequency, decay, rate):
     """Several swings leave a polynomial of the whole much, and that is the motion."""
     rng = np.random.default_rng(0)
-    t = np.arange(0.0, 10.0, 1 / 60)
+    t = np.arange(0.0, 10.0, 1 / rate)
     swing = 0.2 * np.cos(2 * np.pi * frequency * t) * np.exp(-decay * t)
     found = correlation([(t, swing + 5e-4 * rng.standard_normal(len(t)))])
-    assert found.sigma == pytest.approx(5e-4, rel=0.3) and found.amplitude < 2 * found.sigma
+    assert found.sigma == pytest.approx(5e-4, rel=0.3 if rate == 60 else FALLS - 1.0) and found.amplitude < 2 * found.sigma
 
 
 def test_the_origin_of_a_clock_changes_nothing(tmp_path):

@@ -149,3 +149,10 @@ def test_a_spin_is_a_nuisance_and_shows_only_where_something_was_measured(tmp_pa
     (problem,) = track_problems(tmp_path)
     (own,) = (p for p in problem._starts[0].parameters if p.name.startswith("spin"))
     assert own.scale * own.prior == pytest.approx(0.1)
+
+
+def test_what_the_attitude_of_a_disc_leaves_belongs_to_its_noise(tmp_path):
+    _, problem, truth = made(tmp_path, "disc:lift")
+    held = problem.roles["held_out"][0]
+    assert problem.noise_with({}, held) == pytest.approx(problem.recordings[held].noise)
+    assert problem.noise_with(truth, held) > 1.5 * problem.recordings[held].noise

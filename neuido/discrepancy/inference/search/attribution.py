@@ -338,7 +338,7 @@ def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], ro
         leads=leads,
         why=why,
         over={"floor": over, "noise": times_over(after.errors, lab.noise_squares)}
-        | ({"worst": worst_over(after.errors, lab.noise_squares)} if problem.settings == 1 else {}),
+        | ({"worst": worst_over(after.errors, lab.noise_squares_with(after.fit.point))} if problem.settings == 1 else {}),
         power=power,
         unable=unable(lab),
         noise_from={r.name: lab.noise_from(n) for n, r in enumerate(problem.recordings)},

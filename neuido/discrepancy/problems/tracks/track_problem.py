@@ -109,6 +109,13 @@ class TrackProblem(Problem):
         known = "estimated" if track.noise is None else "stated"
         return Recording(track.name, track.role, track.x[early:].reshape(-1), noise, groups, times, known)
 
+    def noise_with(self, point: Point, recording: int) -> float | None:
+        """Return the same as the noise of a recording, with the spin and attitude on which the effects of a point depend."""
+        track, start = self._flights[recording], self._starts[recording]
+        if track.role != "held_out":
+            return self.recordings[recording].noise
+        return settled_error(start, self.forces([point], track), _early(track))
+
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         if not points:
             return np.empty((0, len(self.recordings[recording].y)))
