@@ -26,16 +26,19 @@ if TYPE_CHECKING:
     from neuido.models.render.splatting import rasterize as rasterize
     from neuido.models.render.splatting import render as render
     from neuido.models.video.encoder import DynamicsEncoder as Encoder
+    from neuido.physics import colliders as colliders
     from neuido.physics import effects as effects
     from neuido.physics import laws as laws
     from neuido.physics.fem.finite_elements import FiniteElements as FiniteElements
     from neuido.physics.mpm.simulator import Simulator as Simulator
     from neuido.physics.runtime.frames import Frames as Frames
     from neuido.types import AttachedMass as AttachedMass
+    from neuido.types import Attachment as Attachment
     from neuido.types import Body as Body
     from neuido.types import Box as Box
     from neuido.types import Cameras as Cameras
     from neuido.types import Gaussians as Gaussians
+    from neuido.types import Keyframes as Keyframes
     from neuido.types import ParticleState as ParticleState
     from neuido.types import Plane as Plane
     from neuido.types import Scene as Scene
@@ -48,7 +51,20 @@ __version__ = "0.1.0"
 _PLACES = {  # name: its module, and after a colon its name there; a module alone: the module itself
     **{
         name: f"types:{name}"
-        for name in ("AttachedMass", "Body", "Box", "Cameras", "Gaussians", "ParticleState", "Plane", "Scene", "Skin", "Walls")
+        for name in (
+            "AttachedMass",
+            "Attachment",
+            "Body",
+            "Box",
+            "Cameras",
+            "Gaussians",
+            "Keyframes",
+            "ParticleState",
+            "Plane",
+            "Scene",
+            "Skin",
+            "Walls",
+        )
     },
     "Diagnosis": "discrepancy.report.diagnosis:Diagnosis",
     "Encoder": "models.video.encoder:DynamicsEncoder",
@@ -59,6 +75,7 @@ _PLACES = {  # name: its module, and after a colon its name there; a module alon
     "Simulator": "physics.mpm.simulator:Simulator",
     "UserError": "errors:UserError",
     "diagnose": "discrepancy.workflow:diagnose",
+    "colliders": "physics.colliders",
     "effects": "physics.effects",
     "export": "export",
     "import_file": "data.importers.importing:import_file",
@@ -78,6 +95,7 @@ _PLACES = {  # name: its module, and after a colon its name there; a module alon
 
 __all__ = [
     "AttachedMass",
+    "Attachment",
     "Body",
     "Box",
     "Cameras",
@@ -86,6 +104,7 @@ __all__ = [
     "FiniteElements",
     "Frames",
     "Gaussians",
+    "Keyframes",
     "Operator",
     "OwnEffect",
     "ParticleState",
@@ -96,6 +115,7 @@ __all__ = [
     "UserError",
     "Walls",
     "__version__",
+    "colliders",
     "configs_root",
     "diagnose",
     "effects",

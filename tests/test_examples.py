@@ -29,6 +29,7 @@ ANSWERS = {  # what each must print
     "11": r"lacks linear air drag",
     "12": "",
     "16": r"3\d{3} particles of \d+ cm\^3; the skin comes down to -?\d+ mm",
+    "13": r"d force / d modulus [1-9]",
 }
 
 

@@ -18,14 +18,15 @@ import neuido
 ROOT = Path(__file__).parents[1]
 PUBLIC = {
     "neuido": """
-        AttachedMass Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Operator OwnEffect ParticleState Plane
-        Scene Simulator Skin UserError Walls __version__ configs_root diagnose effects export import_file import_scene laws
-        load_scene rasterize read_experiment read_law read_material_tests read_recording read_tracks render shapes view
+        AttachedMass Attachment Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Keyframes Operator OwnEffect
+        ParticleState Plane Scene Simulator Skin UserError Walls __version__ colliders configs_root diagnose effects export
+        import_file import_scene laws load_scene rasterize read_experiment read_law read_material_tests read_recording
+        read_tracks render shapes view
     """,
     "neuido.data": """
         Experiment FilmDataModule MaterialTest MaterialTests MultiView MultiViewDataModule Recording SceneSetup Track Tracks
-        TrajectoryDataModule VisualDataModule bind_skin cameras load_scene read_experiment read_material_tests read_recording read_tracks
-        scene_names shapes write_experiment
+        TrajectoryDataModule VisualDataModule bind_skin cameras load_scene mesh_collider read_experiment read_material_tests
+        read_recording read_tracks scene_names shapes write_experiment
     """,
     "neuido.models": """
         AdaptModule AlignModule ChamferDistance DynamicsEncoder Encoder FlowVAE FlowVAEModule IntrinsicDynamicsOperator KnownLaw
@@ -34,7 +35,11 @@ PUBLIC = {
         bind chamfer_distance deform fill load_gaussians load_law load_nclaw opacity_volume prepare rasterize read_law relative_lp
         render save_gaussians save_law small_strain_moduli visual_hull write_particles write_video
     """,
-    "neuido.physics": "FiniteElements Frames MassSpring Mesh Simulator effects laws mesh_body",
+    "neuido.physics": "FiniteElements Frames MassSpring Mesh Simulator colliders effects laws mesh_body",
+    "neuido.physics.colliders": """
+        Capsule ColliderFrames ColliderTable Cuboid Cylinder HalfSpace HeightField MeshCollider SolidInputs Sphere
+        collider_table planes_of
+    """,
     "neuido.physics.effects": "Effects Entry LIBRARY Parameter ball_inclusion linear_gradient",
     "neuido.physics.laws": """
         AutogradElastic AutogradPlastic BoundedElastic DruckerPrager ElasticLaw FixedCorotated Identity InvariantElastic

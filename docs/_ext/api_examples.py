@@ -26,6 +26,12 @@ from neuido import AttachedMass, Box, Scene
 weight = AttachedMass(box=Box((0.4, 0.4, 0.4), (0.6, 0.6, 0.6)), mass=0.05)  # 50 g over the particles in the box
 scene = Scene(attached_masses=(weight,))
 """,
+    "Attachment": """
+from neuido import Attachment, Box, Scene
+
+held = Attachment(Box((0.4, 0.8, 0.4), (0.6, 0.9, 0.6)), stiffness=200.0, damping=1.0)  # N/m and N s/m of all these particles together
+scene = Scene(attachments=(held,))
+""",
     "Body": """
 import torch
 
@@ -44,6 +50,15 @@ from neuido.data import cameras
 
 around = cameras.orbit(4, width=100, height=100)  # four cameras around the unit cube
 print(around.viewmats.shape, around.Ks.shape)
+""",
+    "colliders": """
+from neuido import Scene, Simulator, colliders, laws, shapes
+
+ball = colliders.Sphere(0.15, position=(0.5, 0.2, 0.5), friction=0.3, name="ball")
+body = shapes.box(lower=(0.4, 0.4, 0.4), upper=(0.6, 0.6, 0.6), spacing=0.05)
+simulator = Simulator(Scene(cells=16, dt=1e-3, colliders=(ball,)), body, device="cpu")
+frames = simulator.rollout(100, laws.FixedCorotated(5e4, 0.3), every=50)
+print(frames.forces[-1, 0])  # N
 """,
     "configs_root": """
 import neuido
@@ -117,6 +132,12 @@ Path("jelly.xml").write_text('''
 </worldbody></mujoco>
 ''')
 print(*import_scene("jelly.xml", "jelly", particles=500), sep="\\n")  # `neuido simulate jelly/scene.yaml --out run` runs it
+""",
+    "Keyframes": """
+from neuido import Keyframes, colliders
+
+there_and_back = Keyframes(times=(0.0, 0.5, 1.0), positions=((0.2, 0.1, 0.5), (0.8, 0.1, 0.5), (0.2, 0.1, 0.5)))  # s and m
+plate = colliders.Cuboid((0.2, 0.1, 0.4), path=there_and_back)
 """,
     "laws": """
 import torch

@@ -193,7 +193,7 @@ def api_pages() -> dict[str, str]:
     pages, rows = {}, []
     for name in names:
         value = getattr(neuido, name)
-        if name in ("laws", "effects"):
+        if name in ("laws", "effects", "colliders"):
             own = [n for n in getattr(value, "__all__", []) if not n.startswith("_")]
             body = f"{(value.__doc__ or '').splitlines()[0]}\n\n" + "\n".join(
                 directive(getattr(value, n), f"{value.__name__}.{n}") for n in own

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neuido.data import cameras
     from neuido.data.bodies import shapes
+    from neuido.data.bodies.collider_entries import mesh_collider
     from neuido.data.bodies.scene_files import SceneSetup, load_scene, scene_names
     from neuido.data.bodies.skinning import bind_skin
     from neuido.data.clips import FilmDataModule
@@ -37,6 +38,7 @@ __all__ = [
     "bind_skin",
     "cameras",
     "load_scene",
+    "mesh_collider",
     "read_experiment",
     "read_material_tests",
     "read_recording",
@@ -62,6 +64,7 @@ _PLACES = {
     "bind_skin": "bodies.skinning",
     "cameras": "cameras",
     "load_scene": "bodies.scene_files",
+    "mesh_collider": "bodies.collider_entries",
     "read_experiment": "measured.experiment",
     "read_material_tests": "measured.material_test",
     "read_recording": "scenes.readers:read",

@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from neuido.physics import colliders as colliders
     from neuido.physics import effects as effects
     from neuido.physics import laws as laws
     from neuido.physics.fem.finite_elements import FiniteElements as FiniteElements
@@ -19,6 +20,7 @@ __all__ = [
     "MassSpring",
     "Mesh",
     "Simulator",
+    "colliders",
     "effects",
     "laws",
     "mesh_body",
@@ -30,6 +32,7 @@ _PLACES = {
     "MassSpring": "springs.mass_spring:MassSpring",
     "Mesh": "fem.meshing:Mesh",
     "Simulator": "mpm.simulator:Simulator",
+    "colliders": "colliders",
     "effects": "effects",
     "laws": "laws",
     "mesh_body": "fem.meshing:mesh_body",
