@@ -47,8 +47,8 @@ class _Archive:
     """
 
     def __init__(self, path: Path, made: Exchange, speed: float) -> None:
-        import imath
-        from alembic3d import Abc, AbcCoreAbstract, AbcGeom
+        import imath  # type: ignore[import-not-found]  # of an extra that the checks go without
+        from alembic3d import Abc, AbcCoreAbstract, AbcGeom  # type: ignore[import-not-found]
 
         self.imath, self.geom, self.made, self.speed = imath, AbcGeom, made, np.float32(speed)
         self.archive = Abc.OArchive(str(path))

@@ -205,7 +205,7 @@ def _skin(skin: Any, motion: Any, number: int, every: int) -> Surface:
     vertices = np.asarray(_array(skin.vertices_at(motion)))[::every]
     faces = np.asarray(skin.faces.cpu() if hasattr(skin.faces, "cpu") else skin.faces, np.int32)
     name = getattr(skin, "name", "") or ("skin" if number == 0 else f"skin_{number}")
-    return Surface(name, vertices, [faces], [normals_of(at, faces) for at in vertices], colour=PALETTE[number % len(PALETTE)])
+    return Surface(name, list(vertices), [faces], [normals_of(at, faces) for at in vertices], colour=PALETTE[number % len(PALETTE)])
 
 
 def _collider(collider: Any, number: int, every: int, made: Exchange, scene: Scene | None) -> Surface:

@@ -86,7 +86,7 @@ def export(
         frames = _as_frames(frames, ending, frame_interval)
     if ending in PARTICLES_ALONE:
         return _thinned(frames, every).save(target)[0]
-    made = _collected(frames, every, law, scene, surface, surface_spacing, gaussians, cameras)
+    made = _collected(frames, every, law, scene, surface, surface_spacing, gaussians, cameras, progress)
     written = _write(target, ending, made, speed, progress)
     for note in made.notes:
         warnings.warn(note, PlausibilityWarning, stacklevel=2)
@@ -113,6 +113,7 @@ def _collected(
     surface_spacing: float | None,
     gaussians: Gaussians | None,
     cameras: Cameras | None,
+    progress: bool,
 ) -> Any:
     """Collect what is written."""
     from neuido.export.exchange import exchange_of
@@ -123,7 +124,7 @@ def _collected(
     made = exchange_of(frames, every=every, scene=scene)
     add_fields(made, law)
     if surface:
-        own = [reconstruct_surface(made, part, i, spacing=surface_spacing) for i, part in enumerate(made.parts)]
+        own = [reconstruct_surface(made, part, i, spacing=surface_spacing, progress=progress) for i, part in enumerate(made.parts)]
         made.surfaces = (*made.surfaces, *own)
     if gaussians is not None:
         if made.F is None:

@@ -48,7 +48,7 @@ def write_gltf(path: Path, made: Exchange, *, speed: float = 1.0, progress: bool
         scene = _Scene(library, made, speed)
         for number, part in enumerate(made.parts):
             x = np.ascontiguousarray(made.x[:, part.index])
-            scene.morphed(part.name, x, None, None, PALETTE[number % len(PALETTE)])
+            scene.morphed(part.name, list(x), None, None, PALETTE[number % len(PALETTE)])
             work.update()
         for surface in (*made.surfaces, *made.colliders):
             scene.surface(surface)

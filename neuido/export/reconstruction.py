@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.export.exchange import NEAREST_SAMPLED, PALETTE, Exchange, Part, Surface
 from neuido.physics.runtime.device import start_warp
@@ -28,7 +29,7 @@ RATIOS = (0.2, 5.0)
 """Bounds of the volume ratio that weighs a particle [-]."""
 
 
-def reconstruct_surface(made: Exchange, part: Part, number: int = 0, *, spacing: float | None = None) -> Surface:
+def reconstruct_surface(made: Exchange, part: Part, number: int = 0, *, spacing: float | None = None, progress: bool = False) -> Surface:
     """Reconstruct the surface of a body in every frame.
 
     Args:
@@ -36,9 +37,10 @@ def reconstruct_surface(made: Exchange, part: Part, number: int = 0, *, spacing:
         part: The body.
         number: Its number, which selects the colour.
         spacing: Distance between neighbouring particles [m]; found in the first frame where absent.
+        progress: Whether progress is shown on stderr.
 
     Raises:
-        UserError: Fewer than four particles, or a spacing that is not positive.
+        UserError: Fewer than four particles, a spacing that is not positive, or one at which they touch nowhere.
     """
     x = made.x[:, part.index].astype(np.float64)
     if x.shape[1] < 4:
@@ -48,21 +50,28 @@ def reconstruct_surface(made: Exchange, part: Part, number: int = 0, *, spacing:
         raise UserError(f"surface_spacing is {spacing:g}; it must be a positive length in m")
     name = "surface" if len(made.parts) == 1 else f"{part.name}_surface"
     out = Surface(name, [], [], [], colour=PALETTE[number % len(PALETTE)])
-    for k, points in enumerate(x):
-        ratio = np.ones(len(points)) if made.F is None else np.linalg.det(made.F[k, part.index].astype(np.float64))
-        lower, cell, density = _density(points, ratio.clip(*RATIOS), spacing)
-        vertices, faces = _marching_cubes(density, 0.5 * (cell / spacing) ** 3)
-        slopes = np.stack([_at(slope, vertices) for slope in np.gradient(density)], axis=1)
-        normals = -slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-30)
-        a, b, c = (vertices[faces[:, i]] for i in range(3))
-        if float(np.einsum("ni,ni->", np.cross(b - a, c - a), normals[faces[:, 0]])) < 0:
-            faces = faces[:, ::-1]  # anticlockwise as seen from outside
-        out.vertices.append((lower + cell * vertices).astype(np.float32))  # type: ignore[attr-defined]
-        out.faces.append(np.ascontiguousarray(faces, np.int32))  # type: ignore[attr-defined]
-        out.normals.append(normals.astype(np.float32))  # type: ignore[attr-defined]
-    if made.frames > 1:
-        return out
-    return Surface(out.name, out.vertices, out.faces, out.normals, colour=out.colour)
+    with Progress(f"reconstructing the {name}", made.frames, unit="frames", shown=progress) as work:
+        for k, points in enumerate(x):
+            _add_frame(out, points, None if made.F is None else made.F[k, part.index], spacing)
+            work.update()
+    if not any(len(faces) for faces in out.faces):
+        raise UserError(f"{part.name}: its particles lie too far apart for a surface_spacing of {spacing:.3g} m; give a larger one")
+    return out
+
+
+def _add_frame(out: Surface, points: np.ndarray, F: np.ndarray | None, spacing: float) -> None:
+    """Append the surface of a frame."""
+    ratio = np.ones(len(points)) if F is None else np.linalg.det(F.astype(np.float64))
+    lower, cell, density = _density(points, ratio.clip(*RATIOS), spacing)
+    vertices, faces = _marching_cubes(density, 0.5 * (cell / spacing) ** 3)
+    slopes = np.stack([_at(slope, vertices) for slope in np.gradient(density)], axis=1)
+    normals = -slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-30)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    if float(np.einsum("ni,ni->", np.cross(b - a, c - a), normals[faces[:, 0]])) < 0:
+        faces = faces[:, ::-1]  # anticlockwise as seen from outside
+    out.vertices.append((lower + cell * vertices).astype(np.float32))  # type: ignore[attr-defined]
+    out.faces.append(np.ascontiguousarray(faces, np.int32))  # type: ignore[attr-defined]
+    out.normals.append(normals.astype(np.float32))  # type: ignore[attr-defined]
 
 
 def _spacing(x: np.ndarray) -> float:

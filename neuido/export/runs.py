@@ -96,7 +96,7 @@ def _frames(path: Path, frame_interval: float | None) -> Run:
     if times is not None and times.shape != (len(x),):
         raise UserError(f"{path}: times have the shape {times.shape} for {len(x)} frames of one scene: export each scene of its own")
     times = _times(times, len(x), frame_interval, path)
-    own = {name: arrays[name] for name in ("C", "F", "body") if name in arrays}
+    own: dict[str, Any] = {name: arrays[name] for name in ("C", "F", "body") if name in arrays}
     if "body" not in own and "scene" in arrays and arrays["scene"].max() > 0:
         own["body"] = arrays["scene"]
     if "body_names" in arrays:

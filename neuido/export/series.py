@@ -72,7 +72,7 @@ def write_ply(path: Path, made: Exchange, *, progress: bool = False) -> list[Pat
 
 
 def _vertices(columns: dict[str, np.ndarray]) -> np.ndarray:
-    return np.rec.fromarrays(list(columns.values()), names=list(columns))
+    return np.rec.fromarrays(list(columns.values()), dtype=[(name, column.dtype) for name, column in columns.items()])
 
 
 def _write_points(path: Path, made: Exchange, k: int) -> None:

@@ -269,6 +269,13 @@ def test_reconstructed_surface_has_the_volume_of_the_body_and_looks_outwards():
     assert len(vertices) - len(faces) / 2 == 2  # Euler's formula for a closed surface of one piece
 
 
+def test_particles_that_touch_nowhere_have_no_surface(tmp_path):
+    apart = SimpleNamespace(x=torch.eye(4)[None, :, :3], v=torch.zeros(1, 4, 3), times=[0.0])
+    with pytest.raises(UserError, match=r"too far apart for a surface_spacing of 0\.2 m"):
+        neuido.export(apart, tmp_path / "a.glb", surface=True, surface_spacing=0.2)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [

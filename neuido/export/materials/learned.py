@@ -54,7 +54,8 @@ def _read(path: Path) -> tuple[Any, Any]:
     from neuido.data.measured.experiment import read_declared_model
 
     checked, _ = read_declared_model(model, folder=file.resolve().parent)
-    elastic, plastic = load_law(checked["law"]["file"])
+    laws: tuple[Any, Any] = load_law(checked["law"]["file"])
+    elastic, plastic = laws
     factor = checked["law"]["stiffness"]
     W1, b1, W2, b2, W3, b3 = elastic.tensors()
     return type(elastic)(W1, b1, W2, b2, factor * W3, factor * b3, scale=elastic.scale), plastic
