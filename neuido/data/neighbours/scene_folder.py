@@ -119,17 +119,15 @@ def _plain(value: Any) -> Any:
 def _models(bodies: list[SoftBody], entries: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the keys `model` and `body`, or `bodies` where there are several."""
     models = [
-        {
-            "density": body.density,
-            "elasticity": body.elasticity,
-            **({"plasticity": body.plasticity} if body.plasticity else {}),
-        }
-        for body in bodies
+        {"density": own.density, "elasticity": own.elasticity, **({"plasticity": own.plasticity} if own.plasticity else {})}
+        for own in bodies
     ]
     if len(bodies) == 1:
         return {"model": models[0], "body": entries[0]}
-    names = ", ".join(body.name for body in bodies)
-    raise UserError(f"the scene has {len(bodies)} deformable bodies ({names}), and a scene file holds one: leave the others out")
+    names: list[str] = []
+    for own in bodies:
+        names.append(own.name if own.name not in names else f"{own.name} {len(names)}")
+    return {"bodies": [{"name": name, "model": model, "body": body} for name, model, body in zip(names, models, entries)]}
 
 
 def _obj(mesh: TriangleMesh) -> str:

@@ -98,6 +98,20 @@ def test_a_mesh_falls_on_a_robot(tmp_path):
     assert abs(upright[1, 2]) == pytest.approx(1.0)  # its third edge stands upright
 
 
+def test_two_bodies_stay_two(tmp_path):
+    pytest.importorskip("trimesh")
+    soft = '<flexcomp name="{}" type="grid" count="3 3 3" spacing=".1 .1 .1" pos="0 0 {}" dim="3" mass="{}">'
+    soft += '<elasticity young="{}" poisson="0"/></flexcomp>'
+    text = soft.format("low", 0.2, 4, 1e4) + soft.format("high", 0.6, 8, 5e4)
+    (tmp_path / "two.xml").write_text(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
+    lines = import_scene(tmp_path / "two.xml", tmp_path / "out", particles=60)
+    assert any(line.startswith("body low") for line in lines) and any(line.startswith("body high") for line in lines)
+    low, high = load_scene(tmp_path / "out" / "scene.yaml").scene.bodies
+    assert (low.name, high.name) == ("low", "high") and (low.density, high.density) == (pytest.approx(500), pytest.approx(1000))
+    assert float(low.volume.sum()) == pytest.approx(0.008, rel=1e-5)
+    assert high.x.mean(0).tolist() == pytest.approx([0.0, 0.6, 0.0], abs=0.01)
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
