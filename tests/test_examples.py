@@ -28,6 +28,8 @@ ANSWERS = {  # what each must print
     "10": r"Young's modulus read from the video: \d+ kPa, Poisson's ratio 0\.\d+",
     "11": r"lacks linear air drag",
     "12": "",
+    "14": r"d path / d friction -0\.\d+ m",
+    "15": r"the ball sinks to 0\.\d+ m and ends at x = 0\.\d+ m",
     "16": r"3\d{3} particles of \d+ cm\^3; the skin comes down to -?\d+ mm",
     "13": r"d force / d modulus [1-9]",
 }
