@@ -20,7 +20,7 @@ PER_CELL = 2.0
 """Spacings of particles along the edge of a grid cell: eight particles a cell."""
 COURANT = 0.4
 """Share of a cell that an elastic wave may cross in a step: the laws that stiffen need a reserve (the limit is 1)."""
-ROOM = 0.5
+ROOM = 1.5
 """Space around all bodies and colliders, in longest sides of the bodies."""
 REACH = 20.0
 """Distance of a plane up to which the domain includes it, in longest sides of the bodies."""
