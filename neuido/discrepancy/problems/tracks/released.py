@@ -15,8 +15,6 @@ LARGEST_ERROR = 2.0
 """Largest error of a clock or length scale, in standard deviations of its prior."""
 FARTHEST = 5.0
 """Largest error of a spin or an attitude, in standard deviations of its prior."""
-UNKNOWN_SPIN = 0.5
-"""Relative standard deviation of the spins of recordings about their common spin, where none is stated."""
 ITERATIONS = 25
 """Largest number of steps of the least-squares fit."""
 PROBE = 1e-3
@@ -62,8 +60,10 @@ class Released:
             sd = nuisances[name]
             if sd > 0 and not (name == "length_scale" and track.angle):
                 out.append(Parameter(f"{name}:{track.name}", unit, 0.0, sd / 4, -LARGEST_ERROR * sd, LARGEST_ERROR * sd, prior=4.0))
-        of_spin = max(nuisances["spin"], UNKNOWN_SPIN) if track.spin is None and nuisances["spin"] > 0 else nuisances["spin"]
-        for name, axes, sd in (("spin", spin, of_spin), ("attitude", attitude, nuisances["attitude"])):
+        for name, axes, sd in (
+            ("spin", spin if track.spin is not None else (), nuisances["spin"]),
+            ("attitude", attitude, nuisances["attitude"]),
+        ):
             for a in axes if sd > 0 else ():
                 limit = FARTHEST * sd
                 out.append(Parameter(f"{name}_{AXES[a]}:{track.name}", "1", 0.0, sd / 4, -limit, limit, prior=4.0))
