@@ -224,7 +224,7 @@ def place_side_by_side(motions: Sequence[Motion], up: np.ndarray) -> None:
     extent = np.max([np.ptp(part, axis=0) if len(part) else np.zeros(3) for part in every], axis=0)
     axes = [axis for axis in range(3) if abs(up[axis]) < 0.9]
     axis = min(axes, key=lambda a: (extent[a], a))
-    step = (1.0 + GAP) * max(float(extent[axis]), 0.25 * float(extent.max()))
+    step = (1.0 + GAP) * max(float(extent[axis]), 0.5 * float(extent.max()))
     for i, motion in enumerate(motions):
         motion.shift = np.eye(3)[axis] * step * i
 

@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from neuido.data.files.html_page import escaped
+from neuido.physics.colliders.solid_meshes import mesh_of
 from neuido.viewer.content import PLAIN, Content, Motion, with_scene
 from neuido.viewer.live_run import LiveRun, Parameter
+from neuido.viewer.picture import COLLIDER
 from neuido.viewer.quantities import Quantity, TotalGradients, quantities_of, readable, stress_of
 from neuido.viewer.world import HOST, PORT, Cloud, address_of, close_server, furnish, legend_html, open_server
 
@@ -53,6 +55,7 @@ class LivePage:
         self.cloud = Cloud(self.server, "particles", motion.spacing or 0.02 * self.content.size)
         self._hull: Any = None
         self._line: Any = None
+        self._colliders = [self._add_collider(i) for i in range(len(run.colliders.shapes))]
         self._add_controls()
         self.show()
         run.shown = self.show
@@ -86,6 +89,9 @@ class LivePage:
                 gui.add_markdown("This law has no parameters to change.")
         with gui.add_folder("gravity [m/s²]"):
             self.gravity = [self._pull_of(axis) for axis in range(3)]
+        for i in run.colliders.movable():
+            with gui.add_folder(_name(run.colliders.shapes[i], i), expand_by_default=False):
+                self._add_place(i)
         with gui.add_folder("pull"):
             gui.add_markdown("Drag the body with the left mouse button.")
             self.frequency = gui.add_slider("spring [Hz]", *FREQUENCIES, 0.5, run.frequency)
@@ -130,6 +136,24 @@ class LivePage:
         made.on_update(changed)
         return made
 
+    def _add_collider(self, index: int) -> Any:
+        """Add the surface of a collider; None of a half-space, which has none."""
+        mesh = mesh_of(self.run.colliders.shapes[index])
+        if mesh is None:
+            return None
+        points, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
+        return self.server.scene.add_mesh_simple(f"/collider/{index}", points, faces, color=COLLIDER, flat_shading=True, side="double")
+
+    def _add_place(self, index: int) -> None:
+        """Add sliders for the position of a collider."""
+        run, made = self.run, []
+        for axis in range(3):
+            low, high = run.scene.lower[axis], run.scene.upper[axis]
+            now = float(np.clip(run.colliders.poses[index, axis], low, high))
+            made.append(self.server.gui.add_slider(f"{'xyz'[axis]} [m]", low, high, (high - low) / 200, now))
+        for slider in made:
+            slider.on_update(lambda event: run.move_collider(index, np.array([float(each.value) for each in made])))
+
     def _played(self, event: Any) -> None:
         if event.client_id is not None:
             self.run.play(bool(self.play.value))
@@ -169,6 +193,9 @@ class LivePage:
         with self.server.atomic():
             self.cloud.show(x, self.content.motions[0].lit(x, colours))
             self._show_pull()
+            for handle, pose in zip(self._colliders, run.colliders.poses):
+                if handle is not None:
+                    handle.position, handle.wxyz = tuple(pose[:3]), tuple(pose[3:])
             self.legend.content = legend_html(found)
             self.time.value = f"{run.time:.3f} s" + (f", at {run.pace:.2g} of real time" if run.playing else "")
             self.force.value = f"{float(np.linalg.norm(run.force)):.3g} N"
@@ -229,6 +256,10 @@ class LivePage:
 def _number(speed: str) -> float:
     over, _, under = speed.partition("/")
     return float(over) / float(under or 1)
+
+
+def _name(shape: Any, index: int) -> str:
+    return getattr(shape, "name", "") or f"{type(shape).__name__.lower()} {index}"
 
 
 def _words(value: float, unit: str) -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neuido.errors import UserError, one_line, shortened
 from neuido.types import ParticleState
+from neuido.viewer.live_colliders import LiveColliders
 
 CHUNK_SECONDS = 0.04
 """Time that a chunk of substeps should take [s], after which the page is drawn: 25 pictures a second."""
@@ -111,6 +112,7 @@ class LiveRun:
         pace: Simulated time per time of the clock.
         frequency: Frequency of the spring of a pull [Hz]: its stiffness is mass times the square of 2 pi times it.
         force: Force of the pull in the last chunk [N], (3,).
+        colliders: The solid colliders and their poses.
     """
 
     def __init__(self, simulator: Any, family: LawFamily, shown: Callable[[], None] = lambda: None) -> None:
@@ -125,6 +127,7 @@ class LiveRun:
         self.playing, self.error, self.pace, self.time = False, "", 0.0, 0.0
         self.state: ParticleState = simulator.state
         self.force = np.zeros(3)
+        self.colliders = LiveColliders(simulator)
         self.steps_done = 0
         self._pull: Pull | None = None
         self._substeps, self._single, self._reset, self._dirty = LEAST_SUBSTEPS, 0, False, False
@@ -164,6 +167,12 @@ class LiveRun:
         with self._lock:
             self.values[name] = float(value)
             self._dirty = True
+        self._changed.set()
+
+    def move_collider(self, index: int, position: np.ndarray) -> None:
+        """Move a collider towards a position [m], as fast as the grid allows."""
+        with self._lock:
+            self.colliders.targets[index] = np.array(position, float)
         self._changed.set()
 
     def grip(self, point: np.ndarray) -> None:
@@ -229,6 +238,7 @@ class LiveRun:
                 self.state, self.time, self.error, self._reset = self.simulator.state, 0.0, "", False
                 self.steps_done, self.pace = 0, 0.0
                 self._pull = None
+                self.colliders.reset()
             if self._dirty:
                 self._dirty, self.error = False, ""
                 self.laws = self.family.make(self.values)
@@ -250,12 +260,15 @@ class LiveRun:
                 start = self._kicked(self.state, count * self.scene.dt)
             gravity = torch.tensor([self.gravity], dtype=start.x.dtype)
             given = tuple(law for law in self.laws if law is not None)
-            frames = self.simulator.rollout(count, *given, state=start, gravity=gravity, every=count)
+            with self._lock:
+                solids = self.colliders.inputs(count, self.time)
+            frames = self.simulator.rollout(count, *given, state=start, gravity=gravity, solids=solids, every=count)
             after = ParticleState(*(part[-1].clone() for part in frames))
         spent = max(time.monotonic() - begun, 1e-6)
         with self._lock:
             if self._reset:
                 return
+            self.colliders.follow(frames)
             self.state, self.time, self._last = after, self.time + count * self.scene.dt, count
             self.steps_done += count
         self.pace = count * self.scene.dt / max(spent, self._real_seconds())

@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from neuido import Scene, Simulator, UserError, laws, shapes
+from neuido.physics.colliders import Sphere
+from neuido.types import Keyframes
 from neuido.viewer.live_run import LawFamily, LiveRun, classical_family
 
 MATERIAL = {"law": "fixed_corotated", "young": 3e4, "poisson": 0.3}
@@ -94,3 +96,26 @@ def test_several_scenes_are_refused():
     simulator = Simulator([Scene(cells=16)] * 2, [body] * 2, device="cpu")
     with pytest.raises(UserError, match="2 scenes"):
         LiveRun(simulator, LawFamily(lambda values: (None, None), ()))
+
+
+def test_colliders_keep_their_motion_over_chunks_and_follow_a_slider():
+    body = shapes.ball(centre=(0.5, 0.7, 0.5), radius=0.1, spacing=0.04)
+    path = Keyframes((0.0, 0.02), ((0.2, 0.2, 0.5), (0.24, 0.2, 0.5)))
+    solids = (
+        Sphere(radius=0.1, path=path),
+        Sphere(radius=0.1, position=(0.8, 0.2, 0.5)),
+        Sphere(radius=0.1, position=(0.5, 0.4, 0.5), mass=1.0),
+    )
+    simulator = Simulator(Scene(cells=16, dt=1e-3, colliders=solids), body, device="cpu")
+    run = LiveRun(simulator, classical_family(MATERIAL, {"law": "identity"}))
+    assert run.colliders.movable() == [1]
+    run.move_collider(1, np.array([0.8, 0.3, 0.5]))
+    for count in (4, 3, 5):
+        run._chunk(count)
+    whole = simulator.rollout(12, laws.FixedCorotated(3e4, 0.3), every=12).colliders
+    assert run.colliders.poses[0, :3] == pytest.approx([0.224, 0.2, 0.5], abs=1e-6)
+    assert run.colliders.poses[2, :3] == pytest.approx(whole[2].poses[-1][:3, 3].numpy(), abs=1e-6)
+    assert run.colliders.poses[1, 1] > 0.25
+    run.reset()
+    run._turn()
+    assert run.colliders.poses[0, 0] == pytest.approx(0.2)
