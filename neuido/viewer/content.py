@@ -157,7 +157,7 @@ class Content:
         for motion in self.motions:
             few = motion.x[np.unique(np.linspace(0, len(motion.x) - 1, min(len(motion.x), 24)).astype(int))]
             parts.append(few[np.isfinite(few).all(axis=-1)] + motion.shift)
-        for one in self.gaussians[:1]:
+        for one in self.gaussians[:: max(1, len(self.gaussians) // 8)]:
             means = one.means.detach().cpu().numpy()
             parts.append(np.quantile(means, (0.02, 0.98), axis=0))  # splats of a room have floaters far away
         parts = [part for part in parts if len(part)]

@@ -112,12 +112,12 @@ class LivePage:
         gui, name = self.server.gui, parameter.name
         if not parameter.logarithmic:
             label = f"{name} [{parameter.unit}]" if parameter.unit else name
-            made = gui.add_slider(label, parameter.low, parameter.high, (parameter.high - parameter.low) / 200, parameter.value)
+            made = gui.add_slider(label, parameter.low, parameter.high, 0.01 * (parameter.high - parameter.low), parameter.value)
             made.on_update(lambda event: self.run.change(name, float(made.value)))
             return made
-        low, high, now = (float(np.log10(value)) for value in (parameter.low, parameter.high, parameter.value))
+        low, high, now = (round(float(np.log10(value)), 2) for value in (parameter.low, parameter.high, parameter.value))
         shown = gui.add_text(name, _words(parameter.value, parameter.unit), disabled=True)
-        made = gui.add_slider(f"lg {name}", low, high, (high - low) / 200, now)
+        made = gui.add_slider(f"lg {name}", low, high, 0.01, now)
 
         def changed(event: Any) -> None:
             shown.value = _words(10.0 ** float(made.value), parameter.unit)

@@ -68,6 +68,8 @@ def camera_of(content: Content, view: View, scale: int = 1) -> Eye:
     direction /= np.linalg.norm(direction)
     low, high = content.bounds
     corners = np.stack(np.meshgrid(*zip(low, high)), axis=-1).reshape(-1, 3)
+    if content.cameras is not None:
+        corners = np.concatenate([corners, camera_centres(content.cameras)])
     near, far = 0.6 * content.size, 60.0 * content.size
     for _ in range(40):  # the nearest distance from which all corners are in the picture
         distance = (near * far) ** 0.5

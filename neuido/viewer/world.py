@@ -144,10 +144,10 @@ def _frustum(scene: Any, content: Content, index: int) -> Any:
 
 
 def _frustum_size(content: Content) -> float:
-    """Return the length of the drawn pyramids of cameras [m]: a fifth of the distance of the nearest from the middle."""
+    """Return the length of the drawn pyramids of cameras [m]: a share of the distance of the nearest from the middle."""
     assert content.cameras is not None
     tips = frusta(content.cameras, 1.0)[::8, 0]
-    return 0.2 * float(np.linalg.norm(tips - content.middle, axis=1).min()) or 0.1
+    return 0.16 * float(np.linalg.norm(tips - content.middle, axis=1).min()) or 0.1
 
 
 def _quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
