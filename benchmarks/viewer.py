@@ -3,7 +3,8 @@
     python benchmarks/viewer.py [--particles 20000] [--seconds 10] [--csv research/results/viewer.csv]
 
 The page has no graphics card here: Chromium draws it with SwiftShader. Counted are the pictures that the server sends, those that the page
-receives, and those that the page draws (`requestAnimationFrame`) meanwhile; the least of them is what a person sees.
+receives, and those that the page draws (`requestAnimationFrame`) meanwhile; the least of them is what a person sees. On a machine that
+does other work too, the processor time of a picture says what it would be: of the server, and of all processes of Chromium.
 """
 
 import argparse
@@ -38,7 +39,7 @@ def content(particles: int, frames: int = 60) -> Content:
 
 
 def in_the_browser(particles: int, seconds: float, warm: float) -> dict[str, float]:
-    """Return pictures a second that were sent, received and drawn while a motion plays."""
+    """Return pictures a second that were sent, received and drawn while a motion plays, and the processor time of each."""
     from playwright.sync_api import sync_playwright
 
     program = which("chromium") or which("chromium-browser") or which("google-chrome")
@@ -59,13 +60,25 @@ def in_the_browser(particles: int, seconds: float, warm: float) -> dict[str, flo
             page.play.value = True
             tab.wait_for_timeout(1000 * warm)
             sent, got, begun = page.pictures, received[0], time.monotonic()
+            before = time.process_time(), of_chromium()
             drawn = tab.evaluate(DRAWN, seconds)
             passed = time.monotonic() - begun
-            out = {"sent": (page.pictures - sent) / passed, "received": (received[0] - got) / passed, "drawn": drawn}
+            spent = time.process_time() - before[0], of_chromium() - before[1]
+            rates = {"sent": (page.pictures - sent) / passed, "received": (received[0] - got) / passed, "drawn": drawn}
+            out = {f"{name} [1/s]": rate for name, rate in rates.items()}
+            out["server [CPU ms/picture]"] = 1000 * spent[0] / max(page.pictures - sent, 1)
+            out["Chromium [CPU ms/picture]"] = 1000 * spent[1] / max(drawn * passed, 1)
             browser.close()
     finally:
         page.stop()
     return out
+
+
+def of_chromium() -> float:
+    """Return the processor time of the processes below this one [s]."""
+    import psutil
+
+    return sum(sum(child.cpu_times()[:2]) for child in psutil.Process().children(recursive=True))
 
 
 def without_display(particles: int, count: int = 5) -> float:
@@ -88,7 +101,7 @@ def main() -> None:
     given = parser.parse_args()
     found = in_the_browser(given.particles, given.seconds, given.warm)
     row = {"particles": given.particles, "cores": os.cpu_count(), "load": round(os.getloadavg()[0], 1)}
-    row |= {f"{name} [1/s]": round(value, 1) for name, value in found.items()}
+    row |= {name: round(value, 1) for name, value in found.items()}
     row["render [s]"] = round(without_display(given.particles), 2)
     print(", ".join(f"{name}: {value}" for name, value in row.items()))
     if given.csv:

@@ -17,6 +17,8 @@ LEAST_SECONDS = 2.0
 """A motion that is shorter is played slower at first, so that it takes at least as long."""
 PACE = 30.0
 """Largest number of pictures a second that the server sends."""
+TOLD_SECONDS = 0.3
+"""Time between two updates of the controls while a motion plays [s]."""
 IMAGE_WIDTH = 480
 """Width to which the images of cameras are reduced [px]."""
 
@@ -87,8 +89,8 @@ class Playback:
         fitting = [each for each in SPEEDS[:5] if length / _factor(each) >= LEAST_SECONDS]
         return fitting[-1] if fitting else SPEEDS[0]
 
-    def show(self, frame: int) -> None:
-        """Show a frame."""
+    def show(self, frame: int, *, told: bool = True) -> None:
+        """Show a frame; `told`: also in the controls, which cost a browser more than the particles."""
         content = self.content
         with self._lock, self.server.atomic():
             self.frame = frame = int(np.clip(frame, 0, content.frames - 1))
@@ -100,7 +102,8 @@ class Playback:
             if content.gaussians and (len(content.gaussians) > 1 or self._splats is None):
                 self._show_splats(frame)
             self._show_images(frame)
-            self.time.value = content.words(frame)
+            if told:
+                self.time.value, self.slider.value = content.words(frame), frame
         self.server.flush()
 
     def _slid(self, event: Any) -> None:
@@ -144,18 +147,21 @@ class Playback:
         """Move on in time while `play` is set; the slider follows, and a move of the slider is followed."""
         times = self.content.times - self.content.times[0]
         length = float(times[-1]) * (1 + 1 / max(len(times) - 1, 1))  # the last frame stays as long as the others
-        now, before = 0.0, time.monotonic()
+        now, before, told = 0.0, time.monotonic(), 0.0
         while not self._ended.wait(1.0 / PACE):
             passed, before = time.monotonic() - before, time.monotonic()
             if not self.play.value or length <= 0:
+                if told and self.slider.value != self.frame:  # just stopped
+                    self.show(self.frame)
                 continue
             if int(np.searchsorted(times, now, side="right")) - 1 != self.frame:  # someone moved the slider
                 now = float(times[self.frame])
             now = (now + passed * _factor(str(self.speed.value))) % length
             frame = max(int(np.searchsorted(times, now, side="right")) - 1, 0)
             if frame != self.frame:
-                self.show(frame)
-                self.slider.value = frame
+                due = time.monotonic() - told > TOLD_SECONDS
+                told = time.monotonic() if due else told
+                self.show(frame, told=due)
 
     def wait(self) -> None:
         """Serve until `stop` is called or the process is interrupted."""

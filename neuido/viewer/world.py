@@ -16,8 +16,9 @@ from neuido.viewer.shading import grid_step
 
 HOST, PORT = "localhost", 8080
 PORTS = (1, 65535)
-DOT = 1.1
-"""Size of a point relative to the distance of its neighbours, which it touches."""
+DOT = 0.55
+"""`point_size` relative to the distance of neighbours. viser draws a point about 2.7 times as wide (measured in a picture), so that points
+of a lattice overlap by a little more than its diagonal, and a body is closed."""
 FLOOR_REACH = 3.0
 """Side of a drawn floor relative to the size of what is shown."""
 
@@ -176,7 +177,7 @@ class Cloud:
             )  # fmt: skip
 
     def size(self, factor: float = 1.0) -> float:
-        """Return the size of a point [m]."""
+        """Return the `point_size` of a point [m]."""
         return DOT * factor * self.scale * max(self.spacing, 1e-6)
 
 

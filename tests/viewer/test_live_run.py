@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from neuido import Scene, Simulator, UserError, laws, shapes
+from neuido import Operator, Scene, Simulator, UserError, laws, shapes
 from neuido.physics.colliders import Sphere
 from neuido.types import Keyframes
-from neuido.viewer.live_run import LawFamily, LiveRun, classical_family
+from neuido.viewer.live_run import LawFamily, LiveRun, classical_family, latent_family
 
 MATERIAL = {"law": "fixed_corotated", "young": 3e4, "poisson": 0.3}
 
@@ -119,3 +119,13 @@ def test_colliders_keep_their_motion_over_chunks_and_follow_a_slider():
     run.reset()
     run._turn()
     assert run.colliders.poses[0, 0] == pytest.approx(0.2)
+
+
+def test_a_share_leads_from_the_law_of_one_latent_to_that_of_another():
+    operator = Operator.from_pretrained("pretrained")
+    a, b = (operator.latent(name) for name in operator.latent_names[:2])
+    family = latent_family(operator, a, b)
+    with torch.no_grad():
+        for share, z in ((0.0, a), (0.5, (a + b) / 2), (1.0, b)):
+            made, expected = family.make({"share": share})[0], operator.laws(z)[0]
+            assert all(torch.allclose(one, other, rtol=1e-4) for one, other in zip(made.tensors(), expected.tensors()))
