@@ -22,8 +22,8 @@ from neuido.data import cameras
 from neuido.models import attach_gaussians, deform
 from neuido.physics.colliders import Cuboid, Cylinder, Sphere
 from neuido.viewer.content import Content, content_of_frames
-from neuido.viewer.live_page import LivePage
-from neuido.viewer.live_run import LiveRun, classical_family
+from neuido.viewer.live.live_page import LivePage
+from neuido.viewer.live.live_run import LiveRun, classical_family
 from neuido.viewer.notebook import player
 from neuido.viewer.picture import Painter, View
 from neuido.viewer.playback import Playback

@@ -12,7 +12,7 @@ from neuido.viewer.sources import is_scene, read_content
 from neuido.viewer.world import HOST, PORT
 
 if TYPE_CHECKING:
-    from neuido.viewer.live_page import LivePage
+    from neuido.viewer.live.live_page import LivePage
     from neuido.viewer.playback import Playback
 
 WEIGHTS = "pretrained"
@@ -53,10 +53,10 @@ def view(
     if isinstance(thing, Gaussians):
         return _played(Content("Gaussians", gaussians=[thing]), colour, host, port)
     if hasattr(thing, "rollout"):
-        from neuido.viewer.live_run import LawFamily
+        from neuido.viewer.live.live_run import LawFamily
 
-        laws = law if isinstance(law, Sequence) else (law, None)
-        return _live(thing, LawFamily(lambda values: tuple(laws), ()), "scene", colour, host, port)  # type: ignore[arg-type]
+        laws = tuple(law) if isinstance(law, Sequence) else (law, None)
+        return _live(thing, LawFamily(lambda values: laws, ()), "scene", colour, host, port)  # type: ignore[arg-type, return-value]
     if getattr(thing, "x", None) is None or thing.x.ndim != 3:
         raise UserError(f"{type(thing).__name__} cannot be viewed: give Frames, Gaussians, a Simulator or a path")
     elastic = law[0] if isinstance(law, Sequence) else law
@@ -128,7 +128,7 @@ def _live_of_file(
 ) -> "LivePage":
     from neuido.data.bodies.scene_files import load_scene
     from neuido.physics.mpm.simulator import Simulator
-    from neuido.viewer.live_run import LawFamily, classical_family, latent_family
+    from neuido.viewer.live.live_run import LawFamily, classical_family, latent_family
 
     setup = load_scene(path, data_root)
     if latents is not None:
@@ -148,7 +148,7 @@ def _live_of_file(
 
 
 def _live(simulator: Any, family: Any, title: str, colour: str | None, host: str, port: int) -> "LivePage":
-    from neuido.viewer.live_page import LivePage
-    from neuido.viewer.live_run import LiveRun
+    from neuido.viewer.live.live_page import LivePage
+    from neuido.viewer.live.live_run import LiveRun
 
     return LivePage(LiveRun(simulator, family), title, colour=colour, host=host, port=port)

@@ -11,9 +11,9 @@ from neuido.data.files.parsing import naming, read_arrays, read_json, read_yaml
 from neuido.data.files.values import vector
 from neuido.data.formats.ply import read_ply_header, read_ply_vertices
 from neuido.errors import UserError, suggest
-from neuido.types import Gaussians, Plane
+from neuido.types import Gaussians, Plane, Scene
 from neuido.viewer.content import Content, Motion, moved_surface, place_side_by_side, skin_surface, with_scene
-from neuido.viewer.quantities import stress_of
+from neuido.viewer.quantities import stress_by_body, stress_of
 
 RATE = 20.0
 """Frames a second at which motions without times are played: that of the videos of `neuido predict`."""
@@ -112,8 +112,11 @@ def _archive(path: Path, recording: str | None) -> Content:
             raise UserError(f"{path}: {name} has the shape {arrays[name].shape}; with x {x.shape} it must be {shape}")
     given = arrays.get("times", arrays.get("t"))
     times, timed = _times(given if given is None or given.ndim == 1 else given[0], frames, path)
-    scene, law = _beside(path.parent)
-    body, stress = arrays.get("body"), None if law is None else stress_of(law)
+    scene, laws = _beside(path.parent)
+    body = arrays.get("body")
+    stress = stress_of(laws[0]) if len(laws) == 1 else None
+    if body is not None and len(laws) > 1:
+        stress = stress_by_body(laws, body)
     motion = Motion("simulated", times, x.astype(np.float32), arrays.get("v"), arrays.get("F"), stress=stress, body=body)
     content = Content(path.parent.name if path.name == "frames.npz" else path.stem, [motion], times=times, timed=timed)
     _add_surfaces(content, arrays, path)
@@ -165,24 +168,27 @@ def _times(given: np.ndarray | None, frames: int, path: Path) -> tuple[np.ndarra
     return given.astype(np.float64), True
 
 
-def _beside(folder: Path) -> tuple[Any, Any]:
-    """Return the scene and the elastic law that `neuido simulate` kept in a folder; None where absent."""
+def _beside(folder: Path) -> tuple[Scene | None, list[Any]]:
+    """Return the scene and the elastic laws of its bodies that `neuido simulate` kept in a folder; None and no law where absent.
+
+    Colliders other than planes are left out: the file of frames has their surfaces.
+    """
     from neuido.data.bodies.scene_files import model_from_dict, scene_from_dict
     from neuido.physics.laws.classical import material
 
     if not (folder / SCENE).is_file():
-        return None, None
+        return None, []
     content = read_yaml(folder / SCENE)
     with naming(folder / SCENE):
-        scene = scene_from_dict(content["scene"], content["discretisation"])
+        own = dict(content["scene"])
+        own["colliders"] = [each for each in own.get("colliders") or [] if "plane" in (each.get("kind"), each.get("type"))]
+        scene = scene_from_dict(own, content["discretisation"])
         if (folder / LAW).is_file():
             from neuido.models.inference.law_file import load_law
 
-            return scene, load_law(folder / LAW)[0]
-        if "model" not in content:
-            return scene, None
-        model = model_from_dict(content["model"])
-        return scene, material(model["elasticity"], model["plasticity"])[0]
+            return scene, [load_law(folder / LAW)[0]]
+        models = [model_from_dict(each["model"]) for each in content.get("bodies") or [content]]
+        return scene, [material(model["elasticity"], model["plasticity"])[0] for model in models]
 
 
 def _numbered(folder: Path) -> list[Path]:

@@ -7,7 +7,7 @@ import torch
 from neuido import Operator, Scene, Simulator, UserError, laws, shapes
 from neuido.physics.colliders import Sphere
 from neuido.types import Keyframes
-from neuido.viewer.live_run import LawFamily, LiveRun, classical_family, latent_family
+from neuido.viewer.live.live_run import LawFamily, LiveRun, classical_family, latent_family
 
 MATERIAL = {"law": "fixed_corotated", "young": 3e4, "poisson": 0.3}
 

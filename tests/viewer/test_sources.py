@@ -38,6 +38,25 @@ def test_a_folder_of_simulate_has_floor_gravity_and_stress(tmp_path, capsys):
     assert stress.values(0).max() == pytest.approx(0.0, abs=1e-2) and stress.values(9).shape == stress.values(0).shape
 
 
+def test_bodies_have_their_laws_and_colliders_their_surfaces(tmp_path, capsys):
+    model = "{density: 1000.0, elasticity: {law: fixed_corotated, young: %s, poisson: 0.2}}"
+    text = SCENE[: SCENE.index("model:")] + "bodies:\n" + "".join(
+        f"  - {{name: {name}, model: {model % young}, body: {{shape: ball, centre: [{x}, 0.4, 0.5], radius: 0.12, spacing: 0.04}}}}\n"
+        for name, young, x in (("soft", "1.0e+4", 0.3), ("hard", "4.0e+4", 0.7))
+    ) + SCENE[SCENE.index("discretisation:") :]  # fmt: skip
+    text = text.replace("gravity:", "colliders: [{kind: sphere, radius: 0.1, position: [0.3, 0.2, 0.5], contact: separate}]\n  gravity:")
+    (tmp_path / "two.yaml").write_text(text)
+    status, _, err = run(capsys, "simulate", tmp_path / "two.yaml", "--out", tmp_path / "out", "--steps", 40, "--device", "cpu")
+    assert status == 0, err
+    content = read_content(tmp_path / "out")
+    motion = content.motions[0]
+    assert len(content.surfaces) == 1 and np.ptp(content.surfaces[0].vertices(0), axis=0) == pytest.approx([0.2, 0.2, 0.2], abs=0.01)
+    assert set(motion.body) == {0, 1}
+    hard = motion.body == 1
+    strained = motion.F[-1] @ np.diag([1.1, 1.0, 1.0])
+    assert np.linalg.norm(motion.stress(strained)[hard]) > 3 * np.linalg.norm(motion.stress(strained)[~hard])
+
+
 def test_several_scenes_stand_apart(tmp_path):
     arrays = {"x": np.random.default_rng(0).random((2, 20, 3)).astype(np.float32), "scene": np.repeat([0, 1], 10).astype(np.int32)}
     np.savez(tmp_path / "two.npz", **arrays)

@@ -101,8 +101,8 @@ def test_the_slider_moves_the_particles(opened):
 
 @pytest.mark.slow
 def test_a_live_scene_runs_is_pulled_and_resets(opened):
-    from neuido.viewer.live_page import LivePage
-    from neuido.viewer.live_run import LiveRun, classical_family
+    from neuido.viewer.live.live_page import LivePage
+    from neuido.viewer.live.live_run import LiveRun, classical_family
 
     body = shapes.ball(centre=(0.5, 0.5, 0.5), radius=0.2, spacing=0.05)
     simulator = Simulator(Scene(cells=16, dt=1e-3, gravity=(0.0, 0.0, 0.0)), body, device="cpu")

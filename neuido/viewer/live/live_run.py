@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuido.errors import UserError, one_line, shortened
 from neuido.types import ParticleState
-from neuido.viewer.live_colliders import LiveColliders
+from neuido.viewer.live.live_colliders import LiveColliders
 
 CHUNK_SECONDS = 0.04
 """Time that a chunk of substeps should take [s], after which the page is drawn: 25 pictures a second."""

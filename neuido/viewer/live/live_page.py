@@ -8,9 +8,9 @@ import numpy as np
 from neuido.data.files.html_page import escaped
 from neuido.physics.colliders.solid_meshes import mesh_of
 from neuido.viewer.content import PLAIN, Content, Motion, with_scene
-from neuido.viewer.live_run import LiveRun, Parameter
+from neuido.viewer.live.live_run import LiveRun, Parameter
 from neuido.viewer.picture import COLLIDER
-from neuido.viewer.quantities import Quantity, TotalGradients, quantities_of, readable, stress_of
+from neuido.viewer.quantities import Quantity, TotalGradients, quantities_of, readable, stress_by_body, stress_of
 from neuido.viewer.world import HOST, PORT, Cloud, address_of, close_server, furnish, legend_html, open_server
 
 HULL_SECONDS = 0.25
@@ -43,10 +43,12 @@ class LivePage:
         self.run, self.title, self.pictures = run, title, 0
         self._first = [part.detach().cpu().numpy() for part in (run.state.x, run.state.v, run.state.F)]
         self._total = TotalGradients(self._first[0], self._first[2])
+        many = len(run.scene.bodies) > 1
+        self._body = np.repeat(np.arange(len(run.scene.bodies)), [len(each.x) for each in run.scene.bodies]) if many else None
         self._ranges: dict[str, tuple[float, float]] = {}
         self._colour, self._hull_time = colour or "speed", 0.0
         self.server = open_server("neuido", host, port)
-        motion = Motion(title, np.zeros(1), self._first[0][None])
+        motion = Motion(title, np.zeros(1), self._first[0][None], body=self._body)
         self.content = with_scene(Content(title, [motion]), run.scene)
         low, high = self.content.bounds
         down = self.content.up * np.dot(high - low, np.abs(self.content.up))
@@ -174,8 +176,10 @@ class LivePage:
         """Return the quantities of the state now, which is the second of two frames; the first is that at t = 0."""
         now = [part.detach().cpu().numpy() for part in (self.run.state.x, self.run.state.v, self.run.state.F)]
         x, v, F = (np.stack(pair) for pair in zip(self._first, now))
-        law = self.run.laws[0]
+        law, bodies = self.run.laws[0], self.run.scene.bodies
         stress = None if law is None else stress_of(law)
+        if law is None and self._body is not None:
+            stress = stress_by_body([each.law for each in bodies], self._body)
         return quantities_of(np.array([0.0, max(self.run.time, 1e-9)]), x, v, F, stress=stress, gradients=self._total)
 
     def show(self) -> None:
